@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from stcal.design import reference_board
-from stcal.io.camera import read_camera
+from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_toml, load_board, load_target
 from stcal.parallel import run_parallel
 
@@ -179,7 +179,7 @@ def timed_following(film: Path, scene) -> tuple[float, float]:
     from stcal.io.images import decode
     from stcal.sfm import MeasureOptions, Tracker
     from stcal.sfm import measure as measure_images
-    from stcal.sfm.measure.target import TargetCircles
+    from stcal.sfm.measurement.target import TargetCircles
 
     labels, radius = tuple(scene.circles_target), scene.target.radius_of()
     xyz = np.array([scene.circles_target[label] for label in labels])
@@ -229,11 +229,11 @@ def timed_detection(data: Path, cache: Path):
 
 def timed_calibration(out: Path) -> float:
     """Seconds from the models of a finished run's groups to the calibrated target, options as in the run."""
-    from stcal.io.camera import camera_prior
+    from stcal.io.cameras.model import camera_prior
     from stcal.sfm.adjust.calibration import calibrate
     from stcal.sfm.mapping.database import image_ids
     from stcal.sfm.mapping.models import read_model
-    from stcal.sfm.run.saved import load_run
+    from stcal.sfm.runs.saved import load_run
 
     run = load_run(out)
     ids, px = image_ids(run.observations), run.corrected_px
@@ -260,10 +260,10 @@ def timed_advice() -> float:
     from stcal.geometry.rigid import Rigid
     from stcal.sfm.adjust.chain import CalibratedTarget
     from stcal.sfm.adjust.joint import covariance_of
-    from stcal.sfm.plan.advise import Known, advise
-    from stcal.sfm.plan.forecast import CentreNoise, Setup
-    from stcal.sfm.plan.simulated import observe, true_models
-    from stcal.sfm.plan.views import known_scene
+    from stcal.sfm.planning.advise import Known, advise
+    from stcal.sfm.planning.forecast import CentreNoise, Setup
+    from stcal.sfm.planning.simulated import observe, true_models
+    from stcal.sfm.planning.views import known_scene
     from stcal.synthetic.scene import SceneOptions, make_scene
 
     scene = make_scene(SceneOptions(images_per_group=ADVISED // GROUPS))

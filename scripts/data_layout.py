@@ -23,15 +23,15 @@ FILES = Path(__file__).resolve().parents[1] / "docs" / "reference" / "files"
 BLOCK = re.compile(r"(<!-- made by scripts/data_layout\.py: (\w+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 MODULES = (
     "stcal.sfm.adjust.file",
-    "stcal.sfm.run.marker",
-    "stcal.sfm.run.report",
-    "stcal.sfm.run.verify",
-    "stcal.sfm.measure.files",
+    "stcal.sfm.runs.marker",
+    "stcal.sfm.runs.report",
+    "stcal.sfm.runs.verify",
+    "stcal.sfm.measurement.files",
     "stcal.sfm.report.compare",
     "stcal.synthetic.truth",
     "stcal.sfm.camera.file",
     "stcal.sfm.camera.rig_file",
-    "stcal.sfm.plan.file",
+    "stcal.sfm.planning.file",
     "stcal.sfm.budget.file",
     "stcal.sfm.interop.file",
     "stcal.sfm.diagnose.file",
@@ -43,7 +43,7 @@ MODULES = (
     "stcal.locate.report.files",
     "stcal.locate.report.located",
     "stcal.robot.axes.files",
-    "stcal.robot.identify.files",
+    "stcal.robot.identification.files",
     "stcal.robot.use.files",
 )
 """Where the models are."""

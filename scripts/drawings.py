@@ -25,8 +25,8 @@ from stcal.report.figure import COLOURS, FAINT, INK, calm, new_figure
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.refine import eccentricity_px
-from stcal.sfm.plan.simulated import observe, true_models
-from stcal.sfm.run.options import RunOptions
+from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene, nominal_target_from_face
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -67,3 +67,23 @@ class ChecksFailed(StcalError):
     """The result is there, and did not pass its own checks."""
 
     exit_code = 4
+
+
+NO_MEMORY = "not enough memory"
+USED_UP = (
+    "allocate",
+    "failed to map",
+    "start new thread",
+    "bad_alloc",
+    "out of memory",
+    "insufficient memory",
+    "errno 12",
+)
+
+
+def lacks_memory(error: BaseException) -> bool:
+    """Whether this is how Python, the loader of libraries, or a library says that memory or processes are used up."""
+    chain: list[BaseException] = [error]
+    while last := chain[-1].__cause__ or chain[-1].__context__:
+        chain.append(last)
+    return any(isinstance(e, MemoryError) or any(words in str(e).lower() for words in USED_UP) for e in chain)

@@ -29,7 +29,7 @@ from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.model import WorldModel
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.plan.simulated import observe, true_models
+from stcal.sfm.planning.simulated import observe, true_models
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from tests.shared import Once, without_rights
 

@@ -1,7 +1,10 @@
 """Who may import whom, folder by folder, and where heavy libraries belong: read from the source with ``ast``."""
 
 import ast
+import importlib
 from collections import Counter
+from collections.abc import Mapping
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import stcal
@@ -13,7 +16,7 @@ MOST_ENTRIES = 16
 """Of ``sfm/``, folders and files."""
 
 LAYERS = (
-    ("errors", "front", "parallel", "held_out"),
+    ("errors", "parallel", "held_out"),
     ("geometry",),
     ("design", "labels", "likeness"),
     ("io",),
@@ -33,19 +36,19 @@ INSIDE = {
         ("detect", "mapping"),
         ("report",),
         ("adjust",),
-        ("checks", "camera", "measure"),
-        ("run",),
-        ("interop", "diagnose", "plan", "budget", "make"),
+        ("checks", "camera", "measurement"),
+        ("runs",),
+        ("interop", "diagnose", "planning", "budget", "make"),
         (".",),
     ),
-    "robot": (("kinematics",), ("identify", "axes", "urdf"), ("use",), ("export",), (".",)),
+    "robot": (("kinematics",), ("identification", "axes", "urdf"), ("use",), ("export",), (".",)),
     "register": (("core",), ("judge", "workspace"), (".",), ("report",)),
     "handeye": (("data",), ("methods",), ("judge",), (".",), ("rig",), ("report",)),
-    "locate": (("data",), ("pose", "calibrate"), (".",), ("report",)),
+    "locate": (("data",), ("pose", "calibration"), (".",), ("report",)),
 }
 """Folders of each system, from below; ``.`` stands for the files beside them. Folders of one layer know nothing of each
 other; a folder uses those inside it, not they it."""
-SIDEWAYS = {("locate/calibrate", "locate/pose")}
+SIDEWAYS = {("locate/calibration", "locate/pose")}
 """(importer, imported) of one layer."""
 FRONTS = {f"{system}/__init__.py" for system in INSIDE}
 """May hand on everything of their system."""
@@ -67,6 +70,8 @@ def imports_in(source: str, module: str) -> set[str]:
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            found |= {argument.value for argument in node.args[:1] if isinstance(argument, ast.Constant)}
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
@@ -143,7 +148,7 @@ FILES = sorted(str(path.relative_to(ROOT).as_posix()) for path in ROOT.rglob("*.
 
 
 def test_the_source_is_found():
-    assert {"errors.py", "geometry/rigid.py", "design.py", "io/camera.py", "sfm/pipeline.py"} <= set(FILES)
+    assert {"errors.py", "geometry/rigid.py", "design.py", "io/cameras/model.py", "sfm/pipeline.py"} <= set(FILES)
 
 
 def violations_of(path: str, source: str) -> list[str]:
@@ -176,6 +181,47 @@ def test_no_file_repeats_its_folder():
     assert repeated == []
 
 
+def circle(sources: Mapping[str, str]) -> list[str]:
+    """Modules that import each other in a circle, in functions too; empty where there is none.
+
+    Parameters
+    ----------
+    sources : contents of files by their paths below ``stcal/``
+    """
+    modules = {
+        f"stcal.{path.removesuffix('.py').replace('/', '.')}".removesuffix(".__init__"): path for path in sources
+    }
+    graph = {name: imports_in(sources[path], _as_child(name, path)) & modules.keys() for name, path in modules.items()}
+    try:
+        TopologicalSorter({name: others - {name} for name, others in graph.items()}).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def _as_child(module: str, path: str) -> str:
+    """Name by whose parent relative imports are resolved."""
+    return f"{module}.__init__" if path.endswith("__init__.py") else module
+
+
+def test_no_modules_import_each_other():
+    assert circle({path: (ROOT / path).read_text(encoding="utf-8") for path in FILES}) == []
+
+
+def test_circles_are_found():
+    hidden = {"a.py": "from stcal.b import c", "b/c.py": "def f():\n    import stcal.d", "d.py": "from . import a"}
+    assert set(circle(hidden)) == {"stcal.a", "stcal.b.c", "stcal.d"}
+    named = {"a.py": "import stcal.b", "b.py": "import importlib\nimportlib.import_module('stcal.a')"}
+    assert set(circle(named)) == {"stcal.a", "stcal.b"}
+    assert circle({"a.py": "import stcal.b", "b.py": "import stcal.c", "c.py": ""}) == []
+
+
+def test_no_public_name_is_a_module_too():
+    for system in INSIDE:
+        names = importlib.import_module(f"stcal.{system}").__all__
+        assert {each.stem for each in (ROOT / system).iterdir()} & set(names) <= {system}
+
+
 CAUGHT = [
     ("errors.py", "import stcal.geometry"),
     ("geometry/plane.py", "from stcal.labels import BOARD"),
@@ -188,7 +234,7 @@ CAUGHT = [
     ("io/design.py", "import stcal.sfm.adjust.faces"),
     ("sfm/adjust/faces.py", "from stcal.sfm import pipeline"),
     ("sfm/adjust/faces.py", "from stcal.sfm.pipeline import run"),
-    ("sfm/adjust/faces.py", "from stcal.sfm.run.options import RunOptions"),
+    ("sfm/adjust/faces.py", "from stcal.sfm.runs.options import RunOptions"),
     ("sfm/detect/faces.py", "from stcal.sfm.mapping import pairs"),
     ("sfm/detect/circles/fits.py", "from stcal.sfm.detect.faces import x"),
     ("sfm/data/model.py", "from stcal.sfm.detect.faces import x"),
@@ -215,7 +261,7 @@ CAUGHT = [
     ("workflows/board_views.py", "import cv2"),
     ("workflows/board_views.py", "from stcal.cli.main import main"),
     ("boards/tags.py", "from stcal.locate.pose import estimate"),
-    ("sfm/plan/session.py", "from stcal.synthetic.measured import image_poses"),
+    ("sfm/planning/session.py", "from stcal.synthetic.measured import image_poses"),
 ]
 
 
@@ -225,12 +271,12 @@ def test_the_rules_catch_it():
 
 PASSED = [
     ("geometry/plane.py", "from dataclasses import dataclass\nfrom .rigid import Rigid\nimport scipy.spatial"),
-    ("sfm/pipeline.py", "from stcal.sfm.adjust import faces\nfrom stcal.io.camera import read_camera"),
+    ("sfm/pipeline.py", "from stcal.sfm.adjust import faces\nfrom stcal.io.cameras.read import read_camera"),
     ("sfm/__init__.py", "from stcal.sfm.pipeline import run"),
     ("sfm/mapping/database.py", "import sqlite3, pycolmap"),
     ("sfm/detect/circles/centres.py", "import cv2"),
     ("sfm/detect/faces.py", "from stcal.sfm.detect.circles.centres import measure_centres"),
-    ("sfm/run/saved.py", "from stcal.sfm.checks.verdict import Check"),
+    ("sfm/runs/saved.py", "from stcal.sfm.checks.verdict import Check"),
     ("handeye/methods/closed_form.py", "import cv2"),
     ("boards/tags.py", "import cv2\nfrom stcal.io.images import grey_8bit"),
     ("synthetic/render.py", "import cv2\nfrom stcal.io.design import target_toml"),

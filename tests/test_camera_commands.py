@@ -8,8 +8,9 @@ from typer.testing import CliRunner
 
 from stcal.cli.cameras import app
 from stcal.geometry.camera import Camera
-from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
 from stcal.io.cameras.difference import camera_difference
+from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.read import read_camera
 from tests.outcome import fails_with
 
 CAMERA = Camera(1280, 960, [900.0, 905.0], [640.0, 475.0], [-0.1, 0.03, 1e-3, -2e-3, 0, 0, 0, 0])

@@ -15,7 +15,7 @@ from scipy.special import chdtrc
 from stcal.cli.main import main, main_sfm
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 from stcal.io.table import POSE, pose_cells, read_table
 from stcal.locate.data.layout import layout_toml
 from stcal.robot.kinematics.example import mh80

@@ -24,7 +24,7 @@ FOLDERS = {
     ("from_photos", "out"),
 }
 FOLDERS |= {("export_model", "out"), ("capture", "out"), ("capture", "images")}
-"""New ones, which replace nothing, or those of `tests/sfm/run/test_transaction.py`."""
+"""New ones, which replace nothing, or those of `tests/sfm/runs/test_transaction.py`."""
 WRITES = ("Write ", "Also write ", "Draw ", "Keep ")
 EVERY = list(COMMANDS.values())
 

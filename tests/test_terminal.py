@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 
 import stcal
 from stcal.cli import terminal
-from stcal.cli.entry import lacks_memory
 from stcal.cli.main import app, main
 from stcal.cli.sfm import app as sfm
+from stcal.errors import lacks_memory
 from tests.commands import COMMANDS
 from tests.outcome import INPUT, assert_error, ended
 

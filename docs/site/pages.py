@@ -21,7 +21,8 @@ SYSTEMS = {
 """Packages whose ``__all__`` is the public interface."""
 BESIDE = {
     "stcal.geometry.rigid": ("Rigid",),
-    "stcal.io.camera": ("CameraModel", "read_camera"),
+    "stcal.io.cameras.model": ("CameraModel",),
+    "stcal.io.cameras.read": ("read_camera",),
     "stcal.io.design": ("load_target", "load_board"),
     "stcal.errors": None,
 }

@@ -27,8 +27,8 @@ from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.sfm import run
 from stcal.sfm.data.model import WorldModel
-from stcal.sfm.run.options import RunOptions
-from stcal.sfm.run.published import AS_PUBLISHED, STEPS, Answer, answer_of, in_steps
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.published import AS_PUBLISHED, STEPS, Answer, answer_of, in_steps
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 

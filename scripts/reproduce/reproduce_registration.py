@@ -30,7 +30,7 @@ from stcal.register import register
 from stcal.register.core.liu2017 import Liu2017Options, affine_least_squares, liu2017
 from stcal.register.workspace.field import residual_field
 from stcal.report.figure import save
-from stcal.robot.identify.result import IdentifyOptions
+from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.damped import InverseProblem, solve
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward

@@ -24,10 +24,10 @@ from stcal.labels import parse_label
 from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.robot.axes.model import robot_from_sweeps
-from stcal.robot.identify.residuals import jacobian as jacobian_of
-from stcal.robot.identify.residuals import observed, residuals
-from stcal.robot.identify.result import Identified, IdentifyOptions
-from stcal.robot.identify.solve import identify
+from stcal.robot.identification.residuals import jacobian as jacobian_of
+from stcal.robot.identification.residuals import observed, residuals
+from stcal.robot.identification.result import Identified, IdentifyOptions
+from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import inverse
@@ -36,9 +36,9 @@ from stcal.robot.kinematics.model import Joint, Robot
 from stcal.robot.use.compensation import compensate
 from stcal.robot.use.targets import Targets
 from stcal.robot.use.verification import MeasuredPoses, SetResult, verify
-from stcal.sfm.measure.common_errors import common_errors
-from stcal.sfm.measure.pose import pose_from_circles
-from stcal.sfm.measure.target import TargetCircles
+from stcal.sfm.measurement.common_errors import common_errors
+from stcal.sfm.measurement.pose import pose_from_circles
+from stcal.sfm.measurement.target import TargetCircles
 from stcal.synthetic.measured.arms import joint_vectors, made, placed
 from stcal.synthetic.measured.image_poses import KnownTarget, known_target, pose_error, see
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene

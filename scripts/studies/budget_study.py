@@ -26,7 +26,7 @@ from stcal.design import StatedSize, reference_board
 from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.camera import CalibratedCamera, CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import CalibratedCamera, CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import calibrate
@@ -40,8 +40,8 @@ from stcal.sfm.budget.combine import Budget, budget
 from stcal.sfm.budget.sources import correction
 from stcal.sfm.budget.statement import FIELDS, Statement
 from stcal.sfm.data.model import MetricModel
-from stcal.sfm.plan.simulated import observe, true_models
-from stcal.sfm.run.options import RunOptions
+from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of
 

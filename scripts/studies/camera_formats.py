@@ -11,10 +11,10 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.camera import CalibratedCamera, parameter_names
 from stcal.io.cameras.fit import fit_lens
 from stcal.io.cameras.foreign import ForeignLens
 from stcal.io.cameras.forms import WRITERS, written
+from stcal.io.cameras.model import CalibratedCamera, parameter_names
 from stcal.io.cameras.read import read_lens
 
 WIDTH, HEIGHT = 1280, 961

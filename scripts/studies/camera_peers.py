@@ -35,8 +35,9 @@ from stcal.boards.file import load_flat_board
 from stcal.design import BoardDesign, reference_board
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
-from stcal.io.camera import CameraModel, camera_from_colmap, read_camera
 from stcal.io.cameras.difference import camera_difference
+from stcal.io.cameras.model import CameraModel, camera_from_colmap
+from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_of, target_of
 from stcal.sfm import run
 from stcal.sfm.camera.calibrate import calibrate_camera
@@ -44,7 +45,7 @@ from stcal.sfm.camera.held_out import FOLDS, foretold
 from stcal.sfm.camera.intrinsics import adjust_intrinsics
 from stcal.sfm.camera.views import closed_form, start_camera, start_pose
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.run.options import RunOptions
+from stcal.sfm.runs.options import RunOptions
 from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
 
 TRUE = Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [-0.06, 0.045, 1.5e-4, -1e-4, 0, 0, 0, 0])

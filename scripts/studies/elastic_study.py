@@ -27,12 +27,12 @@ import numpy as np
 
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
-from stcal.robot.identify.adjustment import parameter_units
-from stcal.robot.identify.elastic import HEAVIER
-from stcal.robot.identify.nominal import Deviations, NominalRows
-from stcal.robot.identify.residuals import State, jacobian, observed, tip_jacobian, tips
-from stcal.robot.identify.result import Identified, IdentifyOptions
-from stcal.robot.identify.solve import identify
+from stcal.robot.identification.adjustment import parameter_units
+from stcal.robot.identification.elastic import HEAVIER
+from stcal.robot.identification.nominal import Deviations, NominalRows
+from stcal.robot.identification.residuals import State, jacobian, observed, tip_jacobian, tips
+from stcal.robot.identification.result import Identified, IdentifyOptions
+from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.measurements import Measurements

@@ -37,7 +37,7 @@ import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 from stcal.labels import BOARD
 from stcal.synthetic import degrade
 from stcal.synthetic.photograph import Photograph, Plane, RenderedSet, read_set

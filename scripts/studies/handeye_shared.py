@@ -19,7 +19,8 @@ from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.report.file import HandEyeFile
 from stcal.handeye.report.page import outcome_text
-from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
+from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.read import read_camera
 from stcal.workflows.handeye.calibrate import ALL, Splits, calibrate
 from stcal.workflows.handeye.inputs import read_input
 

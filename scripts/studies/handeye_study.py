@@ -24,7 +24,7 @@ from stcal.handeye.data.views import Views, pairs_of_views
 from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.noise import components
 from stcal.handeye.methods.reprojection import problem
-from stcal.io.camera import CalibratedCamera, camera_prior, intrinsic_basis
+from stcal.io.cameras.model import CalibratedCamera, camera_prior, intrinsic_basis
 from stcal.parallel import one_thread
 from stcal.synthetic.measured.handeye import CAMERA, Truth, simulated, simulated_views
 from stcal.workflows.cluster import executor_of

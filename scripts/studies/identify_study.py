@@ -19,9 +19,9 @@ import numpy as np
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.parallel import one_thread
-from stcal.robot.identify.residuals import Observed, State, jacobian, observed, residuals, tips
-from stcal.robot.identify.result import Identified, IdentifyOptions
-from stcal.robot.identify.solve import identify
+from stcal.robot.identification.residuals import Observed, State, jacobian, observed, residuals, tips
+from stcal.robot.identification.result import Identified, IdentifyOptions
+from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements

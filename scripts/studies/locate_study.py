@@ -21,9 +21,10 @@ import numpy as np
 from stcal.boards.design import CharucoDesign
 from stcal.boards.tags import Tags, find_tags
 from stcal.geometry.rigid import Poses
-from stcal.io.camera import CameraModel, read_camera
+from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode, find_images
-from stcal.locate.calibrate.holdout import PoseTrial, half_calibrated, subset_trials
+from stcal.locate.calibration.holdout import PoseTrial, half_calibrated, subset_trials
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.data.layout import LayoutPlan, TargetLayout
 from stcal.locate.data.views import CalibrationImages

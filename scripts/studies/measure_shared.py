@@ -13,7 +13,7 @@ from pathlib import Path
 from stcal.sfm import RunOptions, run
 from stcal.sfm.interop.crosscheck import comparison_text, crosscheck
 from stcal.sfm.report.compare import compare, comparison_table
-from stcal.sfm.run.saved import load_run
+from stcal.sfm.runs.saved import load_run
 
 
 def main() -> None:

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import CameraPrior, intrinsic_basis
 from stcal.parallel import one_thread
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.measure.pose import TargetPose, pose_from_circles
+from stcal.sfm.measurement.pose import TargetPose, pose_from_circles
 from stcal.synthetic.measured.image_poses import (
     KnownTarget,
     face_view,

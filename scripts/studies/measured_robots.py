@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from same_results import prepare
 
-from stcal.robot.identify.result import IdentifyOptions
-from stcal.robot.identify.solve import identify
+from stcal.robot.identification.result import IdentifyOptions
+from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.measurements import read_measurements
 

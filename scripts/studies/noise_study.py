@@ -24,8 +24,8 @@ from stcal.report.figure import save
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.refine import eccentricity_px
-from stcal.sfm.plan.simulated import observe, true_models
-from stcal.sfm.run.options import RunOptions
+from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, nominal_target_from_face
 from stcal.workflows.cluster import executor_of
 

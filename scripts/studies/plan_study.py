@@ -17,10 +17,10 @@ from dataclasses import replace
 import numpy as np
 
 from stcal.design import reference_board, reference_target
-from stcal.sfm.plan import forecast
-from stcal.sfm.plan.nominal import nominal_poses
-from stcal.sfm.plan.session import PlanOptions, pairs_of_faces, plan
-from stcal.sfm.run.options import RunOptions
+from stcal.sfm.planning import forecast
+from stcal.sfm.planning.nominal import nominal_poses
+from stcal.sfm.planning.session import PlanOptions, pairs_of_faces, plan
+from stcal.sfm.runs.options import RunOptions
 
 BASE = PlanOptions()
 FOCAL_MM, SENSOR_MM, WAVELENGTH_MM = 24.0, 36.0, 550e-6

@@ -29,8 +29,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.held_out import dealt, held_out_errors
 from stcal.register import register
 from stcal.register.core.liu2017 import affine_least_squares
-from stcal.robot.identify.result import IdentifyOptions
-from stcal.robot.identify.solve import identify
+from stcal.robot.identification.result import IdentifyOptions
+from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward

@@ -23,8 +23,8 @@ from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.database import write_database
 from stcal.sfm.mapping.graph import image_graph
-from stcal.sfm.run.options import RunOptions
-from stcal.sfm.run.solve import solve_groups
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.solve import solve_groups
 from stcal.synthetic.observe import image_circles, simulate_centres
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 

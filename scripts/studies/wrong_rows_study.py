@@ -16,9 +16,9 @@ import numpy as np
 
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
-from stcal.robot.identify.residuals import State, observed, residuals, tips
-from stcal.robot.identify.result import Identified, IdentifyOptions
-from stcal.robot.identify.solve import identify
+from stcal.robot.identification.residuals import State, observed, residuals, tips
+from stcal.robot.identification.result import Identified, IdentifyOptions
+from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot

@@ -11,7 +11,7 @@ from stcal.cli.terminal import print_each, say, write
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
-    from stcal.io.camera import CalibratedCamera
+    from stcal.io.cameras.model import CalibratedCamera
 
 app = typer.Typer(
     name="stcal camera",
@@ -119,8 +119,8 @@ def compare(
 
 
 def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
-    from stcal.io.camera import CameraModel
     from stcal.io.cameras.fit import fit_lens
+    from stcal.io.cameras.model import CameraModel
     from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
     from stcal.io.cameras.read import read_lens
     from stcal.report.camera import exif_text, fitted_text

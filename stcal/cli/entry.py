@@ -7,17 +7,8 @@ from importlib import import_module
 from types import ModuleType
 
 import stcal
+from stcal.errors import NO_MEMORY, lacks_memory
 
-NO_MEMORY = "not enough memory"
-USED_UP = (
-    "allocate",
-    "failed to map",
-    "start new thread",
-    "bad_alloc",
-    "out of memory",
-    "insufficient memory",
-    "errno 12",
-)
 ADDRESS_SPACE = 800 << 20
 """Bytes; NumPy, SciPy, OpenCV and pycolmap take 740 MB of it when they are loaded (`VmPeak`)."""
 LOADING = {signal.SIGINT: ("interrupted", 130), signal.SIGTERM: ("terminated", 143)}
@@ -31,14 +22,6 @@ def main() -> None:
 def main_sfm() -> None:
     """Entry point of ``stcal-sfm``."""
     _run("main_sfm")
-
-
-def lacks_memory(error: BaseException) -> bool:
-    """Whether this is how Python, the loader of libraries, or a library says that memory or processes are used up."""
-    chain: list[BaseException] = [error]
-    while last := chain[-1].__cause__ or chain[-1].__context__:
-        chain.append(last)
-    return any(isinstance(e, MemoryError) or any(words in str(e).lower() for words in USED_UP) for e in chain)
 
 
 def _run(name: str) -> None:

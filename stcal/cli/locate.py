@@ -117,8 +117,8 @@ def calibrate(
 ) -> None:
     """Find where the corners of the target's tags lie, with σ, in a frame in the middle of the layout's origin tag."""
     from stcal.boards.file import load_flat_board
-    from stcal.io.camera import read_camera
-    from stcal.locate.calibrate.solve import calibrate as calibrated
+    from stcal.io.cameras.read import read_camera
+    from stcal.locate.calibration.solve import calibrate as calibrated
     from stcal.locate.data.layout import layout_toml, load_plan
     from stcal.locate.report.calibration import calibrated_file, calibrated_text, warnings
     from stcal.workflows.locate import calibration_images
@@ -225,7 +225,7 @@ def run(
 
     Exit code 3 when no pose is accepted.
     """
-    from stcal.io.camera import read_camera
+    from stcal.io.cameras.read import read_camera
     from stcal.locate.data.exposures import find_scenes
     from stcal.locate.data.layout import load_layout
     from stcal.locate.pipeline import LocateOptions

@@ -13,11 +13,10 @@ from typer._completion_classes import completion_init
 
 import stcal
 from stcal.cli import cameras, handeye, locate, register, robot, sfm
-from stcal.cli.entry import NO_MEMORY, lacks_memory
 from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import protect_outputs
 from stcal.cli.terminal import printable, say
-from stcal.errors import StcalError
+from stcal.errors import NO_MEMORY, StcalError, lacks_memory
 
 INTERRUPTED, TERMINATED = 130, 143
 MESSAGE_CHARACTERS = 600

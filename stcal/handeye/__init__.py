@@ -1,5 +1,5 @@
 """Hand-eye calibration: where a camera sits on a robot's flange, or beside the robot, and how well that is known."""
 
-from stcal.front import front
+import lazy_loader
 
-front(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -16,7 +16,7 @@ from stcal.handeye.result import HandEye
 from stcal.handeye.scatter import widened_by_scatter
 from stcal.handeye.solve import HandEyeOptions, handeye
 from stcal.handeye.validate import HeldOutPoses, errors_without
-from stcal.io.camera import CameraPrior
+from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread, run_parallel
 
 FIRST_SPLITS = 5

@@ -30,7 +30,7 @@ from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses
 from stcal.handeye.methods.reprojection import CAMERA_GAIN, AdjustedViews, adjust_views, resected
 from stcal.handeye.result import HandEye
-from stcal.io.camera import CameraPrior
+from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
 
 S = TypeVar("S", PoseSolution, AdjustedViews)

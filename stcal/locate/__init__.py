@@ -1,5 +1,5 @@
 """A planar target of several tags: its calibration, where it is under any light, and whether that may be trusted."""
 
-from stcal.front import front
+import lazy_loader
 
-front(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

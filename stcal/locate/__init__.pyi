@@ -1,5 +1,5 @@
-from .calibrate.solve import CalibratedLayout as CalibratedLayout
-from .calibrate.solve import calibrate as calibrate
+from .calibration.solve import CalibratedLayout as CalibratedLayout
+from .calibration.solve import calibrate as calibrate
 from .data.exposures import SceneFiles as SceneFiles
 from .data.exposures import find_scenes as find_scenes
 from .data.layout import LayoutPlan as LayoutPlan

@@ -6,7 +6,7 @@ from typing import Literal
 
 from stcal.boards.tags import other_dictionaries
 from stcal.errors import InputError, StcalError
-from stcal.io.camera import CameraModel, CameraPrior
+from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode
 from stcal.locate.data.exposures import SceneFiles, SceneTags, read_scenes

@@ -1,5 +1,5 @@
 """Registration of two instruments from corresponding points; read ``pipeline.py`` first."""
 
-from stcal.front import front
+import lazy_loader
 
-front(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -20,6 +20,6 @@ Lengths in mm, angles in rad, joint values (m, n) as the controller has them::
     axes = robot.robot_from_sweeps(robot.read_measurements("sweeps.csv", nominal), nominal)  # axes.robot
 """
 
-from stcal.front import front
+import lazy_loader
 
-front(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,7 +1,7 @@
 from .axes.model import robot_from_sweeps as robot_from_sweeps
-from .identify.result import Identified as Identified
-from .identify.result import IdentifyOptions as IdentifyOptions
-from .identify.solve import identify as identify
+from .identification.result import Identified as Identified
+from .identification.result import IdentifyOptions as IdentifyOptions
+from .identification.solve import identify as identify
 from .kinematics.file import load_robot as load_robot
 from .kinematics.file import robot_toml as robot_toml
 from .kinematics.file import save_robot as save_robot

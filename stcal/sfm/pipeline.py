@@ -5,7 +5,8 @@ from pathlib import Path
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
-from stcal.io.camera import CameraModel, camera_prior, read_camera, refinable
+from stcal.io.cameras.model import CameraModel, camera_prior, refinable
+from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_of, target_of
 from stcal.io.images import chosen_images
 from stcal.io.saving import save
@@ -19,13 +20,13 @@ from stcal.sfm.detect.files import DetectionResult, detect_files, require_uprigh
 from stcal.sfm.detect.labels import LabelledImage, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
 from stcal.sfm.mapping.graph import image_graph
-from stcal.sfm.run.folder import overlays_beside, write_run
-from stcal.sfm.run.marker import MarkerFile
-from stcal.sfm.run.options import RunOptions
-from stcal.sfm.run.published import compare_with_paper, require_comparable
-from stcal.sfm.run.result import RunResult
-from stcal.sfm.run.solve import solve_groups, ungrouped, unseen_board, usable_groups
-from stcal.sfm.run.transaction import RunFolder, run_folder
+from stcal.sfm.runs.folder import overlays_beside, write_run
+from stcal.sfm.runs.marker import MarkerFile
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.published import compare_with_paper, require_comparable
+from stcal.sfm.runs.result import RunResult
+from stcal.sfm.runs.solve import solve_groups, ungrouped, unseen_board, usable_groups
+from stcal.sfm.runs.transaction import RunFolder, run_folder
 
 DRAWN_WITH = "matplotlib.backends.backend_svg", "mpl_toolkits.mplot3d.axes3d"
 """What figures of the report take half a second to load."""
@@ -49,7 +50,7 @@ def run(
     images
         Folder with one folder of images for each group.
     camera
-        COLMAP's cameras.txt, OpenCV's YAML or XML, or what :func:`stcal.io.camera.read_camera` returned.
+        COLMAP's cameras.txt, OpenCV's YAML or XML, or what :func:`stcal.io.cameras.read.read_camera` returned.
     out
         The run's folder: new, empty, or of an earlier run.
     target, board

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from stcal.errors import InputError
-from stcal.io.camera import write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.design import board_toml, target_toml
 from stcal.parallel import run_parallel
 from stcal.synthetic.render import RenderOptions, encode, render

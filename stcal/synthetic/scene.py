@@ -11,7 +11,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import FISHEYE, CalibratedCamera, CameraModel
+from stcal.io.cameras.model import FISHEYE, CalibratedCamera, CameraModel
 from stcal.labels import CircleLabel
 from stcal.synthetic.designs import REFERENCE_GROUPS, nominal_target_from_face, second_design, three_point_frame
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes

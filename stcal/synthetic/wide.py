@@ -6,7 +6,7 @@ import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CalibratedCamera
+from stcal.io.cameras.model import CalibratedCamera
 from stcal.synthetic.scene import Scene, SceneOptions
 
 PLACED_FOCAL = 0.39

@@ -12,7 +12,7 @@ import numpy as np
 from stcal.boards.design import BoardView, CharucoDesign, ChessboardDesign, FlatBoard
 from stcal.design import BoardDesign
 from stcal.errors import InputError
-from stcal.io.camera import CameraModel
+from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, find_images
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, one_thread

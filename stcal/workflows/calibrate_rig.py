@@ -7,8 +7,8 @@ from pathlib import Path
 from stcal.boards.design import CharucoDesign, FlatBoard
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
-from stcal.io.camera import CalibratedCamera, cameras_txt
 from stcal.io.cameras.forms import kalibr_chain
+from stcal.io.cameras.model import CalibratedCamera, cameras_txt
 from stcal.io.images import name_fault
 from stcal.io.json import ResultFile
 from stcal.io.saving import json_text

@@ -6,8 +6,8 @@ from pathlib import Path
 from stcal.parallel import Progress
 from stcal.sfm.pipeline import run
 from stcal.sfm.report.compare import CompareFile, compare
-from stcal.sfm.run.options import RunOptions
-from stcal.sfm.run.result import RunResult
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.result import RunResult
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import SceneOptions, make_scene
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from stcal.io.camera import CameraModel
+from stcal.io.cameras.model import CameraModel
 from stcal.io.images import find_images
 from stcal.locate.data.views import CalibrationImages
 from stcal.workflows.board_views import Board, detect_boards

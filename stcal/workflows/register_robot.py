@@ -21,9 +21,9 @@ from stcal.register.report.page import matrix_lines, matrix_rows
 from stcal.register.workspace.findings import Findings
 from stcal.report.page import render
 from stcal.report.text import number, text_table
-from stcal.robot.identify.residuals import State, tips
-from stcal.robot.identify.result import Identified, IdentifyOptions
-from stcal.robot.identify.solve import identify
+from stcal.robot.identification.residuals import State, tips
+from stcal.robot.identification.result import Identified, IdentifyOptions
+from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import read_conditions
 from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.measurements import Measurements, joint_values, targets_of

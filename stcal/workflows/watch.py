@@ -9,7 +9,8 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
-from stcal.io.camera import CameraModel, read_camera
+from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_of, target_of
 from stcal.io.images import ImageFile, Skipped, find_images
 from stcal.io.saving import CACHE
@@ -17,10 +18,10 @@ from stcal.parallel import Progress
 from stcal.sfm.detect.files import detect_files
 from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.sfm.pipeline import run
-from stcal.sfm.plan.advise import Advice, advise, known_of
-from stcal.sfm.run.options import RunOptions
-from stcal.sfm.run.result import RunResult
-from stcal.sfm.run.saved import load_run
+from stcal.sfm.planning.advise import Advice, advise, known_of
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.result import RunResult
+from stcal.sfm.runs.saved import load_run
 
 RELOAD_S = 5
 """The report's page shows itself anew so often."""

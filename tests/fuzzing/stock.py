@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
 from stcal.io.cameras.forms import written
+from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.read import read_camera
 from stcal.io.design import target_toml
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.data.layout import layout_toml
@@ -25,7 +26,7 @@ from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.make.box import sides_of
 from stcal.sfm.make.pattern import make_pattern
 from stcal.sfm.pipeline import RunOptions, run
-from stcal.sfm.run.marker import MarkerFile, digest_of
+from stcal.sfm.runs.marker import MarkerFile, digest_of
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.measured.arms import elastic, joint_vectors, made, measured, placed
 from stcal.synthetic.measured.handeye import simulated

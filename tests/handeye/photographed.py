@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.camera import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 from stcal.io.table import POSE, pose_cells
 from stcal.synthetic.measured.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA
 from tests.boards.drawn import photograph

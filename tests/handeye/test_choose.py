@@ -9,7 +9,7 @@ import pytest
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions, Views, handeye, pairs_of_views, splits
 from stcal.handeye.choose import BY_VIEWS, Candidate, choose
-from stcal.io.camera import CalibratedCamera, camera_prior
+from stcal.io.cameras.model import CalibratedCamera, camera_prior
 from stcal.synthetic.measured.handeye import CAMERA, simulated, simulated_views
 from tests.levels import sampled
 

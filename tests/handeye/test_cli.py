@@ -12,7 +12,7 @@ from stcal.design import BoardDesign
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import METHODS
 from stcal.handeye.report.export import FORMS
-from stcal.io.camera import read_camera
+from stcal.io.cameras.read import read_camera
 from stcal.io.table import POSE, pose_cells
 from stcal.synthetic.measured.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, simulated
 from tests.boards.drawn import chessboard_mm

@@ -18,7 +18,7 @@ from stcal.boards.design import (
 from stcal.design import BoardDesign
 from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CameraModel
+from stcal.io.cameras.model import CameraModel
 from stcal.io.images import find_images
 from stcal.workflows.board_in_image import images_of_centres, symmetries
 from stcal.workflows.board_views import detect_boards

@@ -13,7 +13,7 @@ import yaml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, View, Views, cross_validate, handeye, pairs_of_views, splits
-from stcal.io.camera import CalibratedCamera, camera_prior
+from stcal.io.cameras.model import CalibratedCamera, camera_prior
 
 MEAN_MM = 0.75
 """3-D error at the board that held-out poses may have in the mean."""

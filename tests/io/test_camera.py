@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.camera import CalibratedCamera, read_camera, write_cameras_txt
+from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.read import read_camera
 from tests.outcome import fails_with
 
 K = [[1000.0, 0, 500], [0, 1100, 400], [0, 0, 1]]

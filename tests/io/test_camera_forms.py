@@ -7,8 +7,9 @@ import pytest
 from stcal.cli.cameras import Form
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.camera import CalibratedCamera, read_camera
 from stcal.io.cameras.forms import SUFFIXES, WRITERS, written
+from stcal.io.cameras.model import CalibratedCamera
+from stcal.io.cameras.read import read_camera
 from tests.outcome import fails_with
 
 LENSES = {

@@ -8,7 +8,7 @@ import pytest
 
 from stcal.boards.file import load_flat_board
 from stcal.errors import InputError
-from stcal.io.camera import read_camera
+from stcal.io.cameras.read import read_camera
 from stcal.io.design import load_board
 from stcal.io.files import MB, MODEL_BYTES, SETTINGS_BYTES, TABLE_BYTES, read_bytes
 from stcal.io.json import read_json

@@ -7,10 +7,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from stcal.io.camera import CameraModel, read_camera
 from stcal.io.cameras.fit import fit_lens
 from stcal.io.cameras.foreign import COLMAP_FOREIGN, ForeignLens
-from stcal.io.cameras.read import read_lens
+from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.read import read_camera, read_lens
 from tests.outcome import fails_with
 
 WIDTH, HEIGHT = 1280, 961

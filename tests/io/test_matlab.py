@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from stcal.io.camera import read_camera
 from stcal.io.cameras.fit import fit_lens
 from stcal.io.cameras.foreign import ForeignLens
 from stcal.io.cameras.forms import written
-from stcal.io.cameras.read import read_lens
+from stcal.io.cameras.read import read_camera, read_lens
 from tests.io.test_camera_forms import camera_of
 from tests.outcome import fails_with
 

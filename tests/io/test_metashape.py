@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from stcal.io.camera import CalibratedCamera, camera_prior, parameter_names, read_camera
 from stcal.io.cameras.forms import written
+from stcal.io.cameras.model import CalibratedCamera, camera_prior, parameter_names
+from stcal.io.cameras.read import read_camera
 from tests.io.test_camera_forms import camera_of
 from tests.outcome import fails_with
 

@@ -9,9 +9,10 @@ import pytest
 
 from stcal.boards.design import CharucoDesign
 from stcal.boards.tags import find_tags
-from stcal.io.camera import CameraModel, read_camera
+from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode
-from stcal.locate.calibrate.holdout import half_calibrated, subset_trials
+from stcal.locate.calibration.holdout import half_calibrated, subset_trials
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.data.layout import LayoutPlan
 from stcal.locate.data.views import CalibrationImages

@@ -10,7 +10,7 @@ import pytest
 
 from stcal.cli.main import main
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 from stcal.io.table import POSE, pose_cells, read_table
 from stcal.locate.data.layout import layout_toml, load_layout
 from stcal.synthetic.measured.tags import random_pose

@@ -8,7 +8,7 @@ import pytest
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.camera import CameraModel
+from stcal.io.cameras.model import CameraModel
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pipeline import LocateOptions, locate_scene, run

@@ -12,13 +12,13 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.images import Skipped
 from stcal.io.saving import require_new_folder, save_folder
 from stcal.io.table import Table, pose_cells, read_table
-from stcal.robot.identify.result import IdentifyOptions
+from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.use.targets import Targets
-from stcal.sfm.measure.common_errors import common_errors
-from stcal.sfm.measure.images import MeasuredImage, MeasureResult
-from stcal.sfm.measure.pose import pose_from_circles
+from stcal.sfm.measurement.common_errors import common_errors
+from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
+from stcal.sfm.measurement.pose import pose_from_circles
 from stcal.synthetic.measured.arms import made
 from stcal.synthetic.measured.image_poses import known_target, see
 from stcal.synthetic.scene import SceneOptions, make_scene

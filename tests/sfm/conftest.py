@@ -110,7 +110,7 @@ def small_set(small_dataset, small_run, tmp_path):
 @pytest.fixture
 def no_page(monkeypatch):
     """For those who do not read the report's page, which takes half of a small run's time."""
-    monkeypatch.setattr(import_module("stcal.sfm.run.folder"), "report_html", lambda *_: "")
+    monkeypatch.setattr(import_module("stcal.sfm.runs.folder"), "report_html", lambda *_: "")
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 import stcal
 from stcal.cli.main import main, main_sfm
-from stcal.io.camera import read_camera
+from stcal.io.cameras.read import read_camera
 from stcal.io.design import load_board, load_target
 from stcal.workflows import versions
 from tests.outcome import ended

@@ -10,13 +10,13 @@ import pytest
 
 from stcal.design import BoardDesign, reference_target
 from stcal.geometry.camera import Camera
-from stcal.io.camera import read_camera
+from stcal.io.cameras.read import read_camera
 from stcal.sfm import RunOptions, run
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.interop.crosscheck import crosscheck
 from stcal.sfm.report.compare import compare
-from stcal.sfm.run.saved import load_run
+from stcal.sfm.runs.saved import load_run
 
 # Bounds of the issue: µm of faces 2, 4, 5 and of face 3, mdeg of the same, µm mean of circles after a rigid fit,
 # and the share of visible circles found.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.io.camera import read_camera
+from stcal.io.cameras.read import read_camera
 from stcal.io.design import load_board, load_target
 from stcal.sfm import run
 from stcal.sfm.camera.calibrate import calibrate_camera

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.io.camera import read_camera
+from stcal.io.cameras.read import read_camera
 from stcal.io.design import load_board, load_target
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions, render

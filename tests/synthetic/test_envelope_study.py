@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.io.camera import read_camera
+from stcal.io.cameras.read import read_camera
 from tests.scripts import load_script
 from tests.synthetic.test_degrade import SAMPLE
 

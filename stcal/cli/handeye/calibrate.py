@@ -439,7 +439,7 @@ def _evolution(method: str | None, **given) -> "EvolutionOptions":
 
 
 def _save_camera(path: Path, outcome: "Outcome") -> None:
-    from stcal.io.camera import CalibratedCamera, write_cameras_txt
+    from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 
     found = outcome.result.reprojection
     if found is None:

@@ -51,13 +51,13 @@ def from_photos(
 ) -> None:
     """Measure the target on an arm in photographs, find axes and kinematics, and compensate targets: one folder."""
     load_ahead(workers)
-    from stcal.io.camera import read_camera
+    from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, target_of
     from stcal.io.saving import require_new_folder, save_folder
-    from stcal.robot.identify.result import IdentifyOptions
+    from stcal.robot.identification.result import IdentifyOptions
     from stcal.robot.kinematics.file import load_robot
-    from stcal.sfm.measure.images import MeasureOptions
-    from stcal.sfm.measure.target import read_target
+    from stcal.sfm.measurement.images import MeasureOptions
+    from stcal.sfm.measurement.target import read_target
     from stcal.workflows.from_photos.output import files_of
     from stcal.workflows.from_photos.report import story
     from stcal.workflows.from_photos.run import from_photos

@@ -112,10 +112,10 @@ def identify(
     report: ReportFile = None,
 ) -> None:
     """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
-    from stcal.robot.identify.nominal import adjusted
-    from stcal.robot.identify.report import identified_file, identified_page, identified_text
-    from stcal.robot.identify.result import IdentifyOptions
-    from stcal.robot.identify.solve import identify as identified_from
+    from stcal.robot.identification.nominal import adjusted
+    from stcal.robot.identification.report import identified_file, identified_page, identified_text
+    from stcal.robot.identification.result import IdentifyOptions
+    from stcal.robot.identification.solve import identify as identified_from
     from stcal.robot.kinematics.file import load_robot, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
 

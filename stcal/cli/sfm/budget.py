@@ -58,8 +58,8 @@ def budget(
     from stcal.sfm.budget.page import budget_page
     from stcal.sfm.budget.statement import statement_of
     from stcal.sfm.budget.text import budget_text
-    from stcal.sfm.run.saved import load_run
-    from stcal.sfm.run.verify import verify
+    from stcal.sfm.runs.saved import load_run
+    from stcal.sfm.runs.verify import verify
 
     saved = load_run(run)
     stated = statement_of(saved.board.stated, statement, field or ())

@@ -97,7 +97,7 @@ def calibrate_camera(
 def _one(images: Path, out: Path, target, board, model: str, json_file, report, workers) -> list[str]:
     """What failed."""
     from stcal.design import BoardDesign
-    from stcal.io.camera import CalibratedCamera, write_cameras_txt
+    from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.file import CalibrationFile
     from stcal.sfm.camera.text import calibration_text

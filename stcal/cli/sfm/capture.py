@@ -63,16 +63,16 @@ def plan(
     out: JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
-    from stcal.io.camera import read_camera
+    from stcal.io.cameras.read import read_camera
     from stcal.io.design import board_of, target_of
-    from stcal.sfm.plan.file import PlanFile
-    from stcal.sfm.plan.noise import expected_noise, noise_of_run, stated_noise
-    from stcal.sfm.plan.nominal import nominal_poses
-    from stcal.sfm.plan.session import PlanOptions, pairs_of_faces
-    from stcal.sfm.plan.session import plan as planned
-    from stcal.sfm.plan.tables import plan_text
-    from stcal.sfm.run.options import RunOptions
-    from stcal.sfm.run.saved import load_run
+    from stcal.sfm.planning.file import PlanFile
+    from stcal.sfm.planning.noise import expected_noise, noise_of_run, stated_noise
+    from stcal.sfm.planning.nominal import nominal_poses
+    from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
+    from stcal.sfm.planning.session import plan as planned
+    from stcal.sfm.planning.tables import plan_text
+    from stcal.sfm.runs.options import RunOptions
+    from stcal.sfm.runs.saved import load_run
 
     design = target_of(target)
     if noise is not None and run is not None:
@@ -110,11 +110,11 @@ def advise(
 ) -> None:
     """Compute from a run's own geometry which further photographs would lower the σ of its worst face most."""
     load_ahead(None)
-    from stcal.sfm.plan.advise import advise as advice_for
-    from stcal.sfm.plan.advise import doubts, known_of
-    from stcal.sfm.plan.file import AdviceFile
-    from stcal.sfm.plan.tables import advice_text
-    from stcal.sfm.run.saved import load_run
+    from stcal.sfm.planning.advise import advise as advice_for
+    from stcal.sfm.planning.advise import doubts, known_of
+    from stcal.sfm.planning.file import AdviceFile
+    from stcal.sfm.planning.tables import advice_text
+    from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
     if doubt := doubts(saved):
@@ -152,7 +152,7 @@ def watch(
     """Calibrate while photographs are taken: after each, what was found, the worst σ so far and the view that would
     help most. RUN/report.html is kept up to date and reloads itself."""
     load_ahead(workers)
-    from stcal.sfm.run.options import RunOptions
+    from stcal.sfm.runs.options import RunOptions
     from stcal.workflows.watch import WatchOptions
     from stcal.workflows.watch import watch as updates
 
@@ -169,8 +169,8 @@ def watch(
 
 def _say_update(update: "Update") -> None:
     """What was found in what came, σ so far, and what would help most."""
-    from stcal.sfm.plan.tables import next_text
-    from stcal.sfm.run.text import found_lines, so_far_text
+    from stcal.sfm.planning.tables import next_text
+    from stcal.sfm.runs.text import found_lines, so_far_text
 
     print_each("gone", update.gone)
     for line in found_lines(update.new, update.blur_px):
@@ -235,7 +235,7 @@ def capture(
     saturation, the worst σ so far and the view that would help most."""
     load_ahead(workers)
     from stcal.io.device import OpenCVSource, SimulatedSource
-    from stcal.sfm.run.options import RunOptions
+    from stcal.sfm.runs.options import RunOptions
     from stcal.workflows.capture import Trigger, photograph
     from stcal.workflows.watch import Growing, WatchOptions
 

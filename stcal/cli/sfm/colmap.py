@@ -42,7 +42,7 @@ def export_database(
     """Copy the run's database for another version of COLMAP to open; ids, orders and values stay."""
     from stcal.sfm.interop.export_database import export_database as export
     from stcal.sfm.interop.text import database_text
-    from stcal.sfm.run.saved import load_run
+    from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
     written = export(saved.database, out, schema, saved)
@@ -137,8 +137,8 @@ def crosscheck(
 ) -> None:
     """Map the same database with the native COLMAP and compare faces, circles and cameras, into the report."""
     from stcal.sfm.interop.crosscheck import comparison_text, crosscheck_run
-    from stcal.sfm.run.crosscheck import Tolerances
-    from stcal.sfm.run.saved import load_run
+    from stcal.sfm.runs.crosscheck import Tolerances
+    from stcal.sfm.runs.saved import load_run
 
     tolerances = Tolerances(
         tolerance_um, tolerance_mdeg, tolerance_um, camera_tolerance_um, camera_tolerance_mdeg, tolerance_sigma
@@ -178,7 +178,7 @@ def faces(
     """Find scale and faces from a COLMAP model made or edited elsewhere; labels come by (image, keypoint)."""
     from stcal.sfm.interop.external import calibrate_models, write_faces
     from stcal.sfm.interop.text import faces_text
-    from stcal.sfm.run.saved import load_run
+    from stcal.sfm.runs.saved import load_run
 
     if out is not None and not out.parent.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{out}: no folder {out.parent}; make it, or give another place with --out")
@@ -200,7 +200,7 @@ def pairs(
     """Rank the initial pairs, and show how each fares at every gate: ours, and COLMAP's as set and at its defaults."""
     from stcal.sfm.interop.file import PairsFile
     from stcal.sfm.interop.gates import limits_text, pairs_table, run_gates
-    from stcal.sfm.run.saved import load_run
+    from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
     found = run_gates(saved, group)
@@ -229,7 +229,7 @@ def doctor(
     from stcal.sfm.diagnose import findings
     from stcal.sfm.diagnose.doctor import diagnose
     from stcal.sfm.diagnose.file import DoctorFile
-    from stcal.sfm.run.saved import load_run
+    from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
     with StageProgress() as progress:

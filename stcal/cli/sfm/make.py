@@ -79,13 +79,13 @@ def design(
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw everything random with this seed.")] = 0,
 ) -> None:
     """Make a target for a box: circles on five sides that name each face with any three hidden; and forecast its σ."""
-    from stcal.io.camera import read_camera
+    from stcal.io.cameras.read import read_camera
     from stcal.io.design import board_toml, load_board, target_toml
     from stcal.sfm.make.box import size_of
     from stcal.sfm.make.design import MakeOptions, made_text, make_target
-    from stcal.sfm.plan.noise import expected_noise
-    from stcal.sfm.plan.session import PlanOptions, plan
-    from stcal.sfm.plan.tables import plan_text
+    from stcal.sfm.planning.noise import expected_noise
+    from stcal.sfm.planning.session import PlanOptions, plan
+    from stcal.sfm.planning.tables import plan_text
 
     target_file, board_file = folder / TARGET, folder / BOARD
     if os.path.lexists(target_file):

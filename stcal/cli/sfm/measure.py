@@ -126,13 +126,13 @@ def measure(
     if images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, or --serve")
     load_ahead(workers)
-    from stcal.io.camera import read_camera
+    from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, target_of
     from stcal.io.table import read_table
-    from stcal.sfm.measure import images as work
-    from stcal.sfm.measure import output
-    from stcal.sfm.measure.pose import PoseOptions, fit_verdict
-    from stcal.sfm.measure.target import read_target
+    from stcal.sfm.measurement import images as work
+    from stcal.sfm.measurement import output
+    from stcal.sfm.measurement.pose import PoseOptions, fit_verdict
+    from stcal.sfm.measurement.target import read_target
 
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
@@ -155,7 +155,7 @@ def measure(
     if json_file:
         write(json_file, output.poses_file(result), "as JSON")
     if report:
-        from stcal.sfm.measure.report import measure_page
+        from stcal.sfm.measurement.report import measure_page
 
         write(report, measure_page(result, str(images)), "report")
     failed = [each.name for each in result.images if fit_verdict(each.pose) == "failed"]
@@ -163,12 +163,12 @@ def measure(
 
 
 def _serve(camera, faces, target, board, sigma_factor, ellipses, listen) -> None:
-    from stcal.io.camera import read_camera
+    from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, target_of
-    from stcal.sfm.measure.pose import PoseOptions
-    from stcal.sfm.measure.serve import MeasureServer, ServeOptions, counts_text, serve
-    from stcal.sfm.measure.service import MeasureService, Setting
-    from stcal.sfm.measure.target import read_target
+    from stcal.sfm.measurement.pose import PoseOptions
+    from stcal.sfm.measurement.serve import MeasureServer, ServeOptions, counts_text, serve
+    from stcal.sfm.measurement.service import MeasureService, Setting
+    from stcal.sfm.measurement.target import read_target
 
     host, port, max_megabytes, workers = listen
     workers = workers or os.cpu_count() or 1

@@ -143,8 +143,8 @@ def run(
 
     from stcal.sfm import pipeline
     from stcal.sfm.mapping.pairs import PairOptions
-    from stcal.sfm.run.options import RunOptions
-    from stcal.sfm.run.text import found_lines, run_text
+    from stcal.sfm.runs.options import RunOptions
+    from stcal.sfm.runs.text import found_lines, run_text
 
     options = RunOptions(
         solve=solve.value if solve is not None else None,
@@ -191,14 +191,14 @@ def detect(
 ) -> None:
     """Detect circles alone: detections.csv and an overlay picture of every image."""
     load_ahead(workers)
-    from stcal.io.camera import read_camera
+    from stcal.io.cameras.read import read_camera
     from stcal.io.design import board_of, target_of
     from stcal.io.images import chosen_images
     from stcal.sfm import pipeline
-    from stcal.sfm.run.marker import MarkerFile
-    from stcal.sfm.run.options import RunOptions
-    from stcal.sfm.run.text import detection_text
-    from stcal.sfm.run.transaction import run_folder
+    from stcal.sfm.runs.marker import MarkerFile
+    from stcal.sfm.runs.options import RunOptions
+    from stcal.sfm.runs.text import detection_text
+    from stcal.sfm.runs.transaction import run_folder
 
     model = read_camera(camera)
     target_design = target_of(target)
@@ -229,8 +229,8 @@ def detect(
 @app.command()
 def verify(run: Run, out: JsonFile = None) -> None:
     """Compare all files of a run's folder with the hashes that the run kept, and its version with this one."""
-    from stcal.sfm.run.verify import require_whole, verified_text
-    from stcal.sfm.run.verify import verify as verified
+    from stcal.sfm.runs.verify import require_whole, verified_text
+    from stcal.sfm.runs.verify import verify as verified
 
     result = verified(run)
     say(verified_text(result))
@@ -249,7 +249,7 @@ def report(
     ] = None,
 ) -> None:
     """Write the report of a finished run again, from the files in its folder: the page, and a PDF of it."""
-    from stcal.sfm.run.folder import report_again
+    from stcal.sfm.runs.folder import report_again
 
     if pdf and out is not None:
         keep_apart([("--pdf", out.with_suffix(".pdf"))], [("RUN", run)])

@@ -117,9 +117,9 @@ def _scene(
     fisheye: float | None,
 ) -> "Scene":
     """The designs, with faces at their rough poses, before the camera of a file or one that the options describe."""
-    from stcal.io.camera import read_camera
-    from stcal.sfm.plan.nominal import nominal_poses
-    from stcal.sfm.plan.session import pairs_of_faces
+    from stcal.io.cameras.read import read_camera
+    from stcal.sfm.planning.nominal import nominal_poses
+    from stcal.sfm.planning.session import pairs_of_faces
     from stcal.synthetic.scene import make_scene, seen_by
     from stcal.synthetic.wide import seen_wide, wide_options
 
@@ -151,7 +151,7 @@ def compare(
     """Compare a run with a known truth, as a table and as JSON."""
     from stcal.sfm.report.compare import compare as against
     from stcal.sfm.report.compare import comparison_table
-    from stcal.sfm.run.transaction import COMPARISON, added_results
+    from stcal.sfm.runs.transaction import COMPARISON, added_results
 
     into_run = run / COMPARISON
     if (run / RUN_MARKER).is_file() and (out is None or real_place(out) == real_place(into_run)):
@@ -177,7 +177,7 @@ def demo(
 ) -> None:
     """Render a small data set with known truth, calibrate it, and print the faces against the truth."""
     from stcal.sfm.report.compare import comparison_table
-    from stcal.sfm.run.text import run_text
+    from stcal.sfm.runs.text import run_text
     from stcal.workflows.demo import WHAT
     from stcal.workflows.demo import demo as demonstrate
 

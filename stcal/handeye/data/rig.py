@@ -9,7 +9,7 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import Views, pairs_of_views
-from stcal.io.camera import CameraPrior
+from stcal.io.cameras.model import CameraPrior
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,7 +21,7 @@ from stcal.handeye.methods.camera_error import CameraError, of_corners
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
 from stcal.handeye.methods.rounds import LEAST, Problem, adjust
-from stcal.io.camera import PARAMETER_NAMES, CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import PARAMETER_NAMES, CameraPrior, intrinsic_basis
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
 """A pose that misses by more (rotation; translation in shares of the distance) is wrong from the start: no error of the

@@ -28,7 +28,7 @@ from stcal.handeye.methods.reprojection import (
 )
 from stcal.handeye.methods.rig_bundle import RigBundle, RigCorners
 from stcal.handeye.methods.rounds import adjust
-from stcal.io.camera import intrinsic_basis
+from stcal.io.cameras.model import intrinsic_basis
 
 LEAST_VIEWS = 1
 """Of a camera: one image of a board tells where its camera is, if other cameras tell where the board is."""

@@ -14,7 +14,7 @@ from stcal.handeye.report.outcome import ArmFound, Outcome
 from stcal.handeye.report.verdict import Verdict, Word, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.validate import Compared, HeldOutPoses
-from stcal.io.camera import PARAMETER_NAMES, parameter_names
+from stcal.io.cameras.model import PARAMETER_NAMES, parameter_names
 from stcal.io.json import Finite, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Vector, Vector3
 
 

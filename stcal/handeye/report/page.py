@@ -15,7 +15,7 @@ from stcal.handeye.report.verdict import Verdict, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared
-from stcal.io.camera import PARAMETER_NAMES, parameter_names
+from stcal.io.cameras.model import PARAMETER_NAMES, parameter_names
 from stcal.report.figure import uri
 from stcal.report.page import render, verdict
 from stcal.report.poses import HEADS, transform_rows

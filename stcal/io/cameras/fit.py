@@ -7,8 +7,8 @@ from scipy.optimize import least_squares
 
 from stcal.errors import InputError
 from stcal.geometry.camera import WIDEST_RAD, Camera
-from stcal.io.camera import FISHEYE, CalibratedCamera, intrinsic_basis, parameter_names
 from stcal.io.cameras.foreign import ForeignLens
+from stcal.io.cameras.model import FISHEYE, CalibratedCamera, intrinsic_basis, parameter_names
 
 CANDIDATES = ("OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE")
 """From few parameters to many, perspective and equidistant."""

@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.camera import (
+from stcal.io.cameras.model import (
     COLMAP_PIXEL_ORIGIN,
     CalibratedCamera,
     CameraModel,

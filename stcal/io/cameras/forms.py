@@ -14,13 +14,6 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import (
-    CalibratedCamera,
-    CameraModel,
-    camera_from_opencv,
-    cameras_txt,
-    parameter_names,
-)
 from stcal.io.cameras import metashape
 from stcal.io.cameras.foreign import (
     COLMAP_FOREIGN,
@@ -35,6 +28,7 @@ from stcal.io.cameras.foreign import (
     refused,
 )
 from stcal.io.cameras.matlab import mat, zhang
+from stcal.io.cameras.model import CalibratedCamera, CameraModel, camera_from_opencv, cameras_txt, parameter_names
 
 SUFFIXES = {
     ".txt": "colmap",

@@ -13,8 +13,8 @@ from scipy.io import loadmat, savemat
 from scipy.io.matlab import MatReadWarning, MatWriteWarning
 
 from stcal.errors import InputError
-from stcal.io.camera import CalibratedCamera, CameraModel
 from stcal.io.cameras.foreign import ForeignLens, of_skewed, one_of
+from stcal.io.cameras.model import CalibratedCamera, CameraModel
 
 HEADS = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 PIXEL_ORIGIN = 1.0

@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.io.camera import (
+from stcal.io.cameras.foreign import one_of, refused
+from stcal.io.cameras.model import (
     COLMAP_PIXEL_ORIGIN,
     FISHEYE,
     PARAMETER_NAMES,
@@ -20,7 +21,6 @@ from stcal.io.camera import (
     camera_from_opencv,
     intrinsic_basis,
 )
-from stcal.io.cameras.foreign import one_of, refused
 from stcal.io.covariance import Rows, require_covariance
 
 NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")

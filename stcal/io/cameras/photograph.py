@@ -7,7 +7,7 @@ import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from stcal.errors import InputError
-from stcal.io.camera import CalibratedCamera, camera_from_opencv
+from stcal.io.cameras.model import CalibratedCamera, camera_from_opencv
 
 HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")
 """First bytes of JPEG, TIFF and PNG."""

@@ -10,7 +10,10 @@ import numpy as np
 import yaml
 
 from stcal.errors import InputError
-from stcal.io.camera import (
+from stcal.io.cameras import forms, matlab, metashape
+from stcal.io.cameras.foreign import ForeignLens, of_colmap, of_database, of_opencv, one_of
+from stcal.io.cameras.model import (
+    COLMAP_MODELS,
     CORRELATION,
     EQUIDISTANT,
     MAX_SIDE_PX,
@@ -22,8 +25,6 @@ from stcal.io.camera import (
     camera_model,
     parameter_names,
 )
-from stcal.io.cameras import forms, matlab, metashape
-from stcal.io.cameras.foreign import ForeignLens, of_colmap, of_database, of_opencv, one_of
 from stcal.io.covariance import Rows, require_covariance
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.plain_yaml import load_yaml
@@ -32,9 +33,33 @@ SQLITE = b"SQLite format 3\0"
 """First bytes of a database."""
 
 
+def read_camera(path: str | Path, name: str = "") -> CameraModel:
+    """Read a camera file of any supported kind, told apart by content.
+
+    Parameters
+    ----------
+    path : str or Path
+        COLMAP, OpenCV, ROS, ROS-Industrial, Kalibr, mrcal or Metashape (``data_layout.md``).
+    name : str
+        Of the camera in files of several.
+
+    Raises
+    ------
+    InputError
+        Missing or malformed file, more than one camera, or a lens that no model here holds.
+    """
+    lens = read_lens(path, name)
+    if isinstance(lens, CameraModel):
+        return lens
+    raise InputError(
+        "E-CAMERA-MODEL",
+        f"camera file {path}: {lens.called} is none of {', '.join(COLMAP_MODELS)}; fit one of them to it with "
+        "`stcal camera convert`",
+    )
+
+
 def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
-    """The lens of a camera file; arguments and errors as of :func:`stcal.io.camera.read_camera`, but lenses that no
-    model here holds are lenses too."""
+    """The lens of a camera file, also one that no model here holds; arguments and errors as of :func:`read_camera`."""
     path = Path(path)
     try:
         database = path.is_file() and _starts_with(path, SQLITE)

@@ -26,7 +26,7 @@ from stcal.geometry.plane_poses import (
 from stcal.geometry.pose_descent import Minima, PoseStack
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.geometry.uncertain import ImageFit
-from stcal.io.camera import CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import CameraPrior, intrinsic_basis
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pose.problem import PlanarProblem, descent_near, project, weighed
 

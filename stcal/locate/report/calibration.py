@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stcal.locate.calibrate.solve import CalibratedLayout
+from stcal.locate.calibration.solve import CalibratedLayout
 from stcal.locate.report.files import CalibratedLayoutFile
 
 FEW_IMAGES = 3

@@ -7,7 +7,7 @@ import numpy as np
 from markupsafe import Markup
 
 from stcal.geometry.camera import Camera
-from stcal.io.camera import CameraModel
+from stcal.io.cameras.model import CameraModel
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
 from stcal.locate.data.exposures import Exposure, SceneFiles

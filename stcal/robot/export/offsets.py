@@ -6,9 +6,9 @@ import io
 import numpy as np
 
 from stcal.io.poses.text import fixed
-from stcal.robot.identify.nominal import dh_values
-from stcal.robot.identify.report import DH, SHOWN, UNITS
-from stcal.robot.identify.result import Identified
+from stcal.robot.identification.nominal import dh_values
+from stcal.robot.identification.report import DH, SHOWN, UNITS
+from stcal.robot.identification.result import Identified
 from stcal.robot.kinematics.model import Robot
 
 HEAD = ("joint", "parameter", "nominal", "identified", "difference", "sigma", "unit", "determined")

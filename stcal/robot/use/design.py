@@ -16,7 +16,7 @@ from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Poses
 from stcal.io.table import POSE, pose_cells
 from stcal.parallel import one_thread
-from stcal.robot.identify.observability import (
+from stcal.robot.identification.observability import (
     EXPLAINED,
     SEEN,
     ObservabilityIndices,

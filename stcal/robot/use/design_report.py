@@ -5,7 +5,7 @@ import numpy as np
 from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, plane, uri
 from stcal.report.page import render
 from stcal.report.text import NONE, number
-from stcal.robot.identify.observability import MEANING
+from stcal.robot.identification.observability import MEANING
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import joint_cells, joint_columns
 from stcal.robot.use.design import PoseDesign

@@ -10,10 +10,10 @@ from scipy.stats import t as t_distribution
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import length_limit, robust_sigma
-from stcal.robot.identify.adjustment import Weighting
-from stcal.robot.identify.left import LEAST_FREEDOM, Finding, left
-from stcal.robot.identify.nominal import Placed, base_name, tool_name
-from stcal.robot.identify.residuals import (
+from stcal.robot.identification.adjustment import Weighting
+from stcal.robot.identification.left import LEAST_FREEDOM, Finding, left
+from stcal.robot.identification.nominal import Placed, base_name, tool_name
+from stcal.robot.identification.residuals import (
     WIDTH,
     Observed,
     State,
@@ -25,8 +25,8 @@ from stcal.robot.identify.residuals import (
     residuals,
     tips_of,
 )
-from stcal.robot.identify.result import position_errors
-from stcal.robot.identify.start import Fit, start
+from stcal.robot.identification.result import position_errors
+from stcal.robot.identification.start import Fit, start
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 

@@ -14,9 +14,9 @@ from stcal.io.quaternions import COLUMNS
 from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, new_figure, uri
 from stcal.report.page import render
 from stcal.report.text import number, text_table
-from stcal.robot.identify.drawings import Drawn, joints_figure, space_picture
-from stcal.robot.identify.report import placed_cells, placed_parts
-from stcal.robot.identify.residuals import tips_of
+from stcal.robot.identification.drawings import Drawn, joints_figure, space_picture
+from stcal.robot.identification.report import placed_cells, placed_parts
+from stcal.robot.identification.residuals import tips_of
 from stcal.robot.use.compensation import joint_cells, joint_columns
 from stcal.robot.use.evaluation import Evaluated, Evaluation, Figures
 from stcal.robot.use.files import EvaluationFile

@@ -9,7 +9,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CameraPrior
+from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
 from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group, missing_frame_circles

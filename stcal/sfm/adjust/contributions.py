@@ -14,7 +14,7 @@ import numpy as np
 from stcal.geometry.arrays import frozen
 from stcal.geometry.normal_equations import constrained_inverse
 from stcal.geometry.rigid import skew
-from stcal.io.camera import PARAMETER_NAMES
+from stcal.io.cameras.model import PARAMETER_NAMES
 from stcal.sfm.adjust.blocks import Block, Reduced, robust_weights
 from stcal.sfm.adjust.equations import Setting, Shared, free_directions, normal_equations, planes
 from stcal.sfm.adjust.group import projection_jacobians

@@ -19,7 +19,7 @@ from stcal.geometry.least_squares import minimise
 from stcal.geometry.normal_equations import constrained_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
-from stcal.io.camera import PARAMETER_NAMES, CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import PARAMETER_NAMES, CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, DotLabel, dot_cells
 from stcal.sfm.adjust import dots_first
 from stcal.sfm.adjust.blocks import Block, Shared, normalised, robust_weights, rows_of_view, without_cameras

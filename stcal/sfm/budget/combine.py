@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
-from stcal.io.camera import CalibratedCamera
+from stcal.io.cameras.model import CalibratedCamera
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.contributions import Contributions, contributions_of
 from stcal.sfm.adjust.joint import JointResult
@@ -17,8 +17,8 @@ from stcal.sfm.adjust.uncertainty import Derivatives, derivatives
 from stcal.sfm.budget.sources import Source, correction, sources_of
 from stcal.sfm.budget.statement import Statement, statement_of
 from stcal.sfm.data.model import MetricModel
-from stcal.sfm.run.adjusted import adjusted_run
-from stcal.sfm.run.saved import SavedRun
+from stcal.sfm.runs.adjusted import adjusted_run
+from stcal.sfm.runs.saved import SavedRun
 
 COVERAGE_FACTOR = 2.0
 LONGEST = 5

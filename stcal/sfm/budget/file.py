@@ -14,8 +14,8 @@ from stcal.io.saving import RUN_MARKER
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row
 from stcal.sfm.budget.lengths import LengthTest
 from stcal.sfm.budget.sources import Source
-from stcal.sfm.run.saved import SavedRun
-from stcal.sfm.run.verify import VerifyFile
+from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.verify import VerifyFile
 
 MICRO = 1e3
 MILLIDEGREES = 1e3 * float(np.degrees(1.0))

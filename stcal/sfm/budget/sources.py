@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, StatedSize
 from stcal.geometry.arrays import frozen
-from stcal.io.camera import CalibratedCamera, intrinsic_basis
+from stcal.io.cameras.model import CalibratedCamera, intrinsic_basis
 from stcal.sfm.adjust.contributions import BOARD, CIRCLES, DOTS, FLATNESS, INTRINSICS, Contributions
 from stcal.sfm.budget.statement import Statement
 

@@ -10,7 +10,7 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.camera import Camera
-from stcal.io.camera import COLMAP_MODELS, CameraModel
+from stcal.io.cameras.model import COLMAP_MODELS, CameraModel
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, Skipped, decode, find_images
 from stcal.parallel import Progress, counted, one_thread

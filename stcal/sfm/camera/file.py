@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from stcal.io.camera import parameter_names
+from stcal.io.cameras.model import parameter_names
 from stcal.io.json import ByName, Matrix, NamedReason, Part, ResultFile
 from stcal.sfm.camera.calibrate import CORNERS, OUTLIER_WEIGHT, CameraCalibration, residual_rms_px
 from stcal.sfm.camera.intrinsics import Intrinsics, model_parameters

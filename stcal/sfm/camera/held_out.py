@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.camera import Camera
-from stcal.io.camera import FISHEYE, intrinsic_basis, parameter_names
+from stcal.io.cameras.model import FISHEYE, intrinsic_basis, parameter_names
 from stcal.labels import Label
 from stcal.parallel import run_parallel
 from stcal.sfm.adjust.group import moved_poses

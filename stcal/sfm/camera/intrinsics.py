@@ -16,7 +16,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.geometry.variances import sigma_factor
-from stcal.io.camera import intrinsic_basis
+from stcal.io.cameras.model import intrinsic_basis
 from stcal.labels import Label
 from stcal.sfm.adjust.blocks import robust_weights
 from stcal.sfm.adjust.refine import eccentricity_px

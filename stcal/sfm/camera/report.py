@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stcal.io.camera import CalibratedCamera
+from stcal.io.cameras.model import CalibratedCamera
 from stcal.report.camera import distortion_figure
 from stcal.report.figure import INK, SMALL, calm, new_figure, round_below, uri
 from stcal.report.page import render

@@ -12,7 +12,7 @@ import numpy as np
 from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import intrinsic_basis
+from stcal.io.cameras.model import intrinsic_basis
 from stcal.parallel import one_thread
 from stcal.sfm.camera.calibrate import CameraCalibration, rejudged, residual_rms_px
 from stcal.sfm.camera.equations import Setting, State

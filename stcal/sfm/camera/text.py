@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stcal.io.camera import COLMAP_PIXEL_ORIGIN
+from stcal.io.cameras.model import COLMAP_PIXEL_ORIGIN
 from stcal.report.text import number, text_table
 from stcal.sfm.camera.calibrate import CameraCalibration
 from stcal.sfm.camera.file import CalibrationFile

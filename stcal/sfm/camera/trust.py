@@ -11,7 +11,7 @@ from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.io.camera import intrinsic_basis
+from stcal.io.cameras.model import intrinsic_basis
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters
 from stcal.sfm.data.observations import ImageObservations
 

@@ -9,7 +9,7 @@ from stcal.design import BoardDesign
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import FISHEYE
+from stcal.io.cameras.model import FISHEYE
 from stcal.labels import DotLabel
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.files import DetectedImage

@@ -9,7 +9,7 @@ from scipy.special import bdtrc, chdtri
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import ratio_limit, robust_sigma
-from stcal.io.camera import PARAMETER_NAMES, CalibratedCamera, CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import PARAMETER_NAMES, CalibratedCamera, CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, solve_score

@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
-from stcal.io.camera import CalibratedCamera, CameraPrior
+from stcal.io.cameras.model import CalibratedCamera, CameraPrior
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factor
 from stcal.sfm.adjust.group import adjust

@@ -16,7 +16,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cache import keep, kept, packed
-from stcal.io.camera import CameraModel
+from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, same_photograph, thumbnail
 from stcal.io.saving import save
 from stcal.io.spread import run_on_images

@@ -25,7 +25,7 @@ from stcal.sfm.diagnose.findings import WHOLE_PATTERN, Diagnosis, Finding, advic
 from stcal.sfm.diagnose.missing import missing_circles
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
-from stcal.sfm.run.saved import SavedRun
+from stcal.sfm.runs.saved import SavedRun
 
 MIN_VIEWS = 2
 NOTHING_KNOWN = "is it sharp and well lit? "

@@ -12,7 +12,7 @@ from stcal.io.images import name_fault
 from stcal.sfm.mapping.database import colmap_camera, from_colmap_px, image_ids, match_labels
 from stcal.sfm.mapping.graph import image_graph, kind_of_graph
 from stcal.sfm.mapping.models import KEYPOINT_TOLERANCE_PX, parameter_count
-from stcal.sfm.run.saved import SavedRun
+from stcal.sfm.runs.saved import SavedRun
 
 PAIR_BASE = 2**31 - 1
 """A pair's id is this times the smaller image id, plus the larger one (COLMAP's ``kMaxNumImages``)."""

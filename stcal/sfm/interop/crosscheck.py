@@ -38,7 +38,7 @@ from stcal.sfm.mapping.models import (
     write_reconstruction,
 )
 from stcal.sfm.report.judgement import judged
-from stcal.sfm.run.crosscheck import (
+from stcal.sfm.runs.crosscheck import (
     CameraDifference,
     Crosscheck,
     FaceDifference,
@@ -50,9 +50,9 @@ from stcal.sfm.run.crosscheck import (
     Tolerances,
     allowed_text,
 )
-from stcal.sfm.run.folder import require_report, write_report
-from stcal.sfm.run.saved import AGAIN, SavedRun
-from stcal.sfm.run.transaction import added_results
+from stcal.sfm.runs.folder import require_report, write_report
+from stcal.sfm.runs.saved import AGAIN, SavedRun
+from stcal.sfm.runs.transaction import added_results
 
 MICRO = 1e3
 TOLERANCES = Tolerances()

@@ -12,7 +12,7 @@ from pathlib import Path
 from stcal.errors import InputError, StcalError
 from stcal.sfm.interop.content import damaged, require_of_run, require_whole
 from stcal.sfm.interop.schema import SCHEMAS, SOURCE, Column, Index, Reference, Schema, SchemaTable, find_schema
-from stcal.sfm.run.saved import SavedRun
+from stcal.sfm.runs.saved import SavedRun
 
 HEADER = b"SQLite format 3\0"
 WAL_MODE = b"\2\2"

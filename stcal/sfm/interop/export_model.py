@@ -25,7 +25,7 @@ from stcal.sfm.mapping.models import (
     rigid_from_colmap,
     write_reconstruction,
 )
-from stcal.sfm.run.saved import SavedRun, load_run
+from stcal.sfm.runs.saved import SavedRun, load_run
 
 ModelFormat = Literal["colmap-bin", "colmap-txt", "ply", "nvm", "bundler"]
 FOLDERS = ("colmap-bin", "colmap-txt", "bundler")

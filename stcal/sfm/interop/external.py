@@ -17,7 +17,7 @@ from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.data.model import WorldModel
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import ReadModel, find_models, read_model
-from stcal.sfm.run.saved import SavedRun
+from stcal.sfm.runs.saved import SavedRun
 
 Chained = Literal["chain", "paper"]
 

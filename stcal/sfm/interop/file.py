@@ -8,7 +8,7 @@ from pydantic import Field
 
 from stcal.io.json import Part, ResultFile
 from stcal.sfm.interop.gates import Gate, GateVerdict, PairGates
-from stcal.sfm.run.report import Number, PairRow
+from stcal.sfm.runs.report import Number, PairRow
 
 
 class GateRow(Part):

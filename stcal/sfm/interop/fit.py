@@ -11,7 +11,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.json import Part
 from stcal.labels import Label
-from stcal.sfm.run.report import CameraInSpace, ImageResiduals, ReportCamera
+from stcal.sfm.runs.report import CameraInSpace, ImageResiduals, ReportCamera
 
 ROUNDING = 1e-6
 """Of a residual, relative, …"""

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.io.camera import CalibratedCamera
+from stcal.io.cameras.model import CalibratedCamera
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import colmap_camera, image_ids, match_labels, to_colmap_px, write_database
 from stcal.sfm.mapping.incremental import LOG_ERRORS_ONLY, SEED, pipeline_options
 from stcal.sfm.mapping.pairs import MIN_ANGLE_RAD, MIN_IN_FRONT, MIN_LABELS, PairOptions, PairScore
-from stcal.sfm.run.saved import SavedRun
+from stcal.sfm.runs.saved import SavedRun
 
 MIN_TRIALS = 30
 """Of RANSAC, for the initial pair: a constant of COLMAP, not an option."""

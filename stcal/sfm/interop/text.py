@@ -6,7 +6,7 @@ from stcal.sfm.interop.crosscheck import face_differences
 from stcal.sfm.interop.export import FORMS, ExportedRun
 from stcal.sfm.interop.export_database import Exported
 from stcal.sfm.interop.export_model import ExportedModel
-from stcal.sfm.run.saved import SavedRun
+from stcal.sfm.runs.saved import SavedRun
 
 
 def database_text(written: Exported) -> str:

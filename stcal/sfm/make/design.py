@@ -8,7 +8,7 @@ import numpy as np
 from stcal.design import BoardDesign, Polarity
 from stcal.errors import InputError
 from stcal.geometry.camera import COEFFICIENTS, Camera
-from stcal.io.camera import CameraModel
+from stcal.io.cameras.model import CameraModel
 from stcal.sfm.data.patterns import MAX_TILT_RAD
 from stcal.sfm.detect.circles.ellipses import EllipseOptions, diameter_limits_px
 from stcal.sfm.make.box import sides_of

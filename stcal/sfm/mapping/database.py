@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.io.camera import COLMAP_PIXEL_ORIGIN, CalibratedCamera
+from stcal.io.cameras.model import COLMAP_PIXEL_ORIGIN, CalibratedCamera
 from stcal.labels import CircleLabel
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.mapping.colmap import pycolmap

@@ -12,7 +12,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.camera import CalibratedCamera, camera_from_colmap
+from stcal.io.cameras.model import CalibratedCamera, camera_from_colmap
 from stcal.io.files import MODEL_BYTES, TABLE_BYTES, read_bytes, require_size
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import GroupModel, MetricModel, WorldModel

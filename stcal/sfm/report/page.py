@@ -40,7 +40,7 @@ def report_html(
 
     Parameters
     ----------
-    report : what :func:`stcal.sfm.run.output.report_of` made
+    report : what :func:`stcal.sfm.runs.output.report_of` made
     overlays : JPEG by image name
     residuals : centres and their residuals by image name, px; none are drawn where None
     reload_s : the page loads itself anew so often; never where None

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.identify.elastic import DOWN, MOMENT, usual
-from stcal.robot.identify.nominal import Deviations
-from stcal.robot.identify.residuals import State, tips
+from stcal.robot.identification.elastic import DOWN, MOMENT, usual
+from stcal.robot.identification.nominal import Deviations
+from stcal.robot.identification.residuals import State, tips
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.example import mh80

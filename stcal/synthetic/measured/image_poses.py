@@ -15,9 +15,9 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import covariance_of
 from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.measure.pose import TargetPose
-from stcal.sfm.measure.target import TargetCircles
-from stcal.sfm.plan.simulated import observe, true_models
+from stcal.sfm.measurement.pose import TargetPose
+from stcal.sfm.measurement.target import TargetCircles
+from stcal.sfm.planning.simulated import observe, true_models
 from stcal.synthetic.scene import Scene
 
 FLATNESS_MM = 0.02

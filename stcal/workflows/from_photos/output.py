@@ -2,15 +2,15 @@
 
 from stcal.io.saving import json_text
 from stcal.robot.axes.report import axes_file, axes_page
-from stcal.robot.identify.report import identified_file, identified_page
+from stcal.robot.identification.report import identified_file, identified_page
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.use.compensation import (
     compensated_csv,
     compensation_file,
 )
 from stcal.robot.use.report import compensation_page
-from stcal.sfm.measure.output import poses_csv, poses_file
-from stcal.sfm.measure.report import measure_page
+from stcal.sfm.measurement.output import poses_csv, poses_file
+from stcal.sfm.measurement.report import measure_page
 from stcal.workflows.from_photos.report import from_photos_page
 from stcal.workflows.from_photos.result import FromPhotos
 

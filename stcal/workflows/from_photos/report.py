@@ -8,7 +8,7 @@ from stcal.report.text import number
 from stcal.robot.use.compensation import (
     compensated_summary,
 )
-from stcal.sfm.measure.output import summary
+from stcal.sfm.measurement.output import summary
 from stcal.workflows.from_photos.result import DRAWING, FromPhotos
 
 PAGES = {

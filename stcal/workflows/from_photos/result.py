@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.robot.axes.model import AxesResult
-from stcal.robot.identify.predicted import predicted_at
-from stcal.robot.identify.result import Identified
+from stcal.robot.identification.predicted import predicted_at
+from stcal.robot.identification.result import Identified
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import (
     Compensated,
 )
 from stcal.robot.use.evaluation import Figures
-from stcal.sfm.measure.images import MeasureResult
+from stcal.sfm.measurement.images import MeasureResult
 
 DRAWING, AXES, SAME_ROWS = "as drawn", "by the axis method", "identified, the same rows"
 

@@ -14,7 +14,7 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CameraModel
+from stcal.io.cameras.model import CameraModel
 from stcal.io.images import find_images
 from stcal.io.join import join
 from stcal.io.saving import save
@@ -22,8 +22,8 @@ from stcal.io.table import POSE, Table, read_table
 from stcal.robot.axes.model import AxesResult, robot_from_sweeps
 from stcal.robot.axes.orientations import length_of, ring
 from stcal.robot.axes.sweeps import find_arcs
-from stcal.robot.identify.result import IdentifyOptions
-from stcal.robot.identify.solve import identify
+from stcal.robot.identification.result import IdentifyOptions
+from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.measurements import Measurements, joint_values, read_measurements, targets_of
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import (
@@ -31,9 +31,9 @@ from stcal.robot.use.compensation import (
 )
 from stcal.robot.use.evaluation import Figures, evaluate
 from stcal.robot.use.targets import Targets, read_targets
-from stcal.sfm.measure.images import MeasureOptions, MeasureResult, measure
-from stcal.sfm.measure.output import IMAGE, poses_csv
-from stcal.sfm.measure.target import TargetCircles
+from stcal.sfm.measurement.images import MeasureOptions, MeasureResult, measure
+from stcal.sfm.measurement.output import IMAGE, poses_csv
+from stcal.sfm.measurement.target import TargetCircles
 from stcal.workflows.from_photos.output import POSES
 from stcal.workflows.from_photos.result import AXES, DRAWING, SAME_ROWS, FromPhotos
 
@@ -59,7 +59,7 @@ def from_photos(
     Parameters
     ----------
     images, camera, target, design, board, progress
-        As of :func:`stcal.sfm.measure.images.measure`.
+        As of :func:`stcal.sfm.measurement.images.measure`.
     joints : path
         Table of joint values with a column ``key`` that names each one's photograph (CSV).
     nominal : Robot

@@ -15,7 +15,7 @@ from stcal.handeye.data.robot_poses import RobotPoses
 from stcal.handeye.report.outcome import ArmFound, Outcome
 from stcal.handeye.scatter import widened_by_scatter
 from stcal.handeye.validate import cross_validate
-from stcal.io.camera import CameraPrior
+from stcal.io.cameras.model import CameraPrior
 from stcal.io.quaternions import Order
 from stcal.io.table import read_table
 from stcal.robot import Robot

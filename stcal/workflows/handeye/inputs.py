@@ -17,7 +17,8 @@ from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import Timed
 from stcal.handeye.judge.spread import spread_text
 from stcal.handeye.methods import start
-from stcal.io.camera import CameraPrior, camera_prior, read_camera, refinable
+from stcal.io.cameras.model import CameraPrior, camera_prior, refinable
+from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
 from stcal.io.quaternions import Order
 from stcal.io.table import Table

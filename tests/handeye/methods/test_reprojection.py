@@ -9,7 +9,7 @@ from stcal.handeye import HandEyeOptions, Noise, View, Views, handeye, pairs_of_
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.reprojection import problem
-from stcal.io.camera import CalibratedCamera, camera_prior, intrinsic_basis
+from stcal.io.cameras.model import CalibratedCamera, camera_prior, intrinsic_basis
 from stcal.synthetic.measured.handeye import simulated_views
 from tests.outcome import fails_with
 

@@ -14,7 +14,7 @@ from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.report.page import outcome_page, outcome_text
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
-from stcal.io.camera import CalibratedCamera, camera_prior
+from stcal.io.cameras.model import CalibratedCamera, camera_prior
 from stcal.io.saving import json_text
 from stcal.synthetic.measured.handeye import simulated, simulated_views
 

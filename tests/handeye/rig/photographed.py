@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.camera import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 from stcal.io.table import POSE, pose_cells
 from stcal.synthetic.measured.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, disturbed
 from tests.boards.drawn import chessboard_mm

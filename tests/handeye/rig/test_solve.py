@@ -12,7 +12,7 @@ from stcal.handeye.data.loop import Loop
 from stcal.handeye.methods.reprojection import board_of, problem
 from stcal.handeye.methods.rig_bundle import RigBundle, RigCorners
 from stcal.handeye.rig.solve import alone, of_places
-from stcal.io.camera import CalibratedCamera, camera_prior, intrinsic_basis
+from stcal.io.cameras.model import CalibratedCamera, camera_prior, intrinsic_basis
 from stcal.synthetic.measured.handeye_rig import NAMES, RigTruth, simulated_rig
 from tests.outcome import fails_with
 

@@ -8,7 +8,7 @@ import pytest
 from stcal.boards.tags import Tags
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.camera import CameraPrior
+from stcal.io.cameras.model import CameraPrior
 from stcal.locate.pose.estimate import SeenTags, covering_both, locate
 from stcal.locate.pose.merge import merge
 from stcal.locate.pose.verdict import VerdictOptions, judge

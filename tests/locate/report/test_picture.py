@@ -6,7 +6,7 @@ import cv2
 import pytest
 
 from stcal.boards.tags import Tags
-from stcal.io.camera import CameraModel
+from stcal.io.cameras.model import CameraModel
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.pipeline import run
 from stcal.locate.report.page import best_exposure, run_page

@@ -8,8 +8,8 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.export.offsets import HEAD, offsets_csv, zeros
-from stcal.robot.identify.result import IdentifyOptions
-from stcal.robot.identify.solve import identify
+from stcal.robot.identification.result import IdentifyOptions
+from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
 from stcal.synthetic.measured.arms import joint_vectors, measured, placed

@@ -9,9 +9,9 @@ import pytest
 from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import read_table
-from stcal.robot.identify.observability import ObservabilityIndices, identification_jacobian, parameter_scale
-from stcal.robot.identify.result import IdentifyOptions
-from stcal.robot.identify.solve import identify
+from stcal.robot.identification.observability import ObservabilityIndices, identification_jacobian, parameter_scale
+from stcal.robot.identification.result import IdentifyOptions
+from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forward, moved_chain

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identify.result import IdentifyOptions
-from stcal.robot.identify.solve import identify
+from stcal.robot.identification.result import IdentifyOptions
+from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
@@ -19,7 +19,7 @@ from stcal.robot.use.evaluation_report import evaluated_csv, evaluated_text, eva
 from stcal.robot.use.verification import read_measured, verify
 from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
-from tests.robot.identify.test_solve import rokae
+from tests.robot.identification.test_solve import rokae
 
 BASE, TOOL = Rigid.exp([0.1, -0.05, 2.1, 2500.0, -900.0, 400.0]), Rigid.exp([0, 0.1, 0, 220, 60, 150])
 SIGMA_MM = 0.05

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.geometry.normal_equations import free_motions
-from stcal.io.camera import CameraPrior
+from stcal.io.cameras.model import CameraPrior
 from stcal.sfm.adjust.contributions import OBSERVED, contributions_of
 from stcal.sfm.adjust.joint import adjusted
 from stcal.synthetic.scene import SceneOptions, make_scene

@@ -8,7 +8,7 @@ import pytest
 from stcal.geometry.rigid import Rigid
 from stcal.io.saving import json_text
 from stcal.sfm.adjust.file import FacesFile
-from stcal.sfm.run.options import RunOptions
+from stcal.sfm.runs.options import RunOptions
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.camera import CalibratedCamera, camera_prior
+from stcal.io.cameras.model import CalibratedCamera, camera_prior
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import refine
-from stcal.sfm.plan.simulated import observe, true_models
-from stcal.sfm.run.options import RunOptions
+from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 

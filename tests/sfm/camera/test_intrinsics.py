@@ -15,7 +15,8 @@ from stcal.design import reference_board
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
-from stcal.io.camera import camera_prior, parameter_names, read_camera
+from stcal.io.cameras.model import camera_prior, parameter_names
+from stcal.io.cameras.read import read_camera
 from stcal.sfm.camera import calibrate as calibration
 from stcal.sfm.camera.calibrate import require_determined
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, model_parameters

@@ -9,7 +9,7 @@ import pytest
 
 from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CalibratedCamera
+from stcal.io.cameras.model import CalibratedCamera
 from stcal.sfm.adjust import joint
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.joint import SETTLED_PX
@@ -19,7 +19,7 @@ from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS, Trial, judge
 from stcal.sfm.pipeline import run
 from stcal.sfm.report.checks import checks_values, count_verdicts
-from stcal.sfm.run.options import RunOptions
+from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene

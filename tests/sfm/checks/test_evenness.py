@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.camera import read_camera
+from stcal.io.cameras.read import read_camera
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.checks.images import UNEVEN_BY_CHANCE, evenness_check
 from stcal.sfm.pipeline import run
-from stcal.sfm.run.options import RunOptions
+from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.photograph import read_set
 from tests.scripts import load_script
 

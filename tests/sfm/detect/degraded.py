@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from stcal.design import reference_board, reference_target
-from stcal.io.camera import read_camera
+from stcal.io.cameras.read import read_camera
 from stcal.io.images import find_images
 from stcal.sfm.data.observations import detections_csv
 from stcal.sfm.detect.circles.ellipses import EllipseOptions

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.design import reference_board, reference_target
-from stcal.io.camera import read_camera
+from stcal.io.cameras.read import read_camera
 from stcal.io.images import find_images
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.files import detect_files

@@ -8,7 +8,7 @@ import pytest
 
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.detect.overlay import draw_overlay
-from stcal.sfm.run.folder import overlay_path
+from stcal.sfm.runs.folder import overlay_path
 
 FOCAL = np.array([2000.0, 2000.0])
 GREY = 90

@@ -23,7 +23,7 @@ from stcal.sfm.diagnose.missing import missing_circles
 from stcal.sfm.diagnose.trace import trace_outlines
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
-from stcal.sfm.run.saved import load_run
+from stcal.sfm.runs.saved import load_run
 from tests.outcome import fails_with
 from tests.shared import own_copy
 

@@ -9,7 +9,7 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.sfm.interop.export_database import export_database
-from stcal.sfm.run.saved import load_run
+from stcal.sfm.runs.saved import load_run
 from tests.outcome import fails_with
 from tests.shared import own_copy
 

@@ -26,10 +26,10 @@ from stcal.sfm.interop.crosscheck import crosscheck, mapper_options
 from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import pipeline_options
-from stcal.sfm.run.crosscheck import Tolerances
-from stcal.sfm.run.folder import write_report
-from stcal.sfm.run.saved import load_run
-from stcal.sfm.run.verify import verify
+from stcal.sfm.runs.crosscheck import Tolerances
+from stcal.sfm.runs.folder import write_report
+from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.verify import verify
 from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
 from tests.shared import own_copy
 

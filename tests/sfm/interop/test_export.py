@@ -21,7 +21,7 @@ from stcal.labels import parse_label
 from stcal.sfm.interop.export import FORMS, export_run
 from stcal.sfm.interop.export.content import content_of
 from stcal.sfm.interop.export.solids import EDGES
-from stcal.sfm.run.saved import load_run
+from stcal.sfm.runs.saved import load_run
 from tests.outcome import fails_with
 
 AGAIN_MM = 1e-9

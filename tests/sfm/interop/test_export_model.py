@@ -16,7 +16,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.io.camera import read_camera, write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
+from stcal.io.cameras.read import read_camera
 from stcal.sfm.interop.export_model import export_model
 from tests.shared import own_copy
 

@@ -21,7 +21,7 @@ from stcal.sfm.interop.external import calibrate_models, faces_from_models
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.incremental import seeded_mapping
 from stcal.sfm.mapping.models import find_models, open_model, read_model, write_model
-from stcal.sfm.run.saved import load_run
+from stcal.sfm.runs.saved import load_run
 from tests.outcome import COMPUTATION, INPUT, assert_error, fails_with
 from tests.shared import own_copy
 

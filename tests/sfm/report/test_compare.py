@@ -7,7 +7,7 @@ import pytest
 
 from stcal.design import reference_target
 from stcal.errors import InputError
-from stcal.sfm.measure.target import read_target
+from stcal.sfm.measurement.target import read_target
 from stcal.sfm.report.compare import compare
 from tests.outcome import fails_with
 

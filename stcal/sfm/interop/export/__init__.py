@@ -10,7 +10,7 @@ from stcal.io.saving import save
 from stcal.sfm.interop.export import gltf, robots, solids, tables
 from stcal.sfm.interop.export.content import Content, content_of
 from stcal.sfm.interop.export.recording import write_rrd
-from stcal.sfm.run.saved import load_run
+from stcal.sfm.runs.saved import load_run
 
 ROOT = "target"
 """Name of the target frame where none is given."""

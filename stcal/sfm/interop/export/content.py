@@ -7,13 +7,13 @@ import numpy as np
 import stcal
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.camera import CalibratedCamera
+from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.json import Part
 from stcal.io.poses.static import Static
 from stcal.labels import CircleLabel, parse_label
 from stcal.report.text import number
-from stcal.sfm.run.report import ReportCamera, Space
-from stcal.sfm.run.saved import SavedRun
+from stcal.sfm.runs.report import ReportCamera, Space
+from stcal.sfm.runs.saved import SavedRun
 
 FACES_RGB = (
     (230, 159, 0),

@@ -1,0 +1,305 @@
+"""Camera models, made of the parameters of COLMAP or OpenCV, and ``cameras.txt``; each with its pixel origin.
+
+Files are read by :mod:`stcal.io.cameras.read`.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.io.saving import save
+
+COLMAP_PIXEL_ORIGIN = 0.5
+"""COLMAP's coordinate of the centre of the top-left pixel; OpenCV's, and ours, is 0."""
+
+SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
+"""Comments of ``cameras.txt`` that state the uncertainty of its parameters."""
+
+MAX_FOCAL_RATIO = 10.0
+"""Between fx and fy; anamorphic lenses have 2."""
+SQUARE_WITHIN = 1e-6
+"""Of correlations of a parameter with itself, which are 1."""
+FARTHEST = 1e12
+"""Of any parameter: its square is still a number."""
+MAX_SIDE_PX = 1_000_000
+"""Longest image side that a camera file may state, px."""
+
+EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt")
+"""Names of ``distortion_model`` for OpenCV's fisheye."""
+DISTORTION_COUNTS = (0, 4, 5, 8, 12, 14)
+"""Numbers of distortion coefficients that OpenCV knows."""
+
+# Places of COLMAP's parameters in fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4.
+_COLMAP_LAYOUT = {
+    "SIMPLE_PINHOLE": [(0, 1), 2, 3],
+    "PINHOLE": [0, 1, 2, 3],
+    "SIMPLE_RADIAL": [(0, 1), 2, 3, 4],
+    "RADIAL": [(0, 1), 2, 3, 4, 5],
+    "OPENCV": list(range(8)),
+    "FULL_OPENCV": list(range(12)),
+    "SIMPLE_RADIAL_FISHEYE": [(0, 1), 2, 3, 4],
+    "RADIAL_FISHEYE": [(0, 1), 2, 3, 4, 5],
+    "OPENCV_FISHEYE": [0, 1, 2, 3, 4, 5, 8, 9],
+    "THIN_PRISM_FISHEYE": [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 14],
+}
+COLMAP_MODELS = tuple(_COLMAP_LAYOUT)
+"""Camera models that stcal supports."""
+PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+FISHEYE = "FISHEYE"
+"""In the names of COLMAP's equidistant models."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraModel:
+    """A camera as its file states it.
+
+    ``focal``, ``centre``, ``distortion`` : as in :class:`Camera`, pixel origin already OpenCV's;
+    ``colmap_model`` : the COLMAP model that holds it exactly;
+    ``width``, ``height`` : px, or None where the file states none (see :meth:`sized`);
+    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None where the file states none.
+    """
+
+    focal: np.ndarray
+    centre: np.ndarray
+    distortion: np.ndarray
+    colmap_model: str
+    width: int | None
+    height: int | None
+    source: str
+    covariance: np.ndarray | None = None
+
+    def sized(self, width: int, height: int) -> Camera:
+        """The camera; a size that the file does not state is taken from the arguments."""
+        size = self.width or width, self.height or height
+        return Camera(*size, self.focal, self.centre, self.distortion, FISHEYE in self.colmap_model)
+
+    def calibrated(self, width: int, height: int) -> "CalibratedCamera":
+        """The same with its model and covariance."""
+        return CalibratedCamera.of(self.sized(width, height), self.colmap_model, self.covariance)
+
+    def require_inside(self, width: int, height: int, image: str) -> None:
+        """Refuse an image that the principal point is outside of: a file that states no size may be another camera's.
+
+        Raises
+        ------
+        InputError
+            The camera file and the image do not belong together.
+        """
+        x, y = self.centre
+        if not (0 < x < width and 0 < y < height):
+            raise InputError(
+                "E-CAMERA-CENTRE",
+                f"camera file {self.source}: principal point ({x:.0f}, {y:.0f}) px is outside of {image} "
+                f"({width}×{height} px); use the camera file that belongs to the images",
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedCamera(Camera):
+    """A camera of known size and what is stated of its parameters.
+
+    ``colmap_model`` : the COLMAP model that holds it exactly;
+    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None where none is stated.
+    """
+
+    colmap_model: str = "FULL_OPENCV"
+    covariance: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, camera: Camera, colmap_model: str, covariance: np.ndarray | None = None) -> "CalibratedCamera":
+        """``camera`` with its model and covariance."""
+        lens = camera.focal, camera.centre, camera.distortion, FISHEYE in colmap_model
+        return cls(camera.width, camera.height, *lens, colmap_model, covariance)
+
+    def colmap_params(self) -> list[float]:
+        """Parameters in COLMAP's order and pixel origin."""
+        flat = self.parameters()
+        flat[2:4] += COLMAP_PIXEL_ORIGIN
+        return [float(flat[p[0] if isinstance(p, tuple) else p]) for p in _COLMAP_LAYOUT[self.colmap_model]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPrior:
+    """Intrinsics as observations: ``covariance`` (q, q) of the parameters of ``colmap_model``, in its order."""
+
+    colmap_model: str
+    covariance: np.ndarray
+
+
+WITHOUT_DISTORTION = ("SIMPLE_PINHOLE", "PINHOLE")
+PRIOR_FOCAL = 1e-3
+"""σ of the focal lengths where the camera file states none, relative …"""
+PRIOR_CENTRE = 2e-3
+"""… of the principal point, in image widths …"""
+PRIOR_RADIAL = 0.01
+"""… of k1 … k6 (and a tenth of each) …"""
+PRIOR_TANGENTIAL = 1e-3
+"""… and of p1, p2, s1 … s4: what a calibration of some weeks ago, or of another copy of the lens, is worth."""
+
+
+def camera_prior(camera: CalibratedCamera) -> CameraPrior:
+    """The intrinsics as observations with the covariance of their file, or with that of a calibration of some age."""
+    if camera.covariance is not None:
+        return CameraPrior(camera.colmap_model, camera.covariance)
+    radial = np.maximum(PRIOR_RADIAL, 0.1 * np.abs(camera.distortion))
+    radial[[2, 3, 8, 9, 10, 11]] = PRIOR_TANGENTIAL
+    flat = np.concatenate([PRIOR_FOCAL * camera.focal, [PRIOR_CENTRE * camera.width] * 2, radial])
+    first = intrinsic_basis(camera.colmap_model).argmax(0)
+    return CameraPrior(camera.colmap_model, np.diag(flat[first] ** 2))
+
+
+def refinable(camera: CalibratedCamera) -> CalibratedCamera:
+    """The same for a refinement: a file without distortion, and without σ that say that there is none, leaves the
+    lens's distortion out; it is refined as OPENCV, from zero."""
+    if camera.covariance is None and camera.colmap_model in WITHOUT_DISTORTION:
+        return replace(camera, colmap_model="OPENCV")
+    return camera
+
+
+def intrinsic_basis(colmap_model: str) -> np.ndarray:
+    """Derivative (16, q) of fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6, s1 … s4 by the q parameters of a COLMAP model."""
+    layout = _COLMAP_LAYOUT[colmap_model]
+    basis = np.zeros((len(PARAMETER_NAMES), len(layout)))
+    for column, place in enumerate(layout):
+        basis[list(place) if isinstance(place, tuple) else place, column] = 1
+    return basis
+
+
+def parameter_names(colmap_model: str) -> list[str]:
+    """Names of the parameters of a COLMAP model, in its order."""
+    layout = _COLMAP_LAYOUT[colmap_model]
+    return ["f" if isinstance(place, tuple) else PARAMETER_NAMES[place] for place in layout]
+
+
+def write_cameras_txt(path: str | Path, camera: CalibratedCamera) -> None:
+    """Write ``cameras.txt`` with one camera of id 1; σ and correlations of its parameters as comments."""
+    save(Path(path), cameras_txt(camera))
+
+
+def cameras_txt(camera: CalibratedCamera) -> str:
+    """The text of :func:`write_cameras_txt`."""
+    params, covariance = " ".join(map(repr, camera.colmap_params())), camera.covariance
+    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] (centre of the first pixel at 0.5, 0.5)"]
+    if covariance is not None:
+        sigma = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(sigma, sigma)
+        lines.append(f"{SIGMA} {' '.join(repr(float(s)) for s in sigma)}")
+        lines += [f"{CORRELATION} {' '.join(repr(float(c)) for c in row)}" for row in correlation]
+    lines.append(f"1 {camera.colmap_model} {camera.width} {camera.height} {params}")
+    return "\n".join(lines) + "\n"
+
+
+def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:
+    flat = np.pad(flat, (0, len(PARAMETER_NAMES) - len(flat)))
+    if not np.isfinite(flat).all():
+        raise InputError(
+            "E-CAMERA-NOT-FINITE", f"camera file {path}: a camera parameter is not a finite number; correct it"
+        )
+    if (far := np.abs(flat).max()) > FARTHEST:
+        raise InputError(
+            "E-CAMERA-TOO-FAR",
+            f"camera file {path}: a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it",
+        )
+    if (flat[:2] <= 0).any():
+        raise InputError(
+            "E-CAMERA-FOCAL", f"camera file {path}: focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed"
+        )
+    if max(flat[:2]) > MAX_FOCAL_RATIO * min(flat[:2]):
+        raise InputError(
+            "E-CAMERA-FOCAL",
+            f"camera file {path}: focal lengths {flat[0]:g} and {flat[1]:g} px; not more than {MAX_FOCAL_RATIO:g} "
+            "times apart needed, pixels are nearly square",
+        )
+    for side in (width, height):
+        if side is not None and not (0 < side <= MAX_SIDE_PX and float(side).is_integer()):
+            raise InputError(
+                "E-CAMERA-SIZE", f"camera file {path}: image side {side:g} px; a whole number in 1…{MAX_SIDE_PX} needed"
+            )
+    width, height = (None if side is None else int(side) for side in (width, height))
+    return CameraModel(flat[:2], flat[2:4], flat[4:], colmap_model, width, height, str(path))
+
+
+def camera_from_colmap(colmap_model: str, width: float, height: float, params, source: str | Path) -> CameraModel:
+    """The camera of COLMAP's ``params`` (its order, its pixel origin); ``source`` : where they come from.
+
+    Raises
+    ------
+    InputError
+        A camera model that stcal does not support, a wrong number of parameters, or impossible values.
+    """
+    if colmap_model not in _COLMAP_LAYOUT:
+        known = ", ".join(_COLMAP_LAYOUT)
+        raise InputError(
+            "E-CAMERA-MODEL", f"camera file {source}: model {colmap_model} is not supported; use one of {known}"
+        )
+    layout = _COLMAP_LAYOUT[colmap_model]
+    if len(params) != len(layout):
+        raise InputError(
+            "E-CAMERA-COEFFICIENTS",
+            f"camera file {source}: {len(params)} parameters for {colmap_model}, {len(layout)} needed",
+        )
+    flat = np.zeros(len(PARAMETER_NAMES))
+    for place, value in zip(layout, params, strict=True):
+        flat[list(place) if isinstance(place, tuple) else place] = value
+    flat[2:4] -= COLMAP_PIXEL_ORIGIN
+    return camera_model(flat, colmap_model, width, height, Path(source))
+
+
+def camera_from_opencv(
+    lens,
+    given: np.ndarray,
+    fisheye: bool,
+    width: float,
+    height: float,
+    path: str | Path,
+    tangential: bool = False,
+) -> CameraModel:
+    """The camera of fx, fy, cx, cy and OpenCV's coefficients.
+
+    Parameters
+    ----------
+    lens : sequence of 4 float
+        px, pixel origin of OpenCV.
+    given : (k,) array
+        k1, k2, p1, p2, k3 …; of an equidistant camera k1 to k4, or with ``tangential`` k1, k2, p1, p2, k3, k4.
+    fisheye, tangential : bool
+        Equidistant; and which of both.
+    width, height : float
+        px; 0 where the file states none.
+    path : str or Path
+        For messages.
+
+    Raises
+    ------
+    InputError
+        Coefficients of another number, or that no model here has; impossible values.
+    """
+    path, size = Path(path), (width or None, height or None)
+    if fisheye:
+        if len(given) not in ((6,) if tangential else (0, 4)):
+            raise InputError(
+                "E-CAMERA-COEFFICIENTS",
+                f"camera file {path}: {len(given)} coefficients of an equidistant lens; k1 to k4 needed",
+            )
+        distortion = np.zeros(12)
+        distortion[[0, 1, 2, 3, 4, 5] if tangential else [0, 1, 4, 5][: len(given)]] = given
+        kind = "THIN_PRISM_FISHEYE" if distortion[2:4].any() else "OPENCV_FISHEYE"
+        return camera_model(np.concatenate([lens, distortion]), kind, *size, path)
+    if given[8:].any():
+        raise InputError(
+            "E-CAMERA-COEFFICIENTS",
+            f"camera file {path}: {len(given)} distortion coefficients, at most 8 are supported",
+        )
+    if len(given) not in DISTORTION_COUNTS:
+        raise InputError(
+            "E-CAMERA-COEFFICIENTS",
+            f"camera file {path}: {len(given)} distortion coefficients; {', '.join(map(str, DISTORTION_COUNTS))} "
+            "are possible (k1, k2, p1, p2, k3 …)",
+        )
+    distortion = np.zeros(8)
+    distortion[: min(len(given), 8)] = given[:8]
+    kind = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
+    return camera_model(np.concatenate([lens, distortion]), kind, *size, path)

@@ -1,0 +1,126 @@
+"""Pictures of residuals: by joint, and in space."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.report.figure import COLOURS, INK, SMALL, calm, new_figure, plane, round_below, uri
+from stcal.robot.identification.left import Finding
+from stcal.robot.identification.residuals import Observed, State, as_seen, tips_of
+from stcal.robot.kinematics.forward import joint_frames
+
+ARROW_SHARE, LONGEST_SHARE = 0.12, 0.3
+"""Of the picture's side: a typical residual, and the longest that is drawn."""
+FEW_ARROWS = 60
+"""More are drawn shorter and thinner."""
+LEAST_MOTION = 1e-6
+"""Of the largest: a joint that moves the tool by less does not move it."""
+FEW = 200
+"""Rows, of more than which points are small."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """What is drawn: ``residuals`` (r, 6), (r, 3) or (r, 1) measured minus modelled, rad and mm in the world's axes, of
+    the observations ``seen`` by ``state``; ``good`` : (r,) of bool, rows that are not wrong."""
+
+    state: State
+    world_from_base: Rigid
+    seen: Observed
+    residuals: np.ndarray
+    good: np.ndarray
+    colour: str = COLOURS[0]
+
+    def tips(self) -> Poses:
+        """world_from_tool of the rows of the file."""
+        return tips_of(self.state, self.seen.data)
+
+
+def joints_figure(shown: Drawn, findings: Iterable[Finding]):
+    """Residual along each joint's own motion against its value, of good rows that it moves; a curve where it was found
+    to go with it."""
+    seen, chain, tip = shown.seen, shown.state.chain, shown.tips()
+    data = seen.data
+    turned, origins = joint_frames(chain, data.q, data.conditions)
+    values, n, carries = data.q @ chain.coupling.T, len(chain), chain.carries(data.targets)
+    found = shown.residuals[:, -3:]
+    across = min(n, 3)
+    down = -(-n // across)
+    height = 0.35 + 1.75 * down
+    figure = new_figure(9, height)
+    grid = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
+    turns_of = {finding.joint: finding.turns for finding in reversed(tuple(findings))}
+    for i, axes in enumerate(grid):
+        if i >= n:
+            axes.set_visible(False)
+            continue
+        z, sliding = turned[i][:, :, 2], chain.prismatic[i]
+        own = [z * 0, z] if sliding else [z, np.cross(z, tip.translation - origins[i])]
+        own = np.hstack(own) * carries[i, :, None]
+        motion = as_seen(shown.state, seen, tip, own[:, :, None])[:, -found.shape[1] :, 0]
+        size = np.linalg.norm(motion, axis=1)
+        moves = shown.good & (size > LEAST_MOTION * max(size.max(), 1e-300))
+        along = np.einsum("rw,rw->r", motion[moves], found[moves]) / size[moves]
+        at = values[seen.first[moves], i] * (1 if sliding else np.degrees(1))
+        axes.axhline(0, color="#9aa0a8", lw=0.7)
+        axes.plot(at, along, "o", color=shown.colour, ms=3 if len(at) <= FEW else 1.4, mew=0)
+        if turns_of.get(i + 1) and len(at) > 3:
+            fitted = np.linalg.lstsq(_wave(at, turns_of[i + 1]), along, rcond=None)[0]
+            x = np.linspace(at.min(), at.max(), 100)
+            axes.plot(x, _wave(x, turns_of[i + 1]) @ fitted, color=INK, lw=1.2)
+        calm(axes)
+        axes.set_xlabel(f"joint {i + 1}, {'mm' if sliding else 'deg'}", fontsize=SMALL + 0.5, color=INK)
+        if i % across == 0:
+            axes.set_ylabel("along its motion, mm", fontsize=SMALL + 0.5, color=INK)
+    figure.subplots_adjust(left=0.08, right=0.99, bottom=0.42 / height, top=0.97, hspace=0.5, wspace=0.08)
+    return figure
+
+
+def _wave(degrees: np.ndarray, turns: int) -> np.ndarray:
+    """(m, 3) constant, cosine and sine."""
+    angle = turns * np.radians(degrees)
+    return np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1)
+
+
+def space_picture(shown: Drawn) -> dict[str, str]:
+    """Residuals of positions from above and from the side, exaggerated, with a bar that shows how long one is:
+    ``picture`` and ``caption``."""
+    good, colour, base_from_world = shown.good, shown.colour, shown.world_from_base.inverse()
+    place = base_from_world @ shown.tips().translation
+    found = shown.residuals[:, -3:] @ base_from_world.rotation.T
+    length = np.linalg.norm(found, axis=1)
+    side = float(np.ptp(place, axis=0).max()) or 1.0
+    crowded = min(1.0, FEW_ARROWS / len(place)) ** (1 / 3)
+    scale = round_below(ARROW_SHARE * crowded * side / max(float(np.sqrt((length[good] ** 2).mean())), 1e-12))
+    cut = np.minimum(1, LONGEST_SHARE * side / np.maximum(scale * length, 1e-300))
+    ends = place + scale * found * cut[:, None]
+    bar = round_below(1.5 * ARROW_SHARE * crowded * side / scale)
+    figure = new_figure(9, 4.4)
+    for k, (i, j) in enumerate(((0, 1), (0, 2))):
+        axes = figure.add_axes((0.075 + 0.5 * k, 0.12, 0.42, 0.85))
+        every = np.concatenate([place, ends])[:, [i, j]]
+        low = every.min(0) - 0.08 * side
+        axes.plot(*np.vstack([every, low]).T, " ")  # all of it is within the limits
+        for mask, own in ((good, colour), (~good, COLOURS[1] if colour != COLOURS[1] else COLOURS[0])):
+            start, way = place[mask][:, [i, j]], (ends - place)[mask][:, [i, j]]
+            style = {
+                "angles": "xy",
+                "scale_units": "xy",
+                "scale": 1,
+                "width": 0.004 * crowded,
+                "headwidth": 3.5,
+                "headlength": 4,
+            }
+            axes.quiver(*start.T, *way.T, color=own, **style)
+            axes.plot(*start.T, ".", color=own, ms=3)
+        plane(axes, f"{'xyz'[i]} of the base, mm", f"{'xyz'[j]} of the base, mm", 0.04)
+        axes.plot([low[0], low[0] + scale * bar], [low[1], low[1]], color=INK, lw=2, solid_capstyle="butt")
+        axes.annotate(f"{bar:g} mm", low, (0, 4), textcoords="offset points", fontsize=SMALL, color=INK)
+    caption = f"Residuals (measured minus modelled), {scale:g} times, from above and from the side"
+    if not good.all():
+        caption += f"; in the other colour: {(~good).sum()} that are not fitted"
+    if (cut < 1).any():
+        caption += f"; cut, as they are too long: {(cut < 1).sum()}"
+    return {"picture": uri(figure), "caption": caption}

@@ -1,0 +1,147 @@
+"""How well a set of poses shows a robot's parameters: the observability indices O1 … O5."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.errors import InputError
+from stcal.robot.identification.residuals import WIDTH, Kind, State, tip_jacobian, tool_width
+from stcal.robot.kinematics.damped import reach_mm
+from stcal.robot.kinematics.forward import chain_parameters
+from stcal.robot.kinematics.model import Robot
+
+SEEN = 1e-9
+"""Singular values below this share of the largest are rounding: the parameter is not seen by any pose."""
+
+TOGETHER, MOST_BESIDE = 0.2, 2
+"""Share of a direction's largest motion from which on a parameter moves with it; so many are named beside the first."""
+
+MEANING = {
+    "O1": "volume of the ellipsoid of uncertainty (D-optimality)",
+    "O2": "inverse condition number",
+    "O3": "the combination of parameters that is seen worst (E-optimality)",
+    "O4": "noise amplification",
+    "O5": "harmonic mean, near to A-optimality",
+}
+"""Of the indices, in words."""
+EXPLAINED = [f"  {name}: {words}" for name, words in MEANING.items()]
+"""A line of each, for the terminal."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObservabilityIndices:
+    """Indices of an identification Jacobian with singular values σ₁ ≥ … ≥ σ_L from ``count`` poses; larger is better.
+
+    They depend on the unit of the parameters but for the order that O1 gives to sets of poses. Everywhere here all
+    parameters are lengths in mm, an angle being the arc that it makes at the arm's whole reach
+    (:func:`parameter_scale`), and what is measured is counted in its σ. So singular values, O1, O3, O4 and O5 are in
+    1/mm; O2 has no unit; and 1 / O3 is the σ in mm of the combination of parameters that is seen worst.
+
+    Parameters
+    ----------
+    o1 : float
+        (σ₁ … σ_L)^(1/L) / √count: the volume of the ellipsoid of uncertainty, D-optimality (Borm & Menq 1989, 1991).
+    o2 : float
+        σ_L / σ₁: inverse condition number (Driels & Pathre 1990).
+    o3 : float
+        σ_L: the parameter that is seen worst, E-optimality (Nahvi, Hollerbach & Hayward 1994).
+    o4 : float
+        σ_L² / σ₁: noise amplification (Nahvi & Hollerbach 1996).
+    o5 : float
+        1 / (1/σ₁ + … + 1/σ_L): harmonic, near to A-optimality (Sun & Hollerbach 2008).
+    """
+
+    o1: float
+    o2: float
+    o3: float
+    o4: float
+    o5: float
+
+    @classmethod
+    def of(cls, singular_values: np.ndarray, count: int) -> "ObservabilityIndices":
+        """From the singular values (L,) of the Jacobian of ``count`` poses; all indices are 0 where one of them is 0.
+
+        Raises
+        ------
+        InputError
+            No singular values, negative ones, or no poses.
+        """
+        sigma = np.sort(np.asarray(singular_values, float).ravel())[::-1]
+        if not len(sigma) or not np.isfinite(sigma).all() or sigma[-1] < 0 or count < 1:
+            raise InputError(
+                "E-ARRAY-SHAPE",
+                f"observability: {len(sigma)} singular values of {count} poses; at least one of each, none negative",
+            )
+        first, last = float(sigma[0]), float(sigma[-1])
+        if last == 0:
+            return cls(0.0, 0.0, 0.0, 0.0, 0.0)
+        volume = float(np.exp(np.log(sigma).mean()))
+        return cls(
+            float(volume / np.sqrt(count)), last / first, last, last * last / first, float(1 / (1 / sigma).sum())
+        )
+
+    @classmethod
+    def of_jacobian(cls, rows: np.ndarray, seen: int | None = None) -> "ObservabilityIndices":
+        """From the Jacobian (m, r, k) of m poses over σ, parameters in mm; of its ``seen`` largest singular values."""
+        sigma = np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False)[:seen]
+        return cls.of(np.where(sigma > SEEN * sigma[0], sigma, 0.0), len(rows))
+
+    def values(self) -> dict[str, float]:
+        """By name, O1 … O5."""
+        return {"O1": self.o1, "O2": self.o2, "O3": self.o3, "O4": self.o4, "O5": self.o5}
+
+
+def identification_jacobian(
+    robot: Robot,
+    q: np.ndarray,
+    observe: Kind = "position",
+    sigma_mm: float = 1.0,
+    sigma_rad: float = 1.0,
+    tool: str = "",
+) -> np.ndarray:
+    """Derivative of what is measured at joint vectors by all that is identified, over σ, (m, r, k).
+
+    r is 6 (rotation over σ_rad, translation over σ_mm) or 3 (position over σ_mm), in the world's axes; the k parameters
+    are those of :func:`~stcal.robot.identification.residuals.parameter_names`, rad and mm.
+
+    Parameters
+    ----------
+    q : (m, n) array
+        Values of the controller, rad or mm.
+    """
+    state = State(robot.chain(), {tool: robot.tool(tool)})
+    derivative = tip_jacobian(state, q, (tool,) * len(q), observe)[1]
+    sigma = np.repeat([sigma_rad, sigma_mm], 3)
+    return (derivative / sigma[:, None])[:, -WIDTH[observe] :]
+
+
+def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[str] = ("",)) -> np.ndarray:
+    """(k,) factors of the columns of an identification Jacobian after which all parameters are in mm: an angle counts
+    by the arc that it makes at the arm's whole reach (:func:`~stcal.robot.kinematics.damped.reach_mm`, of the longest
+    tool)."""
+    tools = list(tools)
+    turning = [c < 3 for _, c in chain_parameters(robot.chain())]
+    turning += ([True] * (tool_width(observe) - 3) + [False] * 3) * len(tools)
+    return np.where(turning, 1 / max(reach_mm(robot, tool) for tool in tools), 1.0)
+
+
+def directions_named(directions: np.ndarray, names: list[str]) -> tuple[str, ...]:
+    """Names of directions (k, d) of k parameters, such as ``J2 y (with tool z)``: each led by a parameter that no other
+    one has, with those that move with it."""
+    lead, reduced = [], directions.copy()
+    for column in range(reduced.shape[1]):
+        free = np.abs(reduced)
+        free[lead] = 0
+        i, j = np.unravel_index(free[:, column:].argmax(), free[:, column:].shape)
+        reduced[:, [column, column + j]] = reduced[:, [column + j, column]]
+        reduced[:, column] /= reduced[i, column]
+        others = np.arange(reduced.shape[1]) != column
+        reduced[:, others] -= np.outer(reduced[:, column], reduced[i, others])
+        lead.append(int(i))
+    found = []
+    for i, own in zip(lead, reduced.T, strict=True):
+        strong = [k for k in np.argsort(-np.abs(own)) if k != i and abs(own[k]) > TOGETHER * np.abs(own).max()]
+        beside = " and ".join(names[k] for k in strong[:MOST_BESIDE]) + (" …" if len(strong) > MOST_BESIDE else "")
+        found.append(f"{names[i]} (with {beside})" if beside else names[i])
+    return tuple(found)

@@ -1,0 +1,164 @@
+"""What the identified robot is expected to err by, where it was measured and elsewhere.
+
+Few rows, or rows of a small part of the joints' ranges, fit well and tell little: the covariance knows by how much.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.geometry.rigid import Rigid
+from stcal.robot.identification.left import Finding
+from stcal.robot.identification.observability import directions_named
+from stcal.robot.identification.residuals import WIDTH, Kind, Observed, State, tip_jacobian
+from stcal.robot.kinematics.conditions import USUAL, Conditions
+from stcal.robot.kinematics.damped import reach_mm
+from stcal.robot.kinematics.model import Robot
+
+SAMPLES, SEED = 200, 0
+ELSEWHERE = 3.0
+"""Times the σ at the measured rows, from which on that elsewhere is a warning: 40 rows over the middle 60 % of all
+ranges have 1.6, over 30 % 3.5, eight rows 3."""
+FEW = 2.0
+"""Numbers measured, in those of the parameters, below which σ are hardly estimated: of 40 simulated sets of eight poses
+(1.6) two found a tenth of the true one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Predicted:
+    """σ of the tool's position, mm (root of the summed variances of x, y, z), by the covariance of the parameters.
+
+    ``here_mm`` : (m,) at the joint values that were measured; ``ranges_mm`` : (s,) at random ones over the joints'
+    ranges (± half a turn, or the reach, where unlimited), with ``left_mm`` in it, RMS of what residuals go with;
+    ``covariance`` : (k, k) of all parameters, those of elasticity too, rad and mm.
+    """
+
+    here_mm: np.ndarray
+    ranges_mm: np.ndarray
+    covariance: np.ndarray
+    left_mm: float = 0.0
+
+    def elsewhere(self) -> float:
+        """σ over the ranges in units of that at the measured rows (RMS)."""
+        return _rms(self.ranges_mm) / max(_rms(self.here_mm), 1e-9)
+
+
+def predicted(state: State, robot: Robot, seen: Observed, covariance: np.ndarray) -> Predicted | None:
+    """Of the target that most rows have; None of distances, which say nothing of the place of all.
+
+    Parameters
+    ----------
+    state : State
+        As identified.
+    robot : Robot
+        With the joints' ranges.
+    seen : Observed
+        The observations.
+    covariance : (k, k) array
+        Of the parameters, rad and mm.
+    """
+    if seen.kind == "distance":
+        return None
+    names = list(dict.fromkeys(seen.data.targets))
+    target = max(names, key=seen.data.targets.count)
+
+    here = _sigma(state, seen.data.q, seen.data.targets, seen.kind, covariance, seen.data.conditions)
+    ranges = _sigma(state, _over_ranges(robot, SAMPLES), (target,) * SAMPLES, seen.kind, covariance)
+    return Predicted(here, ranges, covariance)
+
+
+def _sigma(
+    state: State,
+    q: np.ndarray,
+    targets: Sequence[str],
+    kind: Kind,
+    covariance: np.ndarray,
+    conditions: Conditions = USUAL,
+) -> np.ndarray:
+    """(r,) at joint values (r, n), mm."""
+    place = tip_jacobian(state, q, targets, kind, conditions)[1][:, 3:]
+    return np.sqrt(np.einsum("rik,kl,ril->r", place, covariance, place))
+
+
+def predicted_at(found: Predicted, state: State, kind: Kind, q: np.ndarray, targets: Sequence[str]) -> np.ndarray:
+    """(r,) σ of the tool's position at joint values (r, n) that were not measured, mm, with what residuals go with; nan
+    of tools that were not measured.
+
+    Parameters
+    ----------
+    found : Predicted
+        Of the identification.
+    state, kind
+        As identified, and from what.
+    q : (r, n) array
+        Joint values, rad and mm.
+    targets : (r,) sequence of str
+        The tool of each.
+    """
+    sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
+    if known.any():
+        own = [name for name in targets if name in state.tools]
+        sigma[known] = np.hypot(_sigma(state, q[known], own, kind, found.covariance), found.left_mm)
+    return sigma
+
+
+def _over_ranges(robot: Robot, count: int) -> np.ndarray:
+    """(count, n) random joint values, rad or mm."""
+    low, high = robot.limits().T
+    half = np.where(robot.prismatic, reach_mm(replace(robot, tools={"": Rigid()})), np.pi)
+    low, high = np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)
+    return np.random.default_rng(SEED).uniform(low, high, (count, len(half)))
+
+
+def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted | None, tuple[str, ...]]:
+    """With what residuals go with in the σ over the ranges, and what is to be said of it.
+
+    The rows show by how much the model fails among them; the covariance, which takes the model as true, does not know
+    of it, and values identified from other rows differ by more than it says.
+    """
+    if found is None or not left:
+        return found, ()
+    each = np.array([finding.effect_mm / (np.sqrt(2) if finding.turns else 1.0) for finding in left])
+    size = float(np.sqrt((each**2).sum()))
+    wider = replace(found, ranges_mm=np.hypot(found.ranges_mm, size), left_mm=size)
+    return wider, (
+        f"σ hold for these rows, and for places like theirs: the model leaves {size:.2g} mm RMS that goes with what is "
+        f"named above; over the joints' ranges the tool's position is known to {_rms(wider.ranges_mm):.2g} mm (σ, with "
+        "that in it)",
+    )
+
+
+def doubts(
+    found: Predicted | None, seen: Observed, units: np.ndarray, covariance: np.ndarray, names: list[str], tested: bool
+) -> tuple[str, ...]:
+    """What is to be said of rows that are few, or of a small part of the ranges.
+
+    ``units`` : (k,) make each parameter a movement of the tool of about 1 mm; ``tested`` : rows were held out.
+    """
+    notes = []
+    numbers = WIDTH[seen.kind] * len(seen)
+    said = f"{len(seen)} {seen.kind}s give {numbers} numbers for {len(names)} parameters"
+    if not tested:
+        notes.append(
+            f"{said}: none can be held out to test the result, and errors of the same rows say nothing; measure twice "
+            "as many"
+        )
+    elif numbers < FEW * len(names):
+        notes.append(
+            f"{said}: σ estimated from so few may be several times too small; state --sigma-mm, or measure more"
+        )
+    if found is not None and found.elsewhere() > ELSEWHERE:
+        sizes, directions = np.linalg.eigh(covariance / units[:, None] / units)
+        worst = directions_named(directions[:, -1:], names)[0]
+        notes.append(
+            f"over the joints' ranges the tool's position is known to {_rms(found.ranges_mm):.2g} mm (σ), "
+            f"{found.elsewhere():.0f} times that at the measured rows, {_rms(found.here_mm):.2g} mm: they are few, or "
+            f"of a small part of the ranges; least known: {worst}, ± {np.sqrt(sizes[-1]):.2g} mm; add rows "
+            "(`stcal robot design`), or use the result where it was measured only"
+        )
+    return tuple(notes)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean()))

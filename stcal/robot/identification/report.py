@@ -1,0 +1,353 @@
+"""What an identification found, as text, JSON and page."""
+
+from collections.abc import Iterable
+from dataclasses import asdict
+
+import numpy as np
+
+from stcal.report.figure import COLOURS, calm, new_figure, uri
+from stcal.report.page import render
+from stcal.report.text import NONE, number, text_table
+from stcal.robot.identification.drawings import Drawn, joints_figure, space_picture
+from stcal.robot.identification.files import IdentifiedFile
+from stcal.robot.identification.nominal import DIMENSIONS, Placed, dh_values
+from stcal.robot.identification.observability import EXPLAINED, MEANING
+from stcal.robot.identification.result import OUTLIER_WEIGHT, Identified
+from stcal.robot.kinematics.forward import links, torques
+from stcal.robot.kinematics.model import Elasticity, Robot
+
+DH = DIMENSIONS
+UNITS = ("mm", "deg", "mm", "deg", "deg")
+SHOWN = np.array([1.0, 180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
+PLACE = ("x", "y", "z", "rx", "ry", "rz")
+FIRST_OUTLIERS = 10
+MDEG = 1000 * 180 / np.pi
+ELASTIC = ["<joint, mdeg", "gravity", "across axis", "once a turn", "twice a turn"]
+
+
+def identified_text(result: Identified, nominal: Robot) -> str:
+    """Tables for the terminal."""
+    kinds = ", ".join(f"{k}s {v}" for k, v in result.ranks.items())
+    lines = [
+        f"robot {nominal.name}: {_observations(result)}, {result.rank} parameters determined "
+        f"(what these joint values determine: {kinds})",
+        _noise(result),
+        *_price(result),
+        *_model(result),
+    ]
+    errors = [[name, *(number(v, 4) for v in _statistics(each))] for name, each in _errors(result).items()]
+    rows = [["joint", *(head for n, u in zip(DH, UNITS, strict=True) for head in (f"{n} {u}", "±"))]]
+    values, sigma = dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
+    for i, each in enumerate(zip(values, sigma, strict=True), 1):
+        rows.append([str(i), *(cell for v, s in zip(*each, strict=True) for cell in (number(v, 4), _sigma(s)))])
+    placed = [line for each in result.placed for line in _placed(each)]
+    lines += ["", *text_table([["<error, mm", "mean", "RMS", "max"], *errors], (34, *[7] * 3))]
+    lines += ["", *text_table(rows, (6, *[11, 7] * 5))]
+    lines += ["", *text_table([["<mm and rotation vector, deg", *PLACE], *placed], (34, *[9] * 6))]
+    if result.elasticity_sigma is not None:
+        head = elastic_head(result)
+        lines += ["", *text_table([head, *elastic_rows(result)], (16, *[12] * (len(head) - 1)))]
+    indices = result.observability.values()
+    lines += ["", "observability  " + "   ".join(f"{name} {value:.3g}" for name, value in indices.items())]
+    lines += EXPLAINED
+    outliers = result.outliers()
+    if outliers:
+        lines.append(f"outliers, of less than half weight: {len(outliers)}")
+        lines += [f"  {_place(result, row)}: {error:.3f} mm" for row, error in outliers[:FIRST_OUTLIERS]]
+    if result.undetermined:
+        lines.append(f"kept nominal, as the data leave it open: {', '.join(result.undetermined)}")
+    lines += [f"note: {note}" for note in result.notes]
+    return "\n".join(lines)
+
+
+def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
+    """Everything, for programs (keys: ``data_layout.md``)."""
+    values, before = dh_values(result.robot), dh_values(nominal)
+    held = result.held_out
+    content = {
+        "format": "stcal identified 1",
+        "robot": nominal.name,
+        "observed": result.seen.used,
+        "observations": len(result.seen),
+        "rank": result.rank,
+        "parameters": len(result.names),
+        "ranks": result.ranks,
+        "undetermined": list(result.undetermined),
+        "notes": list(result.notes),
+        "fixed": [
+            {"joint": i + 1, "dimension": DIMENSIONS[k], "reason": nominal.joints[i].fixed.get(DIMENSIONS[k])}
+            for i, k in np.argwhere(result.adjustment.rows.fixed).tolist()
+        ],
+        "all_held_out_rms_mm": result.all_held_out and _statistics(result.all_held_out.position_mm)[1],
+        "stations": {name: pose.inverse().matrix() for name, pose in result.state.stations.items()},
+        "model": result.model,
+        "models": None if result.gain is None else asdict(result.gain),
+        "elasticity": _elasticity(result),
+        "sigma_mm": None if result.weighting.given else result.weighting.sigma_mm,
+        "sigma_rad": result.weighting.sigma_rad if result.seen.kind == "pose" and not result.weighting.given else None,
+        "sigma0": result.sigma0,
+        "deviations": result.deviations,
+        "errors": {
+            key: _named(_statistics(errors))
+            for key, errors in zip(("nominal", "identified"), list(_errors(result).values())[:2], strict=True)
+        },
+        "held_out": None,
+        "predicted": None,
+        "observability": result.observability.values(),
+        "rows": [
+            {name: {"nominal": b, "identified": v, "sigma": s} for name, b, v, s in zip(DH, *each, strict=True)}
+            for each in zip(before.tolist(), values.tolist(), result.dh_sigma.tolist(), strict=True)
+        ],
+        "placed": placed_parts(result.placed),
+        "parameter_names": list(result.names),
+        "covariance": result.covariance,
+        "residuals": [
+            {"line": _line(result, i), "error_mm": float(e), "weight": float(w)}
+            for i, (e, w) in enumerate(zip(result.fitted_mm, result.weights, strict=True))
+        ],
+        "left": result.left,
+        "outliers": [
+            {"line": _line(result, i), "place": _place(result, i), "error_mm": error} for i, error in result.outliers()
+        ],
+    }
+    if result.predicted is not None:
+        both = {"same_rows": result.predicted.here_mm, "ranges": result.predicted.ranges_mm}
+        content["predicted"] = {name: _named(_statistics(each)) for name, each in both.items()}
+    if held is not None:
+        mean, rms, largest = _statistics(held.position_mm)
+        content["held_out"] = {
+            "folds": held.folds,
+            "repeats": len(held.position_mm),
+            "mean_mm": mean,
+            "rms_mm": rms,
+            "max_mm": largest,
+            "mean_deg": float(np.degrees(np.nanmean(held.rotation_rad))) if result.seen.kind == "pose" else None,
+        }
+    return IdentifiedFile.model_validate(content)
+
+
+def identified_page(result: Identified, nominal: Robot) -> str:
+    """The report page."""
+    good = result.weights >= OUTLIER_WEIGHT
+    drawn = Drawn(result.state, result.robot.world_from_base, result.seen, result.residuals, good)
+    return render(
+        "robot/identification/page.html.jinja",
+        robot=nominal.name,
+        result=result,
+        observations=_observations(result),
+        errors=[[name, *(number(v, 4) for v in _statistics(e))] for name, e in _errors(result).items()],
+        noise=_noise(result),
+        model=[*_price(result), *_model(result)],
+        elastic=elastic_rows(result),
+        elastic_head=elastic_head(result),
+        errors_by_row=uri(_figure(result)),
+        dh=_rows(result, nominal),
+        placed=[placed_cells(each) for each in result.placed],
+        left=[each.sentence() for each in result.left or ()],
+        told=result.left is not None,
+        residuals_by_joint=uri(joints_figure(drawn, result.left or ())),
+        residuals_in_space=space_picture(drawn) if result.seen.kind != "distance" else None,
+        kinds=", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items()),
+        sigma=[
+            [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
+            for name, s in zip(result.names, np.sqrt(np.diag(result.covariance)), strict=True)
+        ],
+        indices=[[name, f"{value:.4g}", MEANING[name]] for name, value in result.observability.values().items()],
+        outliers=[
+            [_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()
+        ],
+    )
+
+
+def _price(result: Identified) -> list[str]:
+    """What is kept as it was, and what that costs."""
+    rows = result.adjustment.rows
+    if not rows.fixed.any():
+        return []
+    said = f"adjusted: base, tools and {int((rows.free & ~rows.fixed).sum())} of {int(rows.free.sum())} dimensions"
+    if result.held_out is None or result.all_held_out is None:
+        return [said]
+    own, every = (_statistics(each.position_mm)[1] for each in (result.held_out, result.all_held_out))
+    return [f"{said}; rows held out err by {own:.3g} mm RMS, by {every:.3g} were all dimensions adjusted"]
+
+
+def _model(result: Identified) -> list[str]:
+    """What was tried, and what it gains."""
+    gain = result.gain
+    if gain is None:
+        return ["model: elastic"] if result.model == "elastic" else []
+    less, beyond = "less" if gain.gain_mm > 0 else "more", "" if gain.beyond_chance else "not "
+    return [
+        f"model: {result.model}; rows held out err by {gain.rigid_mm:.3g} mm RMS of a rigid arm and "
+        f"{gain.elastic_mm:.3g} of an elastic one, {abs(gain.gain_mm):.2g} ± {gain.sigma_mm:.1g} mm {less} a row, "
+        f"{beyond}beyond chance"
+    ]
+
+
+def elastic_head(result: Identified) -> list[str]:
+    """Over :func:`elastic_rows`."""
+    return [*ELASTIC, *(["hysteresis"] if result.state.hysteresis else [])]
+
+
+def elastic_rows(result: Identified) -> list[list[str]]:
+    """Of each joint, what its link gives way by at the torques of the measured rows (RMS), the amplitudes of its gear,
+    and where it was adjusted its hysteresis, with σ."""
+    elasticity, sigma = result.state.chain.elasticity, result.elasticity_sigma
+    if elasticity is None or sigma is None:
+        return []
+    chain, q = result.state.chain, result.seen.data.q
+    conditions = result.seen.data.conditions
+    rotation, origin = links(chain, q, conditions)
+    torque = torques(chain, q, rotation, origin, conditions)
+    axis = rotation[..., 2]
+    about = (torque * axis).sum(2)
+    square = (torque**2).sum(2)
+    rms = np.sqrt(np.stack([(about**2).mean(1), (square - about**2).clip(0).mean(1)], axis=1))
+    rows = []
+    for i in range(len(chain)):
+        cells = [(c * t, s * t) for c, s, t in zip(elasticity.compliance[i], sigma.compliance[i], rms[i], strict=True)]
+        for pair in (slice(0, 2), slice(2, 4)):
+            size, each = float(np.linalg.norm(elasticity.periodic[i, pair])), sigma.periodic[i, pair]
+            cells.append((size, float(np.sqrt((each**2).mean()))))
+        if result.state.hysteresis:
+            cells.append((elasticity.hysteresis[i], sigma.hysteresis[i]))
+        rows.append([str(i + 1), *(f"{MDEG * value:.1f} ± {MDEG * s:.1f}" for value, s in cells)])
+    return rows
+
+
+def _elasticity(result: Identified) -> dict | None:
+    """Of the robot file, with σ."""
+    found, sigma = result.robot.elasticity, result.elasticity_sigma
+    if found is None or sigma is None:
+        return None
+
+    def joints(each: Elasticity) -> list[dict]:
+        parts = (each.compliance, each.moment, each.periodic, each.hysteresis)
+        return [
+            {"axis_rad_per_Nm": a, "across_rad_per_Nm": b, "moment_Nm": m, "periodic_rad": p, "hysteresis_rad": h}
+            for (a, b), m, p, h in zip(*(part.tolist() for part in parts), strict=True)
+        ]
+
+    return {"gravity": found.gravity.tolist(), "joints": joints(found), "sigma": joints(sigma)}
+
+
+def _placed(each: Placed) -> list[list[str]]:
+    """Translation, mm, and rotation vector, deg; σ in a line of their own."""
+    values, sigma = _shown(each)
+    lines = [[each.name, *(number(v, 4) for v in values)]]
+    return lines if np.isnan(sigma).all() else [*lines, ["  σ", *(number(s, 4) for s in sigma)]]
+
+
+def _shown(each: Placed) -> tuple[np.ndarray, np.ndarray]:
+    """Translation, mm, and rotation vector, deg, (6,); and σ of shifts along, and turns about, the axes (6,)."""
+    values = np.append(each.pose.translation, np.degrees(each.pose.log()[:3]))
+    return values, np.append(each.sigma[3:], np.degrees(each.sigma[:3]))
+
+
+def placed_cells(each: Placed) -> list[str]:
+    """Name, and value ± σ of translation, mm, and rotation vector, deg, for a page."""
+    found = [number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in zip(*_shown(each), strict=True)]
+    return [each.name.partition(" in the")[0], *found]
+
+
+def placed_parts(placed: Iterable[Placed]) -> list[dict]:
+    """For result files."""
+    return [{"name": each.name, "pose": each.pose.matrix(), "sigma": each.sigma_or_none()} for each in placed]
+
+
+def _rows(result: Identified, nominal: Robot) -> list[tuple[list, list]]:
+    """Of each unit: the values that have it, each with the columns that it spans, and rows of joints."""
+    values, before, sigma = dh_values(result.robot) * SHOWN, dh_values(nominal) * SHOWN, result.dh_sigma * SHOWN
+    tables = []
+    for unit in dict.fromkeys(UNITS):
+        kinds = [k for k in range(5) if UNITS[k] == unit]
+        lines = []
+        for i in range(len(values)):
+            cells = []
+            for k in kinds:
+                change = NONE if sigma[i, k] == 0 else number(values[i, k] - before[i, k], 4)
+                cells += [number(values[i, k], 4), change, _sigma(sigma[i, k])]
+            lines.append([str(i + 1), *cells])
+        tables.append(([(f"{DH[k]} ({unit})", 3) for k in kinds], lines))
+    return tables
+
+
+def _figure(result: Identified):
+    figure = new_figure(9, 2.6)
+    axes = figure.add_subplot()
+    rows = np.arange(1, len(result.seen) + 1)
+    size = 4 if len(rows) <= 200 else 1.5
+    axes.plot(rows, result.fitted_mm, "o", color=COLOURS[0], ms=size, mew=0, label="identified")
+    if result.held_out is not None:
+        errors = _by_row(result.held_out.position_mm)
+        axes.plot(rows, errors, "_", color=COLOURS[1], ms=size * 2, mew=1.6, label="held out")
+    axes.set_xlabel("observation", fontsize=8)
+    axes.set_ylabel("error, mm", fontsize=8)
+    axes.set_ylim(bottom=0)
+    axes.legend(fontsize=7.5, frameon=False, ncols=2, loc="upper right", bbox_to_anchor=(1, 1.15))
+    calm(axes)
+    figure.subplots_adjust(left=0.07, right=0.99, bottom=0.18, top=0.92)
+    return figure
+
+
+def _by_row(values: np.ndarray) -> np.ndarray:
+    seen = np.isfinite(values)
+    return np.where(seen, values, 0).sum(0) / np.where(seen.any(0), seen.sum(0), np.nan)
+
+
+def _errors(result: Identified) -> dict[str, np.ndarray]:
+    found = {"nominal axes, base and tool fitted": result.nominal_mm, "identified, the same rows": result.fitted_mm}
+    if result.held_out is not None:
+        found[f"held out, {result.held_out.folds} folds"] = result.held_out.position_mm
+    if result.predicted is not None:
+        found["σ, the same rows"] = result.predicted.here_mm
+        found["σ, over the joints' ranges"] = result.predicted.ranges_mm
+    return found
+
+
+def _statistics(errors: np.ndarray) -> tuple[float, float, float]:
+    return float(np.nanmean(errors)), float(np.sqrt(np.nanmean(errors**2))), float(np.nanmax(errors))
+
+
+def _named(statistics: tuple[float, float, float]) -> dict[str, float]:
+    return dict(zip(("mean_mm", "rms_mm", "max_mm"), statistics, strict=True))
+
+
+def _noise(result: Identified) -> str:
+    weighting = result.weighting
+    if weighting.given:
+        noise = f"weights from the covariances given, σ₀ {result.sigma0:.2f}"
+    else:
+        rotation = f", {np.degrees(weighting.sigma_rad):.2g}°" if result.seen.kind == "pose" else ""
+        noise = f"σ of a coordinate {weighting.sigma_mm:.3g} mm{rotation}, σ₀ {result.sigma0:.2f}"
+    degrees = np.degrees(1.0)
+    kinds = (
+        *((" mm in lengths", 1.0), ("° in twists", degrees), ("° in zero positions", degrees)),
+        *(("° by gravity about axes", degrees), ("° across them", degrees), ("° by gears", degrees)),
+        ("° by hysteresis", degrees),
+    )
+    found = zip(result.deviations.values(), kinds, strict=True)
+    shown = ", ".join(f"{sigma * unit:.2g}{what}" for sigma, (what, unit) in found if sigma is not None)
+    return f"{noise}; the robot differs from nominal by σ of {shown}" if shown else noise
+
+
+def _sigma(value: float) -> str:
+    return "" if value == 0 else f"{value:.4f}"
+
+
+def _observations(result: Identified) -> str:
+    """How many of what."""
+    seen = result.seen
+    return f"{len(seen)} {seen.kind}s" + (" by their distances" if seen.frameless else "")
+
+
+def _line(result: Identified, row: int) -> int:
+    return int(result.seen.data.lines[result.seen.first[row]])
+
+
+def _place(result: Identified, row: int) -> str:
+    seen = result.seen
+    if seen.kind == "distance":
+        return f"lines {seen.data.lines[seen.second[row]]} – {seen.data.lines[seen.first[row]]}"
+    target = seen.data.targets[row]
+    return f"line {seen.data.lines[row]}" + (f", target {target}" if target else "")

@@ -1,0 +1,444 @@
+"""Identification of a robot's kinematics from poses, positions or distances: parameters, σ and held-out error."""
+
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+
+from stcal.errors import DegenerateError
+from stcal.geometry.rigid import skew
+from stcal.geometry.robust import huber_weights
+from stcal.held_out import dealt
+from stcal.parallel import one_thread
+from stcal.robot.identification.adjustment import (
+    Solution,
+    Weighting,
+    huber_limit,
+    normal_rank,
+    parameter_units,
+    solve,
+    unseen,
+)
+from stcal.robot.identification.consensus import agreeing
+from stcal.robot.identification.elastic import bending, carries
+from stcal.robot.identification.left import left
+from stcal.robot.identification.nominal import Deviations, NominalRows, placed
+from stcal.robot.identification.observability import ObservabilityIndices, directions_named, parameter_scale
+from stcal.robot.identification.predicted import doubts, predicted, widened
+from stcal.robot.identification.residuals import (
+    WIDTH,
+    Kind,
+    Observed,
+    State,
+    jacobian,
+    observed,
+    only_of,
+    parameter_names,
+    residuals,
+    tips_of,
+)
+from stcal.robot.identification.result import (
+    LEAST_FOLDS,
+    Adjustment,
+    Gain,
+    HeldOutRows,
+    Identified,
+    IdentifyOptions,
+    position_errors,
+)
+from stcal.robot.identification.start import start
+from stcal.robot.identification.variances import GROSS, Relaxation, components, estimated
+from stcal.robot.kinematics.dh import robot_from_chain
+from stcal.robot.kinematics.forward import with_values
+from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.model import Elasticity, Robot
+
+LEAST_MM, LEAST_RAD = 1e-3, 1e-6
+"""σ where none is given begin at the misfit of the nominal robot, but not below this."""
+TYPICAL_MM, TYPICAL_RAD = 0.1, 5e-4
+"""Of instruments: what joint values determine is told for these."""
+VARIANCE_ROUNDS = 10
+"""Two to four do for most data; a robot without noise needs the most."""
+VARIANCE_SETTLED, VARIANCE_UNSETTLED = 1e-3, 1e-2
+"""Of the logarithm of a σ: a thousandth of it is far below what any data tell of one; a hundredth is worth a note."""
+FOLD_ROUNDS = 3
+"""Of the σ without some of the rows, from those of all."""
+FALLS = 0.5
+"""Medians of residuals that fall by less are near enough for the estimates proper."""
+STILL_RAD, STILL_MM = 1e-5, 1e-2
+"""A joint that moves less than this did not move."""
+OUTLIER_ROUNDS = 5
+"""Of leaving errors out; after 1 to 3 the same ones are left out again."""
+MOSTLY_GOOD = 0.5
+"""Share of the observations below which nothing is called an error."""
+TRY_ELASTIC = "gravity and gears may explain it: --model auto tries whether they predict rows held out better"
+REPEATS, FEW_ROWS = 5, 300
+"""Divisions of the cross-validation of few rows; one does for more."""
+
+
+@one_thread()
+def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None = None) -> Identified:
+    """Identify the axes, base and tools of ``robot`` from ``data``.
+
+    Complete, minimal and continuous parameters (:func:`stcal.robot.kinematics.forward.chain_parameters`), trust region,
+    Huber weights, covariance, and the way back to D-H rows with Hayati's β for nearly parallel axes.
+
+    Parameters
+    ----------
+    robot : Robot
+        The nominal robot: mm, rad; it is where the search starts, and what dimensions are expected to be near to.
+    data : Measurements
+        Joint values with what was measured there, in the instrument's frame.
+    options : IdentifyOptions, optional
+        σ, robustness, cross-validation.
+
+    Returns
+    -------
+    Identified
+        The robot with ``world_from_base`` in the instrument's frame, its covariance and errors. Iterations of the σ
+        that had not come to rest are among its notes.
+
+    Raises
+    ------
+    ConvergenceError
+        The adjustment reaches no minimum.
+    DegenerateError
+        A joint or a target never moved, too few observations, or directions that the data do not determine (kept
+        nominal with ``partial``).
+    InputError
+        The nominal robot does not fit the data.
+
+    References
+    ----------
+    S. A. Hayati, "Robot arm geometric link parameter estimation", IEEE CDC 1983. H. Zhuang, Z. S. Roth, F. Hamano, "A
+    complete and parametrically continuous kinematic model for robot manipulators", IEEE Trans. Robotics and Automation
+    8, 1992. K. Okamura, F. C. Park, "Kinematic calibration using the product of exponentials formula", Robotica 14,
+    1996.
+    """
+    options = options or IdentifyOptions()
+    seen = observed(data, options.observe)
+    _still_joints(robot, data, options.partial)
+    first = start(robot, data)
+    rows = NominalRows.about(first, parameter_units(jacobian(first, seen)), robot, options.adjust)
+    _enough(seen, first, rows)
+    adjusted, held_out, gain = _modelled(robot, first, seen, options, rows)
+    solution = adjusted.solution
+    names = parameter_names(solution.state, seen.kind)
+    undetermined = _undetermined(solution, names, seen, options.partial)
+    every, rank = _covariance(adjusted, seen), solution.rank() - _place(seen)
+    own = slice(len(names))
+    covariance = every[own, own]
+    identified = robot_from_chain(solution.state.chain, solution.state.tools, robot)
+    sigma = predicted(solution.state, robot, seen, every)
+    found = left(
+        solution.state,
+        identified.world_from_base,
+        seen,
+        adjusted.weighting,
+        jacobian(solution.state, seen),
+        solution.weights,
+    )
+    wider, hold = widened(sigma, found or ())
+    tested = held_out is not None or options.folds < LEAST_FOLDS
+    return Identified(
+        robot=identified,
+        seen=seen,
+        adjustment=adjusted,
+        names=tuple(names),
+        covariance=covariance,
+        rank=rank,
+        ranks=_ranks(solution.state, data),
+        undetermined=undetermined,
+        nominal_mm=position_errors(residuals(first, seen)),
+        held_out=held_out,
+        predicted=wider,
+        placed=placed(solution.state, seen.kind, covariance, solution.units[own], robot),
+        left=found,
+        dh_sigma=adjusted.rows.sigma(identified, covariance),
+        observability=_observability(identified, adjusted, seen, rank),
+        deviations=adjusted.deviations.of(adjusted.rows.groups),
+        elasticity_sigma=_elasticity_sigma(solution.state, every),
+        gain=gain,
+        all_held_out=_with_all(robot, first, seen, options) if rows.fixed.any() else None,
+        notes=data.notes
+        + adjusted.rows.notes(identified)
+        + adjusted.notes
+        + doubts(sigma, seen, solution.units[own], covariance, names, tested)
+        + tuple(each.sentence() for each in found or ())
+        + hold
+        + ((TRY_ELASTIC,) if hold and not solution.state.elastic else ())
+        + (data.conditions.ignored("the arm as identified") if identified.elasticity is None else ()),
+    )
+
+
+def _modelled(
+    robot: Robot, first: State, seen: Observed, options: IdentifyOptions, rows: NominalRows
+) -> tuple[Adjustment, HeldOutRows | None, Gain | None]:
+    """Adjusted by the model that is asked for, or that predicts better by more than chance."""
+    rigid = _adjusted(first, seen, options, rows)
+    if options.model == "rigid":
+        return rigid, _cross_validated(robot, seen, rigid, options), None
+    _undetermined(rigid.solution, parameter_names(first, seen.kind), seen, options.partial)
+    conditions = seen.data.conditions
+    state = bending(rigid.solution.state, robot, rigid.deviations.axis_rad, conditions)
+    carried, units = carries(state.chain, conditions), parameter_units(jacobian(state, seen))
+    rows = NominalRows.about(state, units, robot, options.adjust, carried)
+    good = rigid.solution.weights >= GROSS
+    good |= good.mean() < MOSTLY_GOOD
+    elastic = _without_errors(state, seen, good, options, (rows, rigid.weighting, rigid.deviations))
+    held = [_cross_validated(robot, seen, each, options) for each in (rigid, elastic)]
+    if held[0] is None or held[1] is None:
+        return (elastic, None, None) if options.model == "elastic" else (rigid, None, None)
+    gain = Gain.between(held[0], held[1])
+    if options.model == "elastic" or gain.beyond_chance:
+        return elastic, held[1], gain
+    return rigid, held[0], gain
+
+
+def _elasticity_sigma(state: State, covariance: np.ndarray) -> Elasticity | None:
+    """σ of the elasticity by the covariance (k, k) of all parameters."""
+    if not state.elastic or state.chain.elasticity is None:
+        return None
+    none = replace(state.chain.elasticity, hysteresis=np.zeros(len(state.chain)))
+    return with_values(none, np.sqrt(np.diag(covariance))[-state.elastic_count :])
+
+
+def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
+    moves = np.ptp(data.q @ robot.coupling.T, axis=0)
+    for i, move in enumerate(moves, 1):
+        prismatic = robot.joints[i - 1].type == "prismatic"
+        if move < (STILL_MM if prismatic else STILL_RAD) and not partial:
+            raise DegenerateError(
+                "E-IDENTIFY-UNMOVED",
+                f"{data.where}: joint {i} never moved, so that its axis is not seen; measure with other values of "
+                f"q{i}, or keep its nominal values with --partial",
+            )
+
+
+def _enough(seen: Observed, state: State, rows: NominalRows) -> None:
+    seeks = len(parameter_names(state, seen.kind)) - unseen(seen.kind) - int(rows.fixed.sum())
+    numbers = WIDTH[seen.kind] * len(seen)
+    if numbers <= seeks:
+        needed = seeks // WIDTH[seen.kind] + 1
+        raise DegenerateError(
+            "E-IDENTIFY-FEW",
+            f"{seen.data.where}: {len(seen)} {seen.kind}s give {numbers} numbers for {seeks} parameters; "
+            f"{needed} or more needed, better twice that",
+        )
+
+
+def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weighting:
+    """Where σ begin, and which the residuals tell. What is given for all coordinates are weights, times σ₀; one σ given
+    of two is taken as it is. The others begin at the misfit, so that no observation is an outlier of the start."""
+    sigma = {"mm": options.sigma_mm, "rad": options.sigma_rad}
+    needed = ("rad", "mm") if seen.kind == "pose" else ("mm",)
+    missing = tuple(name for name in needed if sigma[name] is None)
+    own = seen.data.covariance is not None and seen.kind != "distance" and missing == needed
+    estimated = ("factor",) if own or not missing else missing
+    weighting = Weighting(options.sigma_mm or LEAST_MM, options.sigma_rad or LEAST_RAD, own, estimated=estimated)
+    white = weighting.whiten(residuals(state, seen), seen)
+    misfit = {name: float(np.median(np.abs(white[:, c]))) for name, c in weighting.columns(white.shape[1]).items()}
+    return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
+
+
+def _with_all(robot: Robot, first: State, seen: Observed, options: IdentifyOptions) -> HeldOutRows | None:
+    """Held-out errors of a rigid arm of which all dimensions are adjusted."""
+    free = replace(robot, joints=tuple(replace(joint, fixed={}) for joint in robot.joints))
+    rows = NominalRows.about(first, parameter_units(jacobian(first, seen)), free)
+    return _cross_validated(robot, seen, _adjusted(first, seen, options, rows), options)
+
+
+def _adjusted(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> Adjustment:
+    """Solve with the observations that agree, and estimate σ."""
+    good = np.ones(len(seen), bool)
+    if options.robust:
+        good = agreeing(state, seen, _weighting(state, seen, options))
+        good |= good.mean() < MOSTLY_GOOD
+    own = seen if good.all() else only_of(seen, good)
+    state, weighting = _by_medians(state, own, options, rows)
+    return _without_errors(state, seen, good, options, (rows, weighting, Deviations()))
+
+
+Known = tuple[NominalRows, Weighting, Deviations]
+"""The nominal dimensions; and where σ of measurements and dimensions start."""
+
+
+def _without_errors(
+    state: State,
+    seen: Observed,
+    good: np.ndarray,
+    options: IdentifyOptions,
+    known: Known,
+    rounds: int = VARIANCE_ROUNDS,
+) -> Adjustment:
+    """Solve, and once more without what are errors and no noise, (r,), and with what is none: Huber's weights bound
+    their pull, but let each pull as hard as the worst honest observation, which no covariance knows of."""
+    for _ in range(OUTLIER_ROUNDS + 1):
+        found = _settled(state, seen if good.all() else only_of(seen, good), options, known, rounds)
+        if not good.all():
+            left = residuals(found.solution.state, seen)
+            length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
+            weights = huber_weights(length, huber_limit(seen.kind))
+            found = replace(found, solution=replace(found.solution, residuals=left, weights=weights))
+        if not _errors_change(found, good):
+            return found
+        good, state = found.solution.weights >= GROSS, found.solution.state
+        known = (found.rows, found.weighting, found.deviations)
+    note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
+    return replace(found, notes=(*found.notes, note))
+
+
+def _errors_change(found: Adjustment, good: np.ndarray) -> bool:
+    """Whether other observations than before, (r,), are errors; never where most would be."""
+    now = found.solution.weights >= GROSS
+    return bool((now != good).any() and now.mean() >= MOSTLY_GOOD)
+
+
+def _by_medians(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> tuple[State, Weighting]:
+    """State, and σ by medians, which outliers do not move, until they stay."""
+    weighting = _weighting(state, seen, options)
+    for _ in range(VARIANCE_ROUNDS):
+        state = solve(state, seen, weighting, options.robust, rows.held(state, Deviations(), seen.kind)).state
+        before, weighting = weighting, _weighting(state, seen, options)
+        if all(weighting.value(n) > FALLS * before.value(n) for n in weighting.estimated):
+            break
+    return state, weighting
+
+
+def _settled(state: State, seen: Observed, options: IdentifyOptions, known: Known, rounds: int) -> Adjustment:
+    """Solve, and estimate σ, in turns."""
+    rows, weighting, deviations = known
+    relaxation = Relaxation()
+    for _ in range(rounds):
+        solution = solve(state, seen, weighting, options.robust, rows.held(state, deviations, seen.kind))
+        parts = components(solution, seen, weighting, options.robust, rows, deviations)
+        best = parts.best()
+        change = float(np.abs(best).max())
+        if change < VARIANCE_SETTLED:
+            return Adjustment(solution, weighting, deviations, rows, parts)
+        state = solution.state
+        weighting, deviations = estimated(relaxation.step(best), rows, weighting, deviations)
+    note = f"the σ still change by {np.expm1(change):.2%} after {rounds} rounds of estimating them"
+    return Adjustment(solution, weighting, deviations, rows, parts, (note,) if change > VARIANCE_UNSETTLED else ())
+
+
+def _undetermined(solution: Solution, names: list[str], seen: Observed, partial: bool) -> tuple[str, ...]:
+    """Directions that the data leave open, by the parameters along each, beyond those that distances never see."""
+    _, directions, good = solution.spectrum()
+    expected = unseen(seen.kind)
+    if (~good).sum() <= expected:
+        return ()
+    found = directions_named(directions[:, ~good][:, expected:], names)
+    if not partial:
+        first = ", ".join(found[:4]) + (" …" if len(found) > 4 else "")
+        raise DegenerateError(
+            "E-IDENTIFY-UNDETERMINED",
+            f"{seen.data.where}: the data determine {solution.rank()} of {len(names) - expected - solution.count} "
+            "parameters, open are "
+            f"{first}; measure more varied poses (`stcal robot design`), or keep the nominal values of these with "
+            "--partial",
+        )
+    return found
+
+
+def _ranks(state: State, data: Measurements) -> dict[str, int]:
+    """Parameters that poses, positions and distances at these joint values determine, whichever were measured."""
+    tip = tips_of(state, data)
+    exact = Measurements(
+        data.where,
+        data.lines,
+        data.q,
+        data.targets,
+        tip.translation,
+        tip.rotation,
+        stations=data.stations,
+        conditions=data.conditions,
+    )
+    ranks, weighting = {}, Weighting(TYPICAL_MM, TYPICAL_RAD)
+    for kind in get_args(Kind):
+        seen = observed(exact, kind)
+        ranks[kind] = normal_rank(state, seen, weighting) - _place(seen)
+    return ranks
+
+
+def _observability(robot: Robot, adjusted: Adjustment, seen: Observed, rank: int) -> ObservabilityIndices:
+    state, weighting = adjusted.solution.state, adjusted.weighting
+    scale = parameter_scale(robot, seen.kind, state.tools)
+    rows = weighting.whiten(jacobian(state, seen)[:, :, : len(scale)], seen) * scale
+    if seen.frameless:  # without what a motion of all points of a station makes
+        each = []
+        for own in seen.data.by_station().values():
+            at = (seen.data.points() - seen.data.points()[own].mean(0)) * own[:, None]
+            shift = np.eye(3) * own[:, None, None]
+            each.append(np.concatenate([-skew(at) / np.linalg.norm(at), shift], axis=2))
+        motions = np.concatenate(each, axis=2)
+        u, s, _ = np.linalg.svd(weighting.whiten(motions, seen).reshape(-1, motions.shape[2]), full_matrices=False)
+        u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
+        rows = (flat - u @ (u.T @ flat)).reshape(rows.shape)
+    return ObservabilityIndices.of_jacobian(rows, rank)
+
+
+def _place(seen: Observed) -> int:
+    """Directions in which positions that count by their distances can be moved together: 6 (5 of points on a line)."""
+    if not seen.frameless:
+        return 0
+    directions = 0
+    for rows in seen.data.by_station().values():
+        at = seen.data.points()[rows] - seen.data.points()[rows].mean(0)
+        directions += 3 + int(np.linalg.matrix_rank(skew(at).reshape(-1, 3), tol=STILL_MM))
+    return directions
+
+
+def _covariance(adjusted: Adjustment, seen: Observed) -> np.ndarray:
+    """(k, k) of the parameters; none along the directions that distances never see, which stay where they were."""
+    covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.least)))
+    if seen.kind != "distance":
+        return covariance
+    units = adjusted.solution.units
+    blind = adjusted.solution.spectrum()[1][:, : unseen(seen.kind)]
+    blind = np.pad(blind, ((0, len(units) - len(blind)), (0, 0)))
+    kept = (np.eye(len(units)) - blind @ blind.T) * units[:, None] / units
+    return kept @ covariance @ kept.T
+
+
+def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: IdentifyOptions) -> HeldOutRows | None:
+    """Errors of rows that took no part: of neither the parameters nor (where rows are few) the σ nor which are errors.
+    Descents start at the solution of all rows: the minimum is the same from everywhere, and near."""
+    rows = len(seen)
+    if min(options.folds, rows) < LEAST_FOLDS:
+        return None
+    repeats = options.repeats or (REPEATS if rows <= FEW_ROWS else 1)
+    rng = np.random.default_rng(options.seed)
+    position, rotation = np.full((repeats, rows), np.nan), np.full((repeats, rows), np.nan)
+    good, begin = whole.solution.weights >= GROSS, (whole.rows, whole.weighting, whole.deviations)
+    good |= good.mean() < MOSTLY_GOOD
+    for repeat in range(repeats):
+        for place in dealt(rows, options.folds, rng):
+            others = np.setdiff1d(np.arange(rows), place)
+            train, test = only_of(seen, others), only_of(seen, place)
+            state = _of_targets(whole.solution.state, train)
+            seeks = len(parameter_names(state, seen.kind)) - unseen(seen.kind) - whole.solution.count
+            if WIDTH[seen.kind] * len(train) <= seeks:
+                return None
+            if rows <= FEW_ROWS:
+                state = _without_errors(state, train, good[others], options, begin, FOLD_ROUNDS).solution.state
+            else:
+                held = whole.rows.held(state, whole.deviations, seen.kind)
+                state = solve(state, train, whole.weighting, options.robust, held).state
+            if seen.kind != "distance":
+                named = zip(test.data.targets, test.data.stations, strict=True)
+                known = np.array([target in state.tools and station in state.stations for target, station in named])
+                test, place = only_of(test, known), place[known]
+            found = residuals(state, test)
+            position[repeat, place] = position_errors(found)
+            if seen.kind == "pose":
+                rotation[repeat, place] = np.linalg.norm(found[:, :3], axis=1)
+    return HeldOutRows(min(options.folds, rows), position, rotation)
+
+
+def _of_targets(state: State, seen: Observed) -> State:
+    """With the tools and stations that ``seen`` shows."""
+    tools = {name: tool for name, tool in state.tools.items() if name in seen.data.targets}
+    first = next(iter(state.stations))
+    stations = {name: each for name, each in state.stations.items() if name in {first, *seen.data.stations}}
+    return replace(state, tools=tools, stations=stations)

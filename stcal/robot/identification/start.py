@@ -1,0 +1,306 @@
+"""Where identification starts: base and tools by the nominal axes; and data that this robot cannot have made."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from stcal.errors import ConvergenceError, DegenerateError, InputError
+from stcal.geometry.align import align_rigid
+from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
+from stcal.geometry.rigid import Poses, Rigid, skew
+from stcal.io.quaternions import EXPLAINS
+from stcal.robot.identification.adjustment import USELESS_MM
+from stcal.robot.identification.residuals import State, observed, residuals, tips_of
+from stcal.robot.kinematics.damped import reach_mm
+from stcal.robot.kinematics.fit import FITS, require_convention
+from stcal.robot.kinematics.forward import carried_poses
+from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.model import Robot
+
+Fit = frozenset[Literal["base", "tool"]]
+BOTH: Fit = frozenset(("base", "tool"))
+ROUNDS = 500
+REGULAR = 1e-10
+"""Damping that keeps what these positions leave open, as of a tool that never turned, where it is."""
+NEARLY = 1e-3
+"""Share of the squared misfit that a start may still promise to lose: where the robot file is not that of the data the
+valley is flat, and the misfit says so."""
+STILL_MM = 0.01
+AROUND = 0.1
+"""Of the arm's reach: how far from the given point of the tool distances are tried too."""
+
+
+def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
+    """The nominal chain where the instrument stands, with tools that fit the measurements best.
+
+    Parameters
+    ----------
+    robot : Robot
+        Its axes are taken as they are; and base and tools, unless they are fitted.
+    data : Measurements
+        What the instrument saw.
+    fit : frozenset of {"base", "tool"}
+        What is fitted to it; all if not given.
+
+    Raises
+    ------
+    InputError
+        The nominal robot does not fit the data; the reason is named where one mends it.
+    DegenerateError
+        A target never moved, or only along a line.
+    """
+    if data.positions is not None and len(set(data.stations)) > 1:
+        return _with_stations(robot, data)
+    _moves(data)
+    named = sorted(set(data.targets))
+    if robot.tree is not None:
+        _carried(robot, data, named)
+    if "tool" in fit:
+        tools = {name: robot.tools.get(name, robot.tools.get("", Rigid())) for name in named}
+    else:
+        tools = {name: robot.tool(name) for name in named}
+    state, misfit = _placed(robot, data, tools, fit)
+    extent = _extent(data)
+    if misfit > FITS * extent:
+        if fit != BOTH and _placed(robot, data, tools)[1] <= FITS * extent:
+            raise InputError(
+                "E-IDENTIFY-MISFIT",
+                f"{data.where}: robot {robot.name} as its file stands misses the measurements by {misfit:.3g} mm RMS, "
+                f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; it fits with base and tool fitted to them "
+                "(base-tool)",
+            )
+        _explain(robot, data, tools, misfit, extent)
+    if data.rotations is not None:
+        flange = carried_poses(state.chain, data.q, data.targets, data.conditions).rotation
+        require_convention(data.where, data.targets, flange, data.rotations)
+    return replace(state, stations={data.stations[0]: Rigid()})
+
+
+def _carried(robot: Robot, data: Measurements, named: list[str]) -> None:
+    """Every target of a tree is known to be on a branch."""
+    assert robot.tree is not None
+    missing = [name for name in named if name not in robot.tree.carriers]
+    if missing:
+        target = f"target {missing[0]}" if missing[0] else "the tool of rows without a target"
+        raise InputError(
+            "E-ROBOT-TREE",
+            f"{data.where}: robot {robot.name} is a tree, and its file does not say which joint carries {target}; give "
+            + ("it a [[target]] with joint" if missing[0] else "[tool] joint"),
+        )
+
+
+def _with_stations(robot: Robot, data: Measurements) -> State:
+    """By the rows of the station that has most; the others where these positions put them."""
+    (first, most), *others = data.by_station().items()
+    state = start(robot, data[most])
+    known = robot.tools.get("", Rigid())
+    tools = {name: state.tools.get(name, robot.tools.get(name, known)) for name in sorted(set(data.targets))}
+    state = replace(state, tools=tools)
+    stations = dict(state.stations)
+    for name, own in others:
+        part = data[own]
+        try:
+            station = align_rigid(part.points(), tips_of(state, part).translation)
+        except DegenerateError as error:
+            raise DegenerateError(
+                "E-STATION-FEW",
+                f"{data.where}: station {name}: {own.sum()} positions do not show where it stands; 3 or more off one "
+                "line needed, or leave them out",
+            ) from error
+        off = part.points() - (station @ tips_of(state, part)).translation
+        misfit, extent = float(np.sqrt((off**2).sum(1).mean())), _extent(part)
+        if misfit > FITS * extent:
+            raise InputError(
+                "E-IDENTIFY-STATION",
+                f"{data.where}: station {name}: its rows miss the robot by {misfit:.3g} mm RMS as the rows of station "
+                f"{first} place it, {FITS:.0%} of their spread of {extent:.3g} mm allowed; check column station",
+            )
+        stations[name] = station
+    return replace(state, stations=stations)
+
+
+def _extent(data: Measurements) -> float:
+    """RMS about the mean of what was measured, mm."""
+    if data.positions is None:
+        return float(np.sqrt((data.lengths()[0] ** 2).mean()))
+    return float(np.sqrt(((data.positions - data.positions.mean(0)) ** 2).sum(1).mean()))
+
+
+def _moves(data: Measurements) -> None:
+    if data.positions is None:
+        if np.ptp(data.lengths()[0]) < STILL_MM:
+            raise DegenerateError(
+                "E-IDENTIFY-UNDETERMINED",
+                f"{data.where}: all distances are equal; positions apart from one another needed",
+            )
+        return
+    for name in sorted(set(data.targets)):
+        own = data.positions[[t == name for t in data.targets]]
+        moved = float(np.linalg.norm(np.ptp(own, axis=0)))
+        if moved < STILL_MM and len(own) > 1:
+            raise DegenerateError(
+                "E-IDENTIFY-UNMOVED",
+                f"{data.where}: target {name or 'of all rows'} never moved ({moved:.2g} mm over {len(own)} rows, more "
+                f"than {STILL_MM} mm needed); was it on the robot, were positions read anew?",
+            )
+
+
+def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit = BOTH) -> tuple[State, float]:
+    """Base and tool points by least squares, tool orientations after them; and the RMS misfit, mm."""
+    chain = replace(robot, world_from_base=Rigid()).chain()
+    flange = carried_poses(chain, data.q, data.targets, data.conditions)
+    names = list(tools)
+    rows = np.array([names.index(t) for t in data.targets])
+    points = np.array([tools[name].translation for name in names])
+    if data.positions is None:  # distances see neither base nor where the instrument stands
+        points, misfit = _points_of_distances(robot, flange, data, rows, points, "tool" in fit)
+        return State(chain, {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}), misfit
+    if "base" in fit:
+        _off_a_line(data)
+    given = None if "base" in fit else robot.world_from_base
+    base, points, misfit = _base_and_points(data.where, flange, data.positions, rows, points, given, "tool" in fit)
+    if data.rotations is not None and "tool" in fit:
+        seen = base.inverse() @ data.poses()
+        turns = np.swapaxes(flange.rotation, 1, 2) @ seen.rotation
+        for k, name in enumerate(names):
+            u, _, vt = np.linalg.svd(turns[rows == k].sum(0))
+            rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+            tools = tools | {name: Rigid(rotation, tools[name].translation)}
+    tools = {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}
+    placed = replace(robot, world_from_base=base)
+    return State(placed.chain(), tools), misfit
+
+
+def _off_a_line(data: Measurements) -> None:
+    extents = np.linalg.svd(data.points() - data.points().mean(0), compute_uv=False)
+    if len(extents) < 2 or extents[1] <= STILL_MM:
+        raise DegenerateError(
+            "E-IDENTIFY-UNDETERMINED",
+            f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that it is not seen where the "
+            "instrument stands; move joints that take the target off it",
+        )
+
+
+def _base_and_points(
+    where: str,
+    flange: Poses,
+    positions: np.ndarray,
+    rows: np.ndarray,
+    points: np.ndarray,
+    given: Rigid | None = None,
+    fit_points: bool = True,
+):
+    """Base, unless it is ``given``, and tool points by least squares, from the alignment with the points given; and RMS
+    misfit, mm."""
+    free = np.array([given is None] * 6 + [fit_points] * points.size)
+    try:
+        base = given or align_rigid(positions, flange @ points[rows])
+    except DegenerateError as error:
+        raise DegenerateError(
+            "E-IDENTIFY-UNDETERMINED",
+            f"{where}: by the robot file all joint values put the target on one line, so that it is not seen how the "
+            "instrument stands about it; move other joints, or give the tool in the robot file if it is off the axis",
+        ) from error
+    moving = (rows[:, None] == np.arange(len(points)))[:, None, :, None]
+    spread = np.linalg.norm(positions - positions.mean(0), axis=1).max()
+    held = 1 / np.array([*[USELESS_MM / spread] * 3, *[USELESS_MM] * (3 + points.size)]) ** 2
+
+    def linearise(at: tuple[Rigid, np.ndarray, np.ndarray]) -> NormalEquations:
+        seen = flange @ at[1][rows]
+        turned = np.where(moving, (at[0].rotation @ flange.rotation)[:, :, None], 0.0).reshape(len(rows), 3, -1)
+        by = np.concatenate([-skew(seen @ at[0].rotation.T), np.tile(np.eye(3), (len(rows), 1, 1)), turned], axis=2)
+        own = NormalEquations.of((at[0] @ seen - positions).ravel(), free * by.reshape(-1, by.shape[2]))
+        return own + NormalEquations(float(at[2] @ (held * at[2])), np.diag(held), held * at[2])
+
+    if not free.any():
+        return base, points, float(np.sqrt(((base @ (flange @ points[rows]) - positions) ** 2).sum(1).mean()))
+    found = minimise(
+        (base, points, np.zeros(len(held))),
+        linearise,
+        lambda at, step: (perturbed(at[0], step[:6]), at[1] + step[6:].reshape(-1, 3), at[2] + step),
+        least_damping=REGULAR,
+        max_steps=ROUNDS,
+    )
+    found.required(
+        f"{where}: base and tools", "check the D-H rows and the joint values", NEARLY * float(found.linear.cost)
+    )
+    base, points, _ = found.state
+    misfit = np.linalg.norm(base @ (flange @ points[rows]) - positions, axis=1)
+    return base, points, float(np.sqrt((misfit**2).mean()))
+
+
+def _points_of_distances(
+    robot: Robot, flange: Poses, data: Measurements, rows: np.ndarray, points: np.ndarray, fit_points: bool
+):
+    """Tool points by least squares, from those given and from others around the flange; and RMS misfit, mm."""
+
+    def errors(moved: np.ndarray) -> np.ndarray:
+        tip = flange @ moved.reshape(-1, 3)[rows]
+        return distances - np.linalg.norm(tip - tip[from_row], axis=1)
+
+    distances, from_row = data.lengths()
+    if not fit_points:
+        return points, float(np.sqrt((errors(points.ravel()) ** 2).mean()))
+    reach = max(reach_mm(robot, tool) for tool in robot.tools)
+    around = AROUND * reach * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+    # A start, settled or not: the adjustment goes on from here, and says when it does not converge.
+    fits = [least_squares(errors, (points + shift).ravel(), max_nfev=ROUNDS) for shift in around]
+    best = min(fits, key=lambda fit: fit.cost)
+    return best.x.reshape(-1, 3), float(np.sqrt(2 * best.cost / len(data)))
+
+
+def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: float, extent: float) -> None:
+    """Say what is wrong with the data, or with the robot file."""
+    found = {}
+    for reason, other, guess in _guesses(robot, data, tools):
+        try:
+            found[reason] = _placed(other, guess, tools)[1] / _extent(guess)
+        except (DegenerateError, ConvergenceError):  # a guess that leaves too little, or explains nothing
+            continue
+    says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
+    says += f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; "
+    reason = min(found, key=lambda guess: found[guess])
+    if found[reason] < min(EXPLAINS * misfit / extent, FITS):
+        raise InputError("E-IDENTIFY-MISFIT", f"{says}it would fit if {reason}")
+    raise InputError(
+        "E-IDENTIFY-MISFIT", f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units"
+    )
+
+
+def _guesses(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[tuple[str, Robot, Measurements]]:
+    """Frequent mistakes: what would be right, with robot and data as if it were."""
+    turning, n = ~robot.prismatic, len(robot.rows)
+    q, angle = data.q, np.where(turning, 180 / np.pi, 1.0)
+    scaled = {"distances": data.distances, "positions": data.positions}
+    scaled = {name: 1e3 * values for name, values in scaled.items() if values is not None}
+    yield "joint values are radians in columns of degrees; call the columns q1_rad …", robot, replace(data, q=q * angle)
+    yield "joint values are degrees in columns of radians; call the columns q1_deg …", robot, replace(data, q=q / angle)
+    yield "lengths are metres in columns of mm; call the columns x_m … or distance_m", robot, replace(data, **scaled)
+    reason = "all joint values had the opposite sign; check the rows and the joints' directions"
+    yield reason, robot, replace(data, q=np.where(turning, -q, q))
+    for i in range(n):
+        reason = f"joint {i + 1} had the opposite sign; check its direction in the rows, or the sign of q{i + 1}"
+        yield reason, robot, replace(data, q=q * np.where(np.arange(n) == i, -1, 1))
+    if (robot.coupling != np.eye(n)).any():
+        yield "the joints were not coupled; take coupling out of the robot file", replace(robot, coupling=None), data
+    elif n >= 3:
+        coupling = np.eye(n)
+        coupling[2, 1] = 1.0
+        reason = "joint 3 were coupled to joint 2, as Fanuc's are; give coupling in the robot file"
+        yield reason, replace(robot, coupling=coupling), data
+    if data.positions is None:
+        return
+    mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)
+    yield "positions are mirrored (a left-handed frame); change the sign of one axis", robot, mirrored
+    error = np.linalg.norm(residuals(_placed(robot, data, tools)[0], observed(data, "position")), axis=1)
+    worst = int(error.argmax())
+    reason = f"line {data.lines[worst]} were not there, by far the worst; correct or remove it"
+    yield reason, robot, data[np.arange(len(data)) != worst]
+    if data.rotations is not None:
+        inverse = data.poses().inverse()
+        reason = "poses are inverse (instrument seen from the tool); give the tool in the instrument's frame"
+        there = {"positions": inverse.translation, "rotations": inverse.rotation, "covariance": None}
+        yield reason, robot, replace(data, **there)

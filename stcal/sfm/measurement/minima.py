@@ -1,0 +1,85 @@
+"""The minima of one image's residuals over the pose: two of them where a face is seen alone."""
+
+from functools import partial
+
+import numpy as np
+
+from stcal.errors import DegenerateError
+from stcal.geometry.plane import camera_from_plane, fit_homography
+from stcal.geometry.plane_poses import MAX_OUTLIER_SHARE, two_minima
+from stcal.geometry.pose_descent import PoseStack
+from stcal.geometry.rigid import Rigid
+from stcal.labels import CircleLabel
+from stcal.sfm.data.model import Outlier
+from stcal.sfm.measurement.problem import PoseProblem, descent_near
+from stcal.sfm.measurement.target import TargetCircles
+
+MIN_CIRCLES = 4
+"""Of one face: fewer do not fix its homography."""
+WORST_SHARE = 0.5
+"""Centres at least so much beyond the limit as the worst one go with it; the others may only have been pulled along."""
+MIN_BREADTH = 0.05
+"""Of the circles seen, over their length: in a row they leave the rotation about it open."""
+
+
+def start_pose(
+    names: list[CircleLabel], problem: PoseProblem, target: TargetCircles, where: str
+) -> tuple[PoseStack, Rigid]:
+    """Pose by the homography of the face with the most circles, and target_from_plane of that face."""
+    faces: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        faces.setdefault(name.face, []).append(i)
+    by_size = sorted((f for f in faces if f in target.target_from_plane), key=lambda f: -len(faces[f]))
+    if not by_size or len(faces[by_size[0]]) < MIN_CIRCLES:
+        seen = f"{len(faces[by_size[0]])} of face {by_size[0]}" if by_size else "0"
+        raise DegenerateError(
+            "E-MEASURE-FEW-CIRCLES",
+            f"{where}: {seen} circles seen, {MIN_CIRCLES} of one face needed; show one face as a whole",
+        )
+    for face_id in by_size:
+        rows, plane = faces[face_id], target.target_from_plane[face_id]
+        plane_from_target = plane.inverse()
+        xy = (plane_from_target @ problem.xyz[rows])[:, :2]
+        long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
+        if broad < MIN_BREADTH * long:
+            reason = f"{len(rows)} circles, {MIN_CIRCLES} off one line needed"
+            continue
+        try:
+            homography = fit_homography(xy, problem.centre[rows])
+        except DegenerateError as error:
+            reason = error
+            continue
+        pose = camera_from_plane(homography) @ plane_from_target
+        if (problem.xyz @ pose.rotation[2] + pose.translation[2] <= 0).any():
+            reason = "its circles would be behind the camera; check their labels"
+            continue
+        return PoseStack.of(pose), plane
+    raise DegenerateError("E-MEASURE-AMBIGUOUS", f"{where}: face {by_size[0]}: {reason}; show all of its circles")
+
+
+def minima_without_outliers(problem: PoseProblem, start: PoseStack, plane: Rigid, names: list[CircleLabel], where: str):
+    """The minima by single centres without those that contradict the others, the indices kept, and the outliers."""
+    keep, outliers = np.arange(len(names)), []
+    alone = len({name.face for name in names}) == 1
+    failure = f"{where}: no pose found; check the labels, and that the camera file belongs to the images"
+    while True:
+        part = problem if len(keep) == len(names) else problem.select(keep)
+        both = two_minima(partial(descent_near, part), start, plane, failure, planar=alone)
+        found, limit = both.minima, both.outlier_limit
+        excess = found.length[0] / limit
+        bad = excess > max(1.0, WORST_SHARE * excess.max())
+        if not bad.any():
+            return found, keep, tuple(outliers)
+        residual = np.linalg.norm(part.in_px(part.seen(found.poses[[0]])[0][0]), axis=1)
+        sigma = residual / found.length[0]
+        outliers += [
+            Outlier(where, names[keep[i]], float(residual[i]), float(limit * sigma[i])) for i in np.flatnonzero(bad)
+        ]
+        keep = keep[~bad]
+        if len(outliers) > MAX_OUTLIER_SHARE * len(names) or len(keep) < MIN_CIRCLES:
+            raise DegenerateError(
+                "E-MEASURE-CONTRADICTS",
+                f"{where}: {len(outliers)} of {len(names)} circles contradict the others, first {outliers[0].label} by "
+                f"{outliers[0].residual_px:.2g} px; check that camera file, faces.json and images belong together",
+            )
+        start = found.poses

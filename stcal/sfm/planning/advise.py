@@ -1,0 +1,238 @@
+"""After a run: which further photographs would make its worst face better, and when only a better board would."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from stcal.errors import DegenerateError
+from stcal.parallel import Progress, kept_processes, one_thread, run_briefly
+from stcal.sfm.adjust.blocks import rows_of_view
+from stcal.sfm.adjust.joint import JointResult, basis_of, photographs_of
+from stcal.sfm.data.model import MetricModel
+from stcal.sfm.planning.forecast import (
+    CentreNoise,
+    Forecast,
+    Photographs,
+    PositionsWith,
+    Setup,
+    forecast,
+    variance_shares,
+    without_sources,
+    worst_of,
+)
+from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.planning.views import PlannedView, candidates, known_scene
+from stcal.sfm.runs.adjusted import adjusted_run
+from stcal.sfm.runs.saved import SavedRun
+from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
+from stcal.synthetic.scene import Group, Scene, group_name
+
+SHORTLIST = 8
+"""After the first choice only candidates that were among so many best for one of the faces are looked at again."""
+NEW_GROUP_SPREAD_RAD = float(np.radians(40))
+AT_ONCE = 50
+"""Candidates that one process computes at a time."""
+MIN_NEW_GROUP = 3
+"""Images that a new group needs to be mapped."""
+BOARD_DOMINATES = 0.5
+"""Share of the worst face's variance from which more views are said not to help."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """A view to add, and the face that is worst after it (and those before it in the list), σ in mm."""
+
+    view: PlannedView
+    face: str
+    sigma_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class NewGroup:
+    """Faces to photograph together for the first time in ``images`` views, and the worst face after that, σ in mm."""
+
+    faces: tuple[str, str]
+    images: int
+    face: str
+    sigma_mm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Advice:
+    """``now`` : the run's own geometry; ``shares`` of its variance by face and source; ``choices`` one after the other;
+    ``new_groups`` the best first; ``better_board`` : now with half the board's σ; ``tried`` candidates."""
+
+    now: Forecast
+    shares: dict[str, dict[str, float]]
+    noise: CentreNoise
+    choices: tuple[Choice, ...]
+    new_groups: tuple[NewGroup, ...]
+    better_board: Forecast
+    tried: int
+
+    @property
+    def board_dominates(self) -> bool:
+        """More views will not help much."""
+        return self.shares[self.now.worst()[0]]["board"] > BOARD_DOMINATES
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Known:
+    """A run as the forecast sees it: models in mm in the target frame, σ as in the run's adjustment."""
+
+    models: tuple[MetricModel, ...]
+    joint: JointResult
+    setup: Setup
+    noise: CentreNoise
+    scene: Scene
+
+
+def known_of(run: SavedRun) -> Known:
+    """The geometry of a finished run, adjusted once more (which moves nothing), for what ``faces.json`` does not say.
+
+    Raises
+    ------
+    InputError
+        The run's ``target_model`` is missing or damaged.
+    """
+    again = adjusted_run(run)
+    joint = again.state.result()
+    setup = Setup(
+        target=run.target,
+        board=run.board,
+        camera=joint.camera,
+        start=again.start,
+        frame=run.faces.frame,
+        flatness_mm=run.options.flatness_mm,
+        prior=again.prior,
+        common=joint.board_common,
+        sigma0=joint.sigma0,
+    )
+    noise = CentreNoise.measured(joint.models, joint.camera, setup.radius_mm())
+    return Known(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.camera.colmap_model))
+
+
+def doubts(run: SavedRun) -> str:
+    """Why the σ that advice rests on are not those of the run's faces; empty where nothing speaks against them."""
+    if not run.options.eccentricity:
+        return f"{run.folder} is an uncorrected control, whose faces are biased by tens of µm: these σ are not theirs"
+    failed = [check["title"] for check in run.report.get("checks", ()) if check["verdict"] == "failed"]
+    if failed:
+        what = f"{len(failed)} checks of {run.folder} failed, first {failed[0]}"
+        return f"{what}: its faces may be off by far more than these σ"
+    return ""
+
+
+@one_thread()
+def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Advice:
+    """The views that, taken one after the other, lower the σ of the worst face most, and new groups of as many images.
+
+    Parameters
+    ----------
+    known : Known
+        The geometry of a finished run, see :func:`stcal.sfm.planning.advise.known_of`.
+    count : int
+        Views to choose, each given those before it.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Advice
+        The views, with the worst face and its σ after each, mm; the σ now, and their sources.
+    """
+    setup = known.setup
+    photographs = photographs_of(known.models, setup.board, setup.camera, setup.prior)
+    now = forecast(known.models, setup, photographs=photographs)
+    shares = variance_shares(now, without_sources(known.models, setup, now.derivatives, photographs))
+    with kept_processes():
+        by_group = run_briefly(candidates, [(known.scene, model, setup, known.noise) for model in known.models])
+        views = [view for own in by_group for view in own]
+        chosen = _greedy(known, views, now, photographs, count, progress or (lambda *_: None))
+    return Advice(
+        now,
+        shares,
+        known.noise,
+        tuple(chosen),
+        tuple(_new_groups(known, now, photographs, max(count, MIN_NEW_GROUP))),
+        forecast(known.models, setup.better_board(0.5), now.derivatives, photographs),
+        len(views),
+    )
+
+
+def _greedy(
+    known: Known, views: list[PlannedView], now: Forecast, photographs: Photographs, count: int, progress: Progress
+) -> list[Choice]:
+    """Always the view that leaves the worst face best, given those chosen before."""
+    chosen: list[Choice] = []
+    setup, photographs = known.setup, dict(photographs)
+    while views and len(chosen) < count:
+        progress(f"view {len(chosen) + 1}", 0, len(views))
+        positions = PositionsWith.of(known.models, setup, now.derivatives, photographs)
+        parts = [views[i : i + AT_ONCE] for i in range(0, len(views), AT_ONCE)]
+        results = [sigma for part in run_briefly(_positions, [(positions, part) for part in parts]) for sigma in part]
+        progress(f"view {len(chosen) + 1}", len(views), len(views))
+        best = int(np.argmin([worst_of(sigma)[1] for sigma in results]))
+        chosen.append(Choice(views[best], *worst_of(results[best])))
+        rows = rows_of_view(views[best].model, setup.camera, basis_of(setup.prior))
+        photographs[views[best].group] = photographs[views[best].group] + rows.T @ rows
+        keep = _promising(results) - {best}
+        views = [views[i] for i in sorted(keep)]
+    return chosen
+
+
+def _positions(positions: PositionsWith, views: Sequence[PlannedView]) -> list[dict[str, float]]:
+    return [positions(view.model) for view in views]
+
+
+def _promising(by_view: list[dict[str, float]]) -> set[int]:
+    """The best for any face: which one is worst may change."""
+    return {i for face in by_view[0] for i in sorted(range(len(by_view)), key=lambda k: by_view[k][face])[:SHORTLIST]}
+
+
+def _new_groups(known: Known, now: Forecast, photographs: Photographs, images: int) -> list[NewGroup]:
+    """Pairs of faces that no group shows together, where the geometry allows to."""
+    together = {
+        pair
+        for model in known.models
+        for pair in combinations(sorted(key for key in model.points_by_face() if key != "board"), 2)
+    }
+    found = []
+    for pair in combinations(sorted(face.id for face in known.scene.target.faces), 2):
+        if pair not in together:
+            try:
+                model = _new_model(known, pair, images)
+            except DegenerateError:
+                continue  # the two cannot be seen together at this distance
+            with_it = forecast([*known.models, model], known.setup, now.derivatives, photographs)
+            found.append(NewGroup(pair, images, *with_it.worst()))
+    return sorted(found, key=lambda each: each.sigma_mm)
+
+
+def _new_model(known: Known, pair: tuple[str, str], images: int) -> MetricModel:
+    """A group of two faces with the board beside them, photographed from the distance of the present ones."""
+    scene = known.scene
+    name = f"new {group_name(pair)}"
+    normals = [scene.target_from_face[face].rotation[:, 2] for face in pair]
+    axes = viewing_axes(normals[0], normals[1], name)
+    present = next(iter(scene.groups))
+    dots = np.column_stack([scene.board.xy_mm(), np.zeros(scene.board.rows * scene.board.columns)])
+    shape = GroupShape(
+        name,
+        np.vstack([scene.face_circles(face) for face in pair]),
+        np.repeat(normals, [len(scene.target.face(face).ids) for face in pair], axis=0),
+        axes,
+        np.vstack([scene.face_outline(face.id) for face in scene.target.faces]),
+        dots,
+        scene.groups[present].target_from_board.inverse() @ scene.board_outline(present),
+    )
+    depth = np.median(np.concatenate([model.xyz_camera()[:, 2] for model in known.models]))
+    target_from_board, poses = place_group(
+        shape, scene.camera, images, float(depth), NEW_GROUP_SPREAD_RAD, np.random.default_rng(0)
+    )
+    group = Group(name, pair, axes, target_from_board, target_from_board @ dots, tuple(poses))
+    alone = replace(scene, groups={name: group})
+    (model,) = true_models(alone, observe(alone, 0.0, np.random.default_rng(0)))
+    return known.noise.applied(model, scene.camera, known.setup.radius_mm())

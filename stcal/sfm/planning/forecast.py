@@ -1,0 +1,264 @@
+"""The σ to expect of a geometry, photographed or only planned: centring noise by the size and tilt of the circles, then
+the covariance of the joint adjustment itself."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ellipe, ellipk
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.plane import fit_plane
+from stcal.io.cameras.model import CameraPrior
+from stcal.labels import CircleLabel, Label
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.faces import FrameKind
+from stcal.sfm.adjust.group import projection_jacobians
+from stcal.sfm.adjust.joint import Extensible, covariance_of, extensible
+from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
+from stcal.sfm.data.model import MetricModel
+
+IMAGE_NOISE = 0.01
+"""Standard deviation of the grey values, as a fraction of full scale."""
+CONTRAST = 0.7
+"""Of circle and surroundings, as a fraction of full scale."""
+BLUR_PX = 0.76
+"""Of an edge, standard deviation: a lens of 0.7 px and the pixels themselves, 1/√12 px."""
+PRACTICE = 1.3
+"""Centres against the Cramér–Rao bound, as runs on rendered photographs have them: brightness gradients to be
+estimated, quantisation, neighbouring edges."""
+ONE_PLATE = 0.99
+"""Share of the board's variance that all groups have in common where one plate is in all of them."""
+ENOUGH = 10_000
+"""Observations from which the law of their noise is read."""
+OFF = 1e-2
+"""A source of error that is switched off keeps this share of its σ, so that nothing becomes singular."""
+
+
+@dataclass(frozen=True, slots=True)
+class CentreNoise:
+    """What a measured centre is worth: covariance = edge² (1 + (narrow/b)²) (∮ n nᵀ ds)⁻¹ + floor² 1.
+
+    The integral runs over the rim (normals n, arc ds, px), b is the minor semi-axis. A straight edge fixes its place
+    along its normal with an information of 1/edge² per pixel of its length. For noise s, contrast C and a blur β that
+    bound is edge = s/C √(2 √π β) (∫ of the squared slope over s²: Kay 1993, Fundamentals of Statistical Signal
+    Processing, example 3.13), so that the centre of a circle of radius r has σ = edge/√(π r): noise by the root of its
+    perimeter.
+
+    ``edge`` : px^1.5; ``narrow_px`` : rims so close together lose half of their information, 0 for none; ``floor_px`` :
+    what no size removes, per axis.
+    """
+
+    edge: float
+    narrow_px: float = 0.0
+    floor_px: float = 0.0
+
+    @classmethod
+    def expected(cls) -> "CentreNoise":
+        """Of good photographs: see the constants of this file."""
+        return cls(PRACTICE * IMAGE_NOISE / CONTRAST * float(np.sqrt(2 * np.sqrt(np.pi) * BLUR_PX)))
+
+    @classmethod
+    def measured(cls, models: Sequence[MetricModel], camera: Camera, radius_mm: dict[Label, float]) -> "CentreNoise":
+        """Fitted to the covariances that the observations of metric models carry, evenly chosen ones of large sets."""
+        step = max(1, sum(len(model.point_index) for model in models) // ENOUGH)
+        some = [model.observed(np.arange(0, len(model.point_index), step)) for model in models]
+        rims = [_Rims.of(model, camera, radius_mm) for model in some]
+        ratio = np.concatenate(
+            [
+                np.trace(rim.information @ m.covariance_px2, axis1=1, axis2=2) / 2
+                for rim, m in zip(rims, some, strict=True)
+            ]
+        )
+        narrow = np.concatenate([rim.minor_px for rim in rims]) ** -2
+        usual = ratio <= 4 * np.median(ratio)
+        slope, level = np.polyfit(narrow[usual], ratio[usual], 1)
+        if slope <= 0 or level <= 0:
+            return cls(float(np.sqrt(ratio[usual].mean())))
+        return cls(float(np.sqrt(level)), float(np.sqrt(slope / level)))
+
+    def scaled(self, factor: float) -> "CentreNoise":
+        """The same with all σ multiplied."""
+        return replace(self, edge=factor * self.edge, floor_px=factor * self.floor_px)
+
+    def applied(self, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> MetricModel:
+        """The metric model with the covariances that its observations are to have."""
+        rims = _Rims.of(model, camera, radius_mm)
+        size = self.edge**2 * (1 + (self.narrow_px / rims.minor_px) ** 2)
+        covariance = size[:, None, None] * np.linalg.inv(rims.information) + self.floor_px**2 * np.eye(2)
+        return replace(model, covariance_px2=covariance)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rims:
+    """Images of n circles: ``information`` : (n, 2, 2) ∮ n nᵀ ds, px; ``minor_px`` : (n,) minor semi-axis."""
+
+    information: np.ndarray
+    minor_px: np.ndarray
+
+    @classmethod
+    def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_Rims":
+        """To first order in radius over distance, which a σ does not notice: ellipses."""
+        normal = np.zeros((len(model.labels), 3))
+        for members in model.points_by_face().values():
+            normal[members] = fit_plane(model.xyz_model[members]).normal
+        radius = np.array([radius_mm[label] for label in model.labels])
+        in_plane = np.linalg.svd(normal[:, None])[2][:, 1:] * radius[:, None, None]
+        by_point = projection_jacobians(model, camera)[1]
+        shape = by_point @ np.swapaxes(in_plane, 1, 2)[model.point_index]
+        square, axes = np.linalg.eigh(shape @ np.swapaxes(shape, 1, 2))
+        minor, major = np.sqrt(square).T
+        along = np.stack(_rim_integrals(minor, major), 1)
+        return cls((axes * along[:, None]) @ np.swapaxes(axes, 1, 2), minor)
+
+
+def _rim_integrals(minor: np.ndarray, major: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """∮ nₓ² ds around ellipses with these semi-axes, along the minor and along the major one: complete elliptic
+    integrals (Abramowitz and Stegun 1964, 17.3)."""
+    m = np.maximum(1 - (minor / major) ** 2, 1e-6)  # what a circle itself would need is a limit
+    first, second = ellipk(m), ellipe(m)
+    return 4 * major * (second - (1 - m) * first) / m, 4 * minor**2 / major * (first - second) / m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setup:
+    """What a forecast rests on besides the views: hardware, and what the adjustment is told.
+
+    ``start`` : the target as it is, for the reference face and the sides that faces look to; ``prior`` : of the
+    intrinsics, None where they are fixed; ``common`` : see :func:`stcal.sfm.adjust.joint.covariance_of`; ``sigma0`` :
+    factor on all σ.
+    """
+
+    target: TargetDesign
+    board: BoardDesign
+    camera: Camera
+    start: CalibratedTarget
+    frame: FrameKind
+    flatness_mm: float | None
+    prior: CameraPrior | None
+    common: float
+    sigma0: float = 1.0
+
+    def radius_mm(self) -> dict[Label, float]:
+        """Radius by label."""
+        return self.target.radius_of() | self.board.radius_of()
+
+    def better_board(self, factor: float) -> "Setup":
+        """The same with another σ of the board."""
+        return replace(self, board=replace(self.board, sigma_mm=factor * self.board.sigma_mm))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forecast:
+    """σ to expect, target frame.
+
+    ``face_covariance`` : (6, 6) by face but the reference, rad and mm; ``circle_sigma_mm`` by label: root of the trace;
+    ``scale_sigma`` : of the target's size, relative; ``derivatives`` : serves other views of the same circles.
+    """
+
+    face_covariance: dict[str, np.ndarray]
+    circle_sigma_mm: dict[CircleLabel, float]
+    scale_sigma: float
+    derivatives: Derivatives
+
+    def __post_init__(self):
+        fixed = {face: frozen(c, (6, 6), f"face {face}: covariance") for face, c in self.face_covariance.items()}
+        object.__setattr__(self, "face_covariance", fixed)
+
+    def position_sigma_mm(self) -> dict[str, float]:
+        """By face; see :func:`position_sigma_mm`."""
+        return {face: position_sigma_mm(c) for face, c in self.face_covariance.items()}
+
+    def worst(self) -> tuple[str, float]:
+        """The face whose position is known worst, and its σ in mm."""
+        return worst_of(self.position_sigma_mm())
+
+
+def worst_of(sigma: dict[str, float]) -> tuple[str, float]:
+    """The face of the largest σ, and that."""
+    face = max(sigma, key=sigma.__getitem__)
+    return face, sigma[face]
+
+
+Photographs = Mapping[str, np.ndarray]
+"""By group, what all of its images say of its points and the intrinsics, see
+:func:`stcal.sfm.adjust.joint.photographs_of`: computed once, as the images are many and stay as they are."""
+
+
+def forecast(
+    models: Sequence[MetricModel],
+    setup: Setup,
+    known: Derivatives | None = None,
+    photographs: Photographs | None = None,
+) -> Forecast:
+    """σ of the target from metric models, mm, target frame, as the joint adjustment would state them.
+
+    ``known`` : derivatives of an earlier forecast of the same circles; ``photographs`` of groups, where known.
+    """
+    joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
+    own = known or derivatives(joint, setup.start, setup.target, setup.frame)
+    covariance = setup.sigma0**2 * joint.covariance_mm2
+    reference = setup.start.reference_face
+    circles = np.sqrt(np.trace(own.circle_covariance(covariance), axis1=1, axis2=2))
+    return Forecast(
+        {face: c for face, c in own.face_covariance(covariance).items() if face != reference},
+        dict(zip(joint.labels, circles.tolist(), strict=True)),
+        scale_sigma(joint.xyz_model, covariance),
+        own,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PositionsWith:
+    """Gives :meth:`Forecast.position_sigma_mm` with one further view, as :func:`forecast` would."""
+
+    now: Extensible
+    setup: Setup
+    known: Derivatives
+
+    @classmethod
+    def of(
+        cls, models: Sequence[MetricModel], setup: Setup, known: Derivatives, photographs: Photographs | None = None
+    ) -> "PositionsWith":
+        """Beside these models; ``known`` and ``photographs`` as of :func:`forecast`."""
+        now = extensible(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
+        return cls(now, setup, known)
+
+    def __call__(self, view: MetricModel) -> dict[str, float]:
+        """By face, mm."""
+        faces = self.known.face_covariance(self.setup.sigma0**2 * self.now.with_view(view))
+        return {f: position_sigma_mm(c) for f, c in faces.items() if f != self.setup.start.reference_face}
+
+
+def position_sigma_mm(face_covariance: np.ndarray) -> float:
+    """Root of the trace of a face's position, so that it is the RMS length of the error."""
+    return float(np.sqrt(np.trace(face_covariance[3:, 3:])))
+
+
+def without_sources(
+    models: Sequence[MetricModel], setup: Setup, known: Derivatives, photographs: Photographs | None = None
+) -> dict[str, Forecast]:
+    """The forecast with each source of error in turn switched off: images, board, intrinsics where they are refined."""
+    if photographs is None:
+        fixed, quiet = None, None
+        quieter = [replace(model, covariance_px2=OFF**2 * model.covariance_px2) for model in models]
+    else:
+        fixed = {m.group: photographs[m.group][: 3 * len(m.labels), : 3 * len(m.labels)] for m in models}
+        quiet, quieter = {group: normal / OFF**2 for group, normal in photographs.items()}, models
+    found = {
+        "image noise": forecast(quieter, setup, known, quiet),
+        "board": forecast(models, setup.better_board(OFF), known, photographs),
+    }
+    if setup.prior is not None:
+        found["intrinsics"] = forecast(models, replace(setup, prior=None), known, fixed)
+    return found
+
+
+def variance_shares(whole: Forecast, without: dict[str, Forecast]) -> dict[str, dict[str, float]]:
+    """By face and source: the share of the variance of the face's position that goes with the source."""
+    return {
+        face: {source: 1 - (each.position_sigma_mm()[face] / sigma) ** 2 for source, each in without.items()}
+        for face, sigma in whole.position_sigma_mm().items()
+    }

@@ -1,0 +1,286 @@
+"""Before any image exists: the σ to expect of a plan, and what would help most."""
+
+from dataclasses import dataclass, field, replace
+from itertools import permutations
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.model import CameraModel, camera_prior, refinable
+from stcal.parallel import one_thread
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.data.model import MetricModel
+from stcal.sfm.planning.forecast import (
+    ONE_PLATE,
+    CentreNoise,
+    Forecast,
+    Setup,
+    forecast,
+    variance_shares,
+    without_sources,
+)
+from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.runs.options import RunOptions
+from stcal.synthetic.scene import Scene, SceneOptions, group_name, make_scene, seen_by
+
+SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)
+"""Tried from the largest down: the tilts that a view may have keep the views closer together than that."""
+NEARER = 0.8
+MIN_IMAGES = 2
+MAX_DOTS = 10_000
+"""Of the board …"""
+FINE_DOTS, MAX_CENTRES = 500, 450_000
+"""… and of boards of more than so many the dots in all images, which take about a minute and 0.8 GB."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanOptions:
+    """What is planned.
+
+    Parameters
+    ----------
+    images : int
+        Of each group.
+    spread_deg : float
+        ± about the view that shows both faces equally, degrees.
+    distance_mm : float
+        From the cameras to the target, mm.
+    width : int
+        px; 3:2 images of a 24 mm lens, where no ``camera`` is given.
+    camera : CameraModel, optional
+        The camera; its file must state the image size.
+    groups : tuple of pairs of str, optional
+        Pairs of face ids; those of the design where None.
+    noise : CentreNoise
+        σ of the centres.
+    one_board : bool
+        The same plate in all groups, else made anew for each.
+    run : RunOptions
+        Flatness, frame, refined intrinsics and reference face.
+    seed : int
+        Of where board and cameras happen to stand.
+
+    Raises
+    ------
+    InputError
+        Fewer than two images in each group, or a camera file without image size.
+    """
+
+    images: int = 10
+    spread_deg: float = 40.0
+    distance_mm: float = 1000.0
+    width: int = 5184
+    camera: CameraModel | None = None
+    groups: tuple[tuple[str, str], ...] | None = None
+    noise: CentreNoise = field(default_factory=CentreNoise.expected)
+    one_board: bool = True
+    run: RunOptions = field(default_factory=RunOptions)
+    seed: int = 0
+
+    def __post_init__(self):
+        if self.images < MIN_IMAGES:
+            raise InputError(
+                "E-OPTION-RANGE", f"plan: {self.images} images in each group, {MIN_IMAGES} needed; plan for more"
+            )
+        if self.camera is not None and not (self.camera.width and self.camera.height):
+            raise InputError(
+                "E-CAMERA-SIZE", f"plan: camera file {self.camera.source} states no image size; add it to the file"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Remedy:
+    """What could be done: ``sigma_mm`` of the face that is then worst, or None and ``reason`` where it cannot."""
+
+    what: str
+    sigma_mm: float | None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """The answer. ``centre_sigma_px`` : RMS over all centres; ``shares`` of the variance by face and source."""
+
+    options: PlanOptions
+    setup: Setup
+    groups: tuple[str, ...]
+    observations: int
+    centre_sigma_px: float
+    forecast: Forecast
+    shares: dict[str, dict[str, float]]
+    remedies: tuple[Remedy, ...]
+
+
+def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ...]:
+    """``12,14`` or ``top-left,top-right`` as pairs of face ids.
+
+    Raises
+    ------
+    InputError
+        A name that is no pair of the target's faces.
+    """
+    known = {group_name(pair): pair for pair in permutations([face.id for face in target.faces], 2)}
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in known:
+            raise InputError(
+                "E-OPTION-VALUE", f"--groups: {name!r} is no pair of faces; use such as {', '.join(list(known)[:3])}"
+            )
+    return tuple(known[name] for name in names)
+
+
+@one_thread()
+def plan(
+    options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal: dict[str, Rigid] | None = None
+) -> Plan:
+    """Forecast of a plan: nominal geometry, board and cameras where a simulated session would have them.
+
+    Parameters
+    ----------
+    options : PlanOptions
+        Images, camera, groups and noise.
+    target : TargetDesign
+        Drawing frame of each face, mm.
+    board : BoardDesign
+        With its σ, mm.
+    nominal : dict of Rigid, optional
+        Pose of every face in one common frame, mm, by face id.
+
+    Returns
+    -------
+    Plan
+        σ to expect of every face against the reference face, mm and rad, their sources, and what would help most.
+
+    Raises
+    ------
+    InputError
+        A face without nominal pose, an unknown face in a group, or more dots than ``MAX_DOTS`` and ``MAX_CENTRES``.
+    DegenerateError
+        A group cannot be photographed like that.
+    """
+    if (dots := board.rows * board.columns) > MAX_DOTS:
+        raise InputError(
+            "E-PLAN-TOO-LARGE",
+            f"plan: board of {board.rows}×{board.columns} = {dots} dots, up to {MAX_DOTS} possible; plan with "
+            "fewer dots over the same area, the σ of the faces hardly change",
+        )
+    scene = _scene(options, target, board, nominal)
+    if dots > FINE_DOTS and (centres := dots * options.images * len(scene.groups)) > MAX_CENTRES:
+        raise InputError(
+            "E-PLAN-TOO-LARGE",
+            f"plan: {dots} dots in {options.images * len(scene.groups)} images are {centres} centres, up to "
+            f"{MAX_CENTRES} possible; plan fewer images, or fewer dots over the same area",
+        )
+    setup, models = _setup(scene, options, board), _models(scene, options)
+    whole = forecast(models, setup)
+    half_board = forecast(models, setup.better_board(0.5), whole.derivatives)
+    twice = replace(options, images=2 * options.images)
+    nearer = replace(options, distance_mm=NEARER * options.distance_mm)
+    remedies = [
+        _remedy("twice the images", twice, target, board, nominal),
+        _wider(options, target, board, nominal),
+        Remedy("a board of half the σ", half_board.worst()[1]),
+        _remedy("nearer by 20 %", nearer, target, board, nominal),
+    ]
+    return Plan(
+        options,
+        setup,
+        tuple(scene.groups),
+        sum(len(m.image_index) for m in models),
+        float(np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models]).mean())),
+        whole,
+        variance_shares(whole, without_sources(models, setup, whole.derivatives)),
+        tuple(remedies),
+    )
+
+
+def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Scene:
+    """The nominal geometry: nothing is misplaced."""
+    file = options.camera
+    height = round(options.width * 2 / 3)
+    shape = SceneOptions(
+        seed=options.seed,
+        centre_sigma=0.0,
+        distance_mm=options.distance_mm,
+        spread_deg=options.spread_deg,
+        images_per_group=options.images,
+        groups=options.groups,
+        circle_sigma_mm=0.0,
+        face_shift_mm=0.0,
+        face_turn_deg=0.0,
+        width=options.width,
+        height=height,
+    )
+    if file is not None:
+        shape = seen_by(shape, file)
+    scene = make_scene(shape, target, replace(board, sigma_mm=0.0), nominal)
+    return scene if file is None else replace(scene, camera=file.calibrated(0, 0))
+
+
+def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
+    run = options.run.adjustment(scene.target)
+    linked = _linked(run.reference_face, [group.faces for group in scene.groups.values()])
+    start = CalibratedTarget(
+        run.reference_face,
+        {face: pose for face, pose in scene.target_from_face.items() if face in linked},
+        scene.circles_target,
+        dict.fromkeys(scene.groups, Rigid()),
+    )
+    return Setup(
+        target=scene.target,
+        board=board,
+        camera=scene.camera,
+        start=start,
+        frame=run.frame,
+        flatness_mm=run.flatness_mm,
+        prior=camera_prior(refinable(scene.camera)) if run.refine_camera else None,
+        common=ONE_PLATE if options.one_board else 0.0,
+    )
+
+
+def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
+    """The faces of all groups, each linked to the reference face.
+
+    Raises
+    ------
+    InputError
+        One is not.
+    """
+    planned = {face for pair in pairs for face in pair}
+    linked = {reference}
+    for _ in planned:
+        linked |= {face for pair in pairs if linked & set(pair) for face in pair}
+    if len(linked) < 2 or planned - linked:
+        apart = ", ".join(sorted(planned - linked)) or "any other face"
+        raise InputError(
+            "E-PLAN-UNLINKED",
+            f"plan: no group links face {apart} to reference face {reference}; add a group that shows one of each",
+        )
+    return linked
+
+
+def _models(scene: Scene, options: PlanOptions) -> list[MetricModel]:
+    radius = scene.target.radius_of() | scene.board.radius_of()
+    exact = true_models(scene, observe(scene, 0.0, np.random.default_rng(0)))
+    return [options.noise.applied(model, scene.camera, radius) for model in exact]
+
+
+def _remedy(what: str, options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Remedy:
+    try:
+        scene = _scene(options, target, board, nominal)
+    except DegenerateError as error:
+        return Remedy(what, None, str(error))
+    return Remedy(what, forecast(_models(scene, options), _setup(scene, options, board)).worst()[1])
+
+
+def _wider(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Remedy:
+    """The largest spread that leaves enough views."""
+    remedy = Remedy("larger spread", None, f"±{options.spread_deg:g}° is as far as both faces and the board show")
+    for spread in SPREADS_DEG:
+        if spread > options.spread_deg:
+            remedy = _remedy(f"spread of ±{spread:g}°", replace(options, spread_deg=spread), target, board, nominal)
+            if remedy.sigma_mm is not None:
+                break
+    return remedy

@@ -1,0 +1,227 @@
+"""Photographs that could still be taken: what they would show, and where the photographer has to stand for them."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.design import TargetDesign
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.model import CalibratedCamera
+from stcal.labels import CircleLabel, DotLabel, Label
+from stcal.sfm.adjust.joint import JointResult
+from stcal.sfm.data.model import MetricModel
+from stcal.sfm.planning.forecast import CentreNoise, Setup
+from stcal.synthetic.observe import MAX_FOUND_TILT_RAD, image_circles
+from stcal.synthetic.scene import Group, Scene
+
+REACH_DEG = 50.0
+"""Candidates stand up to this far from the middle of a group's views, in azimuth and in elevation …"""
+GRID_DEG = 10.0
+"""… on a grid of this step."""
+ROLLS_DEG = (0.0, 90.0)
+"""A camera turned by 90° separates intrinsics from poses, and is tried where they are refined."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedView:
+    """A photograph to take in a group.
+
+    ``model`` : the group's model of this one image; ``azimuth_deg``, ``elevation_deg`` : to the right of and above the
+    middle of the group's views, as that photograph (``middle``) shows right and up; ``roll_deg`` : the camera turned
+    about its axis; ``distance_mm`` : to the middle of board and faces; ``tilts_deg`` : by face and ``board``, between
+    its normal and the line of sight; ``nearest`` photograph and ``nearest_deg`` to it, seen from the middle.
+    """
+
+    group: str
+    model: MetricModel
+    azimuth_deg: float
+    elevation_deg: float
+    roll_deg: float
+    distance_mm: float
+    tilts_deg: dict[str, float]
+    middle: str
+    nearest: str
+    nearest_deg: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stand:
+    """Where a group's views are: ``centre`` (3,) of board and faces, ``axes`` (3, 3) rows right, up, towards the
+    cameras, ``directions`` (m, 3) of the views from the centre; target frame."""
+
+    centre: np.ndarray
+    axes: np.ndarray
+    distance_mm: float
+    directions: np.ndarray
+    middle: str
+
+    def __post_init__(self):
+        for name, shape in (("centre", (3,)), ("axes", (3, 3)), ("directions", (None, 3))):
+            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
+
+    @classmethod
+    def of(cls, model: MetricModel) -> "_Stand":
+        centre = (model.xyz_model.min(0) + model.xyz_model.max(0)) / 2
+        away = np.array([pose.inverse().translation for pose in model.camera_from_model]) - centre
+        distance = np.linalg.norm(away, axis=1)
+        directions = away / distance[:, None]
+        towards = directions.mean(0) / np.linalg.norm(directions.mean(0))
+        middle = int(np.argmax(directions @ towards))
+        up = -model.camera_from_model[middle].rotation[1]
+        right = np.cross(up, towards)
+        right /= np.linalg.norm(right)
+        axes = np.array([right, np.cross(towards, right), towards])
+        return cls(centre, axes, float(np.median(distance)), directions, model.images[middle])
+
+    def pose(self, azimuth_deg: float, elevation_deg: float, roll_deg: float) -> Rigid:
+        """camera_from_target that looks at the centre."""
+        azimuth, elevation, roll = np.radians([azimuth_deg, elevation_deg, roll_deg])
+        local = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+        forward = -np.array(local) @ self.axes
+        x = np.cross(forward, self.axes[1])
+        x /= np.linalg.norm(x)
+        y = np.cross(forward, x)
+        c, s = np.cos(roll), np.sin(roll)
+        rotation = np.array([c * x + s * y, c * y - s * x, forward])
+        return Rigid(rotation, -rotation @ (self.centre - self.distance_mm * forward))
+
+
+def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
+    """What a run knows, as a scene: calibrated faces and circles, its boards, no views yet; target frame."""
+    circles = dict(zip(joint.labels, joint.xyz_model, strict=True))
+    groups = {}
+    for model in models:
+        faces = tuple(sorted({label.face for label in model.labels if isinstance(label, CircleLabel)}))
+        target_from_board = joint.model_from_board[model.group]
+        dots = np.column_stack([setup.board.xy_mm(), np.zeros(setup.board.rows * setup.board.columns)])
+        groups[model.group] = Group(
+            model.group, faces, _Stand.of(model).axes, target_from_board, target_from_board @ dots, ()
+        )
+    target = _calibrated_part(setup.target, setup.start.target_from_face, circles)
+    return Scene(
+        target=target,
+        board=setup.board,
+        camera=CalibratedCamera.of(setup.camera, colmap_model),
+        target_from_face=setup.start.target_from_face,
+        circles_target=circles,
+        groups=groups,
+        seed=0,
+    )
+
+
+def _calibrated_part(target: TargetDesign, target_from_face: dict[str, Rigid], circles) -> TargetDesign:
+    faces = []
+    for face in target.faces:
+        if face.id in target_from_face:
+            keep = [i for i, label in enumerate(face.labels()) if label in circles]
+            ids = tuple(face.ids[i] for i in keep)
+            faces.append(replace(face, ids=ids, xy_mm=face.xy_mm[keep], radius_mm=face.radius_mm[keep]))
+    return replace(target, faces=tuple(faces))
+
+
+def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
+    """Views of a group on a grid about its present ones that show the whole board and at least one whole face."""
+    stand = _Stand.of(model)
+    steps = np.arange(-REACH_DEG, REACH_DEG + 1e-9, GRID_DEG)
+    places = [
+        (float(azimuth), float(elevation), roll)
+        for roll in ROLLS_DEG[: 1 if setup.prior is None else None]
+        for elevation in steps
+        for azimuth in steps
+    ]
+    poses = [stand.pose(*place) for place in places]
+    group = replace(scene.groups[model.group], camera_from_target=tuple(poses))
+    scene = replace(scene, groups={model.group: group})
+    limit = _largest_tilt(scene, model)
+    views = []
+    for i, place in enumerate(places):
+        seen = set(model.labels) & shown(scene, model.group, i, limit)
+        if not _worth_it(seen, model):
+            continue
+        single = _single(model, f"{model.group}/view {place}", poses[i], sorted(seen), setup.camera)
+        position = poses[i].inverse().translation
+        cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
+        views.append(
+            PlannedView(
+                model.group,
+                noise.applied(single, setup.camera, setup.radius_mm()),
+                *place,
+                stand.distance_mm,
+                _tilts_deg(scene, model.group, position, seen),
+                stand.middle,
+                model.images[int(np.argmax(cosine))],
+                float(np.degrees(np.arccos(np.clip(cosine.max(), -1, 1)))),
+            )
+        )
+    return views
+
+
+def _largest_tilt(scene: Scene, model: MetricModel) -> float:
+    """Of the circles that the run found in this group, rad; no more than a simulation believes in."""
+    normal = {face.id: scene.target_from_face[face.id].rotation[:, 2] for face in scene.target.faces}
+    board = -scene.groups[model.group].target_from_board.rotation[:, 2]
+    normals = np.array([board if isinstance(x, DotLabel) else normal.get(x.face, board) for x in model.labels])
+    centres = np.array([pose.inverse().translation for pose in model.camera_from_model])[model.image_index]
+    ray = centres - model.xyz_model[model.point_index]
+    cosine = (ray * normals[model.point_index]).sum(1) / np.linalg.norm(ray, axis=1)
+    return min(float(np.arccos(np.clip(cosine.min(), -1, 1))), MAX_FOUND_TILT_RAD)
+
+
+def shown(scene: Scene, group: str, image: int, max_tilt_rad: float) -> set[str]:
+    """Labels of the group's circles that a view shows whole, neither too slantwise nor behind a face or the board."""
+    seen = image_circles(scene, group, image)
+    camera_from_target = scene.groups[group].camera_from_target[image]
+    plates = [scene.face_outline(face.id) for face in scene.target.faces] + [scene.board_outline(group)]
+    hidden = np.zeros(len(seen.labels), bool)
+    for corners in plates:
+        hidden |= _behind(seen.xyz_camera, camera_from_target @ corners)
+    keep = seen.must_find & (seen.tilt_rad <= max_tilt_rad) & ~hidden
+    return {label for label, k in zip(seen.labels, keep, strict=True) if k}
+
+
+def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
+    """Whether a rectangle, (4, 3) corners in turn, is between the camera and points (n, 3)."""
+    origin, a, b = corners_camera[0], corners_camera[1] - corners_camera[0], corners_camera[3] - corners_camera[0]
+    normal = np.cross(a, b)
+    with np.errstate(divide="ignore", invalid="ignore"):  # sight lines in the plane meet it nowhere
+        part = (origin @ normal) / (xyz_camera @ normal)
+        away = part[:, None] * xyz_camera - origin
+        u, v = away @ a / (a @ a), away @ b / (b @ b)
+        return (part > 0) & (part < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
+
+
+def _worth_it(seen: set[Label], model: MetricModel) -> bool:
+    members = {key: {model.labels[i] for i in rows} for key, rows in model.points_by_face().items()}
+    return members["board"] <= seen and any(own <= seen for key, own in members.items() if key != "board")
+
+
+def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label]) -> dict[str, float]:
+    """Between normals and lines of sight of the board and of the faces in view."""
+    board = scene.groups[group].target_from_board.rotation[:, 2]
+    plates = {"board": (-board, scene.board_outline(group).mean(0))}
+    for face_id in sorted({label.face for label in seen if isinstance(label, CircleLabel)}):
+        plates[face_id] = scene.target_from_face[face_id].rotation[:, 2], scene.face_outline(face_id).mean(0)
+    return {
+        key: float(np.degrees(np.arccos(np.clip(normal @ (position - at) / np.linalg.norm(position - at), -1, 1))))
+        for key, (normal, at) in plates.items()
+    }
+
+
+def _single(model: MetricModel, name: str, pose: Rigid, labels: list[Label], camera: Camera) -> MetricModel:
+    """The model of one image of the group that sees these points."""
+    place = {label: i for i, label in enumerate(model.labels)}
+    points = np.array([place[label] for label in labels])
+    n = len(points)
+    return replace(
+        model,
+        images=(name,),
+        camera_from_model=(pose,),
+        image_index=np.zeros(n, int),
+        point_index=points,
+        keypoint=np.arange(n),
+        measured_px=camera.project(pose @ model.xyz_model[points]),
+        shift_px=np.zeros((n, 2)),
+        covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
+    )

@@ -1,0 +1,252 @@
+"""What a run writes into its folder: overlays, results, report."""
+
+import contextlib
+import csv
+import hashlib
+import io
+import os
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import TargetDesign
+from stcal.errors import InputError, StcalError
+from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.design import board_toml, target_toml
+from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.json import checked, read_json
+from stcal.io.saving import BOARD, CAMERA, REFINED_CAMERA, RUN_MARKER, TARGET, json_text, save
+from stcal.parallel import Progress
+from stcal.report.pdf import pdf_of, require_pdf
+from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.data.model import GroupModel
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.detect.files import DetectionResult
+from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.detect.overlay import draw_overlay
+from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
+from stcal.sfm.mapping.models import write_model
+from stcal.sfm.report.judgement import Judgement, judged
+from stcal.sfm.report.page import report_html
+from stcal.sfm.report.photographs import Residuals, shown_overlays
+from stcal.sfm.runs.output import report_of, residuals_px
+from stcal.sfm.runs.report import ReportFile
+from stcal.sfm.runs.result import RunResult
+from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.transaction import added_results, complete_interrupted
+
+LONGEST_NAME = 200
+"""Bytes of an image's name in that of its overlay; file systems take 255, with what is added while it is written."""
+HASH_DIGITS = 12
+
+
+@contextlib.contextmanager
+def overlays_beside(
+    detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, folder: Path, progress: Progress
+) -> Iterator[None]:
+    """Draw into every image what was found in it while other work goes on; all are there at the end."""
+    face_ids = [face.id for face in target.faces]
+
+    def draw(image, each: LabelledImage) -> None:
+        path = overlay_path(folder, image.file.name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        picture = draw_overlay(
+            image.thumbnail,
+            image.thumbnail_scale,
+            each.observations,
+            face_ids,
+            detection.camera.focal,
+            len(each.notes),
+        )
+        save(path, picture)
+
+    with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
+        drawn = pool.map(draw, _in_order(detection, labelled), labelled)
+        try:
+            yield
+        except Exception:
+            raise
+        except BaseException:  # asked to end
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        for i, _ in enumerate(drawn):
+            progress("overlays", i + 1, len(labelled))
+
+
+def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):
+    by_name = {image.file.name: image for image in detection.images}
+    return [by_name[each.observations.name] for each in labelled]
+
+
+def overlay_path(out: Path, name: str) -> Path:
+    """The overlay of an image; a long name is cut, and ends in its hash."""
+    group, slash, own = name.rpartition("/")
+    if len(own.encode()) > LONGEST_NAME:
+        cut = own.encode()[: LONGEST_NAME - HASH_DIGITS - 1].decode(errors="ignore")
+        own = f"{cut}-{hashlib.sha256(name.encode()).hexdigest()[:HASH_DIGITS]}"
+    return out / "overlays" / f"{group}{slash}{own}.jpg"
+
+
+def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | None = None) -> Judgement:
+    """The database with corrected centres, models, faces and report, into a folder that holds the overlays; the report
+    loads itself anew every ``reload_s`` seconds. Returns what the report says in words."""
+    observations = result.observations()
+    ids = image_ids(observations)
+    models = {s.model.group: s.model for s in result.solutions}
+    corrected = _corrected_px(models, observations)
+    write_database(out / "database.db", result.camera, observations, result.graph.pairs, corrected)
+    save(out / "labels.csv", labels_csv(observations, corrected, residuals_px(result)))
+    for name, model in models.items():
+        folder = out / "models" / name  # "models/." where the images lie directly in their folder
+        write_model(folder, [model], observations, ids, result.camera)
+    adjusted = CalibratedCamera.of(result.calibration.camera, result.camera.colmap_model)
+    write_model(out / "target_model", result.calibration.models, observations, ids, adjusted)
+    write_cameras_txt(out / CAMERA, result.camera)
+    if (refined := result.refined_camera) is not None:
+        write_cameras_txt(out / REFINED_CAMERA, refined)
+    save(out / TARGET, target_toml(result.target_design))
+    save(out / BOARD, board_toml(result.board_design))
+    report = judged(report_of(result).content())
+    if result.target.target_from_face:  # none of the board alone
+        options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factor
+        faces = FacesFile.of(result.target, result.target_design, options, factor)
+        save(out / "faces.json", json_text(faces.content()))
+    write_report(out, report, out, reload_s)
+    progress("report", 1, 1)
+    return Judgement.model_validate(report["judgement"])
+
+
+def write_report(out: Path, report: dict, run: Path, reload_s: int | None = None) -> None:
+    """``report.json`` and ``report.html``, into a folder; ``run`` : that of the overlays."""
+    page = _report_page(run, report, reload_s)
+    save(out / "report.json", json_text(report))
+    save(out / "report.html", page)
+
+
+@dataclass(frozen=True, slots=True)
+class ReportAgain:
+    """``files`` : page and PDF that were written; ``gone`` : overlays that the folder no longer holds, so that the page
+    is without them."""
+
+    files: tuple[Path, ...]
+    gone: int
+
+    def text(self) -> str:
+        """For the terminal."""
+        told = [f"{self.gone} overlays are no longer in the folder: the report is without them"] if self.gone else []
+        return "\n".join([*told, *(f"report: {path}" for path in self.files)])
+
+
+def report_again(run: Path, pdf: bool, out: Path | None = None) -> ReportAgain:
+    """Make the page of a finished run anew from its ``report.json`` and its overlays, and a PDF of it.
+
+    Parameters
+    ----------
+    run : the run's folder
+    pdf : whether to make the PDF too
+    out : file for the page, the PDF beside it; where None, those in the folder are replaced
+
+    Raises
+    ------
+    InputError
+        Not a finished run, a damaged file in it, a file that cannot be written, or no WeasyPrint.
+    """
+    if not (run / RUN_MARKER).is_file():
+        raise InputError(
+            "E-RUN-FOLDER", f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
+        )
+    if out is not None and out.suffix.lower() == ".pdf":
+        raise InputError(
+            "E-OUTPUT-SUFFIX",
+            f"--out {out}: the page is HTML; give {out.with_suffix('.html')}, and --pdf for {out.name}",
+        )
+    if pdf:
+        require_pdf()
+    if out is not None:
+        complete_interrupted(run)
+        files, gone = _page_and_pdf(run, pdf, out)
+        return ReportAgain(files, gone)
+    with added_results(run) as stage:
+        files, gone = _page_and_pdf(run, pdf, stage / "report.html")
+    return ReportAgain(tuple(run / path.name for path in files), gone)
+
+
+def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], int]:
+    """Files, and how many overlays are gone."""
+    path = run / "report.json"
+    report = read_json(path, "run", "run it again")
+    try:
+        checked(report, ReportFile)
+    except InputError as error:
+        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again") from error
+    with _as_written(path):
+        shown = shown_overlays(report)
+        overlays = {name: there.read_bytes() for name in shown if (there := overlay_path(run, name)).is_file()}
+    gone, residuals = len(shown) - len(overlays), _residuals(run, list(overlays))
+    with _as_written(path):
+        page = report_html(report, overlays, residuals, gone=gone)
+    made: list[tuple[Path, bytes]] = [(out, page.encode())]
+    if pdf:
+        made.append((out.with_suffix(".pdf"), pdf_of(page)))
+    for file, content in made:
+        save(file, content)
+    return tuple(file for file, _ in made), gone
+
+
+def _report_page(run: Path, report: dict, reload_s: int | None = None) -> bytes:
+    overlays = {name: overlay_path(run, name).read_bytes() for name in shown_overlays(report)}
+    return report_html(report, overlays, _residuals(run, list(overlays)), reload_s).encode()
+
+
+def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
+    """Centres and residuals of these images, by ``labels.csv``; none of a version that kept none."""
+    path = run / "labels.csv"
+    rows: dict[str, list[list[float]]] = {name: [] for name in names}
+    try:
+        for row in csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())):
+            if row["image"] in rows and row.get("residual_x_px"):
+                own = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
+                rows[row["image"]].append(own)
+    except (LookupError, TypeError, ValueError, csv.Error) as error:
+        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again") from error
+    return {name: np.array(own).reshape(-1, 4) for name, own in rows.items()}
+
+
+@contextlib.contextmanager
+def _as_written(path: Path) -> Iterator[None]:
+    """InputError for a report that a page cannot be made of, or a file that it needs."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            "E-RUN-DAMAGED", f"{error.filename}: {error.strerror or error}; the report needs it, run it again"
+        ) from error
+    except (LookupError, TypeError, ValueError, AttributeError, StcalError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else error
+        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({reason}); run it again") from error
+
+
+def require_report(saved: SavedRun) -> None:
+    """Refuse a run whose report cannot be added to: of another version, without its overlays, or read-only."""
+    with _as_written(saved.folder / "report.json"):
+        _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
+    if not os.access(saved.folder, os.W_OK):
+        raise InputError(
+            "E-OUTPUT-UNWRITABLE",
+            f"run {saved.folder}: cannot be written to, and the comparison goes into its report; copy it",
+        )
+
+
+def _corrected_px(models: Mapping[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:
+    """All keypoints of every image as the models of the groups correct them; as measured in groups without one."""
+    rows = {name: rows for m in models.values() for name, rows in zip(m.images, m.rows_by_image(), strict=True)}
+    none = np.zeros(0, int)
+    return [
+        models[image.group].keypoints_px(image, rows.get(image.name, none))
+        if image.group in models
+        else image.centre_px
+        for image in observations
+    ]

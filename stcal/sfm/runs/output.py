@@ -1,0 +1,308 @@
+"""``report.json``: everything that tells how far to trust the result."""
+
+from itertools import combinations
+
+import numpy as np
+
+import stcal
+from stcal.geometry.plane import fit_plane
+from stcal.labels import DotLabel
+from stcal.sfm.data.model import MIN_POINTS, GroupModel
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.mapping.resect import MIN_RAY_ANGLE_RAD
+from stcal.sfm.runs.report import ReportFile
+from stcal.sfm.runs.result import RunResult
+
+MICRO = 1e3
+
+
+def report_of(result: RunResult) -> ReportFile:
+    """The report of a run."""
+    models = _final_models(result)
+    residual = {name: model.residuals_px(result.calibration.camera) for name, model in models.items()}
+    everything = np.concatenate(list(residual.values()))
+    return ReportFile.model_validate(
+        {
+            "format": "stcal report 1",
+            "version": stcal.__version__,
+            "target": result.target_design.name,
+            "reference_face": result.target.reference_face,
+            "options": {
+                "solve": result.options.solve,
+                "frame": result.options.frame,
+                "eccentricity": result.options.eccentricity,
+                "max_pair_angle_deg": round(float(np.degrees(result.options.pairs.limit_rad())), 9),
+            },
+            "camera": {
+                "model": result.camera.colmap_model,
+                "size_px": [result.camera.width, result.camera.height],
+                "focal_px": result.calibration.camera.focal,
+                "centre_px": result.calibration.camera.centre,
+                "distortion": result.calibration.camera.coefficients(),
+            },
+            "summary": {
+                "files": len(result.detection.images) + len(result.detection.skipped),
+                "images": len(result.labelled),
+                "images_mapped": sum(len(model.images) for model in models.values()),
+                "groups": len(models),
+                "faces": len(result.target.target_from_face),
+                "faces_not_seen": [
+                    f.id for f in result.target_design.faces if f.id not in result.target.target_from_face
+                ],
+                "observations": len(everything),
+                "residual_rms_px": float(np.sqrt((everything**2).mean())),
+                "centre_sigma_rms_px": float(
+                    np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models.values()]).mean())
+                ),
+                "sigma_factor": result.calibration.sigma_factor,
+                "scale_sigma_ppm": None if result.target.scale_sigma is None else 1e6 * result.target.scale_sigma,
+                "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
+                "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
+                "last_move_px": result.calibration.joint.last_move_px if result.calibration.joint else None,
+            },
+            "faces": {face: _face(result, face) for face in result.target.target_from_face},
+            "between_faces": _between(result),
+            "chains": {
+                face: [
+                    {
+                        "faces": list(chain.faces),
+                        "groups": list(chain.groups),
+                        "translation_um": MICRO * chain.translation_mm,
+                        "rotation_mdeg": MICRO * float(np.degrees(chain.rotation_rad)),
+                    }
+                    for chain in chains
+                ]
+                for face, chains in result.chains.items()
+            },
+            "checks": result.checks,
+            "groups": [_group(result, solution) for solution in result.solutions],
+            "residuals_by_image": _by_image(models, residual),
+            "residuals_by_label": _by_label(models, residual),
+            "left_out": _left_out(result),
+            "notes": list(result.notes),
+            "images": [
+                {"image_id": i, "name": image.name, "group": image.group, "circles": len(image)}
+                for i, image in enumerate(result.observations(), start=1)
+            ],
+            "scene": _scene(result),
+        }
+        | ({} if result.comparison is None else {"comparison": result.comparison})
+    )
+
+
+def residuals_px(result: RunResult) -> list[np.ndarray]:
+    """Of every keypoint of every image, (k, 2), corrected minus projected; nan where it is not in the answer."""
+    models = _final_models(result)
+    found = {each.name: np.full((len(each), 2), np.nan) for each in result.observations()}
+    for model in models.values():
+        residual = model.residuals_px(result.calibration.camera)
+        for name, rows in zip(model.images, model.rows_by_image(), strict=True):
+            found[name][model.keypoint[rows]] = residual[rows]
+    return list(found.values())
+
+
+def _final_models(result: RunResult) -> dict[str, GroupModel]:
+    """The models that the answer rests on."""
+    if result.calibration.joint:
+        return {model.group: model for model in result.calibration.joint.models}
+    return {solution.model.group: solution.model for solution in result.solutions}
+
+
+def _face(result: RunResult, face_id: str) -> dict:
+    pose = result.target.target_from_face[face_id]
+    labels = [label for label in result.target.circles if label.face == face_id]
+    members = [each for each in result.calibration.faces if each.face == face_id]
+    covariance = result.target.face_covariance.get(face_id)
+    sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
+    return {
+        "target_from_face": pose,
+        "translation_mm": pose.translation,
+        "angle_to_reference_deg": float(np.degrees(np.arccos(np.clip(pose.rotation[2, 2], -1, 1)))),
+        "translation_sigma_um": None if sigma is None else MICRO * sigma[3:],
+        "rotation_sigma_mdeg": None if sigma is None else MICRO * np.degrees(sigma[:3]),
+        "circles": len(labels),
+        "circles_of_design": len(result.target_design.face(face_id).ids),
+        "plane_rms_um": MICRO * fit_plane(np.array([result.target.circles[label] for label in labels])).rms,
+        "groups": [each.group for each in members],
+        "images": sum(each.images for each in members),
+    }
+
+
+def _between(result: RunResult) -> list[dict]:
+    rows = []
+    poses, sigma = result.target.target_from_face, result.target.distance_sigma_mm
+    for a, b in combinations(poses, 2):
+        cosine = poses[a].rotation[:, 2] @ poses[b].rotation[:, 2]
+        rows.append(
+            {
+                "a": a,
+                "b": b,
+                "distance_mm": float(np.linalg.norm(poses[a].translation - poses[b].translation)),
+                "distance_sigma_um": MICRO * sigma[a, b] if (a, b) in sigma else None,
+                "angle_deg": float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
+            }
+        )
+    return rows
+
+
+def _group(result: RunResult, solution) -> dict:
+    name = solution.model.group
+    scale = result.calibration.scales[name]
+    return {
+        "name": name,
+        "images": list(solution.model.images),
+        "faces": [each.face for each in result.calibration.faces if each.group == name],
+        "points": len(solution.model.labels),
+        "seeded": solution.seeded,
+        "rounds": solution.rounds,
+        "pairs": [
+            {
+                "first": p.first,
+                "second": p.second,
+                "shared": p.shared,
+                "median_angle_deg": float(np.degrees(p.median_angle_rad)),
+                "in_front": p.in_front,
+                "forward": p.forward,
+                "verdict": p.verdict,
+            }
+            for p in solution.pairs
+        ],
+        "scale": {
+            "mm_per_unit": scale.mm_per_unit,
+            "mm_per_unit_rows": scale.rows_mm_per_unit,
+            "rows": list(scale.rows),
+            "difference_ppm": 1e6 * (scale.rows_mm_per_unit / scale.mm_per_unit - 1),
+            "sigma_ppm": 1e6 * scale.sigma_mm_per_unit / scale.mm_per_unit,
+            "dots": len(scale.labels),
+            "board_mean_um": MICRO * scale.mean_mm(),
+            "board_spread_um": MICRO * scale.spread_mm(),
+            "board_rms_um": MICRO * scale.rms_mm(),
+            "board_residuals_um": {
+                label: MICRO * residual for label, residual in zip(scale.labels, scale.residuals_mm, strict=True)
+            },
+        },
+    }
+
+
+def _by_image(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) -> list[dict]:
+    rows = []
+    for name, model in models.items():
+        length = np.linalg.norm(residual[name], axis=1)
+        for i, image in enumerate(model.images):
+            own = np.flatnonzero(model.image_index == i)
+            worst = own[np.argmax(length[own])]
+            rows.append(
+                {
+                    "image": image,
+                    "group": name,
+                    "observations": len(own),
+                    "rms_px": float(np.sqrt((residual[name][own] ** 2).mean())),
+                    "max_px": float(length[worst]),
+                    "worst": model.labels[model.point_index[worst]],
+                }
+            )
+    return rows
+
+
+def _by_label(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) -> list[dict]:
+    """Circles of the target over all groups; dots of the board group by group."""
+    gathered: dict[tuple[str, str], list[np.ndarray]] = {}
+    for name, model in models.items():
+        for k, r in zip(model.point_index, residual[name], strict=True):
+            label = model.labels[k]
+            gathered.setdefault((name if isinstance(label, DotLabel) else "", label), []).append(r)
+    return [
+        {
+            "label": label,
+            "group": group or None,
+            "observations": len(rows),
+            "rms_px": float(np.sqrt((np.array(rows) ** 2).mean())),
+            "max_px": float(np.linalg.norm(rows, axis=1).max()),
+        }
+        for (group, label), rows in sorted(gathered.items())
+    ]
+
+
+def _left_out(result: RunResult) -> dict:
+    observed = {(each.observations.name): each for each in result.labelled}
+    images, circles = [], []
+    for solution in result.solutions:
+        mapped = set(solution.model.labels)
+        for name, reason in solution.left_out.items():
+            known = len(mapped & set(observed[name].observations.labels))
+            few = known < MIN_POINTS
+            images.append(
+                {
+                    "name": name,
+                    "reason": reason,
+                    "gate": "known_circles" if few else "fitting_circles",
+                    "value": known if few else None,
+                    "limit": MIN_POINTS,
+                }
+            )
+        circles += [
+            {
+                "image": o.image,
+                "label": o.label,
+                "reason": f"residual {o.residual_px:.3f} px, {o.limit_px:.3f} px allowed: contradicts the other images",
+                "gate": "residual",
+                "value": o.residual_px,
+                "limit": o.limit_px,
+                "unit": "px",
+            }
+            for o in solution.outliers
+        ]
+        own = [observed[name].observations for name in solution.model.images]
+        circles += _without_point(solution.model, own, {(o.image, o.label) for o in solution.outliers})
+    return {
+        "files": result.detection.skipped,
+        "images": images,
+        "circles": circles,
+        "notes": [{"image": name, "note": note} for name, each in observed.items() for note in each.notes],
+    }
+
+
+def _without_point(model: GroupModel, images: list[ImageObservations], outliers: set[tuple[str, str]]) -> list[dict]:
+    """Circles labelled in mapped images that are no points of the model: seen once, or from one direction."""
+    rays: dict[str, list[tuple[str, np.ndarray]]] = {}
+    for image, pose in zip(images, model.camera_from_model, strict=True):
+        for k in range(len(image)):
+            if image.labels[k] not in model.labels and (image.name, image.labels[k]) not in outliers:
+                ray = pose.rotation.T @ np.append(image.centre[k], 1.0)
+                rays.setdefault(image.labels[k], []).append((image.name, ray / np.linalg.norm(ray)))
+    circles = []
+    for label, own in rays.items():
+        direction = np.array([ray for _, ray in own])
+        angle = float(np.degrees(np.arccos(np.clip(direction @ direction.T, -1, 1)).max()))
+        needed = float(np.degrees(MIN_RAY_ANGLE_RAD))
+        if len(own) == 1:
+            gate = {"gate": "views", "value": 1, "limit": 2, "unit": "images"}
+            reason = "seen in one mapped image only; 2 needed"
+        else:
+            gate = {"gate": "ray_angle", "value": angle, "limit": needed, "unit": "deg"}
+            reason = f"{len(own)} images see it within {angle:.2f}°, {needed:g}° needed; add views from further apart"
+        circles += [{"image": name, "label": label, "reason": reason} | gate for name, _ in own]
+    return circles
+
+
+def _scene(result: RunResult) -> dict:
+    """Cameras, board outlines and circles in the target frame, for the picture in space."""
+    cameras, boards = [], {}
+    for model in result.calibration.models:
+        for image, pose in zip(model.images, model.camera_from_model, strict=True):
+            target_from_camera = pose.inverse()
+            cameras.append(
+                {
+                    "image": image,
+                    "group": model.group,
+                    "position_mm": target_from_camera.translation,
+                    "axes": target_from_camera.rotation.T,
+                }
+            )
+        dots = [i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)]
+        boards[model.group] = model.xyz_model[dots]
+    return {
+        "cameras": cameras,
+        "boards": boards,
+        "circles": result.target.circles,
+    }

@@ -1,0 +1,322 @@
+"""What ``report.json`` holds. Fields without a description are named in that of the object that holds them."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from stcal.io.images import name_fault
+from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points, Pose, ResultFile, Vector, Vector3
+from stcal.sfm.adjust.faces import FrameKind
+from stcal.sfm.adjust.options import Solve
+from stcal.sfm.checks.verdict import Verdict
+from stcal.sfm.report.judgement import Judgement
+from stcal.sfm.runs.comparison import Comparison
+from stcal.sfm.runs.crosscheck import Crosscheck
+
+Number = int | float
+"""An integer stays one."""
+
+
+class ReportOptions(Part):
+    solve: Solve
+    frame: FrameKind
+    eccentricity: bool
+    max_pair_angle_deg: float
+
+
+class ReportCamera(Part):
+    model: str
+    size_px: list[int]
+    focal_px: Pair
+    centre_px: Pair
+    distortion: Vector
+
+
+class Summary(Part):
+    files: int
+    images: int
+    images_mapped: int
+    groups: int
+    faces: int
+    faces_not_seen: list[str]
+    observations: int
+    residual_rms_px: float
+    centre_sigma_rms_px: float
+    sigma_factor: float
+    scale_sigma_ppm: float | None
+    sigma0: float | None
+    redundancy: int | None
+    last_move_px: float | None
+
+
+class FaceRow(Part):
+    target_from_face: Pose
+    translation_mm: Vector3
+    angle_to_reference_deg: float
+    translation_sigma_um: Vector3 | None
+    rotation_sigma_mdeg: Vector3 | None
+    circles: int
+    circles_of_design: int
+    plane_rms_um: float
+    groups: list[str]
+    images: int
+
+
+class BetweenFaces(Part):
+    a: str
+    b: str
+    distance_mm: float
+    distance_sigma_um: float | None
+    angle_deg: float
+
+
+class ChainRow(Part):
+    faces: list[str]
+    groups: list[str]
+    translation_um: float
+    rotation_mdeg: float
+
+
+class MeasuredRow(Part):
+    name: str
+    value: Number
+    limit: Number | None
+    unit: str
+    probability: float | None
+
+
+class CheckRow(Part):
+    """One check."""
+
+    key: str = Field(description="short name")
+    title: str = Field(description="what is checked")
+    verdict: Verdict = Field(
+        description="`passed`; `suspicious`: by chance in one honest run of 1000, and `agreement` where the joint "
+        "adjustment has not settled; `failed`: of 100 000; `not possible` in this run"
+    )
+    reason: str = Field(description="the verdict in words")
+    measured: list[MeasuredRow] = Field(
+        description="at most 8 values, the worst first: `name` of what was tested (image, label, face, group, row …), "
+        "`value`, `limit` beyond which it is suspicious (null where there is none), `unit`, `probability` of as much "
+        "by chance before the number of things tested is allowed for (null where it is no test)"
+    )
+    tested: int = Field(description="how many things were")
+    names: list[str] = Field(description="all that are beyond the limit, the worst first")
+    remedy: str = Field(description="what to do about it; empty where nothing is")
+
+
+class PairRow(Part):
+    first: str
+    second: str
+    shared: int
+    median_angle_deg: float
+    in_front: float
+    forward: float
+    verdict: str
+
+
+class ScaleRow(Part):
+    mm_per_unit: float
+    mm_per_unit_rows: float
+    rows: list[int]
+    difference_ppm: float
+    sigma_ppm: float
+    dots: int
+    board_mean_um: float
+    board_spread_um: float
+    board_rms_um: float
+    board_residuals_um: dict[ByLabel, Vector3]
+
+
+class GroupRow(Part):
+    name: str
+    images: list[str]
+    faces: list[str]
+    points: int
+    seeded: str
+    rounds: int
+    pairs: list[PairRow]
+    scale: ScaleRow = Field(
+        description="`mm_per_unit` by least squares over all dots, `mm_per_unit_rows` from all pairs of the two "
+        "`rows`, `difference_ppm`, `sigma_ppm`, `dots`; residuals after the similarity, reconstructed minus design, "
+        "board frame: `board_mean_um`, `board_spread_um` (standard deviation), `board_rms_um` of their lengths, "
+        "`board_residuals_um` label → `[x, y, z]`"
+    )
+
+
+class ImageResiduals(Part):
+    image: str
+    group: str
+    observations: int
+    rms_px: float
+    max_px: float
+    worst: str
+
+
+class LabelResiduals(Part):
+    label: str
+    group: str | None
+    observations: int
+    rms_px: float
+    max_px: float
+
+
+class FileLeftOut(Part):
+    name: str
+    reason: str
+    gate: str
+    value: Number | str | None
+    limit: Number | str | None
+
+
+class CircleLeftOut(Part):
+    image: str
+    label: str
+    reason: str
+    gate: str
+    value: Number
+    limit: Number
+    unit: str
+
+
+class Note(Part):
+    image: str
+    note: str
+
+
+class LeftOut(Part):
+    files: list[FileLeftOut]
+    images: list[FileLeftOut]
+    circles: list[CircleLeftOut]
+    notes: list[Note]
+
+
+class ImageRow(Part):
+    image_id: int
+    name: str
+    group: str
+    circles: int
+
+
+class CameraInSpace(Part):
+    image: str
+    group: str
+    position_mm: Vector3
+    axes: Matrix3
+
+
+class Space(Part):
+    cameras: list[CameraInSpace]
+    boards: dict[ByGroup, Points]
+    circles: dict[ByLabel, Vector3]
+
+
+class ReportFile(ResultFile):
+    """Everything that the report of a run shows."""
+
+    format: Literal["stcal report 1"] = Field(description="the file's form and its version")
+    version: str = Field(description="of stcal")
+    target: str = Field(description="name of the design")
+    reference_face: str = Field(description="face id")
+    options: ReportOptions = Field(description="`solve`, `frame`, `eccentricity`, `max_pair_angle_deg`")
+    camera: ReportCamera = Field(
+        description="COLMAP `model`, `size_px`, `focal_px`, `centre_px` (OpenCV pixel origin), `distortion` k1, k2, "
+        "p1, p2, k3 … k6, and s1 … s4 of a lens with thin prisms"
+    )
+    summary: Summary = Field(
+        description="counts: `files` (skipped ones included), `images`, `images_mapped`, `groups`, `faces`, "
+        "`faces_not_seen`, `observations`; `residual_rms_px` per coordinate; `centre_sigma_rms_px` of the σ used; "
+        "`sigma_factor` by which the residuals of the single groups exceed the centres' own σ; `scale_sigma_ppm`: σ of "
+        "the target's size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
+        "moved a projection at most (settled: less than 1e-7); these four are null with `chain` and `paper`"
+    )
+    faces: dict[ByFace, FaceRow] = Field(
+        description="`target_from_face`, `translation_mm`, `angle_to_reference_deg`, `translation_sigma_um` and "
+        "`rotation_sigma_mdeg` (x, y, z of the target frame; null with `chain`), `circles` of `circles_of_design`, "
+        "`plane_rms_um`, `groups`, `images`"
+    )
+    between_faces: list[BetweenFaces] = Field(
+        description="faces `a`, `b`, `distance_mm` of their origins and its σ `distance_sigma_um` (null with `chain`), "
+        "`angle_deg` of their normals"
+    )
+    chains: dict[ByFace, list[ChainRow]] = Field(
+        description="each way from the reference face through `faces` and `groups`; its distance from the result, "
+        "`translation_um`, `rotation_mdeg`"
+    )
+    checks: list[CheckRow] = Field(description="what residuals cannot show")
+    groups: list[GroupRow] = Field(
+        description="`name`, mapped `images`, `faces`, `points`; `seeded` how the initial pair was registered; "
+        "`rounds` of refinement; `pairs`, the chosen one first: `first`, `second`, `shared` labels, `median_angle_deg` "
+        "of the rays, `in_front` share, `forward` share of the baseline, `verdict`; `scale`"
+    )
+    residuals_by_image: list[ImageResiduals] = Field(
+        description="`image`, `group`, `observations`, `rms_px` per coordinate, `max_px` length, `worst` label"
+    )
+    residuals_by_label: list[LabelResiduals] = Field(
+        description="`label`, `group` (null for circles of the target: all groups together), `observations`, `rms_px`, "
+        "`max_px`"
+    )
+    left_out: LeftOut = Field(
+        description="`files` and `images`: `name`, `reason`; `circles`: `image`, `label`, `reason`, `unit`; all with "
+        "`gate`, `value`, `limit` as [`doctor`](exports.md#out-what-doctor-writes) has them; `notes`: `image`, `note`"
+    )
+    notes: list[str] = Field(
+        description="faces of a group that got no frame, and why; rows and columns of the board that no image shows; a "
+        "joint adjustment that has not settled"
+    )
+    images: list[ImageRow] = Field(
+        description="all images of the database in its order: `image_id`, `name`, `group`, `circles` labelled"
+    )
+    scene: Space = Field(
+        description="target frame, mm: `cameras`: `image`, `group`, `position_mm`, `axes` (rows X, Y, Z of the "
+        "camera); `boards` group → mapped dots; `circles` label → `[x, y, z]`"
+    )
+    judgement: Judgement | None = Field(
+        None, description="the summary in words, by the rules [below](#judgement); absent of an earlier version"
+    )
+    comparison: Comparison | None = Field(None, description="only of a run with `--compare paper`")
+    crosscheck: Crosscheck | None = Field(None, description="only after `crosscheck`, with")
+
+
+class InitialPair(Part):
+    first: str
+    second: str
+
+
+class GroupRead(Part):
+    name: str
+    pairs: list[InitialPair] = Field(min_length=1)
+
+
+class SummaryRead(Part):
+    residual_rms_px: float
+
+
+class ReportRead(Part):
+    """What of ``report.json`` every command on a run needs, of whatever version."""
+
+    format: Literal["stcal report 1"] = "stcal report 1"
+    images: list[ImageRow]
+    groups: list[GroupRead]
+    summary: SummaryRead
+
+    def names(self) -> list[tuple[str, str, int]]:
+        """(name, group, circles) of the images in the database's order.
+
+        Raises
+        ------
+        KeyError
+            A group of images is missing.
+        ValueError
+            A group's initial pair is not of its images, or a name leads out of the folder of images.
+        """
+        pairs = {each.name: each.pairs[0] for each in self.groups}
+        names = [(each.name, each.group, each.circles) for each in self.images]
+        for name, _, _ in names:
+            if fault := name_fault(name):
+                raise ValueError(f"image {name!r}: its name {fault}")
+        for group in {group for _, group, _ in names}:
+            own = {name for name, of, _ in names if of == group}
+            if not {pairs[group].first, pairs[group].second} <= own:
+                raise ValueError(f"group {group}: its initial pair is not of its images")
+        return names

@@ -1,0 +1,107 @@
+"""What a run answers."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.io.cameras.model import CalibratedCamera, CameraPrior
+from stcal.sfm.adjust.calibration import Calibration
+from stcal.sfm.adjust.chain import FaceChain
+from stcal.sfm.checks.suite import Evidence
+from stcal.sfm.checks.verdict import Check
+from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.detect.files import DetectionResult
+from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.mapping.graph import ImageGraph
+from stcal.sfm.report.judgement import Judgement
+from stcal.sfm.runs.comparison import Comparison
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.solve import GroupSolution
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """Everything a run found; :attr:`target` is the answer.
+
+    Parameters
+    ----------
+    out : Path
+        The run's folder.
+    camera : CalibratedCamera
+        As its file states it; refined intrinsics are ``calibration.camera``.
+    target_design, board_design : TargetDesign, BoardDesign
+        As given.
+    options : RunOptions
+        With every default decided.
+    detection : DetectionResult
+        What was found in each image, and the images skipped.
+    labelled : tuple of LabelledImage
+        Labelled centres of all images, px, in the database's order.
+    graph : ImageGraph
+        Which pairs of images were matched.
+    solutions : tuple of GroupSolution
+        Of the single groups, worlds without unit.
+    calibration : Calibration
+        Target and models in mm, target frame.
+    chains : dict of tuple of FaceChain
+        Ways to each face through single groups, by face id.
+    notes : tuple of str
+        What was left out or did not settle, and what to do.
+    checks : tuple of Check
+        In the order of the report.
+    comparison : Comparison, optional
+        With the published method, where it was asked for.
+    judgement : Judgement, optional
+        The report in words, once it is made.
+    """
+
+    out: Path
+    camera: CalibratedCamera
+    target_design: TargetDesign
+    board_design: BoardDesign
+    options: RunOptions
+    detection: DetectionResult
+    labelled: tuple[LabelledImage, ...]
+    graph: ImageGraph
+    solutions: tuple[GroupSolution, ...]
+    calibration: Calibration
+    chains: dict[str, tuple[FaceChain, ...]]
+    notes: tuple[str, ...]
+    checks: tuple[Check, ...] = ()
+    comparison: Comparison | None = None
+    judgement: Judgement | None = None
+
+    @property
+    def target(self):
+        """The calibrated target."""
+        return self.calibration.target
+
+    @property
+    def refined_camera(self) -> CalibratedCamera | None:
+        """As adjusted, with covariance; None where the intrinsics were held."""
+        joint = self.calibration.joint
+        if joint is None or not joint.camera_covariance.size:
+            return None
+        return CalibratedCamera.of(joint.camera, self.camera.colmap_model, joint.camera_covariance)
+
+    def observations(self) -> list[ImageObservations]:
+        """Labelled centres of all images, in the database's order."""
+        return [each.observations for each in self.labelled]
+
+    def evidence(self, prior: CameraPrior) -> Evidence:
+        """What the checks look at; ``prior`` : of the intrinsics, where they were refined."""
+        blur = {i.file.name: i.detection.centres.blur_px for i in self.detection.images}
+        return Evidence(
+            models=tuple(s.model for s in self.solutions),
+            outliers=tuple(o for s in self.solutions for o in s.outliers),
+            images=tuple(self.observations()),
+            camera=self.camera,
+            target=self.target_design,
+            board=self.board_design,
+            options=self.options.adjustment(self.target_design),
+            calibration=self.calibration,
+            prior=prior if self.options.refine_camera else None,
+            blur_px={name: float(np.median(each)) for name, each in blur.items() if len(each)},
+        )

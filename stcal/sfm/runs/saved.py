@@ -1,0 +1,214 @@
+"""A finished run read back from its folder, for every command that goes on from it."""
+
+import csv
+import io
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import Camera
+from stcal.io.cameras.model import CalibratedCamera
+from stcal.io.cameras.read import read_camera
+from stcal.io.covariance import OF_PIXEL, first_fault
+from stcal.io.design import load_board, load_target
+from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.json import Part, checked, read_json
+from stcal.io.saving import BOARD, CAMERA, RUN_MARKER, TARGET
+from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.data.observations import ImageObservations, by_group
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.mapping.pairs import PairOptions
+from stcal.sfm.runs.marker import MarkerFile
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.report import ReportCamera, ReportRead
+from stcal.sfm.runs.transaction import complete_interrupted
+
+AGAIN = "run it again"
+ReportPart = TypeVar("ReportPart", bound=Part)
+COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SavedRun:
+    """What a run's folder holds.
+
+    ``images`` : the folder of photographs as the run was given it; ``observations`` : of all images, in the database's
+    order, without the shapes of the ellipses (zero); ``corrected_px`` : by image, (n, 2), what the database holds;
+    ``faces``, ``report`` : ``faces.json``, and the content of ``report.json``; ``sha256`` : hashes of its files by path
+    below the folder, as the run left them.
+    """
+
+    folder: Path
+    images: Path
+    options: RunOptions
+    camera: CalibratedCamera
+    target: TargetDesign
+    board: BoardDesign
+    observations: tuple[ImageObservations, ...]
+    corrected_px: tuple[np.ndarray, ...]
+    faces: FacesFile
+    report: dict
+    sha256: dict[str, str]
+
+    @property
+    def database(self) -> Path:
+        """COLMAP's database."""
+        return self.folder / "database.db"
+
+    def groups(self) -> dict[str, list[ImageObservations]]:
+        """Observations by group, in order."""
+        return by_group(self.observations)
+
+    def report_as(self, part: type[ReportPart]) -> ReportPart:
+        """What of ``report.json`` a command needs.
+
+        Raises
+        ------
+        InputError
+            It lacks what this version writes.
+        """
+        try:
+            return checked(self.report, part)
+        except InputError as error:
+            path = self.folder / "report.json"
+            raise InputError(
+                "E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again"
+            ) from error
+
+    def adjusted_camera(self, own: ReportCamera) -> CalibratedCamera:
+        """The camera of the run's final model: as refined where it was, else as given; ``own`` : the report's."""
+        if not self.options.refine_camera:
+            return self.camera
+        camera = Camera(self.camera.width, self.camera.height, own.focal_px, own.centre_px, own.distortion)
+        return CalibratedCamera.of(camera, self.camera.colmap_model)
+
+
+def load_run(folder: str | Path) -> SavedRun:
+    """Read a finished run.
+
+    Parameters
+    ----------
+    folder : path
+        What the run was given as ``out``.
+
+    Returns
+    -------
+    SavedRun
+        Its inputs, labelled centres and results.
+
+    Raises
+    ------
+    InputError
+        Not a run's folder, an unfinished one, or a damaged file in it.
+    """
+    folder = Path(folder)
+    if not (folder / RUN_MARKER).is_file():
+        raise InputError(
+            "E-RUN-FOLDER", f"run {folder}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
+        )
+    complete_interrupted(folder)
+    needed = (CAMERA, TARGET, BOARD, "labels.csv", "database.db", "report.json", "faces.json")
+    missing = [name for name in needed if not (folder / name).is_file()]
+    if missing == ["faces.json"]:
+        raise InputError(
+            "E-RUN-NO-FACES",
+            f"run {folder}: no faces.json: of the board alone, or of another version; for faces, run it on photographs "
+            "that show them",
+        )
+    if missing:
+        raise InputError(
+            "E-RUN-UNFINISHED",
+            f"run {folder}: unfinished, or of another version: no {', '.join(missing)}; run it again",
+        )
+    marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
+    camera = read_camera(folder / CAMERA).calibrated(0, 0)
+    target, board = load_target(folder / TARGET), load_board(folder / BOARD)
+    with _as_written(folder / RUN_MARKER):
+        own = checked(marker, MarkerFile)
+        options, images = _options(own.options or {}).settled(target), Path(own.images)
+    with _as_written(folder / "report.json"):
+        names = checked(report, ReportRead).names()
+    with _as_written(folder / "faces.json"):
+        result = checked(faces, FacesFile)
+    with _as_written(folder / "labels.csv"):
+        known = {*target.radius_of(), *board.radius_of()}
+        observations, corrected = _labels(folder / "labels.csv", names, camera, known)
+    return SavedRun(
+        folder=folder,
+        images=images,
+        options=options,
+        camera=camera,
+        target=target,
+        board=board,
+        observations=observations,
+        corrected_px=corrected,
+        faces=result,
+        report=report,
+        sha256=own.sha256 or {},
+    )
+
+
+def _options(stored: dict) -> RunOptions:
+    for part in (stored, stored["pairs"], stored["ellipses"]):
+        for name, value in part.items():
+            if isinstance(value, list | dict) and name not in ("pairs", "ellipses", "exclude"):
+                raise ValueError(f"options: {name} {value}: a single value needed")
+    exclude = stored.get("exclude", [])
+    if not (isinstance(exclude, list) and all(isinstance(name, str) for name in exclude)):
+        raise ValueError(f"options: exclude {exclude}: a list of names needed")
+    pairs, ellipses = PairOptions(**stored["pairs"]), EllipseOptions(**stored["ellipses"])
+    return RunOptions(**(stored | {"pairs": pairs, "ellipses": ellipses, "exclude": tuple(exclude)}))
+
+
+@contextmanager
+def _as_written(path: Path) -> Iterator[None]:
+    """InputError that names the file for whatever is not as a run of this version writes it."""
+    try:
+        yield
+    except (OSError, LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
+        reason = f"no {error}" if isinstance(error, KeyError) else error
+        raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({reason}); run it again") from error
+
+
+def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):
+    """Observations and corrected centres of ``labels.csv`` for the images (name, group, circles) of the database."""
+    rows: dict[str, list[dict]] = {name: [] for name, _, _ in names}
+    for row in csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())):
+        if None in row.values():
+            raise ValueError(f"image {row['image']}: keypoint {row['keypoint']}: its row is cut")
+        rows[row["image"]].append(row)
+    observations, corrected = [], []
+    for name, group, circles in names:
+        own = rows[name]
+        if [int(row["keypoint"]) for row in own] != list(range(circles)):
+            raise ValueError(f"image {name}: its keypoints are not 0 to {circles - 1} in the order of the database")
+        labels = tuple(row["label"] for row in own)
+        unknown = [label for label in labels if label not in known]
+        if unknown or len(set(labels)) < len(labels):
+            raise ValueError(f"image {name}: {f'no circle {unknown[0]}' if unknown else 'a label twice'}")
+        columns = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", *COVARIANCE)
+        values = frozen([[row[column] for column in columns] for row in own] or np.zeros((0, 7)), (None, 7), name)
+        covariance = values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
+        fault = first_fault(covariance, OF_PIXEL, definite=True)
+        if fault is not None:
+            raise ValueError(f"image {name}: keypoint {fault.row}: covariance: {fault.reason}")
+        observations.append(
+            ImageObservations(
+                name=name,
+                group=group,
+                labels=labels,
+                centre_px=values[:, :2],
+                centre=camera.normalised_from_pixel(values[:, :2]),
+                shape=np.zeros((len(own), 2, 2)),
+                covariance_px2=covariance,
+            )
+        )
+        corrected.append(values[:, 2:4])
+    return tuple(observations), tuple(corrected)

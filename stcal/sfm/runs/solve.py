@@ -1,0 +1,320 @@
+"""One group from labels to a corrected model: pairs, mapping, refinement; kept by its inputs."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleError, StcalError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.io.cache import keep, kept
+from stcal.io.cameras.model import CalibratedCamera
+from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
+from stcal.labels import DotLabel, dot_cells, parse_labels
+from stcal.parallel import Progress
+from stcal.sfm.adjust.refine import refine
+from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.data.model import Outlier, WorldModel
+from stcal.sfm.data.observations import ImageObservations, by_group
+from stcal.sfm.data.pitch import pitch_hint
+from stcal.sfm.detect.labels import LabelledImage, leaves_a_board_out
+from stcal.sfm.mapping.database import image_ids, write_database
+from stcal.sfm.mapping.graph import ImageGraph
+from stcal.sfm.mapping.incremental import left_out, map_group
+from stcal.sfm.mapping.pairs import PairOptions, PairScore, rank_pairs
+from stcal.sfm.runs.options import RunOptions
+
+CACHE_VERSION = 6
+_ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroupSolution:
+    """One group solved in a world without unit.
+
+    ``pairs`` : the ranking, the chosen pair first; ``model`` ; ``seeded`` : how the pair was registered; ``rounds`` of
+    refinement; ``left_out`` : image → reason; ``outliers`` : observations left out.
+    """
+
+    pairs: tuple[PairScore, ...]
+    model: WorldModel
+    seeded: str
+    rounds: int
+    left_out: dict[str, str]
+    outliers: tuple[Outlier, ...]
+
+
+def usable_groups(
+    groups: dict[str, list[ImageObservations]], skipped: Sequence[Skipped], board_alone: bool = False
+) -> tuple[dict[str, list[ImageObservations]], list[str]]:
+    """Groups that can be solved, and why others cannot, those of which every image was skipped included; before
+    anything is mapped. With ``board_alone`` they need no face.
+
+    Raises
+    ------
+    MappingError
+        None can: no image or one, no board, or no face in a whole group.
+    """
+    lost: dict[str, list[Skipped]] = {}
+    for each in skipped:
+        # A folder of mere copies is no group of its own.
+        group = each.name.rpartition("/")[0] or TOP_GROUP
+        if each.name.lower().endswith(SUFFIXES) and (group in groups or not each.reason.startswith("the same image")):
+            lost.setdefault(group, []).append(each)
+    usable: dict[str, list[ImageObservations]] = {}
+    errors: list[MappingError] = []
+    for name in sorted(groups.keys() | lost.keys()):
+        group, first = groups.get(name, []), lost.get(name, [])[:1]
+        try:
+            if len(group) < 2:
+                count = f"1 usable image ({group[0].name})" if group else "0 usable images"
+                why = "".join(f", not {s.name}: {s.reason}" for s in first)
+                remedy = "add photographs from other places"
+                if name == TOP_GROUP and group and len(groups) > 1:
+                    others = _listed(g for g in groups if g != TOP_GROUP)
+                    remedy = (
+                        f"it lies beside the folders of groups ({others}): move it into the one it belongs to, or "
+                        f"leave it out with --exclude {group[0].name}"
+                    )
+                raise MappingError("E-GROUP-FEW-IMAGES", f"group {name}: {count}, 2 needed{why}; {remedy}")
+            require_usable(group, board_alone)
+        except MappingError as error:
+            errors.append(error)
+        else:
+            usable[name] = group
+    if not usable:
+        deeper = [f"; {each.name}: {each.reason}" for each in skipped if HOLDS_IMAGES in each.reason]
+        errors[0].append("".join(deeper[:1]))
+        raise errors[0]
+    return usable, [_left_out(error) for error in errors]
+
+
+def ungrouped(labelled: Sequence[LabelledImage]) -> list[str]:
+    """What is taken for granted of images that lie in no folder of a group."""
+    own = [each for each in labelled if each.observations.group == TOP_GROUP]
+    if not own:
+        return []
+    dropped = [each.observations.name for each in own if any(map(leaves_a_board_out, each.notes))]
+    found = (
+        f"; the board of {len(dropped)} of them ({_listed(dropped)}) is elsewhere and was left out, so that they are "
+        "more than one group"
+        if dropped
+        else ""
+    )
+    return [
+        f"assumed: {len(own)} images that lie in no folder of a group are one group, in which only the camera "
+        f"moved{found}; put the images of each setting of target and board into a folder of its own, IMAGES/<group>/"
+    ]
+
+
+def _listed(names: Iterable[str], most: int = 4) -> str:
+    every = list(names)
+    return ", ".join(every[:most]) + (", …" if len(every) > most else "")
+
+
+def _left_out(error: StcalError) -> str:
+    return f"left out whole: {error}"
+
+
+def require_usable(group: list[ImageObservations], board_alone: bool = False) -> None:
+    """Refuse a group that cannot be solved, before anything is mapped; with ``board_alone`` it needs no face.
+
+    Raises
+    ------
+    MappingError
+        One image, no board, or no face in the whole group.
+    """
+    where = f"group {group[0].group}"
+    if len(group) < 2:
+        raise MappingError(
+            "E-GROUP-FEW-IMAGES",
+            f"{where}: 1 usable image ({group[0].name}), 2 needed; add photographs from other places",
+        )
+    if not board_alone and not any(image.face_ids() for image in group):
+        raise MappingError(
+            "E-GROUP-NO-FACE",
+            f"{where}: no face of the target recognised in {len(group)} images; look at the overlays, "
+            "check target.toml (radii, polarity) and the exposure; of the board alone, use --board-only",
+        )
+    if not any(isinstance(label, DotLabel) for image in group for label in image.labels):
+        raise MappingError(
+            "E-GROUP-NO-BOARD",
+            f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
+            "check board.toml (rows, columns, pitch_mm, radius_mm, polarity)",
+        )
+
+
+def solve_group(
+    group: list[ImageObservations],
+    skeleton: Sequence[str],
+    database: Path,
+    scratch: Path,
+    ids: dict[str, int],
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign,
+    pair_options: PairOptions,
+    eccentricity: bool,
+    cache: Path,
+) -> GroupSolution:
+    """Solve one group, or take the solution of an earlier run with the same inputs.
+
+    The initial pair is chosen among the images of the ``skeleton``, which are mapped first.
+
+    Raises
+    ------
+    MappingError, ScaleError, ConvergenceError
+    """
+    key = _key(group, skeleton, ids, camera, target, board, pair_options, eccentricity)
+    path = cache / f"group-{key}.npz"
+    known = kept(path, _stored)
+    if known is not None:
+        return known
+    pairs = rank_pairs([image for image in group if image.name in skeleton], camera, pair_options, board)
+    mapping = map_group(database, scratch, group, skeleton, ids, pairs, camera)
+    refined = refine(mapping.model, camera, target, board, eccentricity)
+    solution = GroupSolution(
+        tuple(pairs),
+        refined.model,
+        mapping.seeded,
+        refined.rounds,
+        mapping.left_out | left_out([i for i in group if i.name in mapping.model.images], refined.model),
+        (*mapping.outliers, *refined.outliers),
+    )
+    _save(path, solution)
+    return solution
+
+
+def _key(
+    group, skeleton, ids, camera: Camera, target: TargetDesign, board: BoardDesign, pair_options, eccentricity: bool
+) -> str:
+    hasher = hashlib.sha256()
+    for image in group:
+        hasher.update(f"{image.name}\0{ids[image.name]}\0{image.labels}\0".encode())
+        hasher.update(image.centre_px.tobytes() + image.covariance_px2.tobytes())
+    plain = [
+        CACHE_VERSION,
+        list(skeleton),
+        [camera.width, camera.height, camera.parameters()],
+        asdict(target.patterns_alone()),
+        asdict(board),
+        asdict(pair_options),
+        eccentricity,
+    ]
+    hasher.update(json.dumps(plain, default=lambda v: v.tolist() if isinstance(v, np.ndarray) else str(v)).encode())
+    return hasher.hexdigest()[:40]
+
+
+def _save(path: Path, solution: GroupSolution) -> None:
+    model = solution.model
+    meta = {
+        "group": model.group,
+        "images": model.images,
+        "labels": model.labels,
+        "seeded": solution.seeded,
+        "rounds": solution.rounds,
+        "left_out": solution.left_out,
+        "outliers": [asdict(o) for o in solution.outliers],
+        "pairs": [
+            {f.name: getattr(p, f.name) for f in fields(PairScore) if f.name != "second_from_first"}
+            for p in solution.pairs
+        ],
+        "pair_poses": [
+            None if p.second_from_first is None else p.second_from_first.matrix().tolist() for p in solution.pairs
+        ],
+    }
+    arrays = {name: getattr(model, name) for name in _ARRAYS}
+    keep(path, {"poses": np.stack([pose.matrix() for pose in model.camera_from_model]), **arrays}, meta)
+
+
+def _stored(stored, meta) -> GroupSolution:
+    """Of what was kept."""
+    model = WorldModel(
+        meta["group"],
+        tuple(meta["images"]),
+        tuple(Rigid(m[:3, :3], m[:3, 3]) for m in stored["poses"]),
+        parse_labels(meta["labels"]),
+        **{name: stored[name] for name in _ARRAYS},
+    )
+    pairs = tuple(
+        PairScore(**p, second_from_first=None if m is None else Rigid.from_matrix(m))
+        for p, m in zip(meta["pairs"], meta["pair_poses"], strict=True)
+    )
+    outliers = tuple(Outlier(**o) for o in meta["outliers"])
+    return GroupSolution(pairs, model, meta["seeded"], meta["rounds"], meta["left_out"], outliers)
+
+
+def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str]:
+    """Rows and columns of the board that no image shows: hidden everywhere, or not there at all."""
+    seen = dot_cells(label for s in solutions for label in s.model.labels if isinstance(label, DotLabel))
+    notes = []
+    for what, count, own in (("row", board.rows, seen[:, 0]), ("column", board.columns, seen[:, 1])):
+        missing = [str(i) for i in range(count) if i not in own]
+        if missing:
+            notes.append(f"board {what} {', '.join(missing)}: not seen in any image; check {what}s in the board file")
+    return notes
+
+
+def solve_groups(
+    observations: Sequence[ImageObservations],
+    graph: ImageGraph,
+    scratch: Path,
+    cache: Path,
+    camera: CalibratedCamera,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    progress: Progress,
+    names: Collection[str] | None = None,
+) -> tuple[list[GroupSolution], list[str]]:
+    """Map and refine group by group, or those of the ``names``; and why groups have no solution.
+
+    ``scratch`` : a folder that is made and removed again; ``cache`` : for what later runs take up.
+
+    Raises
+    ------
+    MappingError, ScaleError, ConvergenceError, DegenerateError
+        No group has one; that of the first.
+    """
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    ids = image_ids(observations)
+    database = scratch / "mapping.db"
+    groups = {name: group for name, group in by_group(observations).items() if names is None or name in names}
+    solutions: list[GroupSolution] = []
+    errors: list[StcalError] = []
+    try:
+        write_database(database, camera, observations, graph.pairs)
+        for done, (name, group) in enumerate(groups.items(), 1):
+            try:
+                solution = solve_group(
+                    group,
+                    [observations[i].name for i in graph.skeleton[name]],
+                    database,
+                    scratch / "models",
+                    ids,
+                    camera,
+                    target,
+                    board,
+                    options.pairs,
+                    options.eccentricity,
+                    cache,
+                )
+                find_scale(solution.model, board)
+            except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
+                error.append(pitch_hint(group, board))
+                errors.append(error)
+            else:
+                solutions.append(solution)
+            progress("map", done, len(groups))
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    if not solutions:
+        raise errors[0]
+    return solutions, [_left_out(error) for error in errors]

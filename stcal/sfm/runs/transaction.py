@@ -1,0 +1,278 @@
+"""A run's folder as a transaction: it holds the results of one run, the earlier or the new one, each complete.
+
+A run writes beside the earlier results, in ``unfinished/``; when all is there, that folder is renamed to ``ready/``,
+which is the moment that counts, and its entries take their places. A run that is killed before leaves the earlier
+results, one that is killed after is completed by whoever opens the folder next.
+"""
+
+import os
+import shutil
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import filelock
+
+from stcal.errors import InputError, StcalError
+from stcal.io.json import read_result
+from stcal.io.saving import (
+    ADDED,
+    CACHE,
+    READY,
+    REPORT_PDF,
+    RUN_ENTRIES,
+    RUN_MARKER,
+    UNFINISHED,
+    json_text,
+    real_place,
+    save,
+)
+from stcal.sfm.runs.marker import MarkerFile, digest_of, files_below
+
+COMPARISON = "compare.json"
+RESULTS = (*RUN_ENTRIES, COMPARISON)
+"""What new results replace, or take away where they have none of it."""
+HOLDER, ENTRIES, LOCK = "holder.txt", "entries.txt", "lock"
+DATABASE_SIDES = ("-wal", "-shm", "-journal")
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """The folder of a run that is going on: ``out`` as it was asked for; ``stage`` : where results are written;
+    ``cache`` : what later runs take up."""
+
+    out: Path
+    stage: Path
+    cache: Path
+
+
+@contextmanager
+def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object]) -> Iterator[RunFolder]:
+    """Claim a run's folder; at the end of the block its results take the earlier ones' place.
+
+    Where the block raises, earlier results stay, and what it made is left in ``unfinished/``; without earlier results
+    it takes its place all the same, to be looked at.
+
+    Parameters
+    ----------
+    out : new, empty, or of an earlier run
+    content : the marker
+    inputs : what the run reads, by the word for it; what is no path is let pass
+
+    Raises
+    ------
+    InputError
+        The folder holds something else, an input, or a run that is going on.
+    """
+    out = Path(out)
+    folder = RunFolder(out, out / UNFINISHED, out / CACHE)
+    _require_ours(out)
+    _require_no_inputs(out, inputs)
+    with _locked(out):
+        with _writable(out):
+            complete(out)
+            if not (out / RUN_MARKER).exists():
+                save(out / RUN_MARKER, json_text(content.content()))
+            _make_empty(folder.stage)
+        try:
+            yield folder
+        except BaseException as error:
+            _leave(folder, content, error)
+            raise
+        with _writable(out):
+            _exchange(folder.stage, out, content.sealed(_digests(folder.stage)), [])
+
+
+@contextmanager
+def added_results(out: Path) -> Iterator[Path]:
+    """A folder for files that are added to a finished run, or that replace some of its own.
+
+    At the end of the block they take their places, and the marker has their hashes. No other command writes meanwhile.
+    The PDF of a report that is replaced goes with it.
+
+    Raises
+    ------
+    InputError
+        Another process is writing there, or the folder is read-only.
+    """
+    stage = out / ADDED
+    with _locked(out):
+        with _writable(out):
+            complete(out)
+            _make_empty(stage)
+        try:
+            yield stage
+            marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")
+            gone = {REPORT_PDF} if (stage / "report.html").exists() else set()
+            if marker.sha256 is not None:  # of a version that kept none
+                others = {name: digest for name, digest in marker.sha256.items() if name not in gone}
+                marker = marker.sealed(others | _digests(stage))
+            with _writable(out):
+                kept = [name for name in RESULTS if name not in gone and os.path.lexists(out / name)]
+                _exchange(stage, out, marker, kept)
+        finally:
+            remove(stage)
+
+
+def _exchange(stage: Path, out: Path, marker: MarkerFile, kept: Sequence[str]) -> None:
+    """Let what is ready in a folder take its place; ``kept`` : earlier results that stay where there is no new one."""
+    save(stage / RUN_MARKER, json_text(marker))
+    save(stage / ENTRIES, "\n".join([*kept, *(path.name for path in stage.iterdir())]))
+    os.replace(stage, out / READY)
+    complete(out)
+
+
+def _digests(stage: Path) -> dict[str, str]:
+    """Of all results in a folder."""
+    names = sorted(name for name in files_below(stage) if name.split("/")[0] in RESULTS)
+    return {name: digest_of(stage / name) for name in names}
+
+
+@contextmanager
+def _writable(out: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise _unwritable(out, error) from error
+
+
+def _unwritable(out: Path, error: OSError) -> InputError:
+    return InputError("E-OUTPUT-UNWRITABLE", f"output folder {out}: {error.strerror or error}; give a writable folder")
+
+
+def complete_interrupted(out: Path) -> None:
+    """Before a finished run is read: complete one that was ended from outside while its results took their places.
+
+    Raises
+    ------
+    InputError
+        Another process is writing there.
+    """
+    if (out / READY).exists():
+        with _locked(out), _writable(out):
+            complete(out)
+
+
+def complete(out: Path) -> None:
+    """Put results that are ready into their places, with the folder locked."""
+    ready = out / READY
+    if ready.is_symlink() or not (ready / ENTRIES).is_file():
+        return
+    new = (ready / ENTRIES).read_text(encoding="utf-8").split()
+    for name in RESULTS:
+        if (ready / name).exists():
+            if (ready / name).is_dir() or not (out / name).is_file():
+                remove(out / name)
+            os.replace(ready / name, out / name)
+        elif name not in new:
+            remove(out / name)
+    for side in DATABASE_SIDES:
+        remove(out / f"database.db{side}")
+    remove(ready)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a folder with all in it, or a link, never what the link leads to."""
+    if path.is_symlink() or path.is_file():
+        path.unlink()
+    elif path.is_dir():
+        shutil.rmtree(path)
+
+
+def _require_ours(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise InputError("E-OUTPUT-FOLDER", f"output {out}: not a folder; give a new folder with --out")
+    ours = (CACHE, UNFINISHED)  # of a run that was ended while it claimed the folder
+    if (
+        out.is_dir()
+        and not (out / RUN_MARKER).exists()
+        and any(path.name not in ours and not path.name.startswith(RUN_MARKER) for path in out.iterdir())
+    ):
+        raise InputError(
+            "E-OUTPUT-EXISTS", f"output folder {out}: not empty and not of an earlier run; give a new folder with --out"
+        )
+    _require_no_links(out)
+
+
+def _require_no_links(out: Path) -> None:
+    for name in (UNFINISHED, ADDED, READY, CACHE):
+        if (out / name).is_symlink():
+            raise InputError(
+                "E-OUTPUT-LINK", f"output folder {out}: {name} in it is a link; remove it, a run writes through none"
+            )
+
+
+def _require_no_inputs(out: Path, inputs: Mapping[str, object]) -> None:
+    """What a run reads must not lie where it writes."""
+    place = real_place(out)
+    for word, given in inputs.items():
+        if isinstance(given, str | Path) and place in (own := real_place(given), *own.parents):
+            raise InputError(
+                "E-OUTPUT-IS-INPUT",
+                f"{word} {given}: lies in the output folder {out}, whose files this run replaces; copy it elsewhere, "
+                "or give another --out",
+            )
+
+
+@contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """Hold the folder against other commands; the system lets go of the lock with the process."""
+    _require_no_links(out)
+    cache = out / CACHE
+    lock = filelock.FileLock(cache / LOCK)
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+    except filelock.Timeout as error:
+        try:
+            holder = (cache / HOLDER).read_text(encoding="utf-8").strip()
+        except (OSError, ValueError):
+            holder = "another process"
+        raise InputError(
+            "E-OUTPUT-IN-USE",
+            f"output folder {out}: {holder} is writing a run there; wait for its end, or give another --out",
+        ) from error
+    except OSError as error:
+        raise _unwritable(out, error) from error
+    try:
+        save(cache / HOLDER, _me())
+        yield
+    finally:
+        lock.release()
+
+
+def _make_empty(folder: Path) -> None:
+    remove(folder)
+    folder.mkdir()
+
+
+def _me() -> str:
+    return f"process {os.getpid()} on {socket.gethostname()}\n"
+
+
+def _finished(out: Path) -> bool:
+    """Whether the folder holds results of a run, or of a detection alone, that came to its end."""
+    try:
+        marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")
+    except InputError:
+        marker = None
+    return (out / "faces.json").exists() or (marker is not None and marker.sha256 is not None)
+
+
+def _leave(folder: RunFolder, content: MarkerFile, error: BaseException) -> None:
+    """What a run that failed has made: in place where no earlier run's result is, else beside it."""
+    remove(folder.stage / "scratch")
+    if not _finished(folder.out):
+        save(folder.stage / RUN_MARKER, json_text(content.content()))
+        for name in RESULTS:
+            if name != RUN_MARKER:
+                remove(folder.out / name)
+            if (folder.stage / name).exists():
+                os.replace(folder.stage / name, folder.out / name)
+        remove(folder.stage)
+    elif not any(folder.stage.iterdir()):
+        remove(folder.stage)
+    elif isinstance(error, StcalError):
+        error.append(f"; the earlier results stay, {folder.stage} holds what this run made")

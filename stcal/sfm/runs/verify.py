@@ -1,0 +1,126 @@
+"""Whether a run's folder holds what the run wrote: ``verify``."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+import stcal
+from stcal.errors import InputError
+from stcal.io.json import ResultFile, checked, read_json
+from stcal.io.saving import ADDED, CACHE, READY, RUN_MARKER, UNFINISHED
+from stcal.sfm.runs.marker import MarkerFile, digest_of, files_below, own_digest
+from stcal.sfm.runs.transaction import DATABASE_SIDES, RESULTS, complete_interrupted
+
+SHOWN = 20
+"""Files of a kind that are listed on the terminal."""
+NO_RESULTS = (CACHE, UNFINISHED, ADDED, READY)
+OWN = (*RESULTS, *(f"database.db{side}" for side in DATABASE_SIDES))
+"""Entries of the folder in which a file that no run made would be taken for a result, or change one."""
+AGAIN = "run it again"
+
+
+class VerifyFile(ResultFile):
+    """Of ``verify``."""
+
+    format: Literal["stcal verify 1"] = Field(description="the file's form and its version")
+    run: str = Field(description="the folder")
+    version: str = Field(description="of stcal that made it")
+    stcal: str = Field(description="version that verified it")
+    files: int = Field(description="of the results, whose hashes are kept in `stcal-run.json`")
+    missing: list[str] = Field(description="paths below the folder of files that are gone")
+    changed: list[str] = Field(description="whose content is another, or in whose place is no file")
+    added: list[str] = Field(description="that the run did not make, among its results")
+    beside: list[str] = Field(description="that lie beside the results; nothing is wrong with these")
+    whole: bool = Field(description="whether nothing is missing, changed or added")
+
+    def faults(self) -> list[str]:
+        """In a clause each, what is wrong; none of a whole run of this version."""
+        kinds = {"missing": self.missing, "changed": self.changed, "added": self.added}
+        found = [f"{len(names)} {kind} ({names[0]}{' …' * (len(names) > 1)})" for kind, names in kinds.items() if names]
+        return found + [f"made by stcal {self.version}, this is {self.stcal}"] * (self.version != self.stcal)
+
+
+def verify(run: str | Path) -> VerifyFile:
+    """Compare the hashes of all files of a finished run with those that were kept when it ended; nothing is written.
+
+    Raises
+    ------
+    InputError
+        Not a run's folder, or one without hashes: unfinished, or of a version that kept none.
+    """
+    run = Path(run)
+    if not (run / RUN_MARKER).is_file():
+        raise InputError(
+            "E-RUN-FOLDER", f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
+        )
+    complete_interrupted(run)
+    before = digest_of(run / RUN_MARKER)
+    content = read_json(run / RUN_MARKER, "run", AGAIN)
+    try:
+        marker = checked(content, MarkerFile)
+    except InputError as error:
+        raise InputError(
+            "E-RUN-DAMAGED", f"run {run / RUN_MARKER}: damaged, or of another version ({error}); {AGAIN}"
+        ) from error
+    if marker.sha256 is None:
+        raise InputError(
+            "E-RUN-UNFINISHED",
+            f"run {run}: no hashes in {RUN_MARKER}, it is unfinished or of a version that kept none "
+            f"(stcal {marker.version}); {AGAIN}",
+        )
+    found = {name for name in files_below(run) if name.split("/")[0] not in NO_RESULTS}
+    missing = sorted(marker.sha256.keys() - found)
+    changed = sorted(
+        name
+        for name, known in marker.sha256.items()
+        if name in found and known != (own_digest(content) if name == RUN_MARKER else digest_of(run / name))
+    )
+    if digest_of(run / RUN_MARKER) != before:
+        raise InputError("E-RUN-REPLACED", f"run {run}: other results took their place meanwhile; verify it again")
+    others = sorted(_printable(name) for name in found - marker.sha256.keys())
+    added = [name for name in others if name.split("/")[0] in OWN]
+    return VerifyFile(
+        format="stcal verify 1",
+        run=str(run),
+        version=marker.version,
+        stcal=stcal.__version__,
+        files=len(marker.sha256),
+        missing=missing,
+        changed=changed,
+        added=added,
+        beside=[name for name in others if name not in added],
+        whole=not (missing or changed or added),
+    )
+
+
+def verified_text(result: VerifyFile) -> str:
+    """What was found, a file on a line."""
+    lines = [f"{result.files} files by stcal {result.version}: {'whole' if result.whole else 'not whole'}"]
+    for kind in ("missing", "changed", "added", "beside"):
+        lines += _listed(kind, getattr(result, kind))
+    return "\n".join(lines)
+
+
+def require_whole(result: VerifyFile) -> None:
+    """Refuse what is not as the run left it, or was made by another version.
+
+    Raises
+    ------
+    InputError
+        What is wrong, in one line.
+    """
+    if faults := result.faults():
+        remedy = "verify it with that version" if result.whole else "take a copy that is whole"
+        raise InputError("E-RUN-CHANGED", f"run {result.run}: {'; '.join(faults)}; {AGAIN}, or {remedy}")
+
+
+def _listed(kind: str, names: Sequence[str]) -> list[str]:
+    more = [f"{kind}: and {len(names) - SHOWN} more"] if len(names) > SHOWN else []
+    return [f"{kind}: {name}" for name in names[:SHOWN]] + more
+
+
+def _printable(name: str) -> str:
+    """A name that is not UTF-8 as a text that is."""
+    return name.encode("utf-8", "backslashreplace").decode()

@@ -1,0 +1,96 @@
+"""Adjusting a part of the robot file: zero positions or geometry alone, and dimensions that the file calls fixed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.geometry.rigid import Rigid
+from stcal.robot.identification.nominal import adjusted, dh_values
+from stcal.robot.identification.result import IdentifyOptions
+from stcal.robot.identification.solve import identify
+from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.file import load_robot, robot_toml
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from tests.outcome import fails_with
+
+TOOL, WORLD = Rigid.exp([0.3, 0.2, 0.1, 100, 50, 200]), Rigid.exp([0.1, 0.2, 0.3, 1000, 500, 200])
+LENGTHS, ANGLES = [0, 2], [1, 3, 4]
+
+
+def zeros_off(seed: int = 0):
+    """An arm of which zero positions alone are off, by milliradians; the first one is in the base."""
+    rng = np.random.default_rng(seed)
+    rows = [replace(row, theta=row.theta + (rng.normal(0, 3e-3) if i else 0)) for i, row in enumerate(mh80().rows)]
+    true = placed(replace(mh80(), rows=tuple(rows)), WORLD, {"": TOOL})
+    return true, measured(true, joint_vectors(true, 30, rng), rng)
+
+
+@pytest.mark.slow
+def test_zeros_alone_are_found_and_nothing_else_moves():
+    true, data = zeros_off()
+    found = identify(mh80(), data, IdentifyOptions(adjust="zeros"))
+    change = dh_values(found.robot) - dh_values(mh80())
+    assert np.abs(change[:, LENGTHS]).max() < 1e-3
+    assert np.abs(change[:, [1, 4]]).max() < 1e-6
+    # five σ of what 30 poses tell, 4 of them zeros that are seen apart from base and tool
+    error = np.abs(dh_values(found.robot) - dh_values(true))[1:-1, 3]
+    assert (error < 5 * found.dh_sigma[1:-1, 3]).all()
+    assert found.rank == 6 + 6 + 4
+    assert (found.dh_sigma[:, LENGTHS] == 0).all()
+
+
+def test_fewer_poses_do_for_zeros():
+    """4 poses are 24 numbers: too few for 30 parameters, enough for 16."""
+    data = zeros_off()[1][:4]
+    with pytest.raises(Exception, match="24 numbers for 30 parameters"):
+        identify(mh80(), data)
+    assert identify(mh80(), data, IdentifyOptions(adjust="zeros", folds=0)).rank == 16
+
+
+@pytest.mark.full
+def test_what_is_kept_costs_held_out_error():
+    rng = np.random.default_rng(1)
+    true = placed(made(mh80(), rng), WORLD, {"": TOOL})
+    data = measured(true, joint_vectors(true, 40, rng), rng)
+    errors = {
+        what: np.sqrt(np.nanmean(identify(mh80(), data, IdentifyOptions(adjust=what)).held_out.position_mm ** 2))
+        for what in ("all", "geometry", "zeros", "base,tool")
+    }
+    assert errors["all"] < errors["geometry"] < errors["base,tool"]
+    assert errors["all"] < errors["zeros"] < errors["base,tool"]
+    kept = identify(mh80(), data, IdentifyOptions(adjust="zeros"))
+    assert np.sqrt(np.nanmean(kept.all_held_out.position_mm**2)) == pytest.approx(errors["all"], rel=1e-6)
+
+
+@pytest.mark.slow
+def test_fixed_dimensions_stay_and_are_said(tmp_path):
+    rng = np.random.default_rng(2)
+    true = placed(made(mh80(), rng), WORLD, {"": TOOL})
+    data = measured(true, joint_vectors(true, 40, rng), rng)
+    joints = list(mh80().joints)
+    joints[1] = replace(joints[1], fixed={"a": "measured on a CMM"})
+    (tmp_path / "robot.toml").write_text(robot_toml(replace(mh80(), joints=tuple(joints))))
+    nominal = load_robot(tmp_path / "robot.toml")
+    assert nominal.joints[1].fixed == {"a": "measured on a CMM"}
+    found = identify(nominal, data)
+    assert found.robot.rows[1].a == pytest.approx(mh80().rows[1].a, abs=1e-3)
+    assert abs(identify(mh80(), data).robot.rows[1].a - mh80().rows[1].a) > 0.01
+    assert any("a of row 2 (measured on a CMM)" in note for note in found.notes)
+    assert found.all_held_out is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        *(("base,tool", "base,tool"), ("tool, base", "base,tool"), ("zeros", "zeros"), ("base,zeros", "zeros")),
+        *(("geometry", "geometry"), ("all", "all"), ("zeros,geometry", "all")),
+    ],
+)
+def test_names_of_what_is_adjusted(text, what):
+    assert adjusted(text) == what
+
+
+def test_other_names_are_refused():
+    with fails_with("E-OPTION-VALUE"):
+        adjusted("lengths")

@@ -1,0 +1,87 @@
+"""The adjustment: it ends where the whitened gradient is zero, common errors are whitened, and no end is an error."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.geometry.rigid import Rigid
+from stcal.robot.identification import adjustment
+from stcal.robot.identification.adjustment import Weighting, huber_limit, solve
+from stcal.robot.identification.residuals import jacobian, moved, observed, residuals
+from stcal.robot.identification.result import IdentifyOptions
+from stcal.robot.identification.solve import identify
+from stcal.robot.kinematics.example import mh80
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from tests.outcome import fails_with
+
+WEIGHTING = Weighting(0.05, 2e-4)
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A state far from what the instrument sees of a made arm, and what it sees: 40 poses, one with a gross error."""
+    rng = np.random.default_rng(3)
+    true = placed(
+        made(mh80(), rng), Rigid.exp([0.1, 0.2, -0.3, 900, 800, 700]), {"": Rigid.exp([0, 0, 0.4, 50, 0, 150])}
+    )
+    data = measured(true, joint_vectors(true, 40, rng), rng, 0.05, 2e-4, [""] * 40)
+    positions = data.positions.copy()
+    positions[7] += [3.0, 0, 0]
+    data = replace(data, positions=positions)
+    start = identify(mh80(), data, IdentifyOptions(folds=0, robust=False)).state
+    return start, observed(data)
+
+
+def test_it_ends_where_the_weighted_gradient_is_zero(case):
+    """In units of its own σ, and of Huber's cost: weight times residual."""
+    state, seen = case
+    found = solve(state, seen, WEIGHTING)
+    white = WEIGHTING.whiten(residuals(found.state, seen), seen)
+    slope = WEIGHTING.whiten(jacobian(found.state, seen), seen)
+    length = np.linalg.norm(white, axis=1)
+    limit = huber_limit(seen.kind)
+    assert found.weights == pytest.approx(np.minimum(1, limit / length))
+    assert found.weights[7] == found.weights.min() < 0.2
+    gradient = np.einsum("r,ri,rik->k", found.weights, white, slope)
+    sigma = np.sqrt(np.diag(found.inverse()))
+    assert np.abs(gradient * sigma).max() < 1e-2
+
+
+def test_the_covariance_is_the_inverse_of_the_whitened_normal_matrix(case):
+    state, seen = case
+    found = solve(state, seen, WEIGHTING, robust=False)
+    slope = WEIGHTING.whiten(jacobian(found.state, seen), seen).reshape(-1, len(found.units))
+    sigma = np.sqrt(np.diag(found.inverse()))
+    wanted = np.linalg.inv(slope.T @ slope + found.prior) / np.outer(sigma, sigma)
+    np.testing.assert_allclose(found.inverse() / np.outer(sigma, sigma), wanted, atol=1e-5)
+    assert found.rank() == len(found.units)
+    assert (found.weights == 1).all()
+
+
+def test_what_is_common_to_all_observations_is_whitened_too():
+    """Values with covariance Σ = own + F Fᵀ become independent, of σ 1: the whitened Σ is the identity."""
+    rng = np.random.default_rng(0)
+    data = measured(mh80(), joint_vectors(mh80(), 5, rng), rng, 0.05, 2e-4, [""] * 5)
+    root = rng.normal(size=(5, 6, 6)) + 3 * np.eye(6)
+    own, common = root @ np.swapaxes(root, 1, 2), rng.normal(size=(5, 6, 2))
+    data = replace(data, covariance=own + common @ np.swapaxes(common, 1, 2), common=common)
+    seen = observed(data)
+    white = Weighting(1.0, 1.0, given=True).whiten(np.eye(30).reshape(5, 6, 30), seen).reshape(30, 30)
+    full = np.zeros((30, 30))
+    for i in range(5):
+        full[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = own[i]
+    flat = common.reshape(30, 2)
+    np.testing.assert_allclose(white @ (full + flat @ flat.T) @ white.T, np.eye(30), atol=1e-9)
+    values = rng.normal(size=(5, 6))  # and half the derivative of their squares is the inverse of Σ times them
+    pull = Weighting(1.0, 1.0, given=True).pull(Weighting(1.0, 1.0, given=True).whiten(values, seen), seen)
+    np.testing.assert_allclose((full + flat @ flat.T) @ pull.ravel(), values.ravel(), atol=1e-9)
+
+
+def test_no_minimum_within_the_steps_is_an_error(case, monkeypatch):
+    state, seen = case
+    monkeypatch.setattr(adjustment, "MAX_STEPS", 1)
+    count = jacobian(state, seen).shape[2]
+    far = moved(state, np.full(count, 0.05), seen.kind)
+    with fails_with("E-NO-MINIMUM … identification … 1"):
+        solve(far, seen, WEIGHTING)

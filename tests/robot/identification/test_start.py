@@ -1,0 +1,82 @@
+"""Orientations in another convention than their columns say are refused with what they are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.cli.main import main
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.table import POSE, pose_cells
+from stcal.robot.identification.start import start
+from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.file import robot_toml
+from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from tests.outcome import fails_with
+
+LAST = "quaternions were x, y, z, w in the order of their columns"
+
+
+def seen(seed: int, count: int, targets=("",)):
+    """What an instrument sees of a made arm: σ 0.05 mm and 0.2 mrad."""
+    rng = np.random.default_rng(seed)
+    tools = {name: Rigid.exp(rng.normal(0, 1.0, 6) * [1, 1, 1, 200, 200, 200]) for name in targets}
+    true = placed(made(mh80(), rng), Rigid.exp(rng.normal(0, 1, 6) * [1, 1, 1, 1000, 1000, 1000]), tools)
+    names = [targets[i % len(targets)] for i in range(count)]
+    return measured(true, joint_vectors(true, count, rng), rng, 0.05, 2e-4, names)
+
+
+def in_order(data, order, conjugated=False):
+    """The file as it is read when its quaternion columns hold other components than they say."""
+    wxyz = data.poses().quaternions() * ([1, -1, -1, -1] if conjugated else [1, 1, 1, 1])
+    return replace(data, rotations=Poses.from_quaternions(wxyz[:, order], data.points()).rotation)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("order", "conjugated", "said"),
+    [
+        ([1, 2, 3, 0], False, f"if {LAST}; give --quaternions xyzw"),
+        (
+            [0, 1, 2, 3],
+            True,
+            "if quaternions were conjugated (the first frame seen from the second); change the sign of qw",
+        ),
+        ([1, 2, 3, 0], True, f"if {LAST}, and conjugated; give --quaternions xyzw and change the sign of qw"),
+    ],
+)
+def test_another_convention_is_named(seed, order, conjugated, said):
+    data = in_order(seen(seed, 30, ("a", "b")), order, conjugated)
+    with fails_with("E-ROBOT-ORIENTATIONS") as caught:
+        start(mh80(), data)
+    assert str(caught.value).endswith(said)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("count", [8, 40])
+def test_orientations_as_their_columns_say_are_taken(seed, count):
+    start(mh80(), seen(seed, count))
+
+
+def test_orientations_that_no_convention_mends_are_left_to_the_adjustment():
+    """One orientation in all rows, whatever the joints do."""
+    data = seen(1, 20)
+    still = np.tile(Rigid.exp([0.4, -0.3, 0.9, 0, 0, 0]).rotation, (20, 1, 1))
+    start(mh80(), replace(data, rotations=still))
+
+
+def test_the_order_of_quaternions_is_an_option(tmp_path, monkeypatch, capsys):
+    data = seen(2, 30)
+    (tmp_path / "robot.toml").write_text(robot_toml(mh80()))
+    rows = [
+        [*(repr(float(v)) for v in np.degrees(q)), *cells[:3], *cells[4:], cells[3]]
+        for q, cells in zip(data.q, map(pose_cells, data.poses()), strict=True)
+    ]
+    header = [*(f"q{i}_deg" for i in range(1, 7)), *POSE]
+    (tmp_path / "data.csv").write_text("\n".join(map(",".join, [header, *rows])))
+    words = ["stcal", "robot", "identify", str(tmp_path / "data.csv"), "--robot", str(tmp_path / "robot.toml")]
+    for more, code in (((), 2), (("--quaternions", "xyzw"), 0)):
+        monkeypatch.setattr("sys.argv", [*words, "--folds", "0", *more])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert (end.value.code or 0) == code, capsys.readouterr().err

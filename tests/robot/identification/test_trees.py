@@ -1,0 +1,273 @@
+"""Two arms on a trunk: one adjustment of all joints, by markers on several branches."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from stcal.geometry.rigid import Rigid
+from stcal.robot.identification.drawings import Drawn, joints_figure
+from stcal.robot.identification.residuals import (
+    State,
+    curvature,
+    jacobian,
+    moved,
+    observed,
+    parameter_names,
+    residuals,
+    tips,
+)
+from stcal.robot.identification.result import IdentifyOptions
+from stcal.robot.identification.solve import identify
+from stcal.robot.kinematics.dh import robot_from_chain
+from stcal.robot.kinematics.file import load_robot, robot_toml
+from stcal.robot.kinematics.forward import elasticity_values, forward, moved_chain
+from stcal.robot.kinematics.forward import jacobian as by_joints
+from stcal.robot.kinematics.inverse import inverse
+from stcal.robot.kinematics.model import Robot
+from stcal.synthetic.measured.arms import MARKERS, RIGHT, elastic, joint_vectors, made, measured, two_arms
+from tests.outcome import fails_with
+
+
+def seen_by(robot: Robot, rng, each=60):
+    targets = [name for name in MARKERS for _ in range(each)]
+    return measured(robot, joint_vectors(robot, len(targets), rng), rng, targets=targets)
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_a_branch_is_the_arm_alone(convention):
+    """The right hand by the tree, and by the torso's rows, mount and arm put one after the other by hand."""
+    robot = two_arms(convention)
+    q = joint_vectors(robot, 5, np.random.default_rng(0))
+    torso = Robot("torso", robot.convention, robot.rows[:2], robot.joints[:2])
+    arm = Robot("arm", robot.convention, robot.rows[8:], robot.joints[8:], tools={"": robot.tool("right")})
+    wanted = forward(torso, q[:, :2]) @ RIGHT @ forward(arm, q[:, 8:])
+    assert np.abs(forward(robot, q, "right").difference(wanted)).max() < 1e-9
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_rows_and_mounts_come_back_from_the_chain(convention):
+    robot = two_arms(convention)
+    true = made(robot, np.random.default_rng(1))
+    q = joint_vectors(robot, 8, np.random.default_rng(2))
+    again = robot_from_chain(true.chain(), true.tools, robot)
+    for name in MARKERS:
+        wanted = true.world_from_base @ forward(true, q, name)
+        assert np.abs((again.world_from_base @ forward(again, q, name)).difference(wanted)).max() < 1e-9
+    assert again.rows[2].theta == robot.rows[2].theta  # of a branch's first row the mount takes what differs
+    assert true.rows[2].theta != robot.rows[2].theta
+    assert again.rows[3] != robot.rows[3]
+    assert np.abs(again.tree.mounts[8][1].matrix() - RIGHT.matrix()).max() > 1e-4
+
+
+def test_derivatives_are_those_of_differences():
+    robot, rng = two_arms(), np.random.default_rng(3)
+    data = measured(robot, joint_vectors(robot, 9, rng), rng, 0.0, 0.0, MARKERS * 3)
+    state, seen = State(robot.chain(), dict(robot.tools)), observed(data)
+    derivative = jacobian(state, seen)
+    for k in range(derivative.shape[2]):
+        step = np.zeros(derivative.shape[2])
+        step[k] = 1e-4 if parameter_names(state, "pose")[k].split()[-1] in ("x", "y", "z") else 1e-7
+        ahead, behind = (residuals(moved(state, sign * step, "pose"), seen) for sign in (1, -1))
+        by_difference = (behind - ahead) / (2 * step[k])
+        assert np.abs(derivative[:, :, k] - by_difference).max() < 1e-5 * max(np.abs(by_difference).max(), 1)
+
+
+@pytest.mark.slow
+def test_derivatives_of_an_elastic_tree_are_those_of_differences():
+    """At a thousandth of usual deflections: torques are those on the rigid tree. The last are second derivatives."""
+    rng = np.random.default_rng(3)
+    robot = elastic(two_arms(), rng, 1e-3)
+    data = measured(robot, joint_vectors(robot, 9, rng), rng, 0.0, 0.0, MARKERS * 3)
+    state, seen = State(robot.chain(), dict(robot.tools), elastic=True), observed(data)
+    derivative, pull = jacobian(state, seen), rng.normal(size=(9, 6))
+    bent, count = curvature(state, seen, pull), state.elastic_count
+    for k in range(count):
+        step = np.zeros(derivative.shape[2])
+        step[k - count] = max(1e-3 * abs(elasticity_values(robot.elasticity)[k]), 1e-9)
+        ahead, behind = (moved(state, sign * step, "pose") for sign in (1, -1))
+        by_difference = (residuals(behind, seen) - residuals(ahead, seen)) / (2 * step[k - count])
+        size = max(np.abs(by_difference).max(), np.abs(derivative[:, :, k - count]).max())
+        assert np.abs(derivative[:, :, k - count] - by_difference).max() < 1e-3 * size + 1e-6
+        if k < 28:  # compliances
+            change = (jacobian(ahead, seen) - jacobian(behind, seen))[:, :, 28 - count : 70 - count]
+            expected = np.einsum("rw,rwk->k", pull, change) / (2 * step[k - count])
+            assert np.abs(bent[k, 28:70] - expected).max() < 1e-3 * np.abs(bent).max()
+
+
+def test_one_arm_bends_the_other():
+    """The left hand sinks as the right arm is stretched out, by the torque on the torso alone."""
+    rng = np.random.default_rng(0)
+    robot = elastic(two_arms(), rng)
+    q = np.zeros((2, 14))
+    q[1, 8:] = joint_vectors(robot, 1, rng)[0, 8:]
+    rigid = replace(robot, elasticity=None)
+    assert np.ptp(forward(rigid, q, "left").translation, axis=0).max() == 0
+    assert np.ptp(forward(robot, q, "left").translation, axis=0).max() > 0.003
+    stiff = np.array(robot.elasticity.compliance)
+    stiff[:2] = 0
+    stiff = replace(robot, elasticity=replace(robot.elasticity, compliance=stiff))
+    assert np.ptp(forward(stiff, q, "left").translation, axis=0).max() < 1e-9
+
+
+def test_a_load_hangs_at_the_tool_without_name():
+    rng = np.random.default_rng(1)
+    robot = elastic(two_arms(), rng)
+    with fails_with("E-ROBOT-TREE"):
+        forward(robot, np.zeros((1, 14)), "left", 50.0)
+    named = replace(robot.tree, carriers={**robot.tree.carriers, "": 7})
+    robot = replace(robot, tree=named, tools={**robot.tools, "": Rigid()})
+    stiff = np.array(robot.elasticity.compliance)
+    stiff[:2] = 0
+    robot = replace(robot, elasticity=replace(robot.elasticity, compliance=stiff))
+    q = joint_vectors(robot, 4, rng)
+    sag = {name: np.abs(forward(robot, q, name, 50.0).difference(forward(robot, q, name))).max() for name in MARKERS}
+    assert sag["left"] > 0.01
+    assert sag["elbow"] > 0.001
+    assert sag["right"] == 0
+
+
+def test_the_file_of_an_elastic_tree_reads_back_the_same(tmp_path):
+    rng = np.random.default_rng(2)
+    robot = elastic(made(two_arms(), rng), rng)
+    (tmp_path / "robot.toml").write_text(robot_toml(robot))
+    again, q = load_robot(tmp_path / "robot.toml"), joint_vectors(robot, 5, rng)
+    for name in MARKERS:
+        assert np.abs(forward(again, q, name).difference(forward(robot, q, name))).max() < 1e-9
+
+
+@pytest.mark.parametrize("convention", ["standard", "modified"])
+def test_rows_of_an_elastic_tree_keep_its_deflections(convention):
+    rng = np.random.default_rng(4)
+    robot = elastic(two_arms(convention), rng)
+    chain = moved_chain(robot.chain(), rng.normal(0, 1, 56) * np.tile([1e-3, 1e-3, 1.0, 1.0], 14))
+    rows, q = robot_from_chain(chain, robot.tools, robot), joint_vectors(robot, 8, rng)
+    for name in MARKERS:
+        by_chain = tips(State(chain, dict(robot.tools)), q, (name,) * 8)
+        by_rows = rows.world_from_base @ forward(rows, q, name)
+        assert np.abs(by_chain.difference(by_rows)[:, 3:]).max() < 1e-2
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_auto_tells_elastic_trees_from_rigid_ones(share):
+    """RMS of the tips at new joint values is 0.11 mm by a rigid model of the elastic tree."""
+    rng = np.random.default_rng([8, int(share)])
+    nominal = two_arms()
+    true = elastic(made(nominal, rng), rng, share) if share else made(nominal, rng)
+    found = identify(nominal, seen_by(true, rng), IdentifyOptions(model="auto", repeats=1))
+    assert found.model == ("elastic" if share else "rigid")
+    q = joint_vectors(true, 200, rng)
+    off = [
+        (true.world_from_base @ forward(true, q, name)).difference(
+            found.robot.world_from_base @ forward(found.robot, q, name)
+        )
+        for name in MARKERS
+    ]
+    assert np.sqrt(np.mean([(each[:, 3:] ** 2).sum(1) for each in off])) < 0.06
+
+
+def test_joints_of_the_other_arm_move_nothing():
+    robot = two_arms()
+    columns = by_joints(robot, joint_vectors(robot, 4, np.random.default_rng(0)), "left")
+    assert np.abs(columns[:, :, 8:]).max() == 0
+    assert np.abs(columns[:, :, :8]).max(axis=(0, 1)).min() > 0
+
+
+def test_joints_are_drawn_with_the_rows_that_they_move():
+    robot, rng = two_arms(), np.random.default_rng(3)
+    seen = observed(seen_by(robot, rng, each=4))
+    state = State(robot.chain(), dict(robot.tools))
+    drawn = Drawn(state, robot.world_from_base, seen, residuals(state, seen), np.ones(12, bool))
+    points = [len(axes.lines[1].get_xdata()) for axes in joints_figure(drawn, ()).axes[:14]]
+    assert points == [12] * 2 + [8] * 3 + [4] * 9  # torso; left arm as far as the elbow; left hand, right arm
+
+
+@pytest.mark.slow
+def test_two_arms_are_identified_together():
+    rng = np.random.default_rng(4)
+    nominal = two_arms()
+    true = made(nominal, rng)
+    found = identify(nominal, seen_by(true, rng))
+    assert found.rank == 4 * 14 + 6 * 3
+    assert found.undetermined == ()
+    assert found.weighting.sigma_mm == pytest.approx(0.05, rel=0.15)
+    q = joint_vectors(true, 200, rng, 0.5)
+    for name in MARKERS:
+        off = (true.world_from_base @ forward(true, q, name)).difference(
+            found.robot.world_from_base @ forward(found.robot, q, name)
+        )
+        before = (true.world_from_base @ forward(true, q, name)).difference(
+            nominal.world_from_base @ forward(nominal, q, name)
+        )
+        assert np.sqrt((off[:, 3:] ** 2).sum(1).mean()) < 0.1 * np.sqrt((before[:, 3:] ** 2).sum(1).mean())
+    mount = next(each for each in found.placed if each.name == "mount of joint 9 behind joint 2")
+    same_form = robot_from_chain(true.chain(), true.tools, nominal)  # a branch's first θ and d as drawn
+    away = mount.pose.translation - same_form.tree.mounts[8][1].translation
+    assert np.abs(away / mount.sigma[3:]).max() < 5
+
+
+@pytest.mark.full
+def test_covariance_of_a_tree_is_honest():
+    """NEES of what the covariance says of the tips over 40 draws: χ² of 3 a place."""
+    nominal, total, count = two_arms(), 0.0, 0
+    for seed in range(40):
+        rng = np.random.default_rng([5, seed])
+        true = made(nominal, rng)
+        found = identify(nominal, seen_by(true, rng, each=40), IdentifyOptions(folds=0))
+        state = found.state
+        q, names = joint_vectors(true, 3, rng), list(MARKERS)
+        exact = measured(true, q, rng, 0.0, 0.0, names)
+        seen = observed(replace(exact, covariance=None))
+        slope, off = jacobian(state, seen)[:, 3:], residuals(state, seen)[:, 3:]
+        for place, error in zip(slope, off, strict=True):
+            total += error @ np.linalg.solve(place @ found.covariance @ place.T, error)
+            count += 3
+    low, high = chi2.ppf([1e-3, 1 - 1e-3], count)
+    assert low < total < high
+
+
+def test_the_file_holds_the_tree(tmp_path):
+    robot = made(two_arms(), np.random.default_rng(6))
+    (tmp_path / "robot.toml").write_text(robot_toml(robot))
+    again = load_robot(tmp_path / "robot.toml")
+    assert again.tree.carriers == robot.tree.carriers
+    q = joint_vectors(robot, 5, np.random.default_rng(0))
+    for name in MARKERS:
+        assert np.abs(forward(again, q, name).difference(forward(robot, q, name))).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("after = 2", "after = 9", "E-ROBOT-BRANCH … 3 … 9 … 2"),
+        ("after = 2", "", "E-ROBOT-BRANCH … 3"),
+        ("joint = 8", "joint = 15", "E-ROBOT-BRANCH … target left … 15 … 14"),
+        ('type = "revolute"', 'type = "revolute"\nafter = 0', "E-ROBOT-BRANCH"),
+    ],
+)
+def test_a_file_that_names_no_tree_is_refused(tmp_path, old, new, message):
+    text = robot_toml(two_arms())
+    assert old in text
+    (tmp_path / "robot.toml").write_text(text.replace(old, new, 1))
+    with fails_with(message):
+        load_robot(tmp_path / "robot.toml")
+
+
+def test_a_target_on_no_branch_is_refused():
+    robot, rng = two_arms(), np.random.default_rng(0)
+    data = seen_by(robot, rng, each=10)
+    with fails_with("E-ROBOT-TREE … target other"):
+        identify(robot, replace(data, targets=("other",) * len(data)))
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_a_hand_is_brought_to_a_pose(share):
+    rng = np.random.default_rng(7)
+    robot = elastic(two_arms(), rng, share)
+    q = joint_vectors(robot, 5, rng, 0.3)
+    wanted = forward(robot, q, "right")
+    found = inverse(robot, wanted, q + rng.normal(0, 0.02, q.shape), "right")
+    assert found.usable.all()
+    assert np.abs(forward(robot, found.q, "right").difference(wanted)).max() < 1e-6

@@ -1,0 +1,544 @@
+"""σ before and without photographs: against simulations, against the run's own adjustment, and against simple laws."""
+
+import json
+import shutil
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+from scipy.stats import chi2
+
+from stcal.design import reference_board, reference_target
+from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.model import CameraModel, CameraPrior
+from stcal.sfm.adjust import dots_first
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.joint import adjust_jointly, covariance_of
+from stcal.sfm.adjust.uncertainty import derivatives
+from stcal.sfm.data.model import MetricModel
+from stcal.sfm.planning import views
+from stcal.sfm.planning.advise import Known, advise, known_of
+from stcal.sfm.planning.forecast import (
+    BLUR_PX,
+    CONTRAST,
+    IMAGE_NOISE,
+    PRACTICE,
+    CentreNoise,
+    Forecast,
+    PositionsWith,
+    Setup,
+    _rim_integrals,
+    forecast,
+)
+from stcal.sfm.planning.session import PlanOptions
+from stcal.sfm.planning.session import plan as make_plan
+from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.planning.views import PlannedView, candidates, known_scene
+from stcal.sfm.runs.saved import load_run
+from stcal.synthetic.scene import Scene, SceneOptions, make_scene, nominal_target_from_face, second_design
+from tests.outcome import fails_with
+from tests.shared import own_copy
+
+NOISE = CentreNoise(0.1, 3.0)
+"""Of centres: about 0.013 px, so that image and a board of 20 µm matter alike."""
+SLOW = pytest.mark.slow
+CHANCE = 1e-4
+"""Of a sound forecast to fall outside the bounds of a χ² test, on either side."""
+SMALL = SceneOptions(
+    seed=4, width=2592, height=1728, images_per_group=3, groups=(("1", "2"), ("1", "4")), circle_sigma_mm=0.0
+)
+
+
+@pytest.fixture(scope="module")
+def exact() -> Scene:
+    """Faces 1, 2 and 4 in two groups of three images; the board as designed."""
+    return make_scene(SMALL, reference_target(), replace(reference_board(), sigma_mm=0.0), nominal_target_from_face())
+
+
+def setup_of(scene: Scene, board_sigma_mm: float = 0.02, common: float = 0.0) -> Setup:
+    seen = {face for group in scene.groups.values() for face in group.faces}
+    poses = {face: pose for face, pose in scene.target_from_face.items() if face in seen}
+    start = CalibratedTarget("1", poses, scene.circles_target, dict.fromkeys(scene.groups, Rigid()))
+    board = replace(scene.board, sigma_mm=board_sigma_mm)
+    return Setup(scene.target, board, scene.camera, start, "plane", None, None, common)
+
+
+def models_of(scene: Scene, noise: CentreNoise = NOISE) -> list[MetricModel]:
+    radius = scene.target.radius_of() | scene.board.radius_of()
+    models = true_models(scene, observe(scene, 0.0, np.random.default_rng(0)))
+    return [noise.applied(model, scene.camera, radius) for model in models]
+
+
+def drawn(models: list[MetricModel], setup: Setup, rng: np.random.Generator) -> list[MetricModel]:
+    """The models with dots displaced by the board's σ, one plate or one for each group, and noisy centres."""
+    model_from_board = covariance_of(models, setup.board, setup.camera).model_from_board
+    labels = setup.board.labels()
+    plate = rng.normal(0, setup.board.sigma_mm, (len(labels), 3))
+    noisy = []
+    for model in models:
+        own = plate if setup.common else rng.normal(0, setup.board.sigma_mm, plate.shape)
+        moved = dict(zip(labels, own @ model_from_board[model.group].rotation.T, strict=True))
+        shift = np.array([moved.get(label, np.zeros(3)) for label in model.labels])
+        true = replace(model, xyz_model=model.xyz_model + shift)
+        root = np.linalg.cholesky(model.covariance_px2)
+        noise = np.einsum("nij,nj->ni", root, rng.standard_normal(model.measured_px.shape))
+        noisy.append(replace(true, measured_px=setup.camera.project(true.xyz_camera()) + noise, shift_px=0 * noise))
+    return noisy
+
+
+def errors_of(models: list[MetricModel], setup: Setup, expected: Forecast, draws: int, seed: int):
+    """Pose errors by face, (draws, 6), of adjusted simulations, and the last adjustment."""
+    rng = np.random.default_rng(seed)
+    truth = covariance_of(models, setup.board, setup.camera).xyz_model
+    rows = []
+    for _ in range(draws):
+        joint = adjust_jointly(drawn(models, setup, rng), setup.board, setup.camera)
+        rows.append((joint.xyz_model - truth).ravel())
+    return {face: np.array(rows) @ expected.derivatives.faces[face].T for face in expected.face_covariance}, joint
+
+
+def require_chi2(errors: np.ndarray, covariance: np.ndarray):
+    """Errors (n, k) are as large as their covariance says, no more and no less."""
+    square = float(np.einsum("ni,ni->", errors, np.linalg.solve(covariance, errors.T).T))
+    low, high = chi2.ppf([CHANCE, 1 - CHANCE], errors.size)
+    assert low < square < high, square / errors.size
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("common", "draws"), [(0.0, 5), *(pytest.param(*p, marks=pytest.mark.full) for p in ((0.0, 60), (0.99, 25)))]
+)
+def test_forecast_is_the_spread_of_simulations(exact, common, draws):
+    setup, models = setup_of(exact, common=common), models_of(exact)
+    expected = forecast(models, setup)
+    errors, _ = errors_of(models, setup, expected, draws, 1)
+    assert set(errors) == {"2", "4"}
+    for face, rows in errors.items():
+        require_chi2(rows, expected.face_covariance[face])
+        require_chi2(rows[:, 3:], expected.face_covariance[face][3:, 3:])
+
+
+def test_forecast_is_what_the_adjustment_states(exact):
+    setup, models = setup_of(exact), models_of(exact)
+    expected = forecast(models, setup)
+    joint = adjust_jointly(drawn(models, setup, np.random.default_rng(2)), setup.board, setup.camera)
+    stated = derivatives(joint, setup.start, setup.target, "plane").face_covariance(joint.covariance_mm2)
+    for face, covariance in expected.face_covariance.items():
+        # σ₀ of some 700 degrees of freedom is good to 2.7 %; Huber's weights take 1 %.
+        assert np.sqrt(np.diag(stated[face])) == pytest.approx(np.sqrt(np.diag(covariance)), rel=0.08)
+
+
+def doubled(model: MetricModel) -> MetricModel:
+    """Every image taken twice."""
+    names = ("point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
+    return replace(
+        model,
+        images=(*model.images, *(f"{name} again" for name in model.images)),
+        camera_from_model=model.camera_from_model * 2,
+        image_index=np.concatenate([model.image_index, model.image_index + len(model.images)]),
+        **{name: np.concatenate([getattr(model, name)] * 2) for name in names},
+    )
+
+
+@pytest.mark.parametrize(("board_sigma_mm", "low", "high"), [(1e-4, 0.707, 0.709), (1.0, 0.85, 1.0)])
+def test_twice_the_images_are_worth_the_root_of_two_unless_the_board_dominates(exact, board_sigma_mm, low, high):
+    setup, models = setup_of(exact, board_sigma_mm), models_of(exact)
+    once, twice = forecast(models, setup), forecast([doubled(model) for model in models], setup)
+    if board_sigma_mm == 1.0:
+        once, twice = once.scale_sigma, twice.scale_sigma
+    else:
+        once, twice = once.worst()[1], twice.worst()[1]
+    assert low <= twice / once <= high
+
+
+def test_scale_is_as_good_as_the_plate(exact):
+    """A plate of n dots with σ: its scale has σ/√Σr², whatever the images (least squares of a similarity)."""
+    setup = setup_of(exact, 0.02, 0.99)
+    away = exact.board.xy_mm() - exact.board.xy_mm().mean(0)
+    expected = 0.02 / np.sqrt((away**2).sum())
+    assert forecast(models_of(exact, CentreNoise(1e-3)), setup).scale_sigma == pytest.approx(expected, rel=0.02)
+
+
+def test_centre_noise_of_a_disc_is_its_cramer_rao_bound():
+    """Fisher's information of a blurred disc, summed over pixels."""
+    radius, step = 15.0, 1e-3
+    y, x = np.mgrid[-30:31, -30:31]
+
+    def disc(shift):
+        return CONTRAST * ndtr((radius - np.hypot(x - shift, y)) / BLUR_PX)
+
+    slope = (disc(step) - disc(-step)) / (2 * step)
+    bound = IMAGE_NOISE / np.sqrt((slope**2).sum())
+    assert PRACTICE * bound == pytest.approx(CentreNoise.expected().edge / np.sqrt(np.pi * radius), rel=0.01)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.999, 0.7, 0.2])
+def test_what_a_rim_tells_is_the_integral_around_it(ratio):
+    """Against a polygon of 4096 sides, which errs by (π/4096)²/6, a part in ten million."""
+    minor, major = 7.0 * ratio, 7.0
+    angle = 2 * np.pi * np.arange(4096) / 4096
+    rim = np.column_stack([minor * np.cos(angle), major * np.sin(angle)])
+    side = np.roll(rim, -1, axis=0) - rim
+    across = np.column_stack([side[:, 1], -side[:, 0]]) / np.sqrt(np.linalg.norm(side, axis=1))[:, None]
+    found = [float(each[0]) for each in _rim_integrals(np.array([minor]), np.array([major]))]
+    # A circle is taken for an ellipse whose axes differ by 5e-7.
+    np.testing.assert_allclose(found, np.diag(across.T @ across), rtol=1e-6)
+
+
+def test_centre_noise_is_found_again(exact):
+    radius = exact.target.radius_of() | exact.board.radius_of()
+    found = CentreNoise.measured(models_of(exact), exact.camera, radius)
+    assert (found.edge, found.narrow_px) == pytest.approx((NOISE.edge, NOISE.narrow_px), rel=1e-6)
+
+
+def known_from(scene: Scene) -> Known:
+    setup, models = setup_of(scene, 0.005), tuple(models_of(scene))
+    joint = covariance_of(models, setup.board, setup.camera)
+    return Known(models, joint, setup, NOISE, known_scene(models, joint, setup, scene.camera.colmap_model))
+
+
+@pytest.fixture(scope="module")
+def known(exact) -> Known:
+    return known_from(exact)
+
+
+@pytest.fixture(scope="module")
+def advice(known):
+    return advise(known, 2)
+
+
+def with_view(model: MetricModel, view: PlannedView) -> MetricModel:
+    """The group's model with one more image."""
+    new = view.model
+    joined = {
+        name: np.concatenate([getattr(model, name), getattr(new, name)])
+        for name in ("point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
+    }
+    return replace(
+        model,
+        images=(*model.images, *new.images),
+        camera_from_model=(*model.camera_from_model, *new.camera_from_model),
+        image_index=np.concatenate([model.image_index, new.image_index + len(model.images)]),
+        **joined,
+    )
+
+
+def after(known: Known, views: list[PlannedView], now: Forecast) -> Forecast:
+    """The forecast with further views, made anew."""
+    models = {model.group: model for model in known.models}
+    for view in views:
+        models[view.group] = with_view(models[view.group], view)
+    return forecast(list(models.values()), known.setup, now.derivatives)
+
+
+@pytest.mark.parametrize("flatness_mm", [None, 0.01])
+@pytest.mark.parametrize("common", [0.0, 0.6])
+@pytest.mark.parametrize("refined", [False, True])
+def test_one_more_view_needs_no_new_adjustment(known, coarse, flatness_mm, common, refined):
+    prior = CameraPrior("OPENCV", np.diag([2.0] * 4 + [1e-3] * 4) ** 2) if refined else None
+    setup = replace(known.setup, flatness_mm=flatness_mm, common=common, prior=prior, sigma0=1.3)
+    known = replace(known, setup=setup)
+    now = forecast(known.models, setup)
+    positions = PositionsWith.of(known.models, setup, now.derivatives)
+    for model, own in offered(known):
+        assert own, model.group
+        for view in own[::3]:
+            assert positions(view.model) == pytest.approx(after(known, [view], now).position_sigma_mm(), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_advised_views_do_what_is_said(known, advice):
+    """Photographed in simulation: errors as forecast, and σ falls from the run to the adjustment as forecast."""
+    models = {model.group: model for model in known.models}
+    for choice in advice.choices:
+        models[choice.view.group] = with_view(models[choice.view.group], choice.view)
+    views = [choice.view for choice in advice.choices]
+    expected = after(known, views, advice.now)
+    assert expected.worst() == (advice.choices[-1].face, pytest.approx(advice.choices[-1].sigma_mm))
+    errors, joint = errors_of(list(models.values()), known.setup, expected, 8, 3)
+    _, before = errors_of(list(known.models), known.setup, advice.now, 1, 4)
+    for face, rows in errors.items():
+        require_chi2(rows, expected.face_covariance[face])
+    face = advice.now.worst()[0]
+    stated = [
+        np.sqrt(np.trace(advice.now.derivatives.face_covariance(j.covariance_mm2)[face][3:, 3:]))
+        for j in (before, joint)
+    ]
+    forecasts = [each.position_sigma_mm()[face] for each in (advice.now, expected)]
+    assert forecasts[1] < 0.9 * forecasts[0]
+    assert stated[1] / stated[0] == pytest.approx(forecasts[1] / forecasts[0], rel=0.1)
+
+
+def offered(known):
+    """Candidates of each group."""
+    return [(model, candidates(known.scene, model, known.setup, known.noise)) for model in known.models]
+
+
+@pytest.mark.slow
+def test_an_advised_view_beats_a_random_one(known, advice):
+    views = [view for _, own in offered(known) for view in own]
+    picked = np.random.default_rng(5).choice(len(views), 20, replace=False)
+    random = [after(known, [views[i]], advice.now).worst()[1] for i in picked]
+    now, best = advice.now.worst()[1], advice.choices[0].sigma_mm
+    assert best <= min(random)
+    assert (now - best) > 1.5 * (now - np.mean(random)) > 0
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    """A handful of candidates for each group."""
+    monkeypatch.setattr(views, "GRID_DEG", 50.0)
+
+
+@pytest.mark.slow
+def test_the_board_dominates_where_it_is_bad(known, advice, coarse):
+    found = advise(replace(known, setup=setup_of(known.scene, 0.2)), 1)
+    assert found.board_dominates
+    assert not advice.board_dominates
+    assert 0.5 <= found.better_board.worst()[1] / found.now.worst()[1] < 0.7
+    assert found.choices[0].sigma_mm > 0.9 * found.now.worst()[1]
+
+
+@pytest.mark.slow
+def test_a_new_group_is_advised_for_faces_not_seen_together(coarse):
+    """Faces 2 and 5 meet in no group; the forecast of a third group is what a scene with that group has."""
+    pairs = (("1", "2"), ("1", "5"), ("2", "5"))
+    board = replace(reference_board(), sigma_mm=0.0)
+    three = make_scene(replace(SMALL, groups=pairs), reference_target(), board, nominal_target_from_face())
+    two = replace(three, groups={name: three.groups[name] for name in ("12", "15")})
+    advice = advise(known_from(two), 3)
+    (group,) = advice.new_groups
+    assert (group.faces, group.images) == (("2", "5"), 3)
+    assert group.sigma_mm < 0.95 * advice.now.worst()[1]
+    known = known_from(three)
+    assert group.sigma_mm == pytest.approx(forecast(known.models, known.setup).worst()[1], rel=0.15)
+
+
+@pytest.mark.parametrize(("grid_deg", "least"), [(25.0, 4), pytest.param(10.0, 20, marks=SLOW)])
+def test_a_candidate_shows_nothing_that_is_hidden(known, monkeypatch, grid_deg, least):
+    """Faces 2 and 4 look to opposite sides: no view shows both, and the whole board is always in it."""
+    monkeypatch.setattr(views, "GRID_DEG", grid_deg)
+    for model, own in offered(known):
+        assert len(own) > least
+        for view in own:
+            assert not {"2", "4"} <= view.tilts_deg.keys()
+            assert sum(model.labels[i].startswith("board:") for i in view.model.point_index) == 63
+            assert max(view.tilts_deg.values()) < 75
+
+
+@pytest.mark.slow
+def test_advise_for_a_large_set(coarse):
+    """Fifty views of each group: a further one helps every time, but by no more than its share of the image noise."""
+    scene = make_scene(replace(SMALL, images_per_group=50, groups=(("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))))
+    known = known_from(scene)
+    advice = advise(known, 2)
+    sigma = [advice.now.worst()[1], *(choice.sigma_mm for choice in advice.choices)]
+    assert len(sigma) == 3
+    for before, after_it in pairwise(sigma):
+        # The mean one of fifty takes 1 % of σ from its group; the best, at the edge, a few times as much.
+        assert 0.96 < after_it / before < 0.998
+
+
+def test_advise_of_a_run_starts_from_its_own_sigma(small_run):
+    known = known_of(load_run(small_run))
+    now = forecast(known.models, known.setup)
+    stated = json.loads((small_run / "faces.json").read_text())["target_from_face_covariance"]
+    for face, covariance in now.face_covariance.items():
+        # Huber's weights of the few long residuals make the difference.
+        assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(stated[face])), rel=0.03)
+
+
+@pytest.mark.slow
+def test_advise_command(stcal_sfm, small_run, tmp_path, coarse):
+    code, text, _ = stcal_sfm("advise", small_run, "--count", 1, "--json", tmp_path / "advice.json")
+    content = json.loads((tmp_path / "advice.json").read_text())
+    assert code == 0
+    assert content["format"] == "stcal advice 1"
+    (view,) = content["views"]
+    assert view["worst_sigma_um"] < content["worst_sigma_um"]
+    assert f"{view['from_image']}" in text
+    now, then = (f"{c['worst_face']}: {c['worst_sigma_um']:.2f}" for c in (content, view))
+    assert f"{now} → {then}" in text
+    assert "warning" not in text
+    (head,) = (i for i, line in enumerate(text.splitlines()) if line.split()[:2] == ["group", "from"])
+    assert max(map(len, text.splitlines()[head : head + 3])) <= 80
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("file", "change", "warning"),
+    [
+        (
+            "stcal-run.json",
+            lambda c: c["options"].update(eccentricity=False),
+            "is an uncorrected control, whose faces are",
+        ),
+        ("report.json", lambda c: c["checks"][0].update(verdict="failed"), "1 checks of"),
+    ],
+)
+def test_advice_on_a_run_that_is_not_to_be_trusted_says_so(
+    stcal_sfm, small_run, tmp_path, coarse, file, change, warning
+):
+    own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("overlays", "cache"))
+    content = json.loads((tmp_path / "run" / file).read_text())
+    change(content)
+    (tmp_path / "run" / file).write_text(json.dumps(content))
+    code, text, _ = stcal_sfm("advise", tmp_path / "run", "--count", 1)
+    assert code == 0
+    assert warning in text.splitlines()[0]
+
+
+def test_advise_without_the_final_model(stcal_sfm, small_run, tmp_path):
+    own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("target_model", "overlays", "cache"))
+    code, _, error = stcal_sfm("advise", tmp_path / "run")
+    assert (code, error.count("\n")) == (2, 1)
+    assert "target_model: damaged or incomplete" in error
+
+
+def test_plan_command(stcal_sfm, tmp_path):
+    code, text, _ = stcal_sfm("plan", "--width", 2592, "--images", 2, "--json", tmp_path / "plan.json")
+    content = json.loads((tmp_path / "plan.json").read_text())
+    assert code == 0
+    assert content["groups"] == ["12", "14", "15", "23"]
+    assert content["worst_face"] == "3"  # the only one that is two groups away from the reference
+    assert "worst is face 3" in text
+    (head,) = (i for i, line in enumerate(text.splitlines()) if line.startswith("face "))
+    assert 70 < max(map(len, text.splitlines()[head : head + 6])) <= 80
+    assert {row["what"] for row in content["remedies"]} >= {"twice the images", "a board of half the σ"}
+
+
+def plan(images=2, noise=NOISE, groups=(("1", "2"), ("2", "3"))):
+    """Of faces 1, 2 and 3, the last two groups away from the first."""
+    options = PlanOptions(width=2592, images=images, groups=groups, noise=noise)
+    return make_plan(options, reference_target(), reference_board(), nominal_target_from_face())
+
+
+@pytest.mark.slow
+def test_plan_remedies_are_plans_of_their_own():
+    """Twice the images is what a plan with twice the images says."""
+    two, four = plan(), plan(images=4)
+    assert two.remedies[0].sigma_mm == pytest.approx(four.forecast.worst()[1], rel=1e-9)
+    assert 0.65 < two.remedies[0].sigma_mm / two.forecast.worst()[1] < 0.95
+
+
+@pytest.mark.slow
+def test_plan_names_what_dominates():
+    one = (("1", "2"),)
+    assert plan(noise=CentreNoise(0.0, floor_px=0.05), groups=one).shares["2"]["image noise"] > 0.9
+    assert plan(noise=CentreNoise(0.0, floor_px=0.0002), groups=one).shares["2"]["board"] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--noise", 0.01, "--run", "anywhere"), "two sources of one σ"),
+        (("--groups", "12,17"), "'17' is no pair of faces"),
+        (("--groups", "12,34"), "no group links face 3, 4 to reference face 1"),
+        (("--run", "nowhere"), "not a run's folder"),
+    ],
+)
+def test_plan_says_what_is_wrong(stcal_sfm, arguments, message):
+    code, _, error = stcal_sfm("plan", *arguments)
+    assert (code, error.count("\n")) == (2, 1)
+    assert message in error
+
+
+@pytest.mark.slow
+def test_plan_out_of_reach(stcal_sfm):
+    code, _, error = stcal_sfm("plan", "--distance", 300, "--images", 2, "--groups", "12")
+    assert (code, error.count("\n")) == (3, 1)
+    assert "enlarge distance_mm" in error
+
+
+@pytest.mark.parametrize(
+    ("faces", "message"),
+    [
+        (None, "E-TARGET-ROUGH-POSE … rough_pose … origin_mm … --faces"),
+        ("nothing", "E-JSON-INVALID"),
+        ('{"unit": "m", "target_from_face": {}}', "E-KEY-VALUE … 'm'"),
+        ('{"target_from_face": {}}', "E-TARGET-NO-FACE … top"),
+    ],
+)
+def test_plan_of_another_design_needs_its_faces(faces, message, tmp_path):
+    from stcal.sfm.planning.nominal import nominal_poses
+
+    target, _, _ = second_design()
+    target = replace(target, faces=tuple(replace(face, rough_target_from_face=None) for face in target.faces))
+    path = tmp_path / "faces.json"
+    if faces is not None:
+        path.write_text(faces)
+    with fails_with(message):
+        nominal_poses(target, None if faces is None else path)
+
+
+@pytest.mark.slow
+def test_plan_of_another_design_with_its_faces(tmp_path):
+    from stcal.sfm.planning.nominal import nominal_poses
+
+    target, board, poses = second_design()
+    path = tmp_path / "faces.json"
+    path.write_text(json.dumps({"target_from_face": {face: pose.matrix().tolist() for face, pose in poses.items()}}))
+    result = make_plan(PlanOptions(width=2592, images=3), target, board, nominal_poses(target, path))
+    assert set(result.forecast.face_covariance) == {"left", "right"}
+    assert 1e-4 < result.forecast.worst()[1] < 0.02
+
+
+def test_plan_needs_the_size_of_the_camera():
+    for size in ((None, None), (2592, None), (None, 1728)):
+        focal, middle = np.array([2800.0, 2800.0]), np.array([1296.0, 864.0])
+        camera = CameraModel(focal, middle, np.zeros(8), "PINHOLE", *size, "f")
+        with fails_with("E-CAMERA-SIZE"):
+            PlanOptions(camera=camera)
+
+
+@pytest.mark.parametrize("common", [0.0, 0.99])
+@pytest.mark.parametrize("refined", [False, True])
+def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, common, refined):
+    """To rounding: the two ways differ in the order of elimination alone."""
+    prior = CameraPrior("OPENCV", np.diag([1, 1, 1, 1, 1e-6, 1e-6, 1e-8, 1e-8])) if refined else None
+    models = true_models(exact, observe(exact, 0.02, np.random.default_rng(0)))
+    board = replace(exact.board, sigma_mm=0.02)
+    found = []
+    for first in (True, False):
+        monkeypatch.setattr(dots_first, "is_cheaper", lambda _, first=first: first)
+        found.append(covariance_of(models, board, exact.camera, 0.02, prior, common))
+    dots, cameras = found
+    np.testing.assert_allclose(
+        dots.covariance_mm2, cameras.covariance_mm2, rtol=0, atol=1e-8 * cameras.covariance_mm2.max()
+    )
+    unit = np.sqrt(np.diag(cameras.camera_covariance)) if refined else np.ones(len(cameras.camera_covariance))
+    np.testing.assert_allclose(
+        dots.camera_covariance / np.outer(unit, unit),
+        cameras.camera_covariance / np.outer(unit, unit),
+        rtol=0,
+        atol=1e-6,
+    )
+    assert (dots.sigma0, dots.redundancy) == (cameras.sigma0, cameras.redundancy)
+
+
+@pytest.mark.slow
+def test_a_fine_board_is_planned():
+    """2500 dots in 8 images; with fewer dots on the same area the σ rise by no more than the root of their number."""
+    fine = replace(
+        reference_board(), rows=50, columns=50, pitch_mm=4.0, radius_mm=1.2, corner=None, corner_radius_mm=None
+    )
+    coarse = replace(fine, rows=10, columns=10, pitch_mm=20.0)
+    options = PlanOptions(images=4, width=2592, groups=(("1", "2"), ("1", "4")))
+    sigma = [
+        make_plan(options, reference_target(), board, nominal_target_from_face()).forecast.worst()[1]
+        for board in (fine, coarse)
+    ]
+    assert sigma[0] < sigma[1] < 5 * sigma[0]
+
+
+@pytest.mark.parametrize(
+    ("rows", "images", "said"),
+    [(101, 10, "E-PLAN-TOO-LARGE … 10201 … 10000"), (100, 100, "E-PLAN-TOO-LARGE … 4000000")],
+)
+def test_a_board_of_too_many_dots_is_refused_at_once(rows, images, said):
+    board = replace(reference_board(), rows=rows, columns=rows if rows > 100 else 100, pitch_mm=4.0, radius_mm=1.2)
+    board = replace(board, corner=None, corner_radius_mm=None)
+    with fails_with(said):
+        make_plan(PlanOptions(images=images), reference_target(), board, nominal_target_from_face())

@@ -1,0 +1,776 @@
+"""Bad input gets one line that names the thing and the remedy; odd but valid input is taken as it is."""
+
+import csv
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.read import read_camera
+from stcal.io.design import board_toml, target_toml
+from stcal.io.images import decode
+from stcal.sfm.detect import files
+from stcal.synthetic.observe import image_circles
+from stcal.synthetic.render import encode, render
+from tests.outcome import COMPUTATION, INPUT, INTERRUPTED, assert_error, fails_with, lines_of
+from tests.shared import own_copy
+
+CHAIN = ("--solve", "chain")
+"""For what is seen before faces are adjusted together, which takes half of a small run's time."""
+RESULTS = ("faces.json", "report.json", "report.html", "database.db")
+
+
+def assert_success(outcome) -> str:
+    """No word on standard error but progress; returns standard output."""
+    code, out, err = outcome
+    assert (code, lines_of(err)) == (0, [])
+    return out
+
+
+def results_in(out: Path) -> list[str]:
+    return [name for name in RESULTS if (out / name).exists()]
+
+
+def detections(out: Path) -> dict[tuple[str, str], tuple[float, float]]:
+    """(image, label) → centre, px."""
+    with (out / "detections.csv").open(encoding="utf-8", newline="") as file:
+        return {(row["image"], row["label"]): (float(row["x_px"]), float(row["y_px"])) for row in csv.DictReader(file)}
+
+
+def pixels(path: Path) -> np.ndarray:
+    return decode(path.read_bytes(), path.name)
+
+
+def encoded(suffix: str, image: np.ndarray, *parameters: int) -> bytes:
+    return cv2.imencode(suffix, image, parameters)[1].tobytes()
+
+
+def box_around(scene, group: str, image: int, board: bool) -> tuple[slice, slice]:
+    """Rows and columns about the board's dots, or the target's circles, of an image."""
+    seen = image_circles(scene, group, image)
+    xy = np.array([c for label, c in zip(seen.labels, seen.centre_px, strict=True) if label.startswith("b") == board])
+    (x0, y0), (x1, y1) = np.maximum(xy.min(0).astype(int) - 12, 0), xy.max(0).astype(int) + 13
+    return slice(y0, y1), slice(x0, x1)
+
+
+def blacken(small, scene, group: str, board: bool, count: int) -> None:
+    """Hide the board, or the target, in the first images of a group, and take its others away."""
+    for i in range(count, 4):
+        small.image(i, group).unlink()
+    for i in range(count):
+        picture = pixels(small.image(i, group)).copy()
+        picture[box_around(scene, group, i, board)] = np.median(picture)
+        small.image(i, group).write_bytes(encoded(".jpg", picture))
+
+
+# --- the folder of images ---
+
+
+def test_missing_folder(small_set, stcal_sfm):
+    small = small_set()
+    small.images.rmdir()
+    assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-FOLDER", str(small.images), "does not exist")
+
+
+def test_a_file_in_place_of_the_folder(small_set, stcal_sfm):
+    small = small_set()
+    outcome = stcal_sfm("run", small.camera, "--camera", small.camera, "--out", small.out)
+    assert_error(outcome, INPUT, "E-IMAGES-FOLDER", str(small.camera), "not a folder")
+
+
+def test_empty_folder(small_set, stcal_sfm):
+    small = small_set()
+    (small.images / "12").mkdir()
+    assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-NONE", str(small.images), f"{small.images}")
+
+
+def test_the_folder_above_the_right_one(small_set, stcal_sfm):
+    small = small_set("12")
+    outcome = stcal_sfm("run", small.folder, "--camera", small.camera, "--out", small.folder.parent / "out")
+    assert_error(outcome, INPUT, "E-IMAGES-NONE", "images lie in <group>/ directly")
+
+
+SPOILT = {
+    "zero bytes": (lambda data: b"", "empty file (0 bytes); copy it again"),
+    "truncated": (lambda data: data[: len(data) // 2], "truncated (", "copy it again"),
+    "text": (lambda data: b"not a photograph", "not readable as an image; copy it again, or convert it to"),
+    "a folder's worth of zeros": (lambda data: bytes(len(data)), "not readable as an image"),
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_no_image_is_left(small_set, stcal_sfm, case):
+    spoil, *parts = SPOILT[case]
+    small = small_set("12")
+    for path in (small.images / "12").iterdir():
+        path.write_bytes(spoil(path.read_bytes()))
+    assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-NONE-USABLE", "4", "12/IMG_1000.jpg", *parts)
+
+
+def test_all_images_of_another_size(small_set, stcal_sfm):
+    small = small_set("12", "14")
+    for group in ("12", "14"):
+        for i in range(4):
+            small.image(i, group).write_bytes(encoded(".jpg", pixels(small.image(i, group))[::2, ::2]))
+    parts = ("12/IMG_1000.jpg", "648×432 px", "1296×864 px", "use images as the camera took them")
+    assert_error(stcal_sfm(*small.arguments()), INPUT, "E-IMAGES-NONE-USABLE", *parts)
+    assert results_in(small.out) == []
+
+
+@pytest.mark.usefixtures("no_page")
+def test_bad_files_among_good_ones_are_left_out_and_listed(small_set, stcal_sfm):
+    small = small_set("12")
+    good = pixels(small.image())
+    folder = small.images / "12"
+    bad = {
+        "cut.jpg": (small.image().read_bytes()[:-5000], "truncated"),
+        "cut.png": (encoded(".png", good)[:-5000], "truncated"),
+        "cut.tif": (encoded(".tif", good)[:-5000], "not readable"),
+        "cut.bmp": (encoded(".bmp", good)[:-5000], "truncated"),
+        "zero.jpg": (b"", "empty file (0 bytes)"),
+        "text.png": (b"this is no image", "not readable"),
+        "small.jpg": (encoded(".jpg", good[:-1]), "1296×863 px, but the camera file says 1296×864 px"),
+        "float.tif": (encoded(".tif", good.astype(np.float32)), "pixels of type float32; 8 or 16 bit needed"),
+        "notes.txt": (b"f/8, ISO 100", "not an image file"),
+        "copy.jpg": (small.image(2).read_bytes(), "the same image as 12/IMG_1002.jpg"),
+    }
+    # Damage that decoders do not report: bytes in the middle are gone, the picture comes out shifted.
+    data = bytearray(small.image(1).read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 3000] = bytes(3000)
+    bad["garbled.jpg"] = (bytes(data), "damaged (Corrupt JPEG data")
+    data = bytearray(encoded(".png", good))
+    data[len(data) // 2] ^= 255
+    bad["garbled.png"] = (bytes(data), "damaged (a checksum is wrong)")
+    for name, (content, _) in bad.items():
+        (folder / name).write_bytes(content)
+    (folder / "link.jpg").symlink_to(folder / "gone.jpg")
+    (folder / "more.jpg").mkdir()
+    bad |= {"link.jpg": (b"", "broken link"), "more.jpg": (b"", "a folder inside a group")}
+    # "copy.jpg" sorts after the capitals, so the original is the one that is used.
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    report = (small.out / "report.json").read_text(encoding="utf-8")
+    for name, (_, reason) in bad.items():
+        line = next(line for line in out.splitlines() if line.startswith(f"skipped 12/{name}: "))
+        assert reason in line
+        assert f"12/{name}" in report
+    assert sum(line.startswith("skipped ") for line in out.splitlines()) == len(bad)
+    assert "group 12: 4 images" in out
+    assert {image for image, _ in detections(small.out)} == {f"12/IMG_{1000 + i}.jpg" for i in range(4)}
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_name_that_is_not_utf8_is_left_out(small_set, stcal_sfm):
+    small = small_set("12")
+    for name in (b"caf\xe9.jpg", b"two\nlines.jpg"):
+        try:
+            Path(os.fsdecode(os.fsencode(small.images / "12") + b"/" + name)).write_bytes(small.image().read_bytes())
+        except OSError:
+            pytest.skip("this file system takes UTF-8 only")
+    arguments = ("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
+    out = assert_success(stcal_sfm(*arguments))
+    assert re.search(r"^skipped 12/caf\S+\.jpg: its name is not UTF-8; rename it$", out, re.M)
+    assert re.search(r"^skipped 12/two\S+\.jpg: its name holds a control character; rename it$", out, re.M)
+
+
+# --- groups that cannot be solved ---
+
+
+def assert_left_out(small, stcal_sfm, *parts: str) -> None:
+    """The run goes on without group 14, says why, and does not claim its face."""
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    notes = json.loads((small.out / "report.json").read_text())["notes"]
+    assert any(note.startswith("left out whole: group 14") and all(part in note for part in parts) for note in notes)
+    assert "left out whole: group 14" in out
+    faces = json.loads((small.out / "faces.json").read_text())["target_from_face"].keys()
+    assert {"1", "2"} <= faces
+    assert "4" not in faces
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_group_with_one_image(small_set, stcal_sfm):
+    small = small_set("12", "14")
+    for i in (1, 2, 3):
+        small.image(i, "14").unlink()
+    parts = ("group 14: 1 usable image (14/IMG_1000.jpg), 2 needed", "add photographs from other places")
+    assert_left_out(small, stcal_sfm, *parts)
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_group_of_copies_of_one_image(small_set, stcal_sfm):
+    small = small_set("12", "14")
+    for i in (1, 2, 3):
+        shutil.copy(small.image(0, "14"), small.image(i, "14"))
+    parts = ("group 14: 1 usable image", "the same image as 14/IMG_1000.jpg", "add photographs from other places")
+    assert_left_out(small, stcal_sfm, *parts)
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_folder_of_copies_is_no_group(small_set, stcal_sfm):
+    small = small_set("12")
+    shutil.copytree(small.images / "12", small.images / "12 copy")
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    assert "skipped 12 copy/IMG_1003.jpg: the same image as 12/IMG_1003.jpg" in out
+    assert out.count("skipped") == 4
+    assert out.count("4 images") == 1
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_group_of_which_nothing_is_left(small_set, stcal_sfm):
+    small = small_set("12", "14")
+    for i in range(4):
+        small.image(i, "14").write_bytes(b"")
+    parts = ("group 14: 0 usable images", "14/IMG_1000.jpg: empty file", "2 needed")
+    assert_left_out(small, stcal_sfm, *parts)
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_group_without_the_board(small_set, small_scene, stcal_sfm):
+    small = small_set("12", "14")
+    blacken(small, small_scene, "14", board=True, count=2)
+    parts = ("group 14: no board recognised in 2 images", "keep the whole board in view", "board.toml")
+    assert_left_out(small, stcal_sfm, *parts)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_page")
+def test_a_group_without_a_face(small_set, small_scene, stcal_sfm):
+    small = small_set("12", "14")
+    blacken(small, small_scene, "14", board=False, count=2)
+    parts = ("group 14: no face of the target recognised in 2 images", "look at the overlays", "target.toml")
+    assert_left_out(small, stcal_sfm, *parts)
+
+
+@pytest.mark.slow
+def test_another_target_than_the_file_says(small_set, stcal_sfm, small_scene):
+    small = small_set("12", detected=False)
+    for i in (2, 3):
+        small.image(i).unlink()
+    path = small.folder / "target.toml"
+    path.write_text(target_toml(replace(small_scene.target, polarity="dark")), encoding="utf-8")
+    outcome = stcal_sfm(*small.arguments("--target", path))
+    assert_error(outcome, COMPUTATION, "group 12: no face of the target recognised in 2 images", "polarity")
+
+
+@pytest.mark.slow  # all dots are tried as circles of faces; the quick one is that of a group without the board
+def test_another_board_than_the_file_says(small_set, stcal_sfm, small_scene):
+    small = small_set("12", detected=False)
+    for i in (2, 3):
+        small.image(i).unlink()
+    path = small.folder / "board.toml"
+    path.write_text(board_toml(replace(small_scene.board, rows=14, columns=17)), encoding="utf-8")
+    outcome = stcal_sfm(*small.arguments("--board", path))
+    assert_error(outcome, COMPUTATION, "group 12: no board recognised in 2 images", "rows, columns")
+
+
+@pytest.mark.slow  # the quick one is without pixels, in tests/sfm/adjust/test_faces_and_chain.py
+@pytest.mark.usefixtures("no_page")
+def test_a_face_that_is_never_linked(small_set, other_pair_scene, stcal_sfm):
+    small = small_set("12")
+    (small.images / "34").mkdir()
+    for i in range(2):
+        picture = render(other_pair_scene, "34", i)
+        (small.images / "34" / f"{i}.jpg").write_bytes(encode(picture, ".jpg"))
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    for face_id in "34":
+        assert f"face {face_id}: left out, never linked to reference face 1; add a group that shows" in out
+    faces = json.loads((small.out / "faces.json").read_text())["target_from_face"].keys()
+    assert {"1", "2"} <= faces
+    assert not faces & {"3", "4"}
+
+
+def test_a_reference_face_that_is_never_seen(small_set, stcal_sfm):
+    small = small_set("12")
+    outcome = stcal_sfm(*small.arguments("--reference-face", "3"))
+    assert_error(outcome, COMPUTATION, "E-FACE-REFERENCE", "3", "1, 2")
+
+
+def test_a_reference_face_that_does_not_exist(small_set, stcal_sfm):
+    small = small_set("12")
+    outcome = stcal_sfm(*small.arguments("--reference-face", "9"))
+    assert_error(outcome, INPUT, "E-TARGET-NO-FACE", "9", "1, 2, 3, 4, 5")
+
+
+def still(first: np.ndarray, scene) -> list[np.ndarray]:
+    """The first photograph twice, with noise of its own."""
+    noise = np.random.default_rng(0).integers(-1, 2, first.shape)
+    return [first, np.clip(first + noise, 0, 255).astype(np.uint8)]
+
+
+def turning(_, scene) -> list[np.ndarray]:
+    """The camera turns on the spot by some degrees about each of its axes."""
+    turns = ([0.06, 0, 0], [0, -0.05, 0.1])
+    poses = [Rigid.exp([*turn, 0, 0, 0]) @ scene.groups["12"].camera_from_target[0] for turn in turns]
+    group = replace(scene.groups["12"], camera_from_target=tuple(poses))
+    return [render(replace(scene, groups=scene.groups | {"12": group}), "12", i) for i in range(len(poses))]
+
+
+@pytest.mark.parametrize("photographs", [still, pytest.param(turning, marks=pytest.mark.slow)])
+def test_a_camera_that_did_not_move(small_set, small_scene, stcal_sfm, photographs):
+    small = small_set("12")
+    pictures = photographs(pixels(small.image()), small_scene)
+    for i in range(4):
+        small.image(i).unlink()
+    for i, picture in enumerate(pictures):
+        small.image(i).write_bytes(encoded(".jpg", picture))
+    parts = ("group 12: no initial pair", "the camera did not move", "take the photographs from different places")
+    assert_error(stcal_sfm(*small.arguments()), COMPUTATION, "E-MAPPING-NO-PAIR", *parts)
+    assert results_in(small.out) == []
+
+
+@pytest.mark.usefixtures("no_page")
+@pytest.mark.parametrize(
+    ("board", "what"), [(False, "face 1"), pytest.param(True, "a board of 63 dots", marks=pytest.mark.slow)]
+)
+def test_two_of_them_in_view(small_set, small_scene, stcal_sfm, board, what):
+    """A picture of the target, or of the board, lies in one image's corner: the group tells which is meant."""
+    small = small_set("12")
+    picture = pixels(small.image()).copy()
+    rows, columns = box_around(small_scene, "12", 0, board)
+    copied = picture[rows, columns]
+    height, width = copied.shape
+    picture[-height - 20 : -20, 20 : 20 + width] = copied
+    small.image().write_bytes(encoded(".jpg", picture, cv2.IMWRITE_JPEG_QUALITY, 95))
+    code, _, _ = stcal_sfm(*small.arguments(*CHAIN))
+    assert code == 0
+    report = json.loads((small.out / "report.json").read_text())
+    notes = [each["note"] for each in report["left_out"]["notes"] if each["image"] == "12/IMG_1000.jpg"]
+    assert any(what in note and "not where the group's other images see it" in note for note in notes)
+    code, _, _ = stcal_sfm("compare", small.out, small.folder / "truth.json")
+    labels = json.loads((small.out / "compare.json").read_text())["labels"]
+    assert (code, labels["wrong"]) == (0, 0)
+    assert labels["found"] >= 0.97 * labels["visible"]  # the copy may cover some
+
+
+# --- files that say what is where ---
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+CIRCLE_1 = '{ id = "1", x_mm = 0.0, y_mm = 0.0, radius_mm = 8.0 }'
+TOML = {
+    "unknown key": ("target", "polarity =", "colour = 1\npolarity =", ("colour: unknown key; remove it",)),
+    "duplicate face": ("target", '[[face]]\nid = "2"', '[[face]]\nid = "1"', ("face id 1", "twice")),
+    "duplicate circle": ("target", '{ id = "2"', '{ id = "1"', ("face 1", "circle id 1", "twice")),
+    "collinear": ("target", 'y = "5"', 'y = "2"', ("face 1", "frame circles 1, 3, 2 are collinear; choose three")),
+    "negative radius": ("target", CIRCLE_1, CIRCLE_1.replace("8.0", "-8.0"), ("face.1.circles.1.radius_mm", "greater")),
+    "frame circle missing": ("target", 'origin = "1"', 'origin = "z"', ("face 1", "z")),
+    "no TOML": ("target", "[[face]]", "[[face", ("target file",)),
+    "board: unknown key": ("board", "rows = 7", "rows = 7\nraws = 7", ("raws: unknown key; remove it",)),
+    "board: negative radius": ("board", "radius_mm = 7.5", "radius_mm = -7.5", ("radius_mm", "greater than 0")),
+    "board: dots overlap": ("board", "radius_mm = 7.5", "radius_mm = 15.5", ("15.5 mm, under half the pitch",)),
+}
+
+
+@pytest.mark.parametrize("case", TOML)
+def test_impossible_toml(small_set, stcal_sfm, case):
+    kind, old, new, parts = TOML[case]
+    small = small_set("12")
+    path = small.folder / f"{kind}.toml"
+    edit(path, old, new)
+    assert_error(stcal_sfm(*small.arguments(f"--{kind}", path)), INPUT, f"{kind} file {path}", *parts)
+
+
+@pytest.mark.parametrize("kind", ["target", "board"])
+def test_missing_toml(small_set, stcal_sfm, kind):
+    small = small_set("12")
+    outcome = stcal_sfm(*small.arguments(f"--{kind}", small.folder / "no.toml"))
+    assert_error(outcome, INPUT, "E-FILE-UNREADABLE", str(small.folder / "no.toml"), "`stcal-sfm init DIR` writes one")
+
+
+CAMERAS = {
+    "missing": (None, ("No such file", "give a readable file")),
+    "empty": ("", ("neither COLMAP's cameras.txt nor OpenCV's YAML or XML", "check its form")),
+    "prose": ("a camera, no doubt", ("neither COLMAP's cameras.txt", "check its form")),
+    "two cameras": (
+        "1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1",
+        ("2 cameras, 1 needed; choose of 1, 2 with `stcal camera",),
+    ),
+    "field of view": ("1 FOV 9 9 1 1 1 1 1", ("COLMAP's FOV", "fit one of them to it with `stcal camera convert`")),
+    "no number": ("1 PINHOLE 1296 864 f f 1 1", ("'f'; numbers needed",)),
+}
+
+
+@pytest.mark.parametrize("case", CAMERAS)
+def test_a_camera_file_that_is_none(small_set, stcal_sfm, case):
+    content, parts = CAMERAS[case]
+    small = small_set("12")
+    small.camera.unlink()
+    if content is not None:
+        small.camera.write_text(content, encoding="utf-8")
+    assert_error(stcal_sfm(*small.arguments()), INPUT, f"camera file {small.camera}", *parts)
+
+
+def opencv_yaml(focal: float, x: float, y: float, distortion: list[float]) -> str:
+    """A camera file that does not state the image size."""
+    matrix = [float(v) for v in (focal, 0, x, 0, focal, y, 0, 0, 1)]
+    return f"%YAML:1.0\n---\ncamera_matrix: {matrix}\ndistortion_coefficients: {distortion}\n"
+
+
+def test_a_camera_of_opencv_for_larger_images(small_set, stcal_sfm):
+    small = small_set("12")
+    path = small.folder / "camera.yml"
+    path.write_text(opencv_yaml(5580, 2592, 1728, []), encoding="utf-8")
+    outcome = stcal_sfm(*small.arguments("--camera", path))
+    parts = ("(2592, 1728) px is outside of 12/IMG_1000.jpg (1296×864 px)", "use the camera file that belongs")
+    assert_error(outcome, INPUT, "E-CAMERA-CENTRE", f"{path}", *parts)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_page")
+def test_another_camera_than_took_the_images(small_set, stcal_sfm):
+    small = small_set("12")
+    small.image(3).unlink()
+    path = small.folder / "camera.yml"
+    path.write_text(opencv_yaml(3000, 648, 432, []), encoding="utf-8")
+    outcome = stcal_sfm(*small.arguments("--camera", path))
+    assert_error(outcome, COMPUTATION, "group 12: ", "check that the camera file belongs to the images")
+
+
+def test_no_pair_within_the_limit(small_set, stcal_sfm):
+    small = small_set("12")
+    outcome = stcal_sfm(*small.arguments("--max-angle", 5))
+    assert_error(outcome, COMPUTATION, "E-MAPPING-NO-PAIR", "12:", "1", "5", "--max-angle")
+
+
+# --- the output ---
+
+
+def test_a_foreign_folder_is_refused_and_left_alone(small_set, stcal_sfm):
+    small = small_set("12", detected=False)
+    small.out.mkdir()
+    (small.out / "faces.json").write_text("mine", encoding="utf-8")
+    outcome = stcal_sfm(*small.arguments())
+    assert_error(outcome, INPUT, "E-OUTPUT-EXISTS", str(small.out), "--out")
+    assert [p.name for p in small.out.iterdir()] == ["faces.json"]
+    assert (small.out / "faces.json").read_text(encoding="utf-8") == "mine"
+
+
+def test_the_images_as_output_are_refused(small_set, stcal_sfm):
+    small = small_set("12", detected=False)
+    outcome = stcal_sfm("detect", small.images, "--camera", small.camera, "--out", small.images)
+    assert_error(outcome, INPUT, "E-OUTPUT-EXISTS", str(small.images), "--out")
+    assert len(list(small.images.rglob("*"))) == 5
+
+
+@pytest.mark.parametrize("below", ["", "deeper"])
+def test_a_file_as_output(small_set, stcal_sfm, below):
+    small = small_set("12", detected=False)
+    small.out.write_text("a file", encoding="utf-8")
+    outcome = stcal_sfm("run", small.images, "--camera", small.camera, "--out", small.out / below)
+    assert_error(outcome, INPUT, str(small.out), "; give a")
+    assert small.out.read_text(encoding="utf-8") == "a file"
+
+
+def test_a_wrong_folder_of_images_costs_no_earlier_result(small_set, small_run, stcal_sfm):
+    small = small_set()
+    own_copy(small_run / "faces.json", small.out)
+    outcome = stcal_sfm("run", small.folder / "imagse", "--camera", small.camera, "--out", small.out)
+    assert_error(outcome, INPUT, "E-IMAGES-FOLDER", "imagse", "does not exist")
+    assert results_in(small.out) == ["faces.json"]
+
+
+USAGE = {
+    "no camera": (["run", "x", "--out", "y"], ("'--camera'", "`stcal-sfm run --help`")),
+    "no such option": (["run", "x", "--camra", "y"], ("--camra", "`stcal-sfm run --help`")),
+    "no such command": (["calibrate"], ("'calibrate'", "`stcal-sfm --help`")),
+    "no such choice": (["run", "x", "--camera", "y", "--out", "z", "--frame", "best"], ("'--frame'", "'three-point'")),
+    "not a number": (["run", "x", "--camera", "y", "--out", "z", "--workers", "all"], ("'--workers'", "--help`")),
+    "no workers": (["run", "x", "--camera", "y", "--out", "z", "--workers", "0"], ("'--workers'", "--help`")),
+    "diameters": (
+        ["run", "x", "--camera", "y", "--out", "z", "--min-diameter", "50", "--max-diameter", "40"],
+        ("--max-diameter 40 px, more than --min-diameter 50 px needed",),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", USAGE)
+def test_a_slip_on_the_command_line(stcal_sfm, monkeypatch, tmp_path, case):
+    monkeypatch.chdir(tmp_path)
+    arguments, parts = USAGE[case]
+    assert_error(stcal_sfm(*arguments), INPUT, *parts)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- compare ---
+
+
+def changed(**keys):
+    return lambda truth: json.dumps(truth | keys)
+
+
+def with_matrix(matrix):
+    return lambda truth: json.dumps(truth | {"target_from_face": truth["target_from_face"] | {"2": matrix}})
+
+
+def with_circle(xyz):
+    return lambda truth: json.dumps(truth | {"circles": truth["circles"] | {"2:1": xyz}})
+
+
+TRUTHS = {
+    "missing": (None, ("No such file", "give a finished run, and truth.json")),
+    "empty": (lambda truth: "", ("not JSON", "give a finished run, and truth.json")),
+    "a list": (lambda truth: "[1, 2]", ("a list, an object with named keys needed", "data_layout.md")),
+    "no unit": (lambda truth: json.dumps({k: v for k, v in truth.items() if k != "unit"}), ("no 'unit'",)),
+    "inches": (changed(unit="in"), ("unit: 'in': ", "'mm'")),
+    "another format": (changed(format="stcal faces 2"), ("format: 'stcal faces 2': ", "'stcal faces 1'")),
+    "group without dots": (changed(groups={"12": {"images": {}}}), ("groups.12", "no 'board_circles_target'")),
+    "faces null": (changed(target_from_face=None), ("target_from_face: None: ", "data_layout.md")),
+    "circles a list": (changed(circles=[1]), ("circles: [1]: ", "data_layout.md")),
+    "another reference": (changed(reference_face="2"), ("reference face 1 in the run, 2 in", "--reference-face 2")),
+    "another target": (
+        changed(target_from_face={"x": np.eye(4).tolist()}),
+        ("no face in common; give the truth of the same target",),
+    ),
+    "matrix of words": (with_matrix("abc"), ("target_from_face.2: ", "abc")),
+    "matrix scaled": (with_matrix((2 * np.eye(4)).tolist()), ("target_from_face.2: ", "0 0 0 1 needed")),
+    "circle of two numbers": (with_circle([1, 2]), ("circles.2:1: [1, 2]: shape (2,), (3,) needed",)),
+    "circle NaN": (with_circle([np.nan] * 3), ("circles.2:1: ", "not finite")),
+}
+
+
+@pytest.mark.parametrize("case", TRUTHS)
+def test_a_truth_that_is_none(small_run, small_dataset, stcal_sfm, tmp_path, case):
+    spoil, parts = TRUTHS[case]
+    path = tmp_path / "truth.json"
+    if spoil is not None:
+        path.write_text(spoil(json.loads((small_dataset / "truth.json").read_text(encoding="utf-8"))), encoding="utf-8")
+    assert_error(stcal_sfm("compare", small_run / "faces.json", path), INPUT, *parts)
+
+
+def test_an_unfinished_run_is_not_compared(small_set, stcal_sfm):
+    small = small_set()
+    outcome = stcal_sfm("compare", small.out, small.folder / "truth.json")
+    assert_error(
+        outcome, INPUT, "E-FILE-UNREADABLE", str(small.out / "faces.json"), "No such file", "give a finished run"
+    )
+
+
+# --- a real process ---
+
+
+def command(*arguments) -> list[str]:
+    return [sys.executable, "-c", "from stcal.cli.main import main_sfm; main_sfm()", *map(str, arguments)]
+
+
+@pytest.mark.slow  # the quick one is that which is interrupted
+def test_a_real_process_exits_alike(small_set):
+    small = small_set("12")
+    for path in (small.images / "12").iterdir():
+        path.write_bytes(b"")
+    done = subprocess.run(command(*small.arguments()), capture_output=True, text=True, timeout=60)
+    assert_error((done.returncode, done.stdout, done.stderr), INPUT, "12/IMG_1000.jpg: empty file (0 bytes)")
+
+
+def test_debug_lets_the_error_through(small_set, stcal_sfm):
+    small = small_set()
+    with fails_with("E-IMAGES-NONE"):
+        stcal_sfm(*small.arguments("--debug"))
+
+
+@pytest.mark.slow  # what Python makes of an error that gets through
+def test_debug_shows_the_traceback(small_set):
+    small = small_set()
+    done = subprocess.run(command(*small.arguments("--debug")), capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert "Traceback" in done.stderr
+    assert "stcal.errors.InputError: image folder" in done.stderr
+
+
+@pytest.mark.usefixtures("no_page")
+def test_an_interrupted_run_keeps_what_it_has_detected(small_set, stcal_sfm, monkeypatch):
+    """Ctrl-C in the second photograph of two."""
+    small = small_set("12", detected=False)
+    for i in (2, 3):
+        small.image(i).unlink()
+    detected, detect_image = [], files.detect_image
+
+    def second_is_interrupted(*given):
+        detected.append(given)
+        if len(detected) == 2:
+            raise KeyboardInterrupt
+        return detect_image(*given)
+
+    monkeypatch.setattr(files, "detect_image", second_is_interrupted)
+    code, _, err = stcal_sfm(*small.arguments(*CHAIN))
+    assert code == INTERRUPTED
+    (line,) = lines_of(err)
+    assert line.startswith("interrupted; finished detections are kept, run the same command again")
+    assert {p.name for p in small.out.iterdir()} == {"cache", "stcal-run.json"}
+    assert "group 12: 2 images" in assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    assert results_in(small.out) == list(RESULTS)
+    assert len(detected) == 3  # the first one was kept
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_page")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_an_interrupted_run_leaves_nothing_that_looks_complete(small_set, stcal_sfm, how):
+    small = small_set("12", detected=False)
+    running = subprocess.Popen(
+        command(*small.arguments(*CHAIN)),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    cache = small.out / "cache"
+    until = time.monotonic() + 60
+    while not (cache.is_dir() and any(cache.glob("*.npz"))) and time.monotonic() < until:
+        time.sleep(0.005)
+    os.killpg(running.pid, how)
+    _, err = running.communicate(timeout=60)
+    kept = {path.name: path.stat().st_mtime_ns for path in cache.glob("*.npz")}
+    assert 1 <= len(kept) < 4
+    assert running.returncode == (-signal.SIGKILL if how == signal.SIGKILL else 130)
+    if how == signal.SIGINT:
+        assert len(lines_of(err)) == 1
+        assert lines_of(err)[0].startswith("interrupted; finished detections are kept, run the same command again")
+    left = {"cache", "stcal-run.json"} | ({"unfinished"} if how == signal.SIGKILL else set())  # nobody could clear it
+    assert {p.name for p in small.out.iterdir()} <= left
+
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    assert "group 12: 4 images" in out
+    assert results_in(small.out) == list(RESULTS)
+    assert not (small.out / "unfinished").exists()
+    assert {name: (cache / name).stat().st_mtime_ns for name in kept} == kept
+
+
+# --- odd, but valid ---
+
+
+def same_centres(found, expected, tolerance_px: float) -> None:
+    """The same labels, and centres that differ by no more than this."""
+    assert found.keys() == expected.keys()
+    assert len(found) > 70
+    worst = max(np.hypot(*np.subtract(found[key], expected[key])) for key in found)
+    assert worst <= tolerance_px
+
+
+@pytest.mark.usefixtures("no_page")
+def test_names_with_spaces_and_non_ascii_and_images_directly_in_the_folder(small_set, small_run, stcal_sfm):
+    small = small_set("12")
+    names = ["zwei Flächen 1.JPG", "Bild, nr. 2.jpeg", "三.Jpg", 'a"quote".jpg']
+    for i, name in enumerate(names):
+        small.image(i).rename(small.images / name)
+    (small.images / "12").rmdir()
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    assert "4 images" in out
+    known = detections(small_run)
+    expected = {(name, label): known[f"12/IMG_{1000 + i}.jpg", label] for i, name in enumerate(names)
+                for image, label in known if image == f"12/IMG_{1000 + i}.jpg"}  # fmt: skip
+    same_centres(detections(small.out), expected, 0)
+    assert set(json.loads((small.out / "faces.json").read_text(encoding="utf-8"))["target_from_face"]) >= {"1", "2"}
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_group_with_an_odd_name(small_set, stcal_sfm):
+    small = small_set("12")
+    (small.images / "12").rename(small.images / "Gruppe „12“ & <b>")
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    assert "group Gruppe „12“ & <b>: 4 images" in out
+    assert (small.out / "overlays" / "Gruppe „12“ & <b>" / "IMG_1003.jpg.jpg").exists()
+
+
+def to_exif(path: Path) -> None:
+    """Put an APP1 segment with orientation 6, a quarter turn, behind the start of the image."""
+    exif = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    data = path.read_bytes()
+    path.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
+
+
+def to_sixteen_bit_png(path: Path) -> None:
+    path.write_bytes(encoded(".png", pixels(path).astype(np.uint16) * 257))
+
+
+def to_sixteen_bit_tiff(path: Path) -> None:
+    path.write_bytes(encoded(".tif", pixels(path).astype(np.uint16) * 257))
+
+
+def to_png_with_alpha(path: Path) -> None:
+    grey = pixels(path)
+    path.write_bytes(encoded(".png", np.dstack([grey, grey, grey, np.full_like(grey, 128)])))
+
+
+def to_jpeg_with_a_trailer(path: Path) -> None:
+    """As telephones append a video, with bytes in it that mean something in a JPEG."""
+    path.write_bytes(path.read_bytes() + b"ftypmp42 \xff\xd9 \xff\xda \xff\xc4 and so on")
+
+
+@pytest.mark.parametrize("convert", [to_exif, to_jpeg_with_a_trailer, to_png_with_alpha])
+def test_formats_of_the_same_pixels(small_set, convert):
+    small = small_set("12")
+    before = pixels(small.image())
+    convert(small.image())
+    np.testing.assert_array_equal(pixels(small.image()), before)
+
+
+@pytest.mark.parametrize("convert", [pytest.param(to_sixteen_bit_png, marks=pytest.mark.slow), to_sixteen_bit_tiff])
+def test_formats_of_more_bits(small_set, small_run, stcal_sfm, convert):
+    """16 bit are scaled so that the bright end just fits, edges are found at other grey levels."""
+    small = small_set("12")
+    for i in (1, 2, 3):
+        small.image(i).unlink()
+    convert(small.image())
+    arguments = ("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
+    assert_success(stcal_sfm(*arguments))
+    expected = {key: xy for key, xy in detections(small_run).items() if key[0] == "12/IMG_1000.jpg"}
+    same_centres(detections(small.out), expected, 0.02)
+
+
+@pytest.mark.usefixtures("no_page")
+def test_a_camera_of_opencv_without_a_size(small_set, small_run, stcal_sfm):
+    small = small_set("12")
+    camera = read_camera(small.camera)
+    path = small.folder / "camera.yml"
+    text = opencv_yaml(camera.focal[0], *camera.centre, camera.distortion[:5].tolist())
+    path.write_text(text, encoding="utf-8")
+    small.image(3).write_bytes(encoded(".jpg", pixels(small.image(3))[:-100]))
+    out = assert_success(stcal_sfm(*small.arguments("--camera", path, *CHAIN)))
+    assert "skipped 12/IMG_1003.jpg: 1296×764 px, but the first readable image says 1296×864 px" in out
+    expected = {key: xy for key, xy in detections(small_run).items() if key[0].startswith("12/IMG_1000")}
+    found = {key: xy for key, xy in detections(small.out).items() if key[0].startswith("12/IMG_1000")}
+    same_centres(found, expected, 1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_page")
+def test_a_second_run_does_only_what_changed(small_set, small_run, stcal_sfm):
+    small = small_set("14")
+    cache = small.out / "cache"
+
+    def stamps() -> dict[str, int]:
+        return {path.name: path.stat().st_mtime_ns for path in cache.glob("*.npz")}
+
+    assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    before = stamps()
+    out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    assert stamps() == before
+    assert len(before) == 8 + 3  # images, two groups together and one alone
+    assert out.replace(str(small.out), "RUN").splitlines()[-1] == "report: RUN/report.html"
+    own = {key: xy for key, xy in detections(small_run).items() if key[0].startswith("14/")}
+    assert detections(small.out) == own
+
+    picture = pixels(small.image(2, "14"))
+    small.image(2, "14").write_bytes(encoded(".jpg", cv2.GaussianBlur(picture, (3, 3), 0)))
+    assert_success(stcal_sfm(*small.arguments(*CHAIN)))
+    after = stamps()
+    assert {name: after[name] for name in before} == before
+    added = sorted(name.startswith("group-") for name in after.keys() - before.keys())
+    assert added == [False, True]  # that image, and its group
+    new = detections(small.out)
+    assert {key[0] for key in new if new[key] != own.get(key)} == {"14/IMG_1002.jpg"}

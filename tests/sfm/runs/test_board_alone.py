@@ -1,0 +1,108 @@
+"""Photographs of the board alone: λ and its residuals, as in Zhang & Wei's table 1."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.design import reference_board
+from stcal.geometry.rigid import Rigid
+from stcal.io.design import target_toml
+from stcal.sfm.detect.board_alone import _is_symmetry, _numbered
+from stcal.sfm.detect.sightings import PlaneView
+from tests.sfm.conftest import SmallSet
+from tests.sfm.runs.test_bad_input import COMPUTATION, INPUT, blacken
+from tests.shared import own_copy
+
+BOARD = reference_board()
+
+
+@pytest.fixture(scope="module")
+def hidden(small_dataset, small_scene, tmp_path_factory):
+    """The small set with the target painted over."""
+    own = SmallSet(tmp_path_factory.mktemp("alone") / "set")
+    own_copy(small_dataset, own.folder)
+    for group in ("12", "14"):
+        blacken(own, small_scene, group, board=False, count=4)
+    return own
+
+
+@pytest.mark.slow
+def test_the_board_alone_gives_scale_and_residuals(hidden, stcal_sfm):
+    code, text, _ = stcal_sfm(*hidden.arguments())
+    assert code == 0
+    assert "the board alone: no face of the target in 8 images, so that there is no faces.json" in text
+    assert not (hidden.out / "faces.json").exists()
+    report = json.loads((hidden.out / "report.json").read_text())
+    assert (report["faces"], report["summary"]["faces"]) == ({}, 0)
+    for group in report["groups"]:
+        assert "by the board" in group["seeded"]
+        scale = group["scale"]
+        # Dots 5 µm off per axis: 5 √(8/π) = 8 µm in length; σ of the centres adds some at this size.
+        assert 4 < scale["board_mean_um"] < 25
+        assert scale["board_spread_um"] < scale["board_mean_um"]
+        assert scale["board_rms_um"] == pytest.approx(np.hypot(scale["board_mean_um"], scale["board_spread_um"]))
+        assert f"{scale['board_mean_um']:.2f}" in text
+    assert "The board alone" in (hidden.out / "report.html").read_text()
+    code, _, error = stcal_sfm("pairs", hidden.out)
+    assert (code, "no faces.json: of the board alone" in error) == (INPUT, True)
+
+
+@pytest.mark.slow
+def test_the_published_method_knows_the_board_alone(hidden, stcal_sfm):
+    code, text, _ = stcal_sfm(*hidden.arguments("--solve", "paper"))
+    assert code == 0
+    assert "the board alone" in text
+
+
+@pytest.mark.slow
+def test_a_target_in_view_is_asked_for(small_set, small_scene, stcal_sfm):
+    """Dark circles are sought and bright ones in view: the file is wrong, unless that does not matter."""
+    small = small_set("12", detected=False)
+    path = small.folder / "target.toml"
+    path.write_text(target_toml(replace(small_scene.target, polarity="dark")), encoding="utf-8")
+    code, _, error = stcal_sfm(*small.arguments("--target", path))
+    assert code == COMPUTATION
+    assert "no face of the target recognised" in error
+    assert "use --board-only" in error
+    code, text, _ = stcal_sfm(*small.arguments("--target", path, "--board-only"))
+    assert code == 0
+    assert "the board alone" in text
+
+
+# --- numbering ---
+
+
+def views(roll_deg: float) -> list[PlaneView]:
+    """Both numberings of the reference board, from a camera that is turned about its axis."""
+    labels = BOARD.labels()
+    xy = BOARD.xy_mm()
+    turn = np.radians(roll_deg)
+    pose = Rigid.exp([0, 0, turn, 0, 0, 0]) @ Rigid(np.eye(3), [-120.0, -90, 900])
+    half_turn = Rigid(np.diag([-1.0, -1, 1]), [240.0, 180, 0])
+    none = np.zeros((len(labels), 2))
+    common = {"plane": "board", "labels": tuple(labels), "rows": np.arange(len(labels)), "xy_mm": xy, "xy": none}
+    return [PlaneView(**common, area=1.0, camera_from_plane=each) for each in (pose, pose @ half_turn)]
+
+
+def test_a_half_turn_is_a_symmetry_and_a_shift_is_none():
+    first, second = views(0)
+    assert _is_symmetry(first.camera_from_plane.inverse() @ second.camera_from_plane, BOARD)
+    assert not _is_symmetry(Rigid(np.eye(3), [30.0, 0, 0]), BOARD)
+    assert not _is_symmetry(Rigid.exp([0, 0, np.pi / 2, 0, 0, 0]), BOARD)
+
+
+def test_numberings_follow_the_camera():
+    """From each image to its nearest, over more than a quarter turn in all."""
+    rolls = [0, 35, 70, 105]
+    chosen, reasons = _numbered([views(r)[::-1] if i % 2 else views(r) for i, r in enumerate(rolls)])
+    assert reasons == {}
+    for i, roll in enumerate(rolls):
+        assert np.allclose(chosen[i].camera_from_plane.matrix(), views(roll)[0].camera_from_plane.matrix())
+
+
+def test_a_quarter_turn_says_nothing():
+    chosen, reasons = _numbered([views(0), views(88)])
+    assert list(chosen) == [0]
+    assert "board numbered from either end: the camera is turned by 88° or 92° from the nearest image" in reasons[1]

@@ -1,0 +1,126 @@
+"""Images taken out by name, and runs that end as failed where their checks have."""
+
+import json
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.io.images import chosen_images
+from stcal.sfm.checks.verdict import Check, ranked
+from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.text import _faces, _noted
+from tests.outcome import INPUT, assert_error, fails_with
+
+CHECKS_FAILED = 4
+STRAY = "12/IMG_1002.jpg"
+
+
+@pytest.fixture
+def with_a_stray(small_set):
+    """A photograph taken with another focus: distorted by 2 px in its corners more than the others."""
+    small = small_set("12", "14")
+    picture = cv2.imread(str(small.image(2)), cv2.IMREAD_GRAYSCALE)
+    height, width = picture.shape
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    from_middle = np.stack([x - width / 2, y - height / 2])
+    square = (from_middle**2).sum(0) / (width**2 + height**2) * 4
+    x, y = from_middle * (1 + 2 * square * 2 / np.hypot(width, height)) + np.array([width, height])[:, None, None] / 2
+    cv2.imwrite(str(small.image(2)), cv2.remap(picture, x.astype(np.float32), y.astype(np.float32), cv2.INTER_CUBIC))
+    return small
+
+
+def files(small):
+    return "--target", small.folder / "target.toml", "--board", small.folder / "board.toml"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_page")
+def test_a_failed_check_names_its_image_and_the_option_that_takes_it_out(with_a_stray, stcal_sfm):
+    """Exit code 0 as ever, 4 with --strict, and 0 again with what the first remedy says."""
+    small = with_a_stray
+    code, out, err = stcal_sfm(*small.arguments(*files(small)))
+    assert code == 0
+    assert {"faces: 4 of 4", "check: 17 of 17"} <= set(err.splitlines())
+    lines = out.splitlines()
+    (counts,) = (i for i, line in enumerate(lines) if line.startswith("checks: "))
+    assert lines[counts + 1] == "  (a check is suspicious by chance in one run in 1,000, failed in one in 100,000)"
+    first = lines[counts + 2]
+    assert first.startswith("  failed: ")
+    assert first.endswith(f"--exclude {STRAY}")
+
+    outcome = stcal_sfm(*small.arguments(*files(small), "--strict"))
+    line = assert_error(outcome, CHECKS_FAILED, "E-CHECKS-FAILED", "--strict", "see")
+    assert line.endswith(str(small.out / "report.html"))
+    assert (small.out / "faces.json").exists()
+
+    code, out, _ = stcal_sfm(*small.arguments(*files(small), "--strict", "--exclude", STRAY))
+    assert code == 0
+    assert f"skipped {STRAY}: taken out with --exclude" in out
+    assert "by chance" not in out
+    report = json.loads((small.out / "report.json").read_text())
+    assert [(each["name"], each["gate"]) for each in report["left_out"]["files"]] == [(STRAY, "excluded")]
+    assert STRAY not in {each["name"] for each in report["images"]}
+    assert load_run(small.out).options.exclude == (STRAY,)
+    assert small.image(2).exists()
+
+
+def test_an_unknown_image_is_an_error(small_set, stcal_sfm):
+    small = small_set("12")
+    outcome = stcal_sfm(*small.arguments("--exclude", "12/IMG_1000.jpg", "--exclude", "IMG_1001.jpg"))
+    assert_error(outcome, INPUT, "E-OPTION-EXCLUDE", "--exclude", "IMG_1001.jpg", "12/IMG_1000.jpg")
+    outcome = stcal_sfm("detect", *small.arguments("--exclude", "12/none.jpg")[1:])
+    assert_error(outcome, INPUT, "E-OPTION-EXCLUDE", "--exclude", "12/none.jpg")
+
+
+def test_images_are_named_as_in_results_or_by_their_path(small_set, monkeypatch):
+    small = small_set("12", "14")
+    monkeypatch.chdir(small.images / "14")
+    kept, left = chosen_images(small.images, ["12/IMG_1001.jpg", "IMG_1002.jpg", str(small.image(3))])
+    assert [each.name for each in left] == ["12/IMG_1001.jpg", "12/IMG_1003.jpg", "14/IMG_1002.jpg"]
+    assert {each.gate for each in left} == {"excluded"}
+    assert len(kept) == 5
+    with fails_with("E-OPTION-EXCLUDE … --exclude … 8"):
+        chosen_images(small.images, [each.name for each in chosen_images(small.images)[0]])
+
+
+def test_images_in_which_something_was_left_out_are_named():
+    images = [
+        SimpleNamespace(observations=SimpleNamespace(name=f"12/{i}.jpg"), notes=(f"face 2: no circle {i}",) * (i % 3))
+        for i in range(18)
+    ]
+    lines = list(_noted(images))
+    assert lines[:3] == ["12/1.jpg: face 2: no circle 1", *["12/2.jpg: face 2: no circle 2"] * 2]
+    assert len(lines) == 7
+    assert lines[-1] == (
+        "something was left out in 12/7.jpg, 12/8.jpg, 12/10.jpg, 12/11.jpg, 12/13.jpg, 12/14.jpg and 2 more too; the "
+        "report says what and why"
+    )
+    assert list(_noted(images[:3])) == lines[:3]
+
+
+def test_the_table_of_faces_fits_into_80_columns(small_result):
+    lines = list(_faces(small_result))
+    assert len(lines) > 3
+    assert max(map(len, lines)) <= 80
+    (name, x, y, z, *sigma) = lines[2].split()
+    assert len(sigma) == 6
+    assert [float(v) for v in (x, y, z)] == [
+        round(v, 4) for v in small_result.target.target_from_face[name].translation.tolist()
+    ]
+
+
+def test_of_failed_checks_those_that_name_an_image_come_first():
+    def check(key, verdict, *names):
+        return Check(key, key, verdict, "", (), 1, names, "")
+
+    checks = [
+        check("dull", "suspicious", "b.jpg"),
+        check("passed", "passed"),
+        check("camera", "failed", "camera"),
+        check("centre", "suspicious", "b.jpg 1:1"),
+        check("image", "failed", "a.jpg"),
+    ]
+    order = [each.key for each in ranked(checks, frozenset({"a.jpg", "b.jpg"}))]
+    assert order == ["image", "camera", "dull", "centre", "passed"]

@@ -1,0 +1,90 @@
+"""The published method end to end, and the comparison with it: a small set of photographs."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stcal.sfm.pipeline import RunOptions, run
+from stcal.sfm.runs.published import AS_PUBLISHED, STEPS
+from tests.outcome import fails_with
+
+
+@pytest.fixture(scope="module")
+def compared(small_dataset, tmp_path_factory):
+    out = tmp_path_factory.mktemp("compared") / "run"
+    data = small_dataset
+    files = [data / name for name in ("target.toml", "board.toml")]
+    return run(data / "images", data / "cameras.txt", out, *files, RunOptions(workers=1, compare="paper"))
+
+
+@pytest.mark.slow
+def test_each_step_is_worth_something(compared, small_result):
+    """1.1 megapixels: the eccentricity moves faces by some 50 µm, contours by more; σ is a few."""
+    rows = {row.method: row for row in compared.comparison.rows}
+    assert list(rows) == [AS_PUBLISHED, *(f"+ {step}" for step in STEPS)]
+    sigma = compared.comparison.sigma
+    assert rows[AS_PUBLISHED].missing == ["5"]  # never whole in view, which the published rules need
+    for face in ("2", "4"):
+        own = sigma[face]
+        off = {name: row.faces[face].translation_um for name, row in rows.items() if row.faces}
+        assert off[AS_PUBLISHED] > 3 * own.translation_um
+        assert off["+ centres of blurred edges"] > 2 * own.translation_um
+        # Groups by themselves with frames of three points: worse than all together by a few times, not by tens.
+        assert off["+ weights"] < 6 * own.translation_um
+    assert rows[AS_PUBLISHED].residual_rms_px > 3 * rows["+ weights"].residual_rms_px
+    assert rows["+ centres of blurred edges"].residual_rms_px > rows["+ eccentricity"].residual_rms_px
+    for face, pose in small_result.target.target_from_face.items():  # the answer is that without the comparison
+        assert np.array_equal(pose.matrix(), compared.target.target_from_face[face].matrix())
+
+
+def test_the_comparison_is_in_the_report(compared):
+    report = json.loads((compared.out / "report.json").read_text())
+    assert report["comparison"]["with"] == "paper"
+    assert report["comparison"]["rows"][-1]["faces"] == {}
+    page = (compared.out / "report.html").read_text()
+    assert 'id="comparison"' in page
+    assert "+ centres of blurred edges" in page
+
+
+@pytest.mark.slow
+def test_the_published_method_is_settled_whole(small_set, stcal_sfm):
+    data = small_set("12", "14")
+    code, text, _ = stcal_sfm(*data.arguments("--solve", "paper"))
+    assert code == 0
+    assert "as published, for comparison: centres of contours" in text
+    faces = json.loads((data.out / "faces.json").read_text())
+    assert (faces["solve"], faces["eccentricity"], faces["frame"]) == ("paper", False, "three-point")
+    report = json.loads((data.out / "report.json").read_text())
+    assert all(group["scale"]["difference_ppm"] == 0 for group in report["groups"])  # λ is that by rows
+    code, text, _ = stcal_sfm("faces", data.out / "models", "--run", data.out, "--solve", "paper")
+    assert code == 0
+    off = [line.split()[-2:] for line in text.splitlines() if line.split()[0] in ("2", "4")]
+    assert off == [["0.00", "0.000"]] * 2
+
+
+def test_what_contradicts_the_published_method_is_refused(small_set, stcal_sfm):
+    data = small_set("12", "14")
+    for more, said in (
+        (("--solve", "paper", "--frame", "plane"), "--solve paper: three-point frames without eccentricity"),
+        (("--solve", "paper", "--refine-camera"), "--refine-camera: part of the joint adjustment, the solve is paper"),
+        (("--solve", "chain", "--compare", "paper"), "--compare paper: compares the joint adjustment, the solve is"),
+        (("--no-eccentricity", "--compare", "paper"), "--compare paper: compares the joint adjustment"),
+    ):
+        code, _, error = stcal_sfm(*data.arguments(*more))
+        assert code == 2, more
+        assert said in error
+        assert not (data.out / "faces.json").exists()
+    with fails_with("E-OPTION-VALUE … 'x'"):
+        RunOptions(compare="x")
+
+
+@pytest.mark.slow
+def test_another_design_is_compared_without_the_published_row(tmp_path, shared_data):
+    data = shared_data("stereo_target/white_block")
+    designs = data / "target.toml", data / "board.toml"
+    result = run(data / "images", data / "cameras.txt", tmp_path / "run", *designs, RunOptions(compare="paper"))
+    first, *others = result.comparison.rows
+    assert first.faces == {}
+    assert "not read by the rules of Zhang & Wei" in first.reason
+    assert all(row.reason is None for row in others)

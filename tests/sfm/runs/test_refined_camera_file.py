@@ -1,0 +1,41 @@
+"""``refined_cameras.txt``: the camera as a run adjusted it, a camera file for other commands."""
+
+import numpy as np
+import pytest
+
+from stcal.io.cameras.read import read_camera
+from stcal.io.saving import CAMERA, REFINED_CAMERA
+from stcal.sfm.camera.intrinsics import model_parameters
+from stcal.sfm.pipeline import RunOptions, run
+
+CHI2_8_999 = 26.1
+"""Of the squares of eight parameters' errors over their σ, once in a thousand draws more."""
+
+
+def test_held_intrinsics_make_no_file(small_run):
+    assert (small_run / CAMERA).is_file()
+    assert not (small_run / REFINED_CAMERA).exists()
+
+
+@pytest.mark.slow
+def test_refined_intrinsics_are_a_camera_file_with_sigma(small_dataset, small_scene, tmp_path):
+    true = small_scene.camera
+    rough = tmp_path / "rough.txt"
+    fx, fy, cx, cy, *distortion = model_parameters(true, "OPENCV")
+    shifted = [1.003 * fx, 1.003 * fy, cx + 3.5, cy - 2.5, *distortion]
+    rough.write_text(f"1 OPENCV {true.width} {true.height} {' '.join(map(str, shifted))}\n")
+    files = [small_dataset / name for name in ("target.toml", "board.toml")]
+
+    def made(refine: bool):
+        return run(small_dataset / "images", rough, tmp_path / "run", *files, RunOptions(refine_camera=refine))
+
+    result = made(True)
+    found = read_camera(tmp_path / "run" / REFINED_CAMERA)
+    assert np.allclose(found.focal, result.calibration.camera.focal, rtol=1e-12)
+    off = model_parameters(found.sized(0, 0), "OPENCV") - model_parameters(true, "OPENCV")
+    before = np.array(shifted) - model_parameters(true, "OPENCV")
+    assert found.covariance is not None
+    assert off @ np.linalg.solve(found.covariance, off) < CHI2_8_999
+    assert np.abs(off[:4]).max() < 0.2 * np.abs(before[:4]).max()
+    made(False)
+    assert not (tmp_path / "run" / REFINED_CAMERA).exists()

@@ -1,0 +1,132 @@
+"""``report``: the page of a finished run made again, and its PDF."""
+
+import csv
+import json
+import math
+import re
+import shutil
+
+import pytest
+from markupsafe import escape
+
+from stcal.io.saving import RUN_MARKER
+from stcal.sfm.report.judgement import Judgement
+from stcal.sfm.runs import folder
+from stcal.sfm.runs.text import run_text
+from stcal.sfm.runs.transaction import added_results
+from stcal.sfm.runs.verify import verify
+from tests.outcome import INPUT, assert_error
+from tests.report.browser import faults, opened, show, sideways_px
+from tests.shared import own_copy
+
+
+@pytest.fixture
+def own(small_run, tmp_path):
+    """A copy of the small run to write to."""
+    return own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
+
+
+def test_the_same_files_make_the_same_page(own, small_run, stcal_sfm, monkeypatch):
+    monkeypatch.setattr(folder, "pdf_of", lambda page: page[:15].encode())
+    (own / "report.html").write_text("spoilt")
+    assert not verify(own).whole
+    code, out, _ = stcal_sfm("report", own, "--pdf")
+    assert (code, out) == (0, f"report: {own}/report.html\nreport: {own}/report.pdf\n")
+    assert (own / "report.html").read_bytes() == (small_run / "report.html").read_bytes()
+    assert (own / "report.pdf").read_bytes() == b"<!DOCTYPE html>"
+    assert verify(own).whole
+
+
+def test_a_pdf_goes_with_the_page_that_it_was_made_of(own, stcal_sfm, monkeypatch):
+    monkeypatch.setattr(folder, "pdf_of", lambda page: b"%PDF")
+    assert stcal_sfm("report", own, "--pdf")[0] == 0
+    with added_results(own) as stage:
+        (stage / "report.html").write_text("another")
+    assert not (own / "report.pdf").exists()
+    assert verify(own).whole
+
+
+@pytest.mark.slow
+def test_into_a_file_of_ones_own(own, tmp_path, stcal_sfm):
+    before = (own / RUN_MARKER).read_bytes()
+    code, out, _ = stcal_sfm("report", own, "--pdf", "--out", tmp_path / "for the lab.html")
+    assert (code, out) == (0, f"report: {tmp_path}/for the lab.html\nreport: {tmp_path}/for the lab.pdf\n")
+    assert (tmp_path / "for the lab.html").read_bytes() == (own / "report.html").read_bytes()
+    assert (tmp_path / "for the lab.pdf").read_bytes().startswith(b"%PDF")
+    assert (own / RUN_MARKER).read_bytes() == before
+    assert not (own / "report.pdf").exists()
+
+
+def test_photographs_that_are_gone_are_counted(own, tmp_path, stcal_sfm):
+    shutil.rmtree(own / "overlays" / "12")
+    code, out, _ = stcal_sfm("report", own, "--out", tmp_path / "page.html")
+    assert code == 0
+    assert out.startswith("4 overlays are no longer in the folder: the report is without them\n")
+    page = (tmp_path / "page.html").read_text()
+    assert "4 photographs are not shown: their overlays were no longer in the run" in page
+    assert page.count('alt="Overlay of 14/') == 4
+    assert "Overlay of 12/" not in page
+
+
+def test_what_cannot_be_made_is_said_in_one_line(own, tmp_path, stcal_sfm):
+    assert_error(stcal_sfm("report", tmp_path), INPUT, "E-RUN-FOLDER", "--out")
+    assert_error(
+        stcal_sfm("report", own, "--out", tmp_path / "a.pdf"), INPUT, "E-OUTPUT-SUFFIX", "a.html", "--pdf", "a.pdf"
+    )
+    assert_error(stcal_sfm("report", own, "--out", own / "report.html"), INPUT, "E-OUTPUT-IS-INPUT", "run")
+    content = json.loads((own / "report.json").read_text())
+    del content["faces"]
+    (own / "report.json").write_text(json.dumps(content))
+    assert_error(stcal_sfm("report", own), INPUT, "E-RUN-DAMAGED", "report.json", "faces")
+    assert (own / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("report.json", '"label": "1:1"', '"label": "?"'),
+        ("labels.csv", "\n1,0,", "\n1,0,12/IMG_1000.jpg,12,x,0,0,0,0,1,0,1,left,0\n1,0,"),
+    ],
+)
+def test_a_page_that_cannot_be_made_leaves_the_earlier_one(own, stcal_sfm, name, old, new):
+    text, before = (own / name).read_text(), (own / "report.html").read_bytes()
+    (own / name).write_text(text.replace(old, new, 1))
+    assert_error(stcal_sfm("report", own), INPUT, "E-RUN-DAMAGED", f"{name}")
+    assert (own / "report.html").read_bytes() == before
+
+
+def test_terminal_file_and_page_have_the_same_judgement(small_result, small_run):
+    stored = Judgement.model_validate(json.loads((small_run / "report.json").read_text())["judgement"])
+    assert stored == small_result.judgement
+    page, terminal = (small_run / "report.html").read_text(), run_text(small_result).splitlines()
+    assert len(stored.answers()) == 4
+    for question, answer in stored.answers():
+        assert f"{question} {answer}" in terminal
+        assert f"<dt>{question}</dt><dd>{escape(answer)}</dd>" in page
+
+
+def test_residuals_of_the_table_are_those_of_the_report_and_of_the_page(small_run):
+    report = json.loads((small_run / "report.json").read_text())
+    with open(small_run / "labels.csv", encoding="utf-8", newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["residual_x_px"]]
+    page = (small_run / "report.html").read_text()
+    factor = float(re.search(r"measured less projected, ([\d,]+) times", page)[1].replace(",", ""))
+    drawn = page.split('alt="Overlay of ')
+    for image in report["residuals_by_image"]:
+        own = [[float(row[f"residual_{axis}_px"]) for axis in "xy"] for row in rows if row["image"] == image["image"]]
+        assert len(own) == image["observations"]
+        assert math.sqrt(sum(x * x + y * y for x, y in own) / (2 * len(own))) == pytest.approx(image["rms_px"])
+        assert max(math.hypot(*each) for each in own) == pytest.approx(image["max_px"])
+        (part,) = [each for each in drawn if each.startswith(image["image"])]
+        vectors = re.findall(r"M[\d.-]+ [\d.-]+l([\d.-]+) ([\d.-]+)", part)
+        assert [[float(v) / factor for v in each] for each in vectors] == [
+            [pytest.approx(v, abs=0.051 / factor) for v in each] for each in own
+        ]
+
+
+@pytest.mark.slow
+def test_the_page_of_a_run_in_a_browser(small_run):
+    with opened() as chrome:
+        for width in (1280, 400):
+            show(chrome, small_run / "report.html", width)
+            assert (width, sideways_px(chrome), faults(chrome)) == (width, 0, [])

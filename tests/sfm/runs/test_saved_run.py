@@ -1,0 +1,336 @@
+"""A run's folder read back: what was written, number by number, or one line that says which file is wrong."""
+
+import csv
+import json
+import shutil
+from dataclasses import asdict
+from importlib import import_module
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.errors import InputError
+from stcal.sfm import run
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.mapping.pairs import PairOptions
+from stcal.sfm.runs.marker import MarkerFile
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.transaction import run_folder
+from tests.outcome import INPUT, assert_error
+from tests.shared import own_copy
+
+FRAME = ("id", "ids", "origin", "x", "y")
+UNLABELLED = "12/IMG_1001.jpg"
+OTHER = RunOptions(
+    solve="chain",
+    frame="three-point",
+    eccentricity=False,
+    reference_face="2",
+    graph="sparse",
+    pairs=PairOptions(max_angle_rad=0.9),
+    ellipses=EllipseOptions(min_diameter_px=7.5, max_diameter_px=321.0, min_axis_ratio=0.23, min_contrast=0.07),
+    workers=3,
+    flatness_mm=0.3,
+    exclude=("12/a.jpg", "b.jpg"),
+)
+SPECIAL = ("refine_camera", "compare", "board_only")
+"""No value is a default but those that only the joint adjustment knows, and that of runs without faces."""
+
+
+@pytest.fixture(scope="module")
+def written(small_dataset, small_run, tmp_path_factory):
+    """A run with options of its own, one image in the middle grey, that shows no circle; and the same read back."""
+    folder = tmp_path_factory.mktemp("written")
+    own_copy(small_dataset, folder / "data")
+    (folder / "run").mkdir()
+    own_copy(small_run / "cache", folder / "run" / "cache")
+    own_copy(small_run / "stcal-run.json", folder / "run")
+    grey(folder / "data" / "images" / UNLABELLED)
+    options = RunOptions("chain", "three-point", True, "2", "sparse", PairOptions(np.radians(40)), workers=1)
+    data = folder / "data"
+    files = [data / name for name in ("images", "cameras.txt")], [data / name for name in ("target.toml", "board.toml")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            import_module("stcal.sfm.runs.folder"), "report_html", lambda *_: ""
+        )  # as no_page, of single tests
+        result = run(*files[0], folder / "run", *files[1], options)
+    return result, load_run(folder / "run")
+
+
+def grey(path) -> None:
+    path.write_bytes(cv2.imencode(".jpg", np.full((864, 1296), 90, np.uint8))[1].tobytes())
+
+
+def test_labels_and_centres_are_the_same_numbers(written):
+    result, saved = written
+    assert [image.name for image in saved.observations] == [image.name for image in result.observations()]
+    for found, known in zip(saved.observations, result.observations(), strict=True):
+        assert (found.group, found.labels) == (known.group, known.labels)
+        assert np.array_equal(found.centre_px, known.centre_px)  # all 64 bits
+        # Undistorted again from the same pixels, by the same iteration to 1e-12.
+        assert np.allclose(found.centre, known.centre, rtol=0, atol=1e-11)
+        # Squared and rooted again: one rounding of 1.1e-16 each.
+        assert np.allclose(found.sigma_px(), known.sigma_px(), rtol=1e-15, atol=0)
+    assert sum(len(image) for image in saved.observations) > 500
+
+
+def test_corrected_centres_are_those_of_the_models(written):
+    result, saved = written
+    by_name = dict(zip((image.name for image in saved.observations), saved.corrected_px, strict=True))
+    for solution in result.solutions:
+        model = solution.model
+        names = np.array(model.images)[model.image_index]
+        found = np.array([by_name[name][k] for name, k in zip(names, model.keypoint, strict=True)])
+        assert np.array_equal(found, model.corrected_px())
+        assert np.abs(model.shift_px).max() > 0.01  # they differ from the measured ones
+
+
+def test_an_image_without_a_label_keeps_its_place(written):
+    _, saved = written
+    assert [image.name for image in saved.observations].index(UNLABELLED) == 1
+    assert len(saved.observations) == 8
+    assert saved.observations[1].labels == ()
+    assert saved.observations[1].centre_px.shape == saved.corrected_px[1].shape == (0, 2)
+    assert len(saved.observations[2]) > 70
+    assert [image.name for image in saved.groups()["12"]][1] == UNLABELLED
+
+
+def test_camera_and_designs_are_the_same(written):
+    result, saved = written
+    assert saved.camera.same_as(result.camera)
+    assert saved.camera.colmap_model == result.camera.colmap_model
+    assert saved.target.radius_of() == result.target_design.radius_of()
+    for found, known in zip(saved.target.faces, result.target_design.faces, strict=True):
+        assert [getattr(found, n) for n in FRAME] == [getattr(known, n) for n in FRAME]
+        assert np.allclose(found.xy_mm, known.xy_mm, rtol=0, atol=1e-9)  # written to nine digits
+    assert asdict(saved.board) == asdict(result.board_design)
+
+
+def test_options_answers_and_places_are_the_same(written):
+    result, saved = written
+    assert saved.options == result.options
+    assert saved.options.reference_face == saved.faces.reference_face == "2"
+    assert saved.images == result.out.parent / "data" / "images"
+    assert saved.database == result.out / "database.db"
+    found = {face: np.array(matrix) for face, matrix in saved.faces.target_from_face.items()}
+    assert found.keys() == result.target.target_from_face.keys()
+    assert all(np.array_equal(found[face], pose.matrix()) for face, pose in result.target.target_from_face.items())
+
+
+def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monkeypatch):
+    """What ``run`` puts into the folder at its start, into a copy of a finished run."""
+    default = RunOptions()
+    assert all(getattr(OTHER, name) != getattr(default, name) for name in RunOptions.__slots__ if name not in SPECIAL)
+    assert all(getattr(OTHER.ellipses, n) != getattr(default.ellipses, n) for n in EllipseOptions.__slots__)
+    monkeypatch.chdir(tmp_path)
+    with run_folder("new", MarkerFile.of("some images", OTHER), {}):
+        pass
+    own = own_copy(small_run, tmp_path / "run")
+    shutil.copy(tmp_path / "new" / "stcal-run.json", own)
+    saved = load_run(own)
+    assert saved.options == OTHER
+    assert saved.images == tmp_path / "some images"
+
+
+# --- damaged, unfinished, of another version ---
+
+
+@pytest.fixture
+def own_run(small_run, tmp_path):
+    """A copy of the small run to spoil."""
+    return own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache", "overlays"))
+
+
+def edit(path, change) -> None:
+    content = json.loads(path.read_text(encoding="utf-8"))
+    change(content)
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
+def faces_of(own_run) -> tuple:
+    return "faces", own_run / "models", "--run", own_run
+
+
+NEEDED = ["cameras.txt", "target.toml", "board.toml", "labels.csv", "database.db", "report.json", "faces.json"]
+
+
+@pytest.mark.parametrize("name", NEEDED)
+def test_a_file_is_missing(own_run, stcal_sfm, name):
+    (own_run / name).unlink()
+    outcome = stcal_sfm(*faces_of(own_run))
+    if name == "faces.json":
+        assert_error(outcome, INPUT, "E-RUN-NO-FACES", f"{own_run}", "faces.json")
+    else:
+        assert_error(outcome, INPUT, "E-RUN-UNFINISHED", f"{own_run}", f"{name}")
+
+
+def test_not_a_run(own_run, tmp_path, stcal_sfm):
+    (own_run / "stcal-run.json").unlink()
+    for path in (own_run, tmp_path / "nothing", tmp_path / "run" / "faces.json"):
+        outcome = stcal_sfm("faces", own_run / "models", "--run", path)
+        assert_error(outcome, INPUT, "E-RUN-FOLDER", f"{path}", "stcal-run.json", "--out")
+
+
+def test_a_folder_of_detections_only(small_set, stcal_sfm):
+    small = small_set("12")
+    stcal_sfm("detect", small.images, "--camera", small.camera, "--out", small.out, "--workers", 1)
+    outcome = stcal_sfm("faces", small.out, "--run", small.out)
+    assert_error(outcome, INPUT, "E-RUN-UNFINISHED", str(small.out), "cameras.txt, target.toml")
+
+
+@pytest.mark.parametrize("name", ["stcal-run.json", "report.json", "faces.json"])
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff\xfe", b"[" * 100_000, b'"text"'])
+def test_a_file_that_is_no_json_object(own_run, stcal_sfm, name, content):
+    (own_run / name).write_bytes(content)
+    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, str(own_run / name), "run it again")
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("stcal-run.json", "images"),
+        ("stcal-run.json", "options"),
+        ("report.json", "images"),
+        ("report.json", "groups"),
+        ("report.json", "summary"),
+        ("faces.json", "target_from_face"),
+        ("faces.json", "circles"),
+    ],
+)
+def test_a_run_of_before_a_key_was_written(own_run, stcal_sfm, name, key):
+    edit(own_run / name, lambda content: content.pop(key))
+    parts = (str(own_run / name), "of another version", f"no '{key}'", "run it again")
+    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-DAMAGED", *parts)
+
+
+WRONG = {
+    "options null, as of detect": ("stcal-run.json", lambda c: c.update(options=None), "no 'pairs'"),
+    "an option unknown here": ("stcal-run.json", lambda c: c["options"].update(magic=1), "magic"),
+    "an option missing": ("stcal-run.json", lambda c: c["options"].pop("ellipses"), "no 'ellipses'"),
+    "no such choice": ("stcal-run.json", lambda c: c["options"].update(solve="guess"), "solve 'guess'"),
+    "no such face": ("stcal-run.json", lambda c: c["options"].update(reference_face="9"), "no face 9"),
+    "images a number": ("stcal-run.json", lambda c: c.update(images=3), "images: 3: "),
+    "report's images a list of names": ("report.json", lambda c: c.update(images=["a", "b"]), "images.1: 'a': "),
+    "a group without pairs": ("report.json", lambda c: c["groups"][0].update(pairs=[]), "groups.1.pairs: []: "),
+    "a group missing": ("report.json", lambda c: c["groups"].pop(), "no '14'"),
+    "another group's pair": (
+        "report.json",
+        lambda c: c["groups"][0].update(pairs=c["groups"][1]["pairs"]),
+        "group 12: its initial pair is not of its images",
+    ),
+    "the residual a word": ("report.json", lambda c: c["summary"].update(residual_rms_px="small"), "'small'"),
+    "another format": ("faces.json", lambda c: c.update(format="stcal faces 2"), "'stcal faces 1'"),
+    "metres": ("faces.json", lambda c: c.update(unit="m"), "'mm'"),
+    "faces a list": ("faces.json", lambda c: c.update(target_from_face=[1]), "target_from_face: [1]: "),
+    "a face of words": ("faces.json", lambda c: c["target_from_face"].update({"2": "abc"}), "abc"),
+    "a face scaled": (
+        "faces.json",
+        lambda c: c["target_from_face"].update({"2": np.diag([2.0, 2, 2, 1]).tolist()}),
+        "scaled",
+    ),
+    "a circle of two": (
+        "faces.json",
+        lambda c: c["circles"].update({"2:1": [1, 2]}),
+        "circles.2:1: [1, 2]: shape (2,)",
+    ),
+    "a list for an option": (
+        "stcal-run.json",
+        lambda c: c["options"]["pairs"].update(max_angle_rad=[1]),
+        "max_angle_rad [1]: a single value needed",
+    ),
+    "names that are none": (
+        "stcal-run.json",
+        lambda c: c["options"].update(exclude=[7]),
+        "options: exclude [7]: a list of names needed",
+    ),
+    "a circle not finite": ("faces.json", lambda c: c["circles"].update({"2:1": [1, 2, np.nan]}), "circles.2:1: "),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_value_that_no_run_writes(own_run, stcal_sfm, case):
+    name, change, part = WRONG[case]
+    edit(own_run / name, change)
+    parts = (f"{own_run / name}: damaged, or of another version", part, "run it again")
+    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-DAMAGED", *parts)
+
+
+def rows(change):
+    """A change of the rows of labels.csv, each a list of values, without the header."""
+
+    def apply(path) -> None:
+        with path.open(encoding="utf-8", newline="") as stream:
+            header, *body = csv.reader(stream)
+        body = change(body)
+        with path.open("w", encoding="utf-8", newline="") as stream:
+            csv.writer(stream, lineterminator="\n").writerows([header, *body])
+
+    return apply
+
+
+def value(row: int, column: int, text: str):
+    return rows(lambda body: [*body[:row], [*body[row][:column], text, *body[row][column + 1 :]], *body[row + 1 :]])
+
+
+ORDER = "image 12/IMG_1000.jpg: its keypoints are not 0 to 8"
+LABELS = {
+    "two rows swapped": (rows(lambda body: [body[1], body[0], *body[2:]]), ORDER),
+    "a row missing": (rows(lambda body: body[:5] + body[6:]), ORDER),
+    "the last rows missing": (rows(lambda body: body[:-20]), "image 14/IMG_1003.jpg: its keypoints are not 0 to"),
+    "a row twice": (rows(lambda body: [*body[:3], body[2], *body[3:]]), ORDER),
+    "an image not of the run": (value(4, 2, "12/other.jpg"), "no '12/other.jpg'"),
+    "a label not of the target": (value(4, 4, "7:1"), "image 12/IMG_1000.jpg: no circle 7:1"),
+    "a label twice": (rows(lambda body: [body[0], [*body[1][:4], body[0][4], *body[1][5:]], *body[2:]]), "label twice"),
+    "a word for a number": (value(4, 5, "left"), "'left'"),
+    "not a number": (value(4, 7, "nan"), "not finite"),
+    "σ of zero": (value(4, 9, "0"), "covariance: variance 0 of x, a positive number needed"),
+    "cut in a row": (lambda path: path.write_bytes(path.read_bytes()[:-25]), "run it again"),
+    "empty": (lambda path: path.write_bytes(b""), ORDER),
+    "not UTF-8": (lambda path: path.write_bytes(b"\xff\xfe\xff"), "utf-8"),
+    "no such column": (lambda path: path.write_text(path.read_text().replace("var_x_px2", "s", 1)), "no 'var_x_px2'"),
+    "one endless field": (lambda path: path.write_text('image\n"' + 200_000 * "x"), "field larger than"),
+}
+
+
+@pytest.mark.parametrize("case", LABELS)
+def test_labels_that_are_not_the_database_s(own_run, stcal_sfm, case):
+    spoil, part = LABELS[case]
+    spoil(own_run / "labels.csv")
+    parts = (f"{own_run / 'labels.csv'}: damaged, or of another version (", part, "run it again")
+    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, "E-RUN-DAMAGED", *parts)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "part"),
+    [
+        ("cameras.txt", "", "neither COLMAP's cameras.txt"),
+        ("cameras.txt", "1 PINHOLE 9 9 1 1 1", "3 parameters for PINHOLE, 4 needed"),
+        ("target.toml", "polarity = 3", "polarity"),
+        ("board.toml", "rows", "not valid TOML"),
+    ],
+)
+def test_a_damaged_copy_of_what_the_run_was_given(own_run, stcal_sfm, name, content, part):
+    (own_run / name).write_text(content, encoding="utf-8")
+    assert_error(stcal_sfm(*faces_of(own_run)), INPUT, f"file {own_run / name}: ", part)
+
+
+def test_rows_of_the_images_in_another_order_are_the_same(own_run, small_run):
+    """Rows name their image; what counts is their order in it."""
+    rows(lambda body: sorted(body, key=lambda row: (-int(row[0]), int(row[1]))))(own_run / "labels.csv")
+    found, known = load_run(own_run), load_run(small_run)
+    assert [image.labels for image in found.observations] == [image.labels for image in known.observations]
+    assert all(np.array_equal(a, b) for a, b in zip(found.corrected_px, known.corrected_px, strict=True))
+
+
+def test_reading_writes_nothing(own_run):
+    before = {path: path.stat().st_mtime_ns for path in own_run.rglob("*")}
+    load_run(own_run)
+    assert {path: path.stat().st_mtime_ns for path in own_run.rglob("*")} == before
+
+
+def test_the_error_is_one_of_input(own_run):
+    (own_run / "labels.csv").unlink()
+    with pytest.raises(InputError):
+        load_run(own_run)

@@ -1,0 +1,72 @@
+"""What cannot be solved is refused before anything is mapped, and says what to add."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.io.cameras.model import CalibratedCamera
+from stcal.io.images import Skipped
+from stcal.sfm.runs.solve import require_usable, usable_groups
+from stcal.sfm.runs.text import run_text
+from tests.outcome import fails_with
+
+
+@pytest.fixture(scope="module")
+def group(scene, labels_only):
+    found = labels_only.observations(scene, 0.01, np.random.default_rng(0))
+    return [image for image in found if image.group == found[0].group]
+
+
+def only(group, board: bool):
+    """Every image with its dots alone, or with its circles alone."""
+    return [
+        image.select([i for i, label in enumerate(image.labels) if str(label).startswith("board") == board])
+        for image in group
+    ]
+
+
+def test_two_images_with_board_and_face_will_do(group):
+    require_usable(group[:2])
+    assert usable_groups({"12": group[:2]}, []) == ({"12": group[:2]}, [])
+
+
+def test_what_is_missing_is_named(group):
+    with fails_with("E-GROUP-FEW-IMAGES"):
+        require_usable(group[:1])
+    with fails_with("E-GROUP-NO-FACE … 5"):
+        require_usable(only(group, board=True))
+    with fails_with("E-GROUP-NO-BOARD … 5"):
+        require_usable(only(group, board=False))
+
+
+def test_a_group_of_which_every_file_was_skipped_is_not_forgotten(group):
+    """Its folder is one of the session: the answer without it says so."""
+    lost = [Skipped("99/a.jpg", "cannot be read")]
+    usable, notes = usable_groups({"12": group}, lost)
+    assert list(usable) == ["12"]
+    assert len(notes) == 1
+    assert notes[0].startswith("left out whole: group 99: 0 usable images, 2 needed, not 99/a.jpg: cannot be read")
+    with fails_with("E-GROUP-FEW-IMAGES … 99 … 0 usable images"):
+        usable_groups({}, lost)
+
+
+def test_a_folder_of_copies_or_of_notes_is_no_group(group):
+    skipped = [
+        Skipped("copies/a.jpg", "the same image as 12/b.jpg", "copy"),
+        Skipped("99/notes.txt", "not an image file"),
+    ]
+    assert usable_groups({"12": group}, skipped) == ({"12": group}, [])
+
+
+def test_a_run_that_takes_a_camera_with_sigma_as_exact_says_so(small_result):
+    assert "--refine-camera" not in run_text(small_result)
+    camera = small_result.camera
+    stated = CalibratedCamera.of(camera, camera.colmap_model, np.diag([1.44] * len(camera.colmap_params())))
+    said = (
+        "the camera file states σ of its parameters (1.2 px of the focal length), and this run takes them as exact: no "
+        "σ below holds them; --refine-camera adjusts the intrinsics within them"
+    )
+    assert said in run_text(replace(small_result, camera=stated))
+    refined = replace(small_result, camera=stated, options=replace(small_result.options, refine_camera=True))
+    assert said not in run_text(refined)

@@ -1,0 +1,168 @@
+"""``verify``: a run's folder holds what the run wrote, or what is wrong with it is named."""
+
+import json
+import os
+import shutil
+
+import pytest
+
+import stcal
+from stcal.errors import InputError
+from stcal.io.saving import RUN_MARKER
+from stcal.sfm.interop import crosscheck as interop
+from stcal.sfm.runs.crosscheck import Tolerances
+from stcal.sfm.runs.marker import MarkerFile
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.transaction import added_results, run_folder
+from stcal.sfm.runs.verify import require_whole, verified_text, verify
+from tests.outcome import INPUT, assert_error, fails_with
+from tests.shared import own_copy
+
+MARKER = MarkerFile.of("images", RunOptions())
+
+
+@pytest.fixture
+def made(tmp_path):
+    """A run's folder of a few files."""
+    with run_folder(tmp_path / "run", MARKER, {}) as folder:
+        for name in ("faces.json", "report.json", "models/12/images.bin", "overlays/12/a.jpg"):
+            (folder.stage / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder.stage / name).write_text(name)
+    return tmp_path / "run"
+
+
+def edit_marker(run, change):
+    content = json.loads((run / RUN_MARKER).read_text())
+    change(content)
+    (run / RUN_MARKER).write_text(json.dumps(content))
+
+
+def test_a_run_is_whole_with_files_beside_it(made):
+    (made / "notes.txt").write_text("mine")
+    (made / "cache" / "x.npz").write_text("later")
+    result = verify(made)
+    assert (result.whole, result.files, result.faults()) == (True, 5, [])
+    assert (result.missing, result.changed, result.added, result.beside) == ([], [], [], ["notes.txt"])
+    assert verified_text(result) == f"5 files by stcal {stcal.__version__}: whole\nbeside: notes.txt"
+    require_whole(result)
+
+
+def link(path):
+    content = path.with_name("elsewhere")
+    path.replace(content)
+    path.symlink_to(content)
+
+
+SPOILT = {
+    "missing": (lambda run: (run / "overlays/12/a.jpg").unlink(), "missing", "overlays/12/a.jpg"),
+    "a folder gone": (lambda run: shutil.rmtree(run / "models"), "missing", "models/12/images.bin"),
+    "one letter": (lambda run: (run / "faces.json").write_text("faces.jsoN"), "changed", "faces.json"),
+    "a link": (lambda run: link(run / "faces.json"), "changed", "faces.json"),
+    "a pipe": (
+        lambda run: ((run / "report.json").unlink(), os.mkfifo(run / "report.json")),
+        "changed",
+        "report.json",
+    ),
+    "the marker": (lambda run: edit_marker(run, lambda c: c.update(images="/elsewhere")), "changed", RUN_MARKER),
+    "its hashes": (lambda run: edit_marker(run, lambda c: c["sha256"].popitem()), "changed", RUN_MARKER),
+    "a file among the results": (lambda run: (run / "models/new.bin").touch(), "added", "models/new.bin"),
+    "a link among the results": (lambda run: (run / "models/new").symlink_to("/"), "added", "models/new"),
+    "a comparison by hand": (lambda run: (run / "compare.json").touch(), "added", "compare.json"),
+    "a database's journal": (lambda run: (run / "database.db-wal").touch(), "added", "database.db-wal"),
+}
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_what_is_not_as_it_was_is_named(made, case):
+    spoil, kind, name = SPOILT[case]
+    spoil(made)
+    result = verify(made)
+    assert not result.whole
+    assert getattr(result, kind) == [name]
+    assert f"{kind}: {name}" in verified_text(result).splitlines()
+    with pytest.raises(InputError, match=rf"run .*: .*1 {kind} \({name}\).*; run it again, or take a copy"):
+        require_whole(result)
+
+
+def test_another_version_is_named(made, monkeypatch):
+    monkeypatch.setattr(stcal, "__version__", "9.9")
+    result = verify(made)
+    assert result.whole
+    with fails_with("E-RUN-CHANGED … 0.1.0 … 9.9 … run it again … verify it"):
+        require_whole(result)
+
+
+def test_what_a_command_adds_belongs_to_the_run(made):
+    for text in ("first", "second"):
+        with added_results(made) as stage:
+            (stage / "compare.json").write_text(text)
+            (stage / "report.json").write_text(text)
+        assert verify(made).whole
+    assert (made / "compare.json").read_text() == "second"
+    assert (made / "faces.json").read_text() == "faces.json"
+    assert verify(made).files == 6
+    (made / "compare.json").unlink()
+    assert verify(made).missing == ["compare.json"]
+
+
+def test_a_command_that_fails_adds_nothing(made):
+    def add():
+        with added_results(made) as stage:
+            (stage / "report.json").write_text("half")
+            raise ValueError
+
+    with pytest.raises(ValueError, match=r"^$"):
+        add()
+    assert verify(made).whole
+    assert not (made / "added").exists()
+
+
+def test_a_run_and_an_addition_wait_for_each_other(made):
+    """The same process counts as another one here: each claim opens the lock anew."""
+    with added_results(made), fails_with("E-OUTPUT-IN-USE"):
+        run_folder(made, MARKER, {}).__enter__()
+    with run_folder(made, MARKER, {}), fails_with("E-OUTPUT-IN-USE"):
+        added_results(made).__enter__()
+
+
+def test_no_run_begins_while_a_crosscheck_maps(small_run, tmp_path, monkeypatch):
+    run = own_copy(small_run, tmp_path / "run")
+
+    def meanwhile(*_):
+        with run_folder(run, MARKER, {}):
+            pytest.fail("a run began")
+
+    monkeypatch.setattr(interop, "crosscheck", meanwhile)
+    with fails_with("E-OUTPUT-IN-USE"):
+        interop.crosscheck_run(load_run(run), None, Tolerances(), 60)
+    assert verify(run).whole
+
+
+def test_a_run_of_an_earlier_version_has_no_hashes_and_gets_none(made, stcal_sfm):
+    edit_marker(made, lambda content: content.pop("sha256"))
+    assert_error(stcal_sfm("verify", made), INPUT, "E-RUN-UNFINISHED", "run it again")
+    with added_results(made) as stage:
+        (stage / "compare.json").write_text("x")
+    assert (made / "compare.json").read_text() == "x"
+    assert_error(stcal_sfm("verify", made), INPUT, "E-RUN-UNFINISHED", "stcal-run.json")
+    edit_marker(made, lambda content: content.update(sha256=3))
+    assert_error(stcal_sfm("verify", made), INPUT, "E-RUN-DAMAGED", RUN_MARKER, "sha256: 3:")
+    assert_error(stcal_sfm("verify", made / "models"), INPUT, "E-RUN-FOLDER")
+
+
+def test_the_command_and_compare(small_run, small_dataset, tmp_path, stcal_sfm):
+    run = own_copy(small_run, tmp_path / "run")
+    code, text, _ = stcal_sfm("verify", run)
+    assert code == 0
+    assert text.splitlines()[0].endswith(": whole")
+    truth = small_dataset / "truth.json"
+    code, text, _ = stcal_sfm("compare", run, truth)
+    assert (code, text.splitlines()[-1]) == (0, f"as JSON: {run / 'compare.json'}")
+    with added_results(run):
+        assert_error(stcal_sfm("compare", run, truth), INPUT, "E-OUTPUT-IN-USE")
+    for name in ("faces.json", "compare.json"):
+        (run / name).write_bytes((run / name).read_bytes() + b" ")
+    outcome = stcal_sfm("verify", run, "--json", tmp_path / "found.json")
+    assert_error(outcome, INPUT, "E-RUN-CHANGED", f"{run}", "compare.json")
+    assert json.loads((tmp_path / "found.json").read_text())["changed"] == ["compare.json", "faces.json"]

@@ -1,0 +1,145 @@
+"""Images and observations that do not fit are left out by name, kept results belong to their inputs, and σ₀ counts."""
+
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.io.cameras.read import read_camera
+from stcal.sfm import RunOptions, run
+from stcal.sfm.adjust.calibration import image_sigma_factor, with_sigma
+from stcal.sfm.adjust.joint import adjust_jointly
+from stcal.sfm.adjust.uncertainty import calibrated_target
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.mapping.incremental import left_out
+from stcal.sfm.pipeline import detect
+from stcal.sfm.report.compare import compare
+from stcal.sfm.runs.transaction import RunFolder
+from stcal.synthetic.scene import SceneOptions, make_scene
+
+pytestmark = pytest.mark.usefixtures("no_page")
+
+
+def pair(small_set):
+    """A group of two images."""
+    small = small_set("12")
+    for i in (2, 3):
+        small.image(i).unlink()
+    return small
+
+
+def calibrate(folder, out, **options):
+    """Chained: what is left out, and what is kept, is seen before faces are adjusted together."""
+    data = [folder / name for name in ("images", "cameras.txt")]
+    return run(
+        *data, out, folder / "target.toml", folder / "board.toml", RunOptions(workers=1, solve="chain", **options)
+    )
+
+
+def test_an_image_without_a_circle_is_reported_and_harms_nothing(small_set):
+    small = small_set("12")
+    folder = small.folder
+    cv2.imwrite(str(folder / "images" / "12" / "black.png"), np.zeros((864, 1296), np.uint8))
+    result = calibrate(folder, small.out)
+    reasons = {name: why for s in result.solutions for name, why in s.left_out.items()}
+    assert list(reasons) == ["12/black.png"]
+    assert "0 of its circles are in the model, 6 needed" in reasons["12/black.png"]
+
+
+@pytest.mark.slow
+def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
+    small = small_set("12", "14")  # its groups are kept, with the correction
+    folder = small.folder
+    shutil.copytree(small.out, tmp_path / "fresh", ignore=shutil.ignore_patterns("group-*"))  # detections alone
+    fresh = calibrate(folder, tmp_path / "fresh", eccentricity=False)
+    again = calibrate(folder, small.out, eccentricity=False)
+    np.testing.assert_array_equal(
+        fresh.target.target_from_face["2"].matrix(), again.target.target_from_face["2"].matrix()
+    )
+    shutil.rmtree(folder / "images" / "14")
+    for i in (1, 2, 3):
+        small.image(i).unlink()
+    target, board = again.target_design, again.board_design
+    coarse = RunOptions(workers=1, solve="chain", ellipses=EllipseOptions(min_diameter_px=9.0)).settled(target)
+    own, camera = RunFolder(small.out, small.out / "unfinished", small.out / "cache"), folder / "cameras.txt"
+    detection, _ = detect(folder / "images", read_camera(camera), own, target, board, coarse, lambda *_: None)
+    assert not any(image.reused for image in detection.images)
+
+
+@pytest.mark.slow
+def test_a_damaged_cache_is_made_anew(small_set):
+    small = pair(small_set)
+    first = calibrate(small.folder, small.out)
+    assert all(image.reused for image in first.detection.images)
+    for path in (small.out / "cache").iterdir():
+        path.write_bytes(path.read_bytes()[:-200])
+    again = calibrate(small.folder, small.out)
+    assert not any(image.reused for image in again.detection.images)
+    np.testing.assert_array_equal(
+        first.target.target_from_face["2"].matrix(), again.target.target_from_face["2"].matrix()
+    )
+
+
+def test_dropping_observations_drops_what_they_alone_hold(scene, labels_only):
+    observed = labels_only.observations(scene, 0.003, np.random.default_rng(0))
+    model = labels_only.models(scene, observed)[0]
+    rows = np.flatnonzero(model.image_index == 1)
+    drop = np.zeros(len(model.image_index), bool)
+    drop[rows[5:]] = True  # five are left, six needed
+    smaller = model.without(drop)
+    assert set(model.images) - set(smaller.images) == {model.images[1]}
+    own = [o for o in observed if o.group == model.group]
+    assert "fewer than 6 of its" in left_out(own, smaller)[model.images[1]]
+    kept = smaller.image_index == smaller.images.index(model.images[2])
+    before = model.image_index == 2
+    np.testing.assert_array_equal(smaller.measured_px[kept], model.measured_px[before])
+
+
+def test_the_redundancy_of_a_free_network(scene, labels_only):
+    """Residuals with the stated σ give a factor of 1 within the spread of χ² (about 900 degrees of freedom a group)."""
+    from stcal.sfm.adjust.refine import refine
+
+    observed = labels_only.observations(scene, 0.005, np.random.default_rng(5))
+    models = [refine(m, scene.camera, scene.target, scene.board).model for m in labels_only.models(scene, observed)]
+    assert image_sigma_factor(models, scene.camera) == pytest.approx(1.0, abs=0.05)
+    assert image_sigma_factor([with_sigma(m, 2.0) for m in models], scene.camera) == pytest.approx(0.5, abs=0.025)
+
+
+def test_sigma_follows_the_residuals_and_not_what_the_centres_claim(labels_only):
+    """All σ stated half as large, the board's too: σ₀ doubles and the faces' σ stay."""
+    pairs = (("1", "2"), ("2", "3"))
+    scene = make_scene(SceneOptions(seed=3, width=2592, height=1728, images_per_group=4, groups=pairs))
+    observed = labels_only.observations(scene, 0.005, np.random.default_rng(6))
+    chained, _ = labels_only.calibrate(scene, 0.005, 6, "chain")
+    radius = scene.target.radius_of() | scene.board.radius_of()
+    from stcal.sfm.adjust.refine import eccentricity_px
+
+    results = []
+    for factor in (1.0, 0.5):
+        board = replace(scene.board, sigma_mm=factor * scene.board.sigma_mm)
+        models = [
+            with_sigma(replace(m, shift_px=eccentricity_px(m, scene.camera, radius, 1.0)), factor)
+            for m in labels_only.models(scene, observed)
+        ]
+        joint = adjust_jointly(models, board, scene.camera)
+        results.append((joint.sigma0, calibrated_target(joint, chained, scene.target, "plane").face_covariance["3"]))
+        # Six free directions, and no more: the rank of the datum of smallest trace.
+        value = np.linalg.eigvalsh(joint.covariance_mm2)
+        assert (value > 1e-9 * value[-1]).sum() == 3 * len(joint.labels) - 6
+    assert results[1][0] == pytest.approx(2 * results[0][0], rel=1e-3)
+    np.testing.assert_allclose(results[1][1], results[0][1], rtol=5e-3, atol=1e-12)
+
+
+def test_a_missing_column_and_a_label_off_the_board_are_counted_rightly(small_dataset, small_run, tmp_path):
+    for file in ("faces.json", "detections.csv"):
+        (tmp_path / file).write_bytes((small_run / file).read_bytes())
+    rows = (small_run / "detections.csv").read_text().splitlines()
+    before = compare(small_run, small_dataset / "truth.json").content()["labels"]
+    some = [r for r in rows if not (r.split(",")[1].startswith("board:") and r.split(",")[1].endswith(":8"))]
+    (tmp_path / "detections.csv").write_text("\n".join(some))
+    assert compare(tmp_path, small_dataset / "truth.json").content()["labels"]["wrong"] == before["wrong"] == 0
+    image = rows[1].split(",")[0]
+    (tmp_path / "detections.csv").write_text("\n".join([*rows, f"{image},board:7:0,5,5,0.01"]))
+    assert compare(tmp_path, small_dataset / "truth.json").content()["labels"]["wrong"] == 1
