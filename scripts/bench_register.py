@@ -27,7 +27,7 @@ from stcal.register.core.pairs import read_pairs
 from stcal.register.report.file import RegistrationFile
 from stcal.register.report.page import registration_page, registration_text
 from stcal.register.workspace.findings import findings
-from stcal.synthetic.measured.point_pairs import make_scene
+from tests.support.point_pairs import make_scene
 
 SHARES = (0.0, 0.2, 0.45)
 HEADER = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"

@@ -95,8 +95,8 @@ def render(folder: Path, images: int, width: int) -> None:
 
 def filmed_scene():
     """A camera that moves on by up to 7.5 mm and 0.75° from image to image."""
-    from stcal.synthetic.film import filmed
     from stcal.synthetic.scene import SceneOptions, make_scene
+    from tests.support.film import filmed
 
     images, width = STREAM
     options = SceneOptions(width=width, height=width * 2 // 3, images_per_group=images // GROUPS)

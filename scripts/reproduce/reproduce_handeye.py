@@ -30,8 +30,8 @@ from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective,
 from stcal.handeye.solve import UNIT_MM
 from stcal.parallel import one_thread
 from stcal.report.figure import save
-from stcal.synthetic.measured.handeye import Truth, simulated_views
 from stcal.workflows.cluster import executor_of
+from tests.support.handeye import Truth, simulated_views
 
 POSES, FITTED = 25, 18
 ROBOT, CORNER_PX = (3e-4, 0.1), 0.1

@@ -36,7 +36,7 @@ from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
-from stcal.synthetic.measured.arms import made
+from stcal.robot.simulated import made
 from stcal.workflows.register_robot import grown, positions
 
 MIDDLE = np.array([800.0, 200.0, 700.0])

@@ -33,16 +33,16 @@ from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Joint, Robot
+from stcal.robot.simulated import joint_vectors, made, placed
 from stcal.robot.use.compensation import compensate
 from stcal.robot.use.targets import Targets
 from stcal.robot.use.verification import MeasuredPoses, SetResult, verify
 from stcal.sfm.measurement.common_errors import common_errors
 from stcal.sfm.measurement.pose import pose_from_circles
 from stcal.sfm.measurement.target import TargetCircles
-from stcal.synthetic.measured.arms import joint_vectors, made, placed
-from stcal.synthetic.measured.image_poses import KnownTarget, known_target, pose_error, see
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of
+from tests.support.image_poses import KnownTarget, known_target, pose_error, see
 
 PUBLISHED = {"mean": (0.6493, 0.4742), "std": (0.5596, 0.2967), "max": (2.1259, 1.3311)}
 """Table 3 of the paper, mm: before, after."""

@@ -22,7 +22,7 @@ from stcal.parallel import one_thread
 from stcal.sfm.data.centres import Centres
 from stcal.sfm.detect.circles.centres import measure_centres
 from stcal.sfm.detect.circles.ellipses import Ellipses
-from stcal.synthetic import degrade
+from tests.support import degrade
 
 RADII_PX = (6.0, 8.0, 12.0, 20.0, 30.0)
 MARGIN_PX = 18

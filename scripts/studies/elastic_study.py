@@ -37,8 +37,9 @@ from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
-from stcal.synthetic.measured.arms import MARKERS, elastic, joint_vectors, made, measured, placed, two_arms
+from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.workflows.cluster import executor_of
+from tests.support.arms import MARKERS, elastic, two_arms
 
 NEW_POSES = 50
 SIGMA_MM, SIGMA_RAD = 0.05, 2e-4

@@ -39,8 +39,8 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 from stcal.labels import BOARD
-from stcal.synthetic import degrade
-from stcal.synthetic.photograph import Photograph, Plane, RenderedSet, read_set
+from tests.support import degrade
+from tests.support.photograph import Photograph, Plane, RenderedSet, read_set
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLE = ROOT / "tests" / "data" / "sample"

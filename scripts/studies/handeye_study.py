@@ -26,8 +26,8 @@ from stcal.handeye.methods.noise import components
 from stcal.handeye.methods.reprojection import problem
 from stcal.io.cameras.model import CalibratedCamera, camera_prior, intrinsic_basis
 from stcal.parallel import one_thread
-from stcal.synthetic.measured.handeye import CAMERA, Truth, simulated, simulated_views
 from stcal.workflows.cluster import executor_of
+from tests.support.handeye import CAMERA, Truth, simulated, simulated_views
 
 CORNERS = {"corner_px": 0.1, "board_mm": 0.03}
 NOISES = {

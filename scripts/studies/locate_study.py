@@ -24,7 +24,6 @@ from stcal.geometry.rigid import Poses
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode, find_images
-from stcal.locate.calibration.holdout import PoseTrial, half_calibrated, subset_trials
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.data.layout import LayoutPlan, TargetLayout
 from stcal.locate.data.views import CalibrationImages
@@ -35,8 +34,9 @@ from stcal.locate.pose.patent import PatentOptions
 from stcal.locate.pose.verdict import VerdictOptions, judge
 from stcal.parallel import one_thread
 from stcal.synthetic.exposure import Light, expose
-from stcal.synthetic.measured.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
 from stcal.workflows.locate import calibration_images
+from tests.support.holdout import PoseTrial, half_calibrated, subset_trials
+from tests.support.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
 
 BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
 TAGS = 17

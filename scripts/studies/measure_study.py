@@ -18,7 +18,9 @@ from stcal.io.cameras.model import CameraPrior, intrinsic_basis
 from stcal.parallel import one_thread
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.measurement.pose import TargetPose, pose_from_circles
-from stcal.synthetic.measured.image_poses import (
+from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+from stcal.workflows.cluster import executor_of
+from tests.support.image_poses import (
     KnownTarget,
     face_view,
     faces_view,
@@ -28,8 +30,6 @@ from stcal.synthetic.measured.image_poses import (
     see,
     view,
 )
-from stcal.synthetic.scene import Scene, SceneOptions, make_scene
-from stcal.workflows.cluster import executor_of
 
 CALIBRATION_NOISE_PX = 0.02
 CAMERA_SIGMA = np.array([1.0, 1.0, 0.7, 0.7, 3e-4, 1e-3, 3e-5, 3e-5])

@@ -35,7 +35,7 @@ from stcal.parallel import one_thread
 from stcal.register import Liu2017Options, Registration, register
 from stcal.register.core.liu2017 import affine_least_squares
 from stcal.register.core.models import parts
-from stcal.synthetic.measured.point_pairs import CENTRE_MM, SIGMA_MM, cube, make_scene, parameter_error
+from tests.support.point_pairs import CENTRE_MM, SIGMA_MM, cube, make_scene, parameter_error
 
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 WITHIN = 1.01

@@ -30,8 +30,8 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.film import filmed
 from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.support.film import filmed
 
 FRAMES = 40
 """Of a client's film, sent forth and back."""

@@ -29,7 +29,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.register import Registration, register
 from stcal.register.core.models import MODELS, jacobian
-from stcal.synthetic.measured.point_pairs import cube, directions, make_scene, random_rigid
+from tests.support.point_pairs import cube, directions, make_scene, random_rigid
 
 KINDS = ("anywhere", "one half", "one axis", "turned")
 SIZES = (20, 30, 50, 100, 300)

@@ -22,20 +22,21 @@ from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.model import Robot
+from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.make.box import sides_of
 from stcal.sfm.make.pattern import make_pattern
 from stcal.sfm.pipeline import RunOptions, run
 from stcal.sfm.runs.marker import MarkerFile, digest_of
 from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.measured.arms import elastic, joint_vectors, made, measured, placed
-from stcal.synthetic.measured.handeye import simulated
-from stcal.synthetic.measured.handeye_rig import FIRST_FROM
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.boards.drawn import chessboard_mm, photograph
 from tests.handeye.photographed import looks, photographs
 from tests.locate.drawn_target import CAMERA, LAYOUT, PER_MM, SHEET_MM, photo, sheet, tilted
 from tests.shared import own_copy
+from tests.support.arms import elastic
+from tests.support.handeye import simulated
+from tests.support.handeye_rig import FIRST_FROM
 
 SMALL = SceneOptions(seed=3, width=1296, height=864, images_per_group=4, groups=(("1", "2"), ("1", "4")))
 """As the tests' small data set."""

@@ -11,8 +11,8 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 from stcal.io.table import POSE, pose_cells
-from stcal.synthetic.measured.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA
 from tests.boards.drawn import photograph
+from tests.support.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA
 
 CAMERA = Camera(800, 600, [1000, 1000], [406, 293], np.zeros(8))
 PER_MM = 4

@@ -13,12 +13,12 @@ from stcal.handeye import HandEyeOptions, cross_validate, handeye, splits
 from stcal.handeye.data.loop import SETUPS
 from stcal.robot import forward, load_robot
 from stcal.robot.kinematics.file import save_robot
-from stcal.synthetic.measured.arms import arm_at
-from stcal.synthetic.measured.handeye import simulated_views
 from stcal.workflows.handeye.arm import Arm
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, PER_MM, looks, photographs
 from tests.outcome import ended, fails_with
+from tests.support.arms import arm_at
+from tests.support.handeye import simulated_views
 
 OFF = (1e-3, 0.5)
 """σ of the axes about the robot's file: rad, mm."""

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign
 from stcal.geometry.rigid import Rigid
-from stcal.synthetic.measured.handeye import FLANGE_FROM_CAMERA
 from tests.boards.drawn import aprilgrid_mm, photograph_of_several
 from tests.handeye.photographed import CAMERA, PER_MM, image_from_sheet, looks, photographs, sheet_of_dots
 from tests.handeye.test_cli import CHANCE, EXACT, command, in_sigmas  # noqa: F401
 from tests.handeye.test_images import charuco
+from tests.support.handeye import FLANGE_FROM_CAMERA
 
 GRID = AprilGridDesign(3, 4, 25.0, 0.3)
 CIRCLES = AsymmetricCirclesDesign(9, 4, 18.0, 6.0, "dark")

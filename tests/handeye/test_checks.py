@@ -19,7 +19,8 @@ from stcal.handeye.judge.remarks import of_size
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods.noise import Noise
 from stcal.io.quaternions import INVERTED
-from stcal.synthetic.measured.handeye import (
+from tests.outcome import fails_with
+from tests.support.handeye import (
     BASE_FROM_BOARD,
     BASE_FROM_CAMERA,
     FLANGE_FROM_BOARD,
@@ -29,7 +30,6 @@ from stcal.synthetic.measured.handeye import (
     simulated,
     simulated_views,
 )
-from tests.outcome import fails_with
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
 ONE_QUICK = ("eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.slow))

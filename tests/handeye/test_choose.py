@@ -10,8 +10,8 @@ from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions, Views, handeye, pairs_of_views, splits
 from stcal.handeye.choose import BY_VIEWS, Candidate, choose
 from stcal.io.cameras.model import CalibratedCamera, camera_prior
-from stcal.synthetic.measured.handeye import CAMERA, simulated, simulated_views
 from tests.levels import sampled
+from tests.support.handeye import CAMERA, simulated, simulated_views
 
 ROBOT = (5e-4, 0.2)
 """σ of a common arm: rad, mm."""

@@ -14,10 +14,10 @@ from stcal.handeye import METHODS
 from stcal.handeye.report.export import FORMS
 from stcal.io.cameras.read import read_camera
 from stcal.io.table import POSE, pose_cells
-from stcal.synthetic.measured.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, simulated
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import CAMERA, looks, photographs, sheet_of_dots
 from tests.outcome import ended
+from tests.support.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, simulated
 
 NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
 INPUT, COMPUTATION = 2, 3

@@ -7,11 +7,11 @@ import pytest
 from markupsafe import escape
 
 from stcal.geometry.rigid import Poses
-from stcal.synthetic.measured.handeye import simulated
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import looks, photographs
 from tests.handeye.test_cli import EXACT, INPUT, NOISE, command, poses_file  # noqa: F401
 from tests.handeye.written import FORMATS, MODEL_MM, colmap_text, easy_handeye, matrices, zivid
+from tests.support.handeye import simulated
 
 QUICK = ("--method", "pose", "--splits", 0)
 

@@ -7,8 +7,8 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, handeye, plan_poses
 from stcal.handeye.data.loop import SETUPS, Loop
 from stcal.handeye.plan import judged_at, worst_sigma
-from stcal.synthetic.measured.handeye import CAMERA, board_corners, disturbed, simulated
 from tests.outcome import fails_with
+from tests.support.handeye import CAMERA, board_corners, disturbed, simulated
 
 ROBOT, SEEN = (5e-4, 0.2), (2e-4, 0.05)
 OUTLINE = board_corners(8, 7, 25.0)

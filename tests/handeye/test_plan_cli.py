@@ -13,9 +13,9 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import Joint, forward, inverse, load_robot
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import save_robot
-from stcal.synthetic.measured.handeye import simulated
 from tests.handeye.test_cli import NOISE, poses_file
 from tests.outcome import ended
+from tests.support.handeye import simulated
 
 INPUT = 2
 

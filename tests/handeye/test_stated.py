@@ -5,7 +5,7 @@ import pytest
 
 from stcal.handeye import HandEyeOptions, Noise, handeye, splits
 from stcal.handeye.validate import better_setup
-from stcal.synthetic.measured.handeye import simulated, simulated_views
+from tests.support.handeye import simulated, simulated_views
 
 BAD = (8e-3, 3.0)
 """σ of a robot in need of repair: rad, mm."""

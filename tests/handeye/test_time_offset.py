@@ -9,8 +9,8 @@ from scipy.stats import chi2
 from stcal.geometry.rigid import Poses
 from stcal.handeye import handeye
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
-from stcal.synthetic.measured.handeye_stream import StreamTruth, simulated_stream
 from tests.outcome import fails_with
+from tests.support.handeye_stream import StreamTruth, simulated_stream
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
 

@@ -9,9 +9,9 @@ import pytest
 
 from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.synthetic.measured.handeye_stream import StreamTruth, simulated_stream
 from tests.handeye.rig.photographed import BOARD, write_poses
 from tests.outcome import ended
+from tests.support.handeye_stream import StreamTruth, simulated_stream
 
 INPUT, COMPUTATION = 2, 3
 CAMERA = "1 PINHOLE 800 600 1000 1000 406.5 293.5\n"

@@ -23,8 +23,8 @@ from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.motions import Motions
 from stcal.handeye.scatter import scatter, widened_by_scatter
 from stcal.handeye.validate import predicted
-from stcal.synthetic.measured.handeye import simulated, simulated_views
 from tests.outcome import fails_with
+from tests.support.handeye import simulated, simulated_views
 
 
 def test_every_pose_has_its_turn():

@@ -10,8 +10,8 @@ from stcal.cli.main import app
 from stcal.geometry.rigid import Rigid
 from stcal.io.join import join, stack
 from stcal.register.core.pairs import read_pairs
-from stcal.synthetic.measured.handeye import simulated
 from tests.outcome import fails_with
+from tests.support.handeye import simulated
 
 
 def written(path, text: str):

@@ -6,8 +6,8 @@ import numpy as np
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.locate.data.layout import TargetLayout
-from stcal.synthetic.measured.tags import example_layout
 from tests.boards.drawn import photograph
+from tests.support.tags import example_layout
 
 CAMERA = Camera(1200, 900, [1300.0, 1300.0], [599.5, 449.5], np.zeros(8))
 PER_MM = 6

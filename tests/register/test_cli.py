@@ -11,8 +11,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
-from stcal.synthetic.measured.arms import elastic, joint_vectors, made, placed
+from stcal.robot.simulated import joint_vectors, made, placed
 from tests.outcome import ended
+from tests.support.arms import elastic
 
 HEAD = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])

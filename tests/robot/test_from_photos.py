@@ -15,18 +15,18 @@ from stcal.io.table import Table, pose_cells, read_table
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.simulated import made
 from stcal.robot.use.targets import Targets
 from stcal.sfm.measurement.common_errors import common_errors
 from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import pose_from_circles
-from stcal.synthetic.measured.arms import made
-from stcal.synthetic.measured.image_poses import known_target, see
 from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows.from_photos import run as work
 from stcal.workflows.from_photos.output import files_of
 from stcal.workflows.from_photos.report import story
 from stcal.workflows.from_photos.result import FromPhotos
 from tests.outcome import fails_with
+from tests.support.image_poses import known_target, see
 
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 REST = np.radians([10.0, 20.0, -15.0, 30.0, -50.0, 40.0])

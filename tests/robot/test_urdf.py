@@ -12,10 +12,11 @@ from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import DHRow, Elasticity, Joint, Robot
+from stcal.robot.simulated import joint_vectors
 from stcal.robot.urdf.read import load_urdf
 from stcal.robot.urdf.write import require_same_poses, robot_urdf
-from stcal.synthetic.measured.arms import joint_vectors, two_arms
 from tests.outcome import fails_with
+from tests.support.arms import two_arms
 
 TOOLS = {"": Rigid.exp([0.1, 0.2, -0.3, 10, 20, 150]), "ball": Rigid.exp([0, 0.5, 0, -40, 0, 90])}
 WORLD = Rigid.exp([0.1, 0.2, 0.3, 1000, -500, 200])

@@ -5,7 +5,7 @@ import pytest
 
 from stcal.io.cameras.read import read_camera
 from tests.scripts import load_script
-from tests.synthetic.test_degrade import SAMPLE
+from tests.support.test_degrade import SAMPLE
 
 study = load_script("envelope_study")
 DATA = study.read_set(SAMPLE, at_most=1)

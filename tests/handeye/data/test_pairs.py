@@ -7,8 +7,8 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses, handeye, read_poses
 from stcal.handeye.data.pairs import inverse_covariance
 from stcal.io.table import COVARIANCE
-from stcal.synthetic.measured.handeye import disturbed, simulated
 from tests.outcome import fails_with
+from tests.support.handeye import disturbed, simulated
 
 CELLS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 

@@ -7,9 +7,9 @@ import pytest
 
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.stream import Stream, stamps_of, taken_at, time_of
-from stcal.synthetic.measured.handeye import disturbed
-from stcal.synthetic.measured.handeye_stream import trajectory
 from tests.outcome import fails_with
+from tests.support.handeye import disturbed
+from tests.support.handeye_stream import trajectory
 
 PHASE = np.array([[0.3, 1.1, 2.0], [0.1, 4.0, 5.0]])
 EVERY = np.arange(0, 10, 0.05)

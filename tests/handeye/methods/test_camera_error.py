@@ -7,7 +7,7 @@ from scipy.stats import chi2
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Views, handeye, pairs_of_views
 from stcal.io.cameras.model import CalibratedCamera, CameraPrior, camera_prior, intrinsic_basis
-from stcal.synthetic.measured.handeye import CAMERA, simulated_views
+from tests.support.handeye import CAMERA, simulated_views
 
 PRIOR = camera_prior(CalibratedCamera.of(CAMERA, "OPENCV"))
 TRIALS = 12

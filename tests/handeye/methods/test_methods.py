@@ -13,8 +13,8 @@ from stcal.handeye.data.motions import Motions, poses_with_log
 from stcal.handeye.methods.closed_form import AX_XB
 from stcal.handeye.methods.convex import convex, equations, smallest_largest
 from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective, evolve, polish, three_others
-from stcal.synthetic.measured.handeye import simulated
 from tests.outcome import fails_with
+from tests.support.handeye import simulated
 
 FROM_POSES = tuple(m for m in METHODS if m != "reprojection")
 EXACT = tuple(m for m in FROM_POSES if m != "de")

@@ -12,7 +12,7 @@ from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, handeye
 from stcal.handeye.data.loop import Loop
 from stcal.handeye.methods.noise import components
 from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses, against_others
-from stcal.synthetic.measured.handeye import simulated, simulated_views
+from tests.support.handeye import simulated, simulated_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
 TRUE = Noise(3e-4, 0.1, 1e-3, 0.3)

@@ -10,8 +10,8 @@ from stcal.handeye.data.loop import Loop
 from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.reprojection import problem
 from stcal.io.cameras.model import CalibratedCamera, camera_prior, intrinsic_basis
-from stcal.synthetic.measured.handeye import simulated_views
 from tests.outcome import fails_with
+from tests.support.handeye import simulated_views
 
 SETUPS = ("eye-in-hand", "eye-to-hand")
 

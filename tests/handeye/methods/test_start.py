@@ -9,8 +9,8 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import SETUPS, Loop
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.methods.start import mean_pose, robust
-from stcal.synthetic.measured.handeye import disturbed, simulated
 from tests.outcome import fails_with
+from tests.support.handeye import disturbed, simulated
 
 
 def apart(found: Rigid, true: Rigid) -> np.ndarray:

@@ -14,7 +14,7 @@ from stcal.handeye.report.figures import MOST_NAMED, enlargement, pose_bars
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.report.overlays import overlays
 from stcal.handeye.report.page import outcome_page
-from stcal.synthetic.measured.handeye import simulated, simulated_views
+from tests.support.handeye import simulated, simulated_views
 
 MOST_BYTES = 3_000_000
 

@@ -16,7 +16,7 @@ from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.cameras.model import CalibratedCamera, camera_prior
 from stcal.io.saving import json_text
-from stcal.synthetic.measured.handeye import simulated, simulated_views
+from tests.support.handeye import simulated, simulated_views
 
 VOID = {"meta", "img", "br"}
 

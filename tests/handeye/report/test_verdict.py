@@ -11,7 +11,7 @@ from stcal.handeye.judge.notes import Aside, Grave
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.report.verdict import judged, share_of_variance
 from stcal.handeye.validate import cross_validate, splits
-from stcal.synthetic.measured.handeye import simulated
+from tests.support.handeye import simulated
 
 NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
 

@@ -8,9 +8,9 @@ import numpy as np
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 from stcal.io.table import POSE, pose_cells
-from stcal.synthetic.measured.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, disturbed
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import CAMERA, looks, take
+from tests.support.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA, disturbed
 
 BOARD = 'type = "chessboard"\nrows = 5\ncolumns = 8\nsquare_mm = 20\n'
 LEFT_FROM = {"left": Rigid(), "right": Rigid.exp([0.02, -0.22, 0.05, 60.0, 8.0, 6.0])}

@@ -10,10 +10,10 @@ import pytest
 from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.robot_poses import read_robot_poses
-from stcal.synthetic.measured.handeye import FLANGE_FROM_CAMERA
 from tests.handeye.rig.photographed import LEFT_FROM, photographed_rig, write_poses
 from tests.outcome import ended
 from tests.shared import own_copy
+from tests.support.handeye import FLANGE_FROM_CAMERA
 
 INPUT = 2
 

@@ -13,8 +13,8 @@ from stcal.handeye.methods.reprojection import board_of, problem
 from stcal.handeye.methods.rig_bundle import RigBundle, RigCorners
 from stcal.handeye.rig.solve import alone, of_places
 from stcal.io.cameras.model import CalibratedCamera, camera_prior, intrinsic_basis
-from stcal.synthetic.measured.handeye_rig import NAMES, RigTruth, simulated_rig
 from tests.outcome import fails_with
+from tests.support.handeye_rig import NAMES, RigTruth, simulated_rig
 
 ROBOT, PX, BOARD = (3e-4, 0.1), (0.1, 0.2, 0.1), 0.03
 STATED = RigOptions(noise=Noise(*ROBOT, board_mm=BOARD))

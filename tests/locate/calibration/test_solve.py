@@ -10,8 +10,8 @@ from stcal.boards.tags import Tags
 from stcal.geometry.rigid import Rigid
 from stcal.locate.calibration.solve import CalibratedLayout, _by_board_corners, calibrate, plane_points
 from stcal.locate.data.layout import LayoutPlan, obj_from_plane
-from stcal.synthetic.measured.tags import CAMERA, PLACES, example_layout, random_pose
 from tests.outcome import fails_with
+from tests.support.tags import CAMERA, PLACES, example_layout, random_pose
 
 BOARD = ChessboardDesign(6, 9, 20.0)
 LAYOUT = example_layout()

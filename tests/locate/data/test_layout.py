@@ -5,8 +5,8 @@ import pytest
 
 from stcal.boards.file import load_flat_board
 from stcal.locate.data.layout import layout_toml, load_layout, load_plan, obj_from_plane, square
-from stcal.synthetic.measured.tags import example_layout
 from tests.outcome import fails_with
+from tests.support.tags import example_layout
 
 HEAD = 'type = "tags"\n'
 TAG = '[[tag]]\ndictionary = "4x4_50"\nid = {}\n'

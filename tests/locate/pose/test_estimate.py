@@ -12,8 +12,8 @@ from stcal.io.cameras.model import CameraPrior
 from stcal.locate.pose.estimate import SeenTags, covering_both, locate
 from stcal.locate.pose.merge import merge
 from stcal.locate.pose.verdict import VerdictOptions, judge
-from stcal.synthetic.measured.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
 from tests.outcome import fails_with
+from tests.support.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
 
 SIX = (0, 1, 2, 3, 4, 5)
 LAYOUT = example_layout()

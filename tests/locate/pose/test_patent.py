@@ -8,8 +8,8 @@ from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
 from stcal.locate.data.exposures import exposure_times
 from stcal.locate.pose.patent import PatentOptions, gate, largest_area, locate_as_patent, most_tags, triangulated_area
-from stcal.synthetic.measured.tags import CAMERA, CornerNoise, example_layout, simulated_exposures
 from tests.outcome import fails_with
+from tests.support.tags import CAMERA, CornerNoise, example_layout, simulated_exposures
 
 LAYOUT = example_layout(1e-6)
 TRUTH = Rigid.exp([0.4, -0.1, 0.2, 10, 5, 600.0])

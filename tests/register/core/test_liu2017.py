@@ -5,8 +5,8 @@ import pytest
 
 from stcal.register import Liu2017Options, register
 from stcal.register.core.liu2017 import affine_least_squares, liu2017
-from stcal.synthetic.measured.point_pairs import cube, make_scene
 from tests.outcome import fails_with
+from tests.support.point_pairs import cube, make_scene
 
 
 def scene(seed, *args, **options):

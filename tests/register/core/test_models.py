@@ -20,8 +20,8 @@ from stcal.register.core.models import (
     unit_covariance,
     whitened,
 )
-from stcal.synthetic.measured.point_pairs import make_scene, parameter_error
 from tests.outcome import fails_with
+from tests.support.point_pairs import make_scene, parameter_error
 
 NOISE = ("equal", "weights", "matrices")
 

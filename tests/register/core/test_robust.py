@@ -12,8 +12,8 @@ from stcal.register.core.problem import PointNoise, Problem
 from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, deletion_squares
 from stcal.register.core.search import by_scale, chernoff, search
 from stcal.register.judge.groups import lies_together, sphericity, two_groups, wilks_bound
-from stcal.synthetic.measured.point_pairs import SIGMA_MM, directions, make_scene
 from tests.outcome import fails_with
+from tests.support.point_pairs import SIGMA_MM, directions, make_scene
 
 RIGID = MODELS["rigid"]
 

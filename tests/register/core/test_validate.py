@@ -7,7 +7,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.align import align_rigid
 from stcal.register import register
 from stcal.register.core.validate import held_out
-from stcal.synthetic.measured.point_pairs import SIGMA_MM, make_scene
+from tests.support.point_pairs import SIGMA_MM, make_scene
 
 
 def scene(seed, *args, **options):

@@ -7,8 +7,8 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.register import register
 from stcal.register.judge.mistakes import mirrored_ratio
-from stcal.synthetic.measured.point_pairs import make_scene
 from tests.outcome import fails_with
+from tests.support.point_pairs import make_scene
 
 
 def scene(seed, *args, **options):

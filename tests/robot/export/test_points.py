@@ -15,9 +15,9 @@ from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import compensate, joint_cells, joint_columns
 from stcal.robot.use.targets import read_targets
-from stcal.synthetic.measured.arms import joint_vectors, made
 from tests.outcome import fails_with
 
 PULSES = (1000.0, -1234.5, 800.0, 900.0, 1100.0, 500.0)

@@ -11,7 +11,7 @@ from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
-from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
 
 TOOL, WORLD = Rigid.exp([0.3, 0.2, 0.1, 100, 50, 200]), Rigid.exp([0.1, 0.2, 0.3, 1000, 500, 200])

@@ -12,7 +12,7 @@ from stcal.robot.identification.residuals import jacobian, moved, observed, resi
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.example import mh80
-from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
 
 WEIGHTING = Weighting(0.05, 2e-4)

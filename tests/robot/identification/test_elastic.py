@@ -14,10 +14,11 @@ from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.model import Elasticity, Robot
+from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import evaluate
 from stcal.robot.use.evaluation_report import notes
-from stcal.synthetic.measured.arms import elastic, joint_vectors, made, measured, placed
 from tests.outcome import fails_with
+from tests.support.arms import elastic
 
 
 def drawn(rows: int, seed: int, share: float = 1.0):

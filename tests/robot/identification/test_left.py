@@ -15,7 +15,7 @@ from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
-from stcal.synthetic.measured.arms import joint_vectors, measured
+from stcal.robot.simulated import joint_vectors, measured
 from tests.robot.identification.test_solve import simulated
 
 NOISE = Weighting(0.05, 2e-4)

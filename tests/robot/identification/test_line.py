@@ -11,7 +11,7 @@ from stcal.robot.identification.residuals import State, tips
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.example import mh80
-from stcal.synthetic.measured.arms import made, measured, placed
+from stcal.robot.simulated import made, measured, placed
 from tests.outcome import fails_with
 
 DOWN = Rigid.exp([0, np.pi * 0.9, 0, 0, 0, 0]).rotation

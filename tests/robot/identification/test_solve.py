@@ -22,7 +22,7 @@ from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
-from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.scripts import load_script
 
 QUICK = IdentifyOptions(folds=0)

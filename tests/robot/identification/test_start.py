@@ -11,7 +11,7 @@ from stcal.io.table import POSE, pose_cells
 from stcal.robot.identification.start import start
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
-from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
 
 LAST = "quaternions were x, y, z, w in the order of their columns"

@@ -10,7 +10,7 @@ from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
+from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
 
 MOVED = Rigid.exp([0.2, -0.1, 1.5, 4000, -3000, 200])

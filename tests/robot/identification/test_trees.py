@@ -26,8 +26,9 @@ from stcal.robot.kinematics.forward import elasticity_values, forward, moved_cha
 from stcal.robot.kinematics.forward import jacobian as by_joints
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.model import Robot
-from stcal.synthetic.measured.arms import MARKERS, RIGHT, elastic, joint_vectors, made, measured, two_arms
+from stcal.robot.simulated import joint_vectors, made, measured
 from tests.outcome import fails_with
+from tests.support.arms import MARKERS, RIGHT, elastic, two_arms
 
 
 def seen_by(robot: Robot, rng, each=60):

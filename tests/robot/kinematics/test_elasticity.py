@@ -22,7 +22,7 @@ from stcal.robot.kinematics.forward import (
     with_values,
 )
 from stcal.robot.kinematics.model import Elasticity, Robot
-from stcal.synthetic.measured.arms import joint_vectors
+from stcal.robot.simulated import joint_vectors
 from tests.outcome import fails_with
 
 TOOL = Rigid.exp([0.1, 0.2, 0.3, 50, 60, 70])

@@ -22,7 +22,7 @@ from stcal.robot.kinematics.forward import (
     moved_chain,
 )
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
-from stcal.synthetic.measured.arms import joint_vectors, made
+from stcal.robot.simulated import joint_vectors, made
 
 
 def arm(seed: int, joints: int, convention: str) -> Robot:

@@ -14,7 +14,7 @@ from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import branches, inverse
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
-from stcal.synthetic.measured.arms import joint_vectors, made
+from stcal.robot.simulated import joint_vectors, made
 from tests.outcome import fails_with
 
 TOOL = Rigid.exp([0.2, -0.4, 0.9, 60.0, -35.0, 120.0])

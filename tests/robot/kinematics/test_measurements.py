@@ -11,8 +11,8 @@ from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import save_robot
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.compensation import joint_cells, joint_columns
-from stcal.synthetic.measured.arms import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
 
 GANTRY = Robot("gantry", "standard", (DHRow(0, 0.3, 0, 0), DHRow(100, 0, 50, 0)), (Joint("prismatic"), Joint()))

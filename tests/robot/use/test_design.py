@@ -16,8 +16,8 @@ from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forward, moved_chain
 from stcal.robot.kinematics.model import Joint
+from stcal.robot.simulated import joint_vectors, made, measured
 from stcal.robot.use.design import DesignOptions, choose, design
-from stcal.synthetic.measured.arms import joint_vectors, made, measured
 from tests.outcome import fails_with
 
 TOOL = Rigid.exp([0.1, 0.2, -0.3, 40.0, -25.0, 110.0])

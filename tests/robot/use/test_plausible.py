@@ -12,10 +12,10 @@ from stcal.io.quaternions import INVERTED
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import compensate
 from stcal.robot.use.plausible import on_targets, robots_apart
 from stcal.robot.use.targets import Targets
-from stcal.synthetic.measured.arms import joint_vectors, made
 from tests.outcome import fails_with
 
 TOOL = Rigid.exp([0.2, -0.4, 0.1, 30, -20, 180])

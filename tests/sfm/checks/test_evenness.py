@@ -11,8 +11,8 @@ from stcal.sfm.adjust.network import free_network
 from stcal.sfm.checks.images import UNEVEN_BY_CHANCE, evenness_check
 from stcal.sfm.pipeline import run
 from stcal.sfm.runs.options import RunOptions
-from stcal.synthetic.photograph import read_set
 from tests.scripts import load_script
+from tests.support.photograph import read_set
 
 SHIFT_PX = 0.02
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from stcal.synthetic.photograph import read_set
 from tests.sfm.detect.degraded import Bench
+from tests.support.photograph import read_set
 
 
 @pytest.fixture(scope="session")

@@ -12,8 +12,8 @@ from stcal.sfm.data.observations import detections_csv
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.files import detect_files
 from stcal.sfm.detect.labels import LabelledImage, label_images
-from stcal.synthetic.photograph import Photograph, RenderedSet
 from tests.scripts import load_script
+from tests.support.photograph import Photograph, RenderedSet
 
 study = load_script("envelope_study")
 KINDS = {kind.name: kind for kind in study.KINDS}

@@ -11,8 +11,8 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
 from stcal.sfm.detect.circles.centres import measure_centres
 from stcal.sfm.detect.circles.ellipses import Ellipses
-from stcal.synthetic import degrade
 from tests.levels import sampled
+from tests.support import degrade
 
 CAMERA = Camera(400, 300, [1400.0, 1400.0], [199.5, 149.5], [-0.15, 0.1, 1e-3, -5e-4, 0, 0, 0, 0])
 

@@ -11,8 +11,8 @@ import pytest
 from stcal.design import reference_board, reference_target
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.image import read_image
-from stcal.synthetic import degrade
 from tests.sfm.detect.degraded import KINDS
+from tests.support import degrade
 
 FIRST = "12/IMG_1000"
 OTHERS = [pytest.param(group, marks=pytest.mark.slow) for group in ("14", "15", "23")]

@@ -16,9 +16,9 @@ from stcal.sfm.data.centres import Centres
 from stcal.sfm.detect.files import DetectedImage, require_upright
 from stcal.sfm.detect.labels import label_groups
 from stcal.sfm.detect.sightings import FaceSighting, ImageDetection
-from stcal.synthetic import degrade
 from tests.sfm.detect.degraded import study
 from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen, plane_centres
+from tests.support import degrade
 
 FIRST = "12/IMG_1000"
 ALL = ("12", "14", "15", "23")

@@ -8,8 +8,8 @@ import pytest
 from stcal.io.cameras.model import CameraPrior, intrinsic_basis
 from stcal.sfm.measurement.common_errors import MOST, common_errors
 from stcal.sfm.measurement.pose import pose_from_circles
-from stcal.synthetic.measured.image_poses import faces_view, known_target, pose_error, see, view
 from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.support.image_poses import faces_view, known_target, pose_error, see, view
 
 NOISE_PX = 0.02
 SIGMA = np.array([0.3, 0.3, 0.3, 0.3, 1e-4, 3e-4, 1e-5, 1e-5])

@@ -26,12 +26,12 @@ from stcal.sfm.measurement.output import measure_text, poses_file
 from stcal.sfm.measurement.pose import NO_FACE, PoseOptions, pose_from_circles, resolved
 from stcal.sfm.measurement.report import measure_page
 from stcal.sfm.measurement.target import TargetCircles, read_target
-from stcal.synthetic.measured.image_poses import face_view, faces_view, is_flipped, known_target, pose_error, see, view
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.levels import FULL
 from tests.outcome import fails_with
 from tests.sfm.truth import true_poses
 from tests.shared import own_copy
+from tests.support.image_poses import face_view, faces_view, is_flipped, known_target, pose_error, see, view
 
 NOISE_PX = 0.02
 

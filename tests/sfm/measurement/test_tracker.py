@@ -11,10 +11,10 @@ from stcal.sfm import MeasureOptions, Tracker, measure
 from stcal.sfm.detect.near import common_shift
 from stcal.sfm.measurement.target import TargetCircles
 from stcal.synthetic.dataset import write_dataset
-from stcal.synthetic.film import filmed
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
+from tests.support.film import filmed
 
 IMAGES = 6
 OTHER_BAND = 1.0

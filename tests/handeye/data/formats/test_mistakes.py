@@ -12,9 +12,9 @@ import pytest
 from stcal.errors import InputError
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import partners, read_pairs, read_robot, read_two
-from stcal.synthetic.measured.handeye import simulated
 from tests.handeye.written import easy_handeye, in_metres, line, matrices, message, moveit, ros_csv, tum
 from tests.outcome import fails_with
+from tests.support.handeye import simulated
 
 PAIRS = simulated(np.random.default_rng(5), 5).pairs
 GOOD = matrices(PAIRS.base_from_flange)

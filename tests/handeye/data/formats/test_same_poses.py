@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from stcal.handeye.data.formats.record import Said
-from stcal.synthetic.measured.handeye import simulated
 from stcal.workflows.handeye.inputs import read_input, two_files
 from tests.handeye.written import FORMATS
+from tests.support.handeye import simulated
 
 PAIRS = simulated(np.random.default_rng(5), 7).pairs
 ROUNDING = 1e-9

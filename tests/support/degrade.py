@@ -2,7 +2,7 @@
 
 Every function takes an image (height, width) in grey values of 0…255, uint8 or float, and returns float32 in the same
 unit, not clipped: :func:`stored` makes the file's pixels of it. Places come as shares of the pixels (0…1) or from a
-:class:`~stcal.synthetic.photograph.Photograph`. The same seed gives the same image.
+:class:`~tests.support.photograph.Photograph`. The same seed gives the same image.
 """
 
 from collections.abc import Iterable
@@ -12,8 +12,8 @@ import numpy as np
 from scipy import ndimage
 
 from stcal.errors import InputError
-from stcal.synthetic.photograph import MARGIN_MM, Photograph, Plane, disc_share, half_share
 from stcal.synthetic.render import encode
+from tests.support.photograph import MARGIN_MM, Photograph, Plane, disc_share, half_share
 
 WHITE = 255.0
 HIDDEN_REACH = 1.35

@@ -11,7 +11,7 @@ from stcal.handeye.data.loop import Setup
 from stcal.handeye.data.rig import RigCamera, RigPoses
 from stcal.handeye.data.views import View, Views
 from stcal.io.cameras.model import CameraPrior
-from stcal.synthetic.measured.handeye import CAMERA, board_corners, disturbed, simulated
+from tests.support.handeye import CAMERA, board_corners, disturbed, simulated
 
 WIDE = Camera(1600, 1200, [1250.0, 1248.0], [805.0, 590.0], [-0.11, 0.06, -1e-4, 3e-4, 0, 0, 0, 0])
 FIRST_FROM = (

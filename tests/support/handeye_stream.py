@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Setup
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.stream import Stream
-from stcal.synthetic.measured.handeye import (
+from tests.support.handeye import (
     BASE_FROM_BOARD,
     BASE_FROM_CAMERA,
     FLANGE_FROM_BOARD,

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.synthetic import degrade
-from stcal.synthetic.photograph import RenderedSet, read_set
 from tests.outcome import fails_with
+from tests.support import degrade
+from tests.support.photograph import RenderedSet, read_set
 
 SAMPLE = Path(__file__).resolve().parents[1] / "data" / "sample"
 STEP = np.tile(np.where(np.arange(120) < 60, 40.0, 200.0).astype(np.float32), (80, 1))

@@ -1,22 +1,16 @@
-"""Simulated arms as they leave the factory, and what an instrument sees of them."""
+"""Simulated arms that bend, that branch, or that hold their flange where it is wanted."""
 
-from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stcal.errors import ConvergenceError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identification.elastic import DOWN, MOMENT, usual
 from stcal.robot.identification.nominal import Deviations
-from stcal.robot.identification.residuals import State, tips
-from stcal.robot.kinematics.conditions import USUAL, Conditions
-from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain, with_values
 from stcal.robot.kinematics.inverse import inverse
-from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, Robot, Tree
 
 MARKERS = ("left", "right", "elbow")
@@ -25,18 +19,6 @@ LEFT, RIGHT = Rigid.exp([0.5, 0.2, 0.1, 100, 250, 300]), Rigid.exp([-0.5, 0.3, -
 """Where its arms begin behind the torso."""
 STEPS, REACHED = 50, 1e-9
 """Of Newton's steps to a pose; rad and mm at which it is reached."""
-
-
-def made(robot: Robot, rng: np.random.Generator, sigma_mm: float = 0.3, sigma_rad: float = 5e-4) -> Robot:
-    """The robot as made: every axis shifted and tilted, every zero position off by normal errors of these σ."""
-    chain = robot.chain()
-    kinds = chain_parameters(chain)
-    step = np.array([rng.normal(0, sigma_rad if c < 3 else sigma_mm) for _, c in kinds])
-    step[: sum(i == 0 for i, _ in kinds)] = 0  # the first axis is where the base is
-    found = robot_from_chain(moved_chain(chain, step), robot.tools, robot)
-    rows = [found.rows[0]]
-    rows += [replace(row, theta=row.theta + rng.normal(0, sigma_rad)) for row in found.rows[1:]]
-    return replace(found, rows=tuple(rows), tools=dict(robot.tools))
 
 
 def elastic(robot: Robot, rng: np.random.Generator, share: float = 1.0, heavier: float = 1.0) -> Robot:
@@ -63,45 +45,6 @@ def two_arms(convention: Convention = "standard") -> Robot:
     base = Rigid.exp([0.1, 0.2, 0.9, 1500, -300, 200])
     rows, joints = (*torso, *arm_rows, *arm_rows), (*wide, *arm.joints, *arm.joints)
     return Robot("torso", arm.convention, rows, joints, world_from_base=base, tools=tools, tree=tree)
-
-
-def joint_vectors(robot: Robot, count: int, rng: np.random.Generator, share: float = 0.6) -> np.ndarray:
-    """(count, n) over the middle ``share`` of each joint's range (± 1 rad or 100 mm of 0 where unlimited)."""
-    low, high = robot.limits().T
-    free = np.where(robot.prismatic, 100.0, 1.0)
-    low, high = np.where(np.isfinite(low), low, -free), np.where(np.isfinite(high), high, free)
-    middle, half = (low + high) / 2, (high - low) / 2 * share
-    return rng.uniform(middle - half, middle + half, (count, len(robot.rows)))
-
-
-def placed(robot: Robot, world_from_base: Rigid, tools: dict[str, Rigid]) -> Robot:
-    """The robot where an instrument sees it, with these tools."""
-    return replace(robot, world_from_base=world_from_base, tools=tools)
-
-
-def measured(
-    robot: Robot,
-    q: np.ndarray,
-    rng: np.random.Generator,
-    sigma_mm: float = 0.05,
-    sigma_rad: float = 2e-4,
-    targets: Sequence[str] = (),
-    covariance: np.ndarray | None = None,
-    conditions: Conditions = USUAL,
-) -> Measurements:
-    """What an instrument sees of the robot at joint vectors (m, n): poses with normal noise of these σ per axis, or of
-    ``covariance`` (m, 6, 6) which then comes with them; of tool ``""``, or of each row's, and under its conditions."""
-    targets = tuple(targets) or ("",) * len(q)
-    tip = tips(State(robot.chain(), dict(robot.tools)), q, targets, conditions)
-    noise = rng.normal(0, 1, (len(q), 6))
-    if covariance is None:
-        noise = noise * np.repeat([sigma_rad, sigma_mm], 3)
-    else:
-        noise = np.einsum("mij,mj->mi", np.linalg.cholesky(covariance), noise)
-    turn = Rotation.from_rotvec(noise[:, :3]).as_matrix()
-    place = tip.translation + noise[:, 3:]
-    lines, rotation = range(2, len(q) + 2), turn @ tip.rotation
-    return Measurements("simulated", lines, q, targets, place, rotation, covariance, conditions=conditions)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
