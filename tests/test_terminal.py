@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from typer.models import ParameterInfo
+from typer.models import OptionInfo, ParameterInfo
 from typer.testing import CliRunner
 
 import stcal
 from stcal.cli import terminal
+from stcal.cli.help import PANELS
 from stcal.cli.main import app, main
 from stcal.cli.sfm import app as sfm
 from stcal.errors import lacks_memory
@@ -127,6 +128,26 @@ def test_h_is_help():
         assert (short.exit_code, short.output) == (0, long.output), words
         assert short.output.startswith("Usage: "), words
         assert re.search(r"-h, --help +Show this message and exit\.", short.output), words
+
+
+def test_help_shows_every_option_once_and_first_what_most_calls_need():
+    used = set()
+    for words, callback in COMMANDS.items():
+        shown = CliRunner().invoke(app, [*words.split(), "--help"]).output
+        listed = re.findall(r"^  (?:-\w, )?(--[\w-]+)", shown, flags=re.MULTILINE)
+        options = [name for name in inspect.signature(callback).parameters if _is_option(callback, name)]
+        assert len(listed) == len(set(listed)) == len(options) + 1, words  # and --help
+        used |= set(options)
+        titles = re.findall(r"^([A-Z].*):$", shown, flags=re.MULTILINE)
+        assert titles == [title for title in ("Arguments", *PANELS) if title in titles], words
+    assert {name for names in PANELS.values() for name in names} - {"help"} <= used
+    shown = CliRunner().invoke(app, ["handeye", "--help"]).output
+    assert len(re.findall(r"^  --", shown[: shown.index("Output:")], flags=re.MULTILINE)) <= 10
+
+
+def _is_option(command, name: str) -> bool:
+    kind = inspect.signature(command, eval_str=True).parameters[name].annotation
+    return any(isinstance(each, OptionInfo) for each in get_args(kind)[1:])
 
 
 # --- a file to standard output ---

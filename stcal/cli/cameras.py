@@ -22,7 +22,7 @@ app = typer.Typer(
 
 
 class Form(StrEnum):
-    """Of a camera file."""
+    """Format of a camera file."""
 
     colmap = "colmap"
     colmap_bin = "colmap-bin"

@@ -1,8 +1,8 @@
-"""Help texts: plain, at once, and whole."""
+"""Help texts: plain, at once, and whole; options stand in panels, the ones that most calls need first."""
 
 from typing import Any
 
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 PLAIN: dict[str, Any] = {
     "rich_markup_mode": None,  # rich takes twice as long to load as all the rest of `--help`
@@ -11,6 +11,59 @@ PLAIN: dict[str, Any] = {
     "no_args_is_help": True,
 }
 """Settings of every group of commands."""
+
+
+PANELS = {
+    "Input": ("setup", "dry_run"),
+    "Method": (),
+    "Output": ("out", "overwrite", "quiet", "verbose", "strict", "help"),
+    "Performance": ("workers", "scheduler", "send_images"),
+    "Input in other forms": (
+        *("rotation", "length_unit", "poses_are", "first", "second", "key", "quaternions", "columns"),
+    ),
+    "Noise": (
+        *("sigma_robot_mm", "sigma_robot_deg", "sigma_camera_mm", "sigma_camera_deg", "sigma_board_mm"),
+        *("sigma_px", "sigma_mm", "sigma_rad"),
+    ),
+    "Cross-validation": ("held_out", "splits", "folds", "motions_held_out"),
+    "Clocks of robot and camera": ("time_offset", "image_times", "time_tolerance"),
+    "Errors of the arm itself": ("with_kinematics", "robot_out"),
+    "Files for other programs": (
+        *("ros", "urdf", "opencv", "export", "parent", "child", "camera_frame", "camera_out"),
+    ),
+    "Differential evolution": (
+        *("de_bounds_deg", "de_bounds_mm", "de_population", "de_f", "de_cr", "de_lambda", "de_generations", "de_seed"),
+    ),
+}
+"""Panels of the help text in their order, each with the names of its parameters. All other parameters are Input where
+they are paths to read, Output where they are paths to write, and Method else."""
+
+
+def panel_of(name: str, reads: bool, writes: bool) -> str:
+    """Panel of a parameter; ``reads``, ``writes`` : whether its value is a path that is read or written."""
+    for panel, names in PANELS.items():
+        if name in names:
+            return panel
+    return "Output" if writes else "Input" if reads else "Method"
+
+
+class Command(TyperCommand):
+    """A command whose help has its options in panels."""
+
+    def format_options(self, ctx, formatter) -> None:
+        """Write arguments, then options panel by panel."""
+        arguments: list[tuple[str, str]] = []
+        panels: dict[str, list[tuple[str, str]]] = {panel: [] for panel in PANELS}
+        for param in self.get_params(ctx):
+            record = param.get_help_record(ctx)
+            if record is None:
+                continue
+            is_argument = param.param_type_name == "argument"
+            (arguments if is_argument else panels[getattr(param, "rich_help_panel", None) or "Output"]).append(record)
+        for title, records in {"Arguments": arguments, **panels}.items():
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
 
 
 class Commands(TyperGroup):

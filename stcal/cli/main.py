@@ -20,7 +20,7 @@ from stcal.errors import NO_MEMORY, StcalError, lacks_memory
 
 INTERRUPTED, TERMINATED = 130, 143
 MESSAGE_CHARACTERS = 600
-"""Of an error's line; what a file holds may be of any length."""
+"""Longest line of an error. Texts from files, which it may quote, can have any length."""
 RESUMED = {"run", "detect", "watch"}
 """Commands that keep what they have done when they are interrupted."""
 # Of Click, which newer versions of Typer carry inside.

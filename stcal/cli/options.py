@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
+from stcal.cli.help import Command, panel_of
 from stcal.cli.terminal import STANDARD_OUTPUT, manner, print_each, said_apart
 from stcal.errors import ChecksFailed, InputError
 from stcal.io.saving import keep_apart
@@ -67,7 +68,7 @@ Strict = Annotated[
     typer.Option("--strict", help="End with exit code 4 where a check has failed; results are written all the same."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace output files that are there.")]
-"""Of every command that writes a file."""
+"""Option of every command that writes a file."""
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")]
 Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="Say more: each step, the time that stages take, what images show.")
@@ -79,7 +80,7 @@ WRITE_NOTHING = ("serve", "dry_run")
 _replacing: ContextVar[bool] = ContextVar("_replacing", default=True)
 """Whether a command's outputs may be there already."""
 MOST_SEED = 2**63 - 1
-"""Of 64 bits with a sign, as other programs read it in result files."""
+"""Largest seed: other programs read seeds in result files as signed 64-bit integers."""
 Workers = Annotated[
     int | None, typer.Option("--workers", min=1, max=1024, help="Use this many processes; one per core if not given.")
 ]
@@ -218,12 +219,12 @@ def exports_of(words: Sequence[str], require_form: Callable[[str], None]) -> lis
 
 
 def name_of(source: "Path | Table") -> str:
-    """Of what :func:`one_table` returned, without its folder."""
+    """Name of what :func:`one_table` returned, without its folder."""
     return source.name if isinstance(source, Path) else source.where
 
 
 def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextManager[None]:
-    """Where images are worked on meanwhile: on a cluster, or by processes of this machine."""
+    """Return the context in which images are processed: on a Dask cluster, or by processes of this machine."""
     if scheduler is None:
         if send_images:
             raise InputError("E-OPTION-NEEDS", "--send-images: only with --scheduler, to whose machines they are sent")
@@ -234,7 +235,7 @@ def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextMana
 
 
 def require_passed(strict: bool, failed: Sequence[str], report: Path | None = None) -> None:
-    """With ``--strict``: end as failed where checks have, which are named; results stand."""
+    """Raise :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given."""
     if strict and failed:
         more = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
         where = f"; see {report}" if report else ""
@@ -276,11 +277,11 @@ def protect_outputs(application: typer.Typer) -> None:
     Every path among its parameters is an input, but those whose option says that it is ``writable``. What is there
     already is replaced with ``--overwrite`` alone, which is added to the options of each command that writes a file, as
     ``--quiet`` and ``--verbose`` are to all.
-    Standard output is that of ``--json -`` alone.
+    Standard output is that of ``--json -`` alone. Each option gets its panel of the help text.
     """
     for command in application.registered_commands:
         if command.callback is not None:
-            command.callback = _protected(command.callback)
+            command.callback, command.cls = _protected(command.callback), Command
     for group in application.registered_groups:
         if group.typer_instance is not None:
             protect_outputs(group.typer_instance)
@@ -296,7 +297,9 @@ def _protected(command: Callable) -> Callable:
             # With Annotated, Typer takes an option's first name for its default.
             names = [each for each in (info.default, *(info.param_decls or ())) if isinstance(each, str)]
             words[name] = names[0] if names else name
-            outputs |= {name} if getattr(info, "writable", False) else set()
+            writes = bool(getattr(info, "writable", False))
+            outputs |= {name} if writes else set()
+            info.rich_help_panel = panel_of(name, "Path" in str(parameter.annotation), writes)
 
     @wraps(command)
     def checked(overwrite: bool = False, quiet: bool = False, verbose: bool = False, **given):
@@ -325,6 +328,8 @@ def _protected(command: Callable) -> Callable:
             _replacing.reset(token)
 
     checked.outputs = frozenset(outputs)  # type: ignore[attr-defined]
+    for option in (Overwrite, Quiet, Verbose):
+        get_args(option)[1].rich_help_panel = "Output"
     more = {"quiet": Quiet, "verbose": Verbose}
     if outputs and command.__name__ not in ALWAYS_NEW:
         more = {"overwrite": Overwrite, **more}

@@ -13,7 +13,7 @@ from stcal.errors import ConvergenceError, DegenerateError, InputError
 
 
 class ModelName(StrEnum):
-    """Of the transform."""
+    """Model of the transform."""
 
     rigid = "rigid"
     similarity = "similarity"
@@ -21,7 +21,7 @@ class ModelName(StrEnum):
 
 
 class Method(StrEnum):
-    """Of the fit."""
+    """Method of the fit."""
 
     robust = "robust"
     least_squares = "least-squares"

@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 
 LINE_EVERY_S = 5.0
 LEFT_FROM_S = 2.0
-"""A stage that will take so long yet says so."""
+"""Shortest remaining time that a stage shows, s."""
 STANDARD_OUTPUT = Path("-")
-"""In place of a JSON file's name."""
+"""Name that stands for standard output in place of a JSON file."""
 _taker: ContextVar[TextIO | None] = ContextVar("_taker", default=None)
 """Standard output while a file goes there."""
 
 _quiet: ContextVar[bool] = ContextVar("_quiet", default=False)
 _verbose: ContextVar[bool] = ContextVar("_verbose", default=False)
 RED, YELLOW, GREEN = 31, 33, 32
-"""Of ECMA-48."""
+"""Colour codes of ECMA-48."""
 COLOURS = {
     "failed": RED,
     "do not use": RED,
@@ -39,7 +39,7 @@ COLOURS = {
     "passed": GREEN,
     "good": GREEN,
 }
-"""By the word of a verdict."""
+"""Colour of each verdict's word."""
 VERDICTS = re.compile(
     r"(?m)(?P<before>^ *|^(?:verdict|split-half check): |(?<=checks: )\d+ |(?<=, )\d+ )"
     rf"(?P<word>{'|'.join(COLOURS)})(?=[:;,]| *$)"
@@ -108,7 +108,7 @@ class StageProgress:
 
 
 def time_left(taken_s: float, done: int, total: int) -> str:
-    """In words, as if each takes as long as those that are done; empty where it is hardly any."""
+    """Remaining time in words, extrapolated from the items that are done; empty below ``LEFT_FROM_S``."""
     left = taken_s / done * (total - done) if done else 0.0
     if left < LEFT_FROM_S:
         return ""
@@ -134,7 +134,7 @@ def say(*values: object, sep: str = " ", end: str = "\n") -> None:
 
 
 def _coloured(text: str) -> str:
-    """With the words of verdicts in colour on a terminal, where `NO_COLOR` (no-color.org) is not set."""
+    """Colour the words of verdicts if standard output is a terminal and `NO_COLOR` (no-color.org) is not set."""
     if not sys.stdout.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text
     return VERDICTS.sub(lambda found: f"{found['before']}\x1b[{COLOURS[found['word']]}m{found['word']}\x1b[0m", text)

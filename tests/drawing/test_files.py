@@ -3,6 +3,7 @@
 import importlib
 import re
 import sys
+from dataclasses import replace
 from itertools import pairwise
 from xml.etree import ElementTree
 
@@ -10,12 +11,13 @@ import numpy as np
 import pytest
 
 from stcal.boards.cells import outlines
+from stcal.boards.design import AprilGridDesign, ChessboardDesign
 from stcal.design import reference_board, reference_target
 from stcal.drawing.draw import SUFFIXES, draw
 from stcal.drawing.parts import board_parts
 from stcal.drawing.pdf import POINT_MM, pdf
-from stcal.drawing.shapes import Disc, Line
-from stcal.drawing.sheets import EDGE, FOOT, FURNITURE, OVERLAP, PAPERS, SIDE, paper_sheets, seams_between
+from stcal.drawing.shapes import Disc, Line, extent
+from stcal.drawing.sheets import EDGE, FOOT, FURNITURE, OVERLAP, PAPERS, SIDE, one_sheet, paper_sheets, seams_between
 from stcal.io.design import board_toml, target_toml
 from tests.outcome import fails_with
 
@@ -143,6 +145,24 @@ def test_seams_leave_no_gap(taken):
 def test_what_fits_a_page_is_not_split():
     room = np.array(PAPERS["A4"]) - FURNITURE
     assert seams_between(0.0, float(room[0]), float(room[0]), np.zeros((0, 2))) == []
+
+
+def test_parts_on_one_sheet_stand_in_rows():
+    """Nine equal ones, none over another: all in a row or a column would be 0.1 or 12 times as wide as high."""
+    part = board_parts(ChessboardDesign(5, 8, 12.0), 10.0)[0]
+    sheet = one_sheet([replace(part, name=f"board {i}") for i in range(9)], "boards")
+    assert 0.3 < (sheet.width - FURNITURE[0]) / (sheet.height - FURNITURE[1]) < 3
+    cut = [s for s in sheet.shapes() if isinstance(s, Line) and s.closed]
+    boxes = [extent([line]) for line in cut]
+    for i, one in enumerate(boxes):
+        assert (one[0] >= 0).all()
+        assert (one[1] <= [sheet.width, sheet.height]).all()
+        assert all((one[1] < other[0]).any() or (other[1] < one[0]).any() for other in boxes[:i])
+
+
+def test_the_side_and_the_step_of_an_aprilgrids_tags_are_said():
+    (part,) = board_parts(AprilGridDesign(3, 4, 20.0, 0.3, 2), 10.0)
+    assert {words for *_, words in part.spans} == {"20, step 26"}
 
 
 def test_outlines_of_cells_have_holes_and_stay_apart_at_corners():

@@ -13,7 +13,7 @@ XML = (".urdf", ".xml")
 
 
 class ConventionName(StrEnum):
-    """Of Denavit–Hartenberg rows."""
+    """Convention of Denavit–Hartenberg rows."""
 
     standard = "standard"
     modified = "modified"

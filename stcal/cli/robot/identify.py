@@ -34,7 +34,7 @@ class Kind(StrEnum):
 
 
 class Model(StrEnum):
-    """Of the arm."""
+    """Model of the arm."""
 
     rigid = "rigid"
     elastic = "elastic"

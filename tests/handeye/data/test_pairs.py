@@ -111,6 +111,8 @@ def test_matrices_are_checked_one_by_one(truth):
         HandEyePoses.from_matrices(broken, board, names=tuple(f"{c}.png" for c in "abcdefgh"))
     with fails_with("E-POSES-COUNT … 8 … 7"):
         HandEyePoses.from_matrices(flange, board[:7])
+    with fails_with("E-POSES-COUNT … 7 … 8"):
+        HandEyePoses.from_matrices(flange[:7], board)
 
 
 def test_covariances_are_read_and_turned_over(tmp_path, truth):
