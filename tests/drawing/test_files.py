@@ -13,10 +13,11 @@ import pytest
 from stcal.boards.cells import outlines
 from stcal.boards.design import AprilGridDesign, ChessboardDesign
 from stcal.design import reference_board, reference_target
+from stcal.drawing.dimensions import framed
 from stcal.drawing.draw import SUFFIXES, draw
 from stcal.drawing.parts import board_parts
 from stcal.drawing.pdf import POINT_MM, pdf
-from stcal.drawing.shapes import Disc, Line, extent
+from stcal.drawing.shapes import Disc, Line, Text, extent
 from stcal.drawing.sheets import EDGE, FOOT, FURNITURE, OVERLAP, PAPERS, SIDE, one_sheet, paper_sheets, seams_between
 from stcal.io.design import board_toml, target_toml
 from tests.outcome import fails_with
@@ -163,6 +164,12 @@ def test_parts_on_one_sheet_stand_in_rows():
 def test_the_side_and_the_step_of_an_aprilgrids_tags_are_said():
     (part,) = board_parts(AprilGridDesign(3, 4, 20.0, 0.3, 2), 10.0)
     assert {words for *_, words in part.spans} == {"20, step 26"}
+
+
+def test_the_outer_dimensions_of_a_part_are_said():
+    """8 × 5 inner corners of 12 mm make 9 × 6 squares: 108 mm × 72 mm, and a square around."""
+    (part,) = board_parts(ChessboardDesign(5, 8, 12.0), 10.0)
+    assert {"132", "96"} <= {shape.words for shape in framed(part) if isinstance(shape, Text)}
 
 
 def test_outlines_of_cells_have_holes_and_stay_apart_at_corners():

@@ -46,6 +46,14 @@ def test_no_index_of_nothing(sigma, count):
         ObservabilityIndices.of(sigma, count)
 
 
+@pytest.mark.parametrize(("limits", "low", "high"), [({"upper": 1.0}, 1.0 - 2 * np.pi, 1.0), ({}, -np.pi, np.pi)])
+def test_a_joint_without_limits_turns_once(limits, low, high):
+    joints = (Joint(**limits), *ARM.joints[1:])
+    (q,) = design(replace(ARM, joints=joints), DesignOptions(count=30, candidates=300)).q[:, :1].T
+    assert low <= q.min() < low + 1
+    assert high - 1 < q.max() <= high
+
+
 @pytest.mark.parametrize("observe", ["pose", "position"])
 def test_jacobian_against_differences(observe):
     robot = made(ARM, np.random.default_rng(2))
