@@ -26,8 +26,7 @@ COMMANDS = {
     "types": f'NODE_OPTIONS="${{NODE_OPTIONS:-}} --max-semi-space-size=128" {PROGRAMS}/basedpyright',
     "site": f"{PYTHON} scripts/build_site.py",
     "wheel": "scripts/try_wheel",
-    # One process more than there are cores: some tests wait for servers, timers and the programs that they start.
-    "tests": f"{PYTHON} -m pytest -n {len(os.sched_getaffinity(0)) + 1} --dist worksteal",
+    "tests": f"{PYTHON} -m pytest -n auto --dist worksteal",
 }
 
 

@@ -15,7 +15,7 @@ __all__ = ["handeye", "locate", "register", "robot", "sfm"]
 
 
 def __getattr__(name: str):
-    """A system."""
+    """Imports a system when it is first used."""
     if name not in __all__:
         raise AttributeError(f"module stcal has no attribute {name}")
     return import_module(f"stcal.{name}")

@@ -1,4 +1,4 @@
-"""``python -m stcal``: the command ``stcal``."""
+"""Entry point of ``python -m stcal``, the command ``stcal``."""
 
 from stcal.cli.entry import main
 

@@ -1,4 +1,4 @@
-"""What the hardware is: the target's faces and circles, and the dot board. Files: ``io/design.py``."""
+"""Designs of the hardware: the target's faces and circles, and the dot board. Their files: ``io/design.py``."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -17,13 +17,13 @@ Polarity = Literal["bright", "dark"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceDesign:
-    """One face: circles in the face frame (origin circle at 0, X through the x circle, Z out of the box).
+    """One face of the target: circles in the face frame (origin circle at 0, X through the x circle, Z out of the box).
 
     ``ids`` : n circle ids; ``xy_mm`` : (n, 2); ``radius_mm`` : (n,);
     ``origin``, ``x``, ``y`` : ids of the circles that define the frame;
-    ``rough_target_from_face`` : where the face is about to be, in any frame that all faces share, or None where the
-    design does not say. For plans and simulations: a calibration does not use it;
-    ``outline_mm`` : (k, 2) corners of its plate in order, face frame, for drawings; None where the design has none.
+    ``rough_target_from_face`` : approximate pose of the face in a frame that all faces share, or None if the design
+    states none. Plans and simulations use it, a calibration does not;
+    ``outline_mm`` : (k, 2) corners of its plate in order, face frame, for drawings, or None if the design states none.
     """
 
     id: str
@@ -43,20 +43,20 @@ class FaceDesign:
             freeze(self, "outline_mm", (None, 2), f"face {self.id}: outline")
 
     def labels(self) -> list[CircleLabel]:
-        """``face:circle`` for every circle, in order."""
+        """Returns the label ``face:circle`` of every circle, in order."""
         return [CircleLabel(self.id, circle) for circle in self.ids]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetDesign:
-    """The target: faces, and whether its circles are brighter or darker than what surrounds them."""
+    """Target: its faces, and whether its circles are brighter or darker than their surroundings."""
 
     name: str
     polarity: Polarity
     faces: tuple[FaceDesign, ...]
 
     def face(self, face_id: str) -> FaceDesign:
-        """The face of that id."""
+        """Returns the face with this id; raises InputError if there is none."""
         for face in self.faces:
             if face.id == face_id:
                 return face
@@ -66,15 +66,15 @@ class TargetDesign:
         )
 
     def rough_poses(self) -> dict[str, Rigid]:
-        """Rough pose by face id, of the faces that have one."""
+        """Returns the rough poses by face id, of the faces that have one."""
         return {face.id: face.rough_target_from_face for face in self.faces if face.rough_target_from_face is not None}
 
     def patterns_alone(self) -> "TargetDesign":
-        """Without the rough poses: what a calibration depends on."""
+        """Returns the design without the rough poses, which is the part that a calibration depends on."""
         return replace(self, faces=tuple(replace(face, rough_target_from_face=None) for face in self.faces))
 
     def radius_of(self) -> dict[CircleLabel, float]:
-        """Radius in mm by label."""
+        """Returns the radius in mm by label."""
         return {
             label: float(radius)
             for face in self.faces
@@ -84,11 +84,12 @@ class TargetDesign:
 
 @dataclass(frozen=True, slots=True)
 class StatedSize:
-    """What is stated of a body's size besides its drawing; None where nothing is. Only the uncertainty budget uses it.
+    """Size of a body as stated in addition to its drawing; None for values that are not stated.
 
-    ``pitch_sigma_ppm`` : relative standard uncertainty of the pitch that all dots share; ``expansion_ppm_per_k`` :
-    coefficient of linear thermal expansion with its σ; ``temperature_c`` : of the body in the photographs with its σ;
-    ``reference_temperature_c`` : at which its size is stated, or is to be (ISO 1: 20 °C).
+    Only the uncertainty budget uses it. ``pitch_sigma_ppm`` : relative standard uncertainty of the pitch, common to all
+    dots; ``expansion_ppm_per_k`` : coefficient of linear thermal expansion, with its σ; ``temperature_c`` : temperature
+    of the body in the photographs, with its σ; ``reference_temperature_c`` : temperature at which its size is stated,
+    or is to be reported (ISO 1: 20 °C).
     """
 
     pitch_sigma_ppm: float | None = None
@@ -101,10 +102,10 @@ class StatedSize:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardDesign:
-    """A rectangular grid of dots; X along a row, Y down the columns, Z into the board, origin at dot (0, 0).
+    """Board with a rectangular grid of dots; X along a row, Y down the columns, Z into the board, origin at dot (0, 0).
 
     ``corner`` : (row, column) of the one larger dot, with ``corner_radius_mm``, or None for a plain board.
-    ``sigma_mm`` : standard deviation of the dots' positions about the grid, per axis; ``stated`` : of its size.
+    ``sigma_mm`` : standard deviation of the dots' positions about the grid, per axis; ``stated`` : its stated size.
     """
 
     rows: int
@@ -118,31 +119,31 @@ class BoardDesign:
     stated: StatedSize = StatedSize()
 
     def cells(self) -> np.ndarray:
-        """Row and column of every dot, (rows·columns, 2), row-major."""
+        """Returns row and column of every dot, (rows·columns, 2), row-major."""
         return np.column_stack(np.divmod(np.arange(self.rows * self.columns), self.columns))
 
     def xy_mm(self) -> np.ndarray:
-        """Grid positions, (rows·columns, 2), row-major, mm."""
+        """Returns the grid positions, (rows·columns, 2), row-major, mm."""
         return self.pitch_mm * self.cells()[:, ::-1].astype(float)
 
     def radii_mm(self) -> np.ndarray:
-        """Dot radii, (rows·columns,), row-major, mm."""
+        """Returns the dot radii, (rows·columns,), row-major, mm."""
         radii = np.full(self.rows * self.columns, self.radius_mm)
         if self.corner is not None:
             radii[self.corner[0] * self.columns + self.corner[1]] = self.corner_radius_mm
         return radii
 
     def labels(self) -> list[DotLabel]:
-        """``board:row:column``, row-major."""
+        """Returns the labels ``board:row:column``, row-major."""
         return list(_dot_labels(self.rows, self.columns))
 
     def places_mm(self, labels: Iterable[Label]) -> np.ndarray:
-        """Grid positions of these dots, (n, 3), board frame."""
+        """Returns the grid positions of these dots, (n, 3), board frame."""
         cells = dot_cells(labels)
         return np.column_stack([self.pitch_mm * cells[:, ::-1], np.zeros(len(cells))])
 
     def radius_of(self) -> dict[DotLabel, float]:
-        """Radius in mm by label."""
+        """Returns the radius in mm by label."""
         return dict(zip(self.labels(), self.radii_mm().tolist(), strict=True))
 
 
@@ -152,9 +153,9 @@ def _dot_labels(rows: int, columns: int) -> tuple[DotLabel, ...]:
 
 
 def reference_target() -> TargetDesign:
-    """The reference design: five faces of seven big and three small circles (after Zhang & Wei 2017, fig. 1).
+    """Returns the reference design: five faces of seven big and three small circles (after Zhang & Wei 2017, fig. 1).
 
-    Rough poses: target frame = frame of face 1; close to table 2 of Zhang & Wei (2017) where that is consistent.
+    Rough poses: target frame = frame of face 1; close to table 2 of Zhang & Wei (2017) as far as that is consistent.
     """
     common = {"1": (0, 0), "2": (40, 0), "3": (80, 0), "4": (0, 40), "5": (0, 80), "6": (40, 40), "7": (80, 80)}
     small = {"a": (20, 0), "b": (0, 20)}
@@ -178,5 +179,5 @@ def reference_target() -> TargetDesign:
 
 
 def reference_board() -> BoardDesign:
-    """The reference board: 9 columns × 7 rows, 30 mm pitch, radius 7.5 mm, bright, plain, σ 5 µm."""
+    """Returns the reference board: 9 columns × 7 rows, 30 mm pitch, radius 7.5 mm, bright, plain, σ 5 µm."""
     return BoardDesign(7, 9, 30.0, 7.5, "bright", 0.005)

@@ -1,12 +1,12 @@
-"""The exception tree, and the codes of errors.
+"""Exceptions of stcal, and the codes of errors.
 
 Every message is one line: what, where, measured, needed, what to do. The command line prints it and exits with the
-class's ``exit_code`` (2: the input is at fault; 3: the computation could not deliver; 4: what it delivered failed its
-checks, and that was asked for).
+class's ``exit_code`` (2: the input is at fault; 3: the computation could not deliver; 4: the result failed its checks,
+and the user asked for this exit code).
 
-Every error also has a short code such as ``E-CAMERA-MODEL``, which stays when its sentence is reworded. One code names
-one kind of mistake, wherever it is found. ``--debug`` and JSON show the code; `docs/reference/errors.md` lists all
-codes with their sentences.
+Every error also has a short code such as ``E-CAMERA-MODEL``, which stays the same when its sentence is reworded. One
+code names one kind of mistake, wherever it is found. ``--debug`` and JSON show the code; `docs/reference/errors.md`
+lists all codes with their sentences.
 """
 
 
@@ -22,7 +22,7 @@ class StcalError(Exception):
     exit_code = 3
 
     def __init__(self, code: str, message: str):
-        super().__init__(code, message)  # both in ``args``, so that processes can hand the error on
+        super().__init__(code, message)  # both in ``args``, so that the error can be pickled between processes
 
     @property
     def code(self) -> str:
@@ -33,7 +33,7 @@ class StcalError(Exception):
         return self.args[1]
 
     def append(self, text: str) -> None:
-        """Add text at the end of the message."""
+        """Appends text to the message."""
         self.args = (self.code, f"{self}{text}")
 
 
@@ -48,11 +48,11 @@ class DetectionError(StcalError):
 
 
 class MappingError(StcalError):
-    """No model can be made of a group, or the group is not linked to the others."""
+    """A group gives no model, or is not linked to the others."""
 
 
 class ScaleError(StcalError):
-    """The model cannot be brought to millimetres."""
+    """The model cannot be scaled to millimetres."""
 
 
 class DegenerateError(StcalError):
@@ -64,7 +64,7 @@ class ConvergenceError(StcalError):
 
 
 class ChecksFailed(StcalError):
-    """The result is there, and did not pass its own checks."""
+    """The result exists, but did not pass its own checks."""
 
     exit_code = 4
 
@@ -82,7 +82,10 @@ USED_UP = (
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """Whether this is how Python, the loader of libraries, or a library says that memory or processes are used up."""
+    """True if the error, or one of its causes, says that memory or processes are used up.
+
+    Python, the loader of libraries, and the libraries themselves report this in different ways.
+    """
     chain: list[BaseException] = [error]
     while last := chain[-1].__cause__ or chain[-1].__context__:
         chain.append(last)

@@ -1,4 +1,4 @@
-"""Rows held out of a fit, to see how it does on what it has not seen (Stone 1974, J. R. Stat. Soc. B 36)."""
+"""Cross-validation: rows are held out of a fit and then predicted by it (Stone 1974, J. R. Stat. Soc. B 36)."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,8 +8,10 @@ from stcal.errors import StcalError
 
 
 def dealt(count: int, folds: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """Rows 0 … count - 1 dealt at random to folds, each in ascending order, of sizes that differ by one at most; as
-    many folds as rows where more are asked for, none below two."""
+    """Deals rows 0 … count - 1 at random to folds whose sizes differ by at most one, each in ascending order.
+
+    There are at most as many folds as rows, and none if that leaves fewer than two.
+    """
     folds = min(folds, count)
     if folds < 2:
         return []
@@ -18,7 +20,7 @@ def dealt(count: int, folds: int, rng: np.random.Generator) -> list[np.ndarray]:
 
 
 def repeated_splits(count: int, size: int, repeats: int, rng: np.random.Generator) -> np.ndarray:
-    """(repeats, size) rows to hold out, in ascending order: in rounds, in each of which every row comes about once."""
+    """Draws rows to hold out, (repeats, size), ascending in each split; each round holds out every row about once."""
     chosen: list[np.ndarray] = []
     while len(chosen) < repeats:
         order = rng.permutation(count)
@@ -29,29 +31,29 @@ def repeated_splits(count: int, size: int, repeats: int, rng: np.random.Generato
 def held_out_errors(
     ways: Sequence[Callable[[np.ndarray, np.ndarray], np.ndarray]], folds: Sequence[np.ndarray]
 ) -> tuple[int, np.ndarray, np.ndarray]:
-    """Errors of each fold's rows by fits to the other folds.
+    """Returns the errors on each fold's rows of fits to the other folds.
 
     Parameters
     ----------
     ways : sequence of callables
-        Each of (rows to fit to, rows (m,) to try on): the errors (m,).
+        Functions of (rows to fit to, rows (m,) to test on) that return the errors (m,).
     folds : sequence of int arrays
-        Rows of each.
+        Rows of each fold.
 
     Returns
     -------
     tuple
-        The number of folds done, their rows (m,) in ascending order, and the errors (ways, m). A fold that some way
-        cannot solve tells nothing of any, and is left out.
+        The number of folds done, their rows (m,) in ascending order, and the errors (ways, m). A fold that one of the
+        ways cannot solve is left out for all ways.
     """
     rows, errors = [np.zeros(0, int)], [np.zeros((len(ways), 0))]
-    for own in folds:
-        rest = np.setdiff1d(np.concatenate(folds), own)
+    for fold in folds:
+        training = np.setdiff1d(np.concatenate(folds), fold)
         try:
-            errors.append(np.array([way(rest, own) for way in ways]))
+            errors.append(np.array([way(training, fold) for way in ways]))
         except StcalError:
             continue
-        rows.append(own)
-    tried = np.concatenate(rows)
-    order = np.argsort(tried)
-    return len(rows) - 1, tried[order], np.hstack(errors)[:, order]
+        rows.append(fold)
+    tested = np.concatenate(rows)
+    order = np.argsort(tested)
+    return len(rows) - 1, tested[order], np.hstack(errors)[:, order]

@@ -1,5 +1,7 @@
-"""Names of circles: ``face:circle`` on the target, ``board:row:column`` on the board. They are text wherever text is
-wanted, in files, tables and as keys; their parts are taken apart in :func:`parse_label` alone."""
+"""Labels of circles: ``face:circle`` on the target, ``board:row:column`` on the board.
+
+Labels are strings, and serve as text in files, tables and as keys. Only :func:`parse_label` takes them apart.
+"""
 
 from collections.abc import Iterable
 from typing import TypeAlias
@@ -12,7 +14,7 @@ BOARD = "board"
 
 
 class CircleLabel(str):
-    """``face:circle``, a circle of the target; ``face`` and ``circle`` are the two ids."""
+    """Label ``face:circle`` of a circle of the target; ``face`` and ``circle`` are the two ids."""
 
     __slots__ = ("circle", "face")
     face: str
@@ -28,12 +30,12 @@ class CircleLabel(str):
 
     @property
     def plane(self) -> str:
-        """What it lies on: its face."""
+        """Plane of the circle: its face."""
         return self.face
 
 
 class DotLabel(str):
-    """``board:row:column``, a dot of the board; ``row`` and ``column`` count from 0."""
+    """Label ``board:row:column`` of a dot of the board; ``row`` and ``column`` count from 0."""
 
     __slots__ = ("column", "row")
     row: int
@@ -49,7 +51,7 @@ class DotLabel(str):
 
     @property
     def plane(self) -> str:
-        """What it lies on: the board."""
+        """Plane of the dot: the board."""
         return BOARD
 
 
@@ -57,34 +59,34 @@ Label: TypeAlias = CircleLabel | DotLabel
 
 
 def parse_label(text: str) -> Label:
-    """The label that a text is.
+    """Parses the text of a label.
 
     Raises
     ------
     InputError
-        It is neither ``face:circle`` nor ``board:row:column``.
+        The text is neither ``face:circle`` nor ``board:row:column``.
     """
     if isinstance(text, Label):
         return text
-    plane, _, rest = text.partition(":")
+    plane, _, name = text.partition(":")
     if plane == BOARD:
-        row, _, column = rest.partition(":")
+        row, _, column = name.partition(":")
         if row.isdecimal() and column.isdecimal():
             label = DotLabel(int(row), int(column))
             if label == text:  # no leading zeros
                 return label
-    elif plane and rest:
-        return CircleLabel(plane, rest)
+    elif plane and name:
+        return CircleLabel(plane, name)
     raise InputError("E-LABEL-FORM", f"label {text}: face:circle or {BOARD}:row:column needed")
 
 
 def parse_labels(texts: Iterable[str]) -> tuple[Label, ...]:
-    """:func:`parse_label` of each."""
+    """Parses each text with :func:`parse_label`."""
     return tuple(map(parse_label, texts))
 
 
 def circle_labels(texts: Iterable[str]) -> tuple[CircleLabel, ...]:
-    """:func:`parse_label` of each, all on the target.
+    """Parses each text with :func:`parse_label`; all labels must be of circles on the target.
 
     Raises
     ------
@@ -100,12 +102,12 @@ def circle_labels(texts: Iterable[str]) -> tuple[CircleLabel, ...]:
 
 
 def dot_cells(labels: Iterable[Label]) -> np.ndarray:
-    """Row and column of the board's dots, (n, 2) int.
+    """Returns row and column of the board's dots, (n, 2) int.
 
     Raises
     ------
     InputError
-        A label is that of a circle.
+        A label belongs to a circle of the target.
     """
     cells = []
     for label in labels:

@@ -1,4 +1,4 @@
-"""How alike two patterns of circles are, turned and at any size: what a camera cannot tell apart."""
+"""Likeness of two patterns of circles under rotation and scale: a camera cannot tell alike patterns apart."""
 
 from dataclasses import dataclass
 
@@ -7,22 +7,23 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist, squareform
 
 MAX_GAP = 0.5
-"""Circles of two patterns coincide when their centres are closer than this many radii …"""
+"""Largest distance of two circles' centres, in radii, at which the circles coincide."""
 MAX_RADIUS_RATIO = 1.3
-"""… and their radii differ by less than this factor."""
+"""Largest ratio of two circles' radii at which the circles coincide."""
 MIN_COMMON = 4
 BLOCK = 4000
-"""Motions looked at together: bounds the memory for patterns of many circles."""
+"""Number of motions tested together, which bounds the memory for patterns of many circles."""
 MOST_CIRCLES = 100
-"""Of a pattern that is compared as a whole; larger ones take minutes."""
+"""Largest number of circles of a pattern that is compared as a whole; larger ones take minutes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """How a whole pattern lies on another at best.
+    """Best motion of a whole pattern onto another one.
 
     ``gap_mm`` : largest distance of two centres; ``radius_mm`` : largest difference of two radii; both at the size of
-    the other pattern; ``turn_rad`` : −π … π; ``scale`` : the other's size over its own; ``shift_mm`` : after both.
+    the other pattern; ``turn_rad`` : rotation, −π … π; ``scale`` : the other pattern's size over the pattern's own;
+    ``shift_mm`` : translation after rotation and scale.
     """
 
     gap_mm: float
@@ -32,84 +33,92 @@ class Likeness:
     shift_mm: tuple[float, float]
 
     def moved(self, xy: np.ndarray) -> np.ndarray:
-        """A point (2,) of the pattern where it lies on the other."""
+        """Returns a point (2,) of the pattern, moved onto the other pattern."""
         c, s = self.scale * np.cos(self.turn_rad), self.scale * np.sin(self.turn_rad)
         return np.array([[c, -s], [s, c]]) @ xy + self.shift_mm
 
 
 def whole_likeness(xy, radius, other_xy, other_radius, in_place: np.ndarray | None = None) -> Likeness | None:
-    """The motion, at any size, that puts every circle of a pattern onto a circle of another one, with the smallest gap.
+    """Returns the motion with scale that puts all circles of a pattern onto circles of another, with the smallest gap.
 
     Parameters
     ----------
     xy, other_xy : (n, 2) and (m, 2) centres, mm
     radius, other_radius : (n,) and (m,) mm
     in_place : (n,) places among the other's, optional
-        Of the same circles, where both are of one pattern: the motion that leaves it in place is none.
+        Places of the same circles, if both are parts of one pattern. The motion that leaves the circles in place is
+        excluded.
 
     Returns
     -------
     Likeness or None
-        None where no motion puts all circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of
-        more than ``MOST_CIRCLES``.
+        None if no motion puts all circles within ``MAX_GAP`` radii and ``MAX_RADIUS_RATIO``, and for patterns of more
+        than ``MOST_CIRCLES``.
     """
-    own, other = (points[:, 0] + 1j * points[:, 1] for points in (np.asarray(xy, float), np.asarray(other_xy, float)))
-    n, m = len(own), len(other)
+    centres, other_centres = (
+        points[:, 0] + 1j * points[:, 1] for points in (np.asarray(xy, float), np.asarray(other_xy, float))
+    )
+    n, m = len(centres), len(other_centres)
     if not 2 <= n <= m <= MOST_CIRCLES:
         return None
     i, j = np.unravel_index(squareform(pdist(xy)).argmax(), (n, n))
     p, q = (g.ravel() for g in np.meshgrid(np.arange(m), np.arange(m)))
     p, q = p[p != q], q[p != q]
-    factor = (other[q] - other[p]) / (own[j] - own[i])
+    factor = (other_centres[q] - other_centres[p]) / (centres[j] - centres[i])
     fits = alike(abs(factor) * radius[i], other_radius[p]) & alike(abs(factor) * radius[j], other_radius[q])
-    tree, best = KDTree(np.column_stack([other.real, other.imag])), None
+    tree, best = KDTree(np.column_stack([other_centres.real, other_centres.imag])), None
     for start, turn in zip(p[fits], factor[fits], strict=True):
-        moved = other[start] + turn * (own - own[i])
+        moved = other_centres[start] + turn * (centres - centres[i])
         nearest = np.asarray(tree.query(np.column_stack([moved.real, moved.imag]))[1])
         if len(np.unique(nearest)) < n or (in_place is not None and (nearest == in_place).all()):
             continue
-        found = _fitted(own, radius, other[nearest], other_radius[nearest])
-        if found is not None and (best is None or _order(found) < _order(best)):
-            best = found
+        likeness = _fitted(centres, radius, other_centres[nearest], other_radius[nearest])
+        if likeness is not None and (best is None or _order(likeness) < _order(best)):
+            best = likeness
     return best
 
 
 def _order(likeness: Likeness) -> tuple[float, float]:
-    """By the gap, and of equal ones by the turn."""
+    """Returns the key that orders likenesses by gap, then by angle."""
     return round(likeness.gap_mm, 6), abs(likeness.turn_rad)
 
 
 def _fitted(own, radius, other, other_radius) -> Likeness | None:
-    """Of circles in pairs, centres as complex numbers: the motion of least squares, if all then coincide; without
-    change of size where that will do."""
+    """Fits a motion to pairs of circles by least squares; centres are complex numbers.
+
+    Returns the motion without scale if all circles then coincide, else that with scale, or None if they never do.
+    """
     centred, target = own - own.mean(), other - other.mean()
     factor = (centred.conj() @ target) / (abs(centred) ** 2).sum()
     for change in (factor / abs(factor), factor):
         scale = float(abs(change))
         gap = abs(change * centred - target)
-        near = gap < MAX_GAP * np.minimum(scale * radius, other_radius)
-        if near.all() and alike(scale * radius, other_radius).all():
-            off = float(abs(scale * radius - other_radius).max())
+        coincides = gap < MAX_GAP * np.minimum(scale * radius, other_radius)
+        if coincides.all() and alike(scale * radius, other_radius).all():
+            radius_difference = float(abs(scale * radius - other_radius).max())
             shift = other.mean() - change * own.mean()
-            return Likeness(float(gap.max()), off, float(np.angle(change)), scale, (shift.real, shift.imag))
+            return Likeness(
+                float(gap.max()), radius_difference, float(np.angle(change)), scale, (shift.real, shift.imag)
+            )
     return None
 
 
 def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozenset[int]]:
-    """Sets of circles that coincide with circles of another pattern under some rigid motion of the plane that puts two
-    circles onto two.
+    """Finds sets of circles that coincide with circles of another pattern under a rigid motion of the plane.
+
+    The motions that are tried put two circles of the pattern onto two circles of the other one.
 
     Parameters
     ----------
     xy, other_xy : (n, 2) and (m, 2) centres, mm
     radius, other_radius : (n,) and (m,) mm
     same : bool
-        Both are one pattern: the motion that leaves it in place is none.
+        True if both are the same pattern. The motion that leaves it in place is then excluded.
 
     Returns
     -------
     set of frozenset of int
-        Places in ``xy``, ``MIN_COMMON`` or more in each.
+        Places in ``xy``; each set has ``MIN_COMMON`` or more.
     """
     n, m = len(xy), len(other_xy)
     k, near = (g.ravel() for g in np.meshgrid(np.arange(n), np.arange(n)))
@@ -131,18 +140,18 @@ def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozen
 
 
 def _coincide(xy, radius, other_xy, other_radius, origin, step, other_step, same: bool) -> np.ndarray:
-    """For every motion, given by two circles put onto two, the mask (motions, n) of circles that coincide."""
+    """Returns the mask (motions, n) of circles that coincide, for motions that put two circles onto two."""
     turn = np.arctan2(other_step[:, 1], other_step[:, 0]) - np.arctan2(step[:, 1], step[:, 0])
     c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
     x, y = np.moveaxis(xy - xy[origin[0]][:, None], 2, 0)
     moved = np.stack([c * x - s * y, s * x + c * y], -1) + other_xy[origin[1]][:, None]
     gap, nearest = KDTree(other_xy).query(moved)
     fits = (gap < MAX_GAP * np.minimum(radius, other_radius[nearest])) & alike(radius[None], other_radius[nearest])
-    if same:  # the reading itself is no rival
+    if same:  # the identity is excluded
         fits = fits[~((nearest == np.arange(len(xy))) | ~fits).all(1)]
     return fits
 
 
 def alike(a, b):
-    """Whether radii pass for one another."""
+    """True where two radii can be taken for each other."""
     return np.maximum(a, b) < MAX_RADIUS_RATIO * np.minimum(a, b)

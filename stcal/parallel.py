@@ -1,4 +1,4 @@
-"""Run one function over many jobs on all cores, or by any executor, and BLAS on one."""
+"""Parallel execution of one function over many jobs, on all cores or by an executor, with BLAS on one thread."""
 
 import contextlib
 import itertools
@@ -25,17 +25,17 @@ from typing import TypeVar
 
 R = TypeVar("R")
 Progress = Callable[[str, int, int], None]
-"""Called with (stage, done, total)."""
+"""Function that is called with (stage, done, total)."""
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-"""Libraries take their number of threads from these when they are loaded; processes side by side need one each."""
+"""Variables from which libraries read their number of threads when they are loaded; parallel processes set it to 1."""
 LOADED_ONCE = "stcal.sfm.pipeline"
-"""Module that is loaded before processes are forked, with all that it imports."""
+"""Module that is loaded, with all its imports, before processes are forked."""
 _limited = threading.Lock()
 _one_starts = threading.Lock()
 
 
 def counted(progress: Progress, stage: str, total: int) -> Callable[[object], None]:
-    """Tell ``progress`` that nothing is done, and, at each call of what is returned, that one more is."""
+    """Reports to ``progress`` that nothing is done, and returns a function that reports one more job at each call."""
     done = itertools.count(1)
     progress(stage, 0, total)
     return lambda _: progress(stage, next(done), total)
@@ -43,19 +43,19 @@ def counted(progress: Progress, stage: str, total: int) -> Callable[[object], No
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Keep BLAS and OpenMP to one thread meanwhile; as a decorator, ``@one_thread()``, during each call.
+    """Limits BLAS and OpenMP to one thread in the context; as a decorator, ``@one_thread()``, during each call.
 
     The matrices here are small, or sparse: threads that wait for each other took the larger part of a run's processor
-    time. The limit stands at the heavy public functions, not at the program's start: the program and a caller from
-    Python get the same, libraries that are loaded after the start are limited too, and the caller's own process is as
-    before when the function returns. Calls inside another, or while one of another thread lasts, leave it to that one:
-    two that each restored what they had found could leave the limit behind.
+    time. The limit is set in the heavy public functions, not at the start of the program. The program and a caller from
+    Python thus behave alike, libraries that are loaded later are limited too, and the limit is gone when the function
+    returns. A nested call, or one while another thread holds the limit, changes nothing: two calls that
+    each restored the previous state could leave the limit behind.
     """
     if not _limited.acquire(blocking=False):
         yield
         return
     try:
-        from threadpoolctl import threadpool_limits  # 40 ms that `stcal --version` need not wait for
+        from threadpoolctl import threadpool_limits  # takes 40 ms, which `stcal --version` need not wait for
 
         with threadpool_limits(1):
             yield
@@ -70,20 +70,20 @@ def run_parallel(
     executor: Executor | None = None,
     at_once: int | None = None,
 ) -> Iterator[tuple[int, R]]:
-    """Yield (index of the job, result of ``function(*job)``) as results come in, in any order.
+    """Yields (index of the job, result of ``function(*job)``) as results arrive, in any order.
 
-    Processes are forked from a server that has loaded the libraries and has no threads (forking one with threads can
-    hang), or started afresh where the system cannot; they do not import the caller's main module, so that a script
-    needs no ``if __name__ == "__main__"``. One worker, or one job, runs right here.
+    Processes are forked from a server that has loaded the libraries and has no threads (forking a process with threads
+    can hang). They are spawned if the system cannot fork. They do not import the caller's main module, so that a script
+    needs no ``if __name__ == "__main__"``. One worker, or one job, runs in this process.
 
     Parameters
     ----------
     workers : int, optional
-        Processes; one per core where None. As many as :func:`kept_processes` says, within it.
+        Number of processes; one per core if None. Within :func:`kept_processes`, its number counts.
     executor : concurrent.futures.Executor, optional
-        Runs the jobs in place of processes of our own, and is left open.
+        Executor that runs the jobs instead of processes of this module. It is left open.
     at_once : int, optional
-        So many jobs are handed to the executor at a time; all of them where None.
+        Number of jobs that are handed to the executor at a time; all of them if None.
     """
     if executor is not None:
         yield from _handed_over(executor, function, jobs, at_once or len(jobs))
@@ -99,21 +99,25 @@ def run_parallel(
 
 
 def run_briefly(function: Callable[..., R], jobs: Sequence[tuple]) -> list[R]:
-    """Results of ``function(*job)`` in the order of the jobs, of a tenth of a second each: by several processes where
-    :func:`kept_processes` keeps them, else right here."""
-    kept = _kept.get()
-    if kept and kept.workers > 1:
+    """Returns the results of ``function(*job)`` in the order of the jobs, for jobs of about a tenth of a second each.
+
+    The jobs run in the processes of :func:`kept_processes` if there are any, else in this process.
+    """
+    processes = _kept.get()
+    if processes and processes.workers > 1:
         try:
-            return [result for _, result in sorted(kept.run(function, jobs), key=itemgetter(0))]
-        except BrokenExecutor:  # a process was ended from outside: it goes on here, and takes longer
+            return [result for _, result in sorted(processes.run(function, jobs), key=itemgetter(0))]
+        except BrokenExecutor:  # a process was ended from outside: the jobs run in this process, more slowly
             pass
     return [function(*job) for job in jobs]
 
 
 @contextlib.contextmanager
 def kept_processes(workers: int | None = None) -> Iterator[None]:
-    """Keep the processes of :func:`run_parallel` from call to call, so that libraries are loaded once; so many of them,
-    one per core where None, started when they are first needed."""
+    """Keeps the processes of :func:`run_parallel` from call to call, so that libraries are loaded only once.
+
+    ``workers`` : number of processes, one per core if None; they start when they are first needed.
+    """
     if _kept.get():
         yield
         return
@@ -126,7 +130,7 @@ def kept_processes(workers: int | None = None) -> Iterator[None]:
 
 
 class _Processes:
-    """Processes of our own, started when the first job comes; they end with the context."""
+    """Pool of processes that starts with the first job and ends with the context."""
 
     def __init__(self, workers: int):
         self.workers = workers
@@ -139,14 +143,14 @@ class _Processes:
         return self._pool
 
     def run(self, function: Callable[..., R], jobs: Sequence[tuple]) -> Iterator[tuple[int, R]]:
-        """Index and result of each job, in any order."""
+        """Yields index and result of each job, in any order."""
         with _plain_main(), _deaf_to_interrupts():
             pool = self._start()
             futures = {pool.submit(function, *job): i for i, job in enumerate(jobs)}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
-        except BrokenExecutor:  # the pool itself ends its futures; cancelled ones would break its thread
+        except BrokenExecutor:  # the pool ends its futures itself; cancelling them would break its thread
             raise
         except (Exception, GeneratorExit):
             for future in futures:
@@ -154,7 +158,7 @@ class _Processes:
             raise
 
     def everywhere(self, function: Callable, arguments: tuple) -> None:
-        """Begin the same in every process, as far as they are idle."""
+        """Starts the function once per process, as far as processes are idle."""
         with _plain_main(), _deaf_to_interrupts():
             for _ in range(self.workers):
                 self._start().submit(function, *arguments)
@@ -165,7 +169,7 @@ class _Processes:
     def __exit__(self, kind: type[BaseException] | None, *_) -> None:
         if self._pool is None:
             return
-        asked_to_end = kind is not None and not issubclass(kind, Exception)  # what is half done is of no use
+        asked_to_end = kind is not None and not issubclass(kind, Exception)  # half-done work is of no use
         self._pool.shutdown(wait=not asked_to_end, cancel_futures=True)
         if asked_to_end:
             for process in multiprocessing.active_children():
@@ -174,11 +178,11 @@ class _Processes:
 
 
 def load_in_processes(*modules: str) -> None:
-    """Load modules in the processes that :func:`kept_processes` keeps, while this one goes on."""
-    kept = _kept.get()
-    if kept and kept.workers > 1:
+    """Loads modules in the processes of :func:`kept_processes`, while this process goes on."""
+    processes = _kept.get()
+    if processes and processes.workers > 1:
         with contextlib.suppress(BrokenExecutor):
-            kept.everywhere(_load, modules)
+            processes.everywhere(_load, modules)
 
 
 def _load(*modules: str) -> None:
@@ -190,13 +194,14 @@ _kept: ContextVar[_Processes | None] = ContextVar("kept processes", default=None
 
 
 class OwnProcess:
-    """One process that holds what it has begun with, such as a tracker, from call to call; a new one takes its place
-    when it ends from outside.
+    """Process that keeps its state, such as a tracker, from call to call.
+
+    A new process takes its place if it is ended from outside.
 
     Parameters
     ----------
     begin : callable
-        Called with ``arguments`` in the process before all else.
+        Function that the process calls with ``arguments`` first.
     """
 
     def __init__(self, begin: Callable[..., object], *arguments):
@@ -205,12 +210,12 @@ class OwnProcess:
         self._pool: ProcessPoolExecutor | None = None
 
     def call(self, function: Callable[..., R], *arguments) -> R:
-        """Result of the function there, after those of calls before.
+        """Returns the result of the function in the process, after all earlier calls.
 
         Raises
         ------
         BrokenExecutor
-            The process ended meanwhile; the next call starts another.
+            The process ended during the call; the next call starts another one.
         """
         with self._guard:
             if self._pool is None:
@@ -228,7 +233,7 @@ class OwnProcess:
             raise
 
     def close(self) -> None:
-        """End the process; calls that wait are given up."""
+        """Ends the process; waiting calls are cancelled."""
         with self._guard:
             pool, self._pool = self._pool, None
         if pool is not None:
@@ -247,7 +252,7 @@ def _as_processes_start() -> Iterator[None]:
 
 
 def load_ahead(workers: int | None = None) -> None:
-    """Load what processes will need, beside this process, which goes on."""
+    """Starts the server of processes, which loads their libraries while this process goes on."""
     if (workers or os.cpu_count() or 1) > 1 and _context().get_start_method() == "forkserver":
         from multiprocessing.forkserver import ensure_running
 
@@ -256,20 +261,20 @@ def load_ahead(workers: int | None = None) -> None:
 
 
 def _context() -> multiprocessing.context.BaseContext:
-    """How processes are started: by a server without threads, which has the libraries, where the system can fork."""
+    """Returns the way to start processes: a server without threads that has loaded the libraries, or spawn."""
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([LOADED_ONCE])  # without effect where a server is running
+    context.set_forkserver_preload([LOADED_ONCE])  # without effect if a server is running
     return context
 
 
 def _handed_over(executor: Executor, function, jobs: Sequence[tuple], at_once: int) -> Iterator[tuple[int, R]]:
     waiting: dict[Future, int] = {}
-    rest = iter(range(len(jobs)))
+    remaining = iter(range(len(jobs)))
     try:
         while True:
-            for i in itertools.islice(rest, at_once - len(waiting)):
+            for i in itertools.islice(remaining, at_once - len(waiting)):
                 waiting[executor.submit(function, *jobs[i])] = i
             if not waiting:
                 return
@@ -282,25 +287,27 @@ def _handed_over(executor: Executor, function, jobs: Sequence[tuple], at_once: i
 
 @contextlib.contextmanager
 def _deaf_to_interrupts():
-    """Processes started meanwhile ignore Ctrl-C from their first moment, not only after their imports. SIGTERM waits: a
-    process that its parent leaves before it has read what to do ends with a stack on the terminal."""
+    """Lets processes that start in the context ignore Ctrl-C from their first moment, not only after their imports.
+
+    SIGTERM is delayed: a process whose parent ends before it has read its task prints a stack on the terminal.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    asked: list[int] = []
-    before = [(signal.SIGINT, signal.signal(signal.SIGINT, signal.SIG_IGN))]
-    before.append((signal.SIGTERM, signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))))
+    received: list[int] = []
+    handlers = [(signal.SIGINT, signal.signal(signal.SIGINT, signal.SIG_IGN))]
+    handlers.append((signal.SIGTERM, signal.signal(signal.SIGTERM, lambda number, _: received.append(number))))
     try:
         yield
     finally:
-        for number, handler in before:
+        for number, handler in handlers:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
-        for number in asked[:1]:
+        for number in received[:1]:
             signal.raise_signal(number)
 
 
 def _follow_parent() -> None:
-    """In a worker: leave Ctrl-C to the parent, which stops the pool in order; end when the parent is killed."""
+    """Lets a worker leave Ctrl-C to the parent, which stops the pool in order, and end when the parent is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is None:
@@ -315,15 +322,17 @@ def _follow_parent() -> None:
 
 @contextlib.contextmanager
 def _plain_main():
-    """Hide the main module's file from new processes, and the folder that the program runs in, whose files might be
-    named like modules; keep their libraries to one thread."""
+    """Hides the main module's file and the working folder from new processes, and limits their libraries to one thread.
+
+    The working folder might hold files with the names of modules.
+    """
     main = sys.modules["__main__"]
     hidden = {name: getattr(main, name) for name in ("__file__", "__spec__") if getattr(main, name, None) is not None}
-    meanwhile: dict[str, str] = dict.fromkeys((*ONE_THREAD, "PYTHONSAFEPATH"), "1")
-    before = {name: os.environ.get(name) for name in meanwhile}
+    variables: dict[str, str] = dict.fromkeys((*ONE_THREAD, "PYTHONSAFEPATH"), "1")
+    before = {name: os.environ.get(name) for name in variables}
     for name in hidden:
         setattr(main, name, None)
-    os.environ.update(meanwhile)
+    os.environ.update(variables)
     try:
         yield
     finally:

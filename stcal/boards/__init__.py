@@ -1,5 +1,5 @@
-"""Flat boards and tags as other makers print them: chessboards, ChArUco boards, ArUco and AprilTag markers.
+"""Flat boards and tags of other makers: chessboards, ChArUco boards, AprilGrids, ArUco and AprilTag markers.
 
-What they are (``design``), their files (``board_file``), and where their corners lie in an image (``chessboard``,
-``tags``). Dot boards are ``stcal.design.BoardDesign`` and are found by ``stcal.sfm``.
+``design`` : the boards; ``file``, ``kalibr``, ``several`` : their files; ``chessboard``, ``tags``, ``aprilgrid`` :
+detection of their corners in an image. Dot boards are ``stcal.design.BoardDesign`` and are detected by ``stcal.sfm``.
 """

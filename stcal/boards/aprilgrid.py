@@ -1,7 +1,7 @@
-"""AprilGrids as Kalibr prints them: AprilTags with a border of one cell or two, small black squares at their corners.
+"""AprilGrids as of Kalibr: AprilTags with a border of one or two cells, and small black squares at their corners.
 
-``cv2.aruco`` looks for dark quadrilaterals. Where a square touches a tag's corner, blur joins the two, and there is
-none: tags are looked for in images with grown white too. Their corners are measured in the image as it is.
+``cv2.aruco`` looks for dark quadrilaterals. Blur joins a tag with the squares at its corners, so that there is none:
+tags are also searched in images with dilated white. Their corners are measured in the original image.
 """
 
 from dataclasses import replace
@@ -14,41 +14,44 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography
 
 KALIBR_BITS, USUAL_BITS = 2, 1
-"""Widths of the black border, cells."""
+"""Widths of the black border of Kalibr's tags and of usual ones, cells."""
 TELLING_SHARE = 0.5
-"""A border of two cells is read as one now and then, one of one never as two: two cells hold where they read so many of
-the tags that one reads …"""
+"""Smallest share of the tags read with a border of one cell that a border of two cells must read to be accepted. A
+border of two cells is sometimes read as one, but a border of one cell never as two."""
 ENOUGH_SHARE = 0.5
-"""… or so many of all tags of the board, and then one is not tried."""
+"""Share of all tags of the board from which on a border of two cells is accepted without trying one cell."""
 MAX_OFF_SHARE = 0.15
-"""Of a tag's side: what lies farther from where one plane puts it stands elsewhere, or is turned."""
+"""Largest deviation of a tag from its place in the board's plane, as a share of its side; a tag with a larger one is
+elsewhere, or rotated."""
 MOST_STRAY_SHARE = 1 / 3
-"""Of the tags in view, that may lie elsewhere."""
+"""Largest share of the tags in view that may be rejected for lying off the plane."""
 
 
 def find_aprilgrid(
     image: np.ndarray, name: str, board: AprilGridDesign, camera: Camera
 ) -> tuple[BoardView | None, str]:
-    """All four corners of each tag that is seen, or why there are none. A part of the board is enough."""
+    """Return the view with all four corners of each tag seen, or None and the reason. A part of the board is enough."""
     layout = board.layout()
     tags, bits = _tags(image, board)
     view = view_of_tags(name, tags, layout)
     if view is None:
         return None, _without_tags(tags, bits, board)
-    own, unused = view, list(view.unused)
+    fitting, unused = view, list(view.unused)
     strangers = [tag for _, tag in tags.tags if tag not in board.tag_ids()]
     unused += [f"tag {tag} is none of its {len(board.tag_ids())}" for tag in strangers]
-    while (off := _off(own, camera)).max() > MAX_OFF_SHARE and len(own) - 4 >= (1 - MOST_STRAY_SHARE) * len(view):
-        worst = own.ids[4 * int(off.argmax())] // 4
+    while (off := _off(fitting, camera)).max() > MAX_OFF_SHARE and len(fitting) - 4 >= (1 - MOST_STRAY_SHARE) * len(
+        view
+    ):
+        worst = fitting.ids[4 * int(off.argmax())] // 4
         unused.append(f"tag {layout.tags[worst][1]} lies off the board's plane")
-        own = _rows(own, own.ids // 4 != worst)
-    if _off(own, camera).max() > MAX_OFF_SHARE:
+        fitting = _rows(fitting, fitting.ids // 4 != worst)
+    if _off(fitting, camera).max() > MAX_OFF_SHARE:
         return None, _why_off(view, board, camera)
-    return replace(own, unused=tuple(unused)), ""
+    return replace(fitting, unused=tuple(unused)), ""
 
 
 def _tags(image: np.ndarray, board: AprilGridDesign) -> tuple[Tags, str]:
-    """Tags with the border that the board has, or that most of them have; and what it was looked for with."""
+    """Return the tags, read with the board's border width or the more likely one, and the widths tried, in words."""
     names = (board.dictionary,)
     if board.border_bits is not None:
         return find_tags(image, names, board.border_bits, joined=True), f"{board.border_bits}"
@@ -79,20 +82,20 @@ def _rows(view: BoardView, keep: np.ndarray) -> BoardView:
 
 
 def _off(view: BoardView, camera: Camera) -> np.ndarray:
-    """Of each tag: how far its corners lie from where the plane puts them, RMS, in sides of the tag as seen."""
-    seen = camera.normalised_from_pixel(view.xy_px)
-    there = apply_homography(fit_homography(view.xyz_board[:, :2], seen), view.xyz_board[:, :2])
-    corners = seen.reshape(-1, 4, 2)
+    """Return the RMS deviation of each tag's corners from their places in the plane, in sides of the tag as seen."""
+    observed = camera.normalised_from_pixel(view.xy_px)
+    predicted = apply_homography(fit_homography(view.xyz_board[:, :2], observed), view.xyz_board[:, :2])
+    corners = observed.reshape(-1, 4, 2)
     side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(1)
-    return np.sqrt(((there - seen) ** 2).sum(1).reshape(-1, 4).mean(1)) / side
+    return np.sqrt(((predicted - observed) ** 2).sum(1).reshape(-1, 4).mean(1)) / side
 
 
 def _why_off(view: BoardView, board: AprilGridDesign, camera: Camera) -> str:
-    """What other printing would put the tags where they are."""
+    """Return why the tags do not fit the board: rotated printing, or another arrangement."""
     turned = replace(board, upright=not board.upright)
     if _off(_as(turned.layout(), view), camera).max() <= MAX_OFF_SHARE:
-        said = "true" if turned.upright else "false"
-        return f"the tags of the AprilGrid are turned by half a turn; write upright = {said} into its file"
+        value = "true" if turned.upright else "false"
+        return f"the tags of the AprilGrid are turned by half a turn; write upright = {value} into its file"
     return (
         f"{len(view) // 4} tags of the AprilGrid, but not where rows, columns and spacing put them; ids count from the "
         "bottom left, row by row upwards"

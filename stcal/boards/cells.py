@@ -1,6 +1,6 @@
-"""What of a board of squares or tags is black, as closed lines in mm: what a printer, a laser or a mill needs.
+"""Black areas of a board of squares or tags, as closed lines in mm for a printer, a laser or a mill.
 
-Cells are joined to areas, as viewers draw hairlines between squares that touch.
+Cells are merged into areas, because viewers draw hairlines between squares that touch.
 """
 
 import cv2
@@ -11,11 +11,11 @@ from stcal.boards.tags import dictionary_of
 
 SquaresOrTags = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign
 UNKNOWN_BITS = 2
-"""Border of an AprilGrid whose file does not say it: Kalibr's."""
+"""Border of an AprilGrid, in cells, if its file does not state it: Kalibr's."""
 
 
 def black_areas(board: SquaresOrTags) -> list[list[np.ndarray]]:
-    """Areas of closed lines (k, 2), mm in the board's frame; lines within lines are holes, turned the other way."""
+    """Return areas as lists of closed lines (k, 2), mm in the board's frame; inner lines are holes, reversed."""
     if isinstance(board, ChessboardDesign):
         return _squares(board.rows + 1, board.columns + 1, board.square_mm, 0, -board.square_mm)
     if isinstance(board, CharucoDesign):
@@ -31,7 +31,7 @@ def black_areas(board: SquaresOrTags) -> list[list[np.ndarray]]:
 
 
 def clear_mm(board: SquaresOrTags) -> float:
-    """White that detectors need around it: a square, or two cells of the smallest tag."""
+    """Return the width of white, mm, that detectors need around the board: a square, or a quarter of a tag."""
     if isinstance(board, ChessboardDesign | CharucoDesign):
         return board.square_mm
     if isinstance(board, AprilGridDesign):
@@ -41,8 +41,11 @@ def clear_mm(board: SquaresOrTags) -> float:
 
 
 def outlines(black: np.ndarray) -> list[np.ndarray]:
-    """Closed lines around the black cells of a mask (rows, columns): corners (k, 2), column and row, the black on the
-    right where rows go down. Areas that touch at a corner alone stay two."""
+    """Return closed lines around the black cells of a mask (rows, columns).
+
+    Each line is (k, 2) corners, column and row, with the black on the right if rows go down. Areas that touch only at a
+    corner stay separate.
+    """
     padded = np.pad(black, 1)
     after: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for row, column in np.argwhere(black).tolist():
@@ -52,31 +55,31 @@ def outlines(black: np.ndarray) -> list[np.ndarray]:
         for k in range(4):
             if not beside[k]:
                 after.setdefault(corners[k], []).append(corners[(k + 1) % 4])
-    found = []
+    lines = []
     while after:
-        here = start = next(iter(after))
+        corner = start = next(iter(after))
         step, line = (0, 0), []
         while True:
-            ends = after[here]
-            right = (here[0] - step[1], here[1] + step[0])
+            ends = after[corner]
+            right = (corner[0] - step[1], corner[1] + step[0])
             end = ends.pop(ends.index(right) if right in ends else 0)
             if not ends:
-                del after[here]
-            turned = (end[0] - here[0], end[1] - here[1])
+                del after[corner]
+            turned = (end[0] - corner[0], end[1] - corner[1])
             if turned != step:
-                line.append(here)
-            here, step = end, turned
-            if here == start:
+                line.append(corner)
+            corner, step = end, turned
+            if corner == start:
                 break
         first = (line[1][0] - line[0][0], line[1][1] - line[0][1])
-        if first[0] * step[1] == first[1] * step[0]:  # begun in the middle of an edge
+        if first[0] * step[1] == first[1] * step[0]:  # the line began in the middle of an edge
             line = line[1:]
-        found.append(np.array(line))
-    return found
+        lines.append(np.array(line))
+    return lines
 
 
 def _squares(rows: int, columns: int, side: float, first: int, origin: float) -> list[list[np.ndarray]]:
-    """Black squares one by one; square (0, 0) begins at ``origin``, and is black where ``first`` is 0."""
+    """Return the black squares one by one; square (0, 0) begins at ``origin``, and is black if ``first`` is 0."""
     row, column = np.divmod(np.arange(rows * columns), columns)
     black = (row + column) % 2 == first
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
@@ -84,7 +87,7 @@ def _squares(rows: int, columns: int, side: float, first: int, origin: float) ->
 
 
 def _charuco(board: CharucoDesign) -> np.ndarray:
-    """Corners of its tags, (n, 4, 2), mm: in the middle of the white squares."""
+    """Return the corners of the board's tags, (n, 4, 2), mm; they are centred in the white squares."""
     first = int(board.legacy and board.rows % 2 == 0)
     row, column = np.divmod(np.arange(board.rows * board.columns), board.columns)
     white = (row + column) % 2 != first
@@ -94,7 +97,7 @@ def _charuco(board: CharucoDesign) -> np.ndarray:
 
 
 def _tag(name: str, tag: int, corners: np.ndarray, border_bits: int) -> list[np.ndarray]:
-    """Lines around the black cells of a tag whose corners (4, 2), as printed from top left, lie there."""
+    """Return lines around the black cells of a tag with these ``corners`` (4, 2), as printed from top left."""
     dictionary = dictionary_of(name)
     cells = dictionary.markerSize + 2 * border_bits
     black = cv2.aruco.generateImageMarker(dictionary, tag, cells, borderBits=border_bits) == 0
@@ -107,7 +110,7 @@ def _tag(name: str, tag: int, corners: np.ndarray, border_bits: int) -> list[np.
 
 
 def _between(board: AprilGridDesign) -> list[list[np.ndarray]]:
-    """The small squares at the tags' corners."""
+    """Return the small squares at the tags' corners."""
     gap = board.spacing * board.tag_mm
     step = board.tag_mm + gap
     places = [

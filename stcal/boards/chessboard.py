@@ -1,8 +1,8 @@
-"""The inner corners of a chessboard, by both detectors of OpenCV in images of several sizes.
+"""Detection of the inner corners of a chessboard, by both detectors of OpenCV in images of several sizes.
 
-``cv2.findChessboardCornersSB`` (after Duda & Frese 2018) stands noise, shade and small squares; the older one, which
-joins dark squares, stands steep views and blur. What neither finds in the image as it is may be found in a smaller one,
-in which a blur is smaller; of a large image a smaller one is looked at first, for it is the faster one.
+``cv2.findChessboardCornersSB`` (after Duda & Frese 2018) tolerates noise, shade and small squares; the older detector,
+which joins dark squares, tolerates steep views and blur. A board that neither finds in the original image may be found
+in a smaller one, in which blur is smaller. A large image is first searched at a smaller size, which is faster.
 """
 
 from collections.abc import Iterator
@@ -18,51 +18,51 @@ WINDOW_SHARE = 0.4
 """Half the side of the window in which a corner is refined, as a share of the smallest square's side."""
 REFINE_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-5)
 LEAST_WINDOW, MOST_WINDOW, MOST_AT_FIRST = 2.0, 20.0, 100.0
-"""Of it, px."""
+"""Limits of half that window's side, px: smallest, largest, and largest in the first pass."""
 SMOOTHED_SHARE, LEAST_SMOOTHING = 0.05, 0.3
-"""σ of the smoothing before, as a share of it, and px: a saddle stays where it is, and noise of the gradients, which
-would keep a corner where it was looked for, goes."""
+"""σ of the smoothing before refinement, as a share of half the window's side, and its lower limit in px. Smoothing does
+not move a saddle, but removes noise of the gradients, which would hold a corner at its start."""
 FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
 OLDER_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 PART, PART_FLAGS = (3, 3), cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
-"""Fewest inner corners that pass for a part of a chessboard."""
+"""Smallest grid of inner corners that counts as a part of a chessboard, and the flags to find one."""
 FIRST_SIDE, LEAST_SIDE = 1600, 300
-"""Longer side of the image that is looked at first, and of the smallest, px."""
+"""Longer side of the first image that is searched, and of the smallest one, px."""
 
 
 def find_chessboard(image: np.ndarray, name: str, board: ChessboardDesign) -> BoardView | None:
-    """All inner corners, numbered so that the square between (0, 0) and (1, 1) is black; None where they are not seen.
+    """Return all inner corners, or None; they are numbered so that the square between (0, 0) and (1, 1) is black.
 
-    A board that looks the same after half a turn may come out turned: :meth:`ChessboardDesign.symmetries`.
+    A board that looks the same after half a turn may be returned rotated: :meth:`ChessboardDesign.symmetries`.
     """
     grey = grey_8bit(image)
-    for found in _found(grey, board):
-        grid = _refined(grey, found)
-        if _is_a_grid(found, grid):
+    for detected in _found(grey, board):
+        grid = _refined(grey, detected)
+        if _is_a_grid(detected, grid):
             return view_of(name, board, np.arange(board.rows * board.columns), _numbered(grey, grid, board))
     return None
 
 
 def _found(grey: np.ndarray, board: ChessboardDesign) -> Iterator[np.ndarray]:
-    """Grids (rows, columns, 2) that a detector takes for the board, px of the image as it is."""
+    """Yield the grids (rows, columns, 2) that the detectors find, px of the original image."""
     height, width = grey.shape
     longer = max(height, width)
     sides = [longer * 0.5**k for k in range(6)]
     first = [side for side in sides if side <= FIRST_SIDE][:1]
-    rest = [side for side in sides if side not in first and side >= LEAST_SIDE]
-    for side in first + rest:
+    others = [side for side in sides if side not in first and side >= LEAST_SIDE]
+    for side in first + others:
         scale = side / longer
         size = (max(round(scale * width), 1), max(round(scale * height), 1))
         small = grey if scale == 1 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         pixel = np.array([width / size[0], height / size[1]])
         for find, flags in ((cv2.findChessboardCornersSB, FLAGS), (cv2.findChessboardCorners, OLDER_FLAGS)):
-            there, corners = find(small, (board.columns, board.rows), flags=flags)
-            if there:
+            success, corners = find(small, (board.columns, board.rows), flags=flags)
+            if success:
                 yield (corners.reshape(board.rows, board.columns, 2).astype(float) + 0.5) * pixel - 0.5
 
 
 def _is_a_grid(found: np.ndarray, refined: np.ndarray) -> bool:
-    """Whether no corner went to another place, and none of the squares is folded."""
+    """Return True if the refinement moved no corner to another one, and no square is folded."""
     steps = [np.linalg.norm(np.diff(refined, axis=axis), axis=2).min() for axis in (0, 1)]
     across, down = refined[:-1, 1:] - refined[:-1, :-1], refined[1:, :-1] - refined[:-1, :-1]
     turn = across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0]
@@ -71,7 +71,7 @@ def _is_a_grid(found: np.ndarray, refined: np.ndarray) -> bool:
 
 
 def _numbered(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> np.ndarray:
-    """The corners (k, 2) in the order of the design."""
+    """Return the corners (k, 2) in the order of the design."""
     across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if across[0] * down[1] - across[1] * down[0] < 0:  # seen from the front, X to Y turns clockwise on the screen
         grid = grid[:, ::-1]
@@ -83,24 +83,24 @@ def _numbered(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> np
 
 
 def _refined(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """The corners to a few hundredths of a pixel; the detectors' own are a quarter to a half off in slanted views.
+    """Return the corners to a few hundredths of a pixel; the detectors are off by up to half a pixel in slanted views.
 
-    First in windows in which blurred edges have room, then in small ones in which a lens bends no edge.
+    The first windows are large enough for blurred edges; the second are so small that lens distortion bends no edge.
     """
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
-    own = max(WINDOW_SHARE * min(steps), LEAST_WINDOW)
+    window = max(WINDOW_SHARE * min(steps), LEAST_WINDOW)
     for most in (MOST_AT_FIRST, MOST_WINDOW):
-        half = int(min(own, most))
+        half = int(min(window, most))
         smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), max(SMOOTHED_SHARE * half, LEAST_SMOOTHING))
         places = np.ascontiguousarray(grid.reshape(-1, 1, 2), np.float32)
         grid = cv2.cornerSubPix(smooth, places, (half, half), (-1, -1), REFINE_STEPS).reshape(grid.shape).astype(float)
-        if own <= MOST_WINDOW:
+        if window <= MOST_WINDOW:
             break
     return grid
 
 
 def _first_is_black(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> bool:
-    """Whether the square between corners (0, 0) and (1, 1) is of the darker colour."""
+    """Return True if the square between corners (0, 0) and (1, 1) has the darker colour."""
     xy = board.xy_mm() / board.square_mm
     image_from_board = fit_homography(xy, grid.reshape(-1, 2))
     row, column = np.divmod(np.arange((board.rows - 1) * (board.columns - 1)), board.columns - 1)
@@ -113,13 +113,13 @@ def _first_is_black(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign)
 
 
 def why_no_chessboard(image: np.ndarray, board: ChessboardDesign) -> str:
-    """Why :func:`find_chessboard` finds nothing, as far as another number of corners tells."""
+    """Return the likely reason why :func:`find_chessboard` finds nothing, judged by the number of corners in view."""
     grey = grey_8bit(image)
     scale = min(FIRST_SIDE / max(grey.shape), 1.0)
     small = grey if scale == 1 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    there, _, meta = cv2.findChessboardCornersSBWithMeta(small, PART, PART_FLAGS)
+    found, _, meta = cv2.findChessboardCornersSBWithMeta(small, PART, PART_FLAGS)
     inner = f"not all {board.rows}×{board.columns} inner corners of the chessboard"
-    if not there:
+    if not found:
         return f"{inner}, which rows and columns of its file count"
     rows, columns = sorted(meta.shape[:2])
     if rows > min(board.rows, board.columns) or columns > max(board.rows, board.columns):

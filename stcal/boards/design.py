@@ -1,4 +1,4 @@
-"""Boards and tags: where their corners are, and which turns leave them looking the same."""
+"""Boards and tags: the places of their corners, and the rotations that leave their appearance unchanged."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from stcal.geometry.rigid import Rigid
 
 @dataclass(frozen=True, slots=True)
 class ChessboardDesign:
-    """``rows`` × ``columns`` inner corners of squares of ``square_mm``.
+    """A chessboard of ``rows`` × ``columns`` inner corners, with squares of ``square_mm``.
 
     X along a row, Y down the columns, Z into the board, origin at inner corner (0, 0); the square between inner
     corners (0, 0) and (1, 1) is black. ``sigma_mm`` : σ of a corner about the grid, per axis.
@@ -24,26 +24,28 @@ class ChessboardDesign:
     sigma_mm: float = 0.01
 
     def xy_mm(self) -> np.ndarray:
-        """Inner corners, (rows·columns, 2), row-major, mm."""
+        """Return the inner corners, (rows·columns, 2), row-major, mm."""
         row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
         return self.square_mm * np.column_stack([column, row]).astype(float)
 
     def symmetries(self) -> list[Rigid]:
-        """Half or quarter turns after which the board looks the same, as board_from_board; never the identity."""
+        """Return the turns after which the board looks the same, as board_from_board, without the identity."""
         if (self.rows + self.columns) % 2:
             return []
-        # After a quarter turn a square board has its colours again where its inner corners are even in number.
+        # A quarter turn preserves the colours of a square board if its number of inner corners per row is even.
         square = self.rows == self.columns
         return turns(self.xy_mm(), [1, 2, 3] if square and self.rows % 2 == 0 else [2])
 
 
 @dataclass(frozen=True, slots=True)
 class CharucoDesign:
-    """``rows`` × ``columns`` squares of ``square_mm``, tags of ``marker_mm`` of ``dictionary`` in the white ones.
+    """A ChArUco board of ``rows`` × ``columns`` squares of ``square_mm``, with tags in the white squares.
+
+    The tags have the size ``marker_mm`` and are from ``dictionary``.
 
     X along a row, Y down the columns, Z into the board, origin at the outer corner of the first square. ``legacy`` :
-    printed by OpenCV before 4.6, which began boards of an even number of rows with a white square. ``sigma_mm`` :
-    σ of a corner about the grid, per axis. ``first_id`` : of its tags, which count up from there.
+    True for the pattern of OpenCV before 4.6, in which boards with an even number of rows began with a white square.
+    ``sigma_mm`` : σ of a corner about the grid, per axis. ``first_id`` : id of the first tag; ids count up from there.
     """
 
     rows: int
@@ -56,16 +58,16 @@ class CharucoDesign:
     first_id: int = 0
 
     def tag_ids(self) -> range:
-        """Ids of its tags: one in every second square."""
+        """Return the ids of the board's tags: one in every second square."""
         return range(self.first_id, self.first_id + self.rows * self.columns // 2)
 
     def xy_mm(self) -> np.ndarray:
-        """Inner corners, ((rows − 1)·(columns − 1), 2), row-major, mm."""
+        """Return the inner corners, ((rows − 1)·(columns − 1), 2), row-major, mm."""
         row, column = np.divmod(np.arange((self.rows - 1) * (self.columns - 1)), self.columns - 1)
         return self.square_mm * (1 + np.column_stack([column, row]).astype(float))
 
     def symmetries(self) -> list[Rigid]:
-        """None: its tags differ."""
+        """Return an empty list: the tags differ."""
         return []
 
 
@@ -73,7 +75,7 @@ class CharucoDesign:
 class TagLayout:
     """Tags in one plane, Z into it.
 
-    ``tags`` : (n,) dictionary and id of each; ``corners_mm`` : (n, 4, 2) top left, top right, bottom right, bottom
+    ``tags`` : (n,) dictionary and id of each tag; ``corners_mm`` : (n, 4, 2) top left, top right, bottom right, bottom
     left as printed, mm; ``sigma_mm`` : σ of a corner's coordinate.
     """
 
@@ -90,24 +92,24 @@ class TagLayout:
             )
 
     def xy_mm(self) -> np.ndarray:
-        """(4n, 2), tag by tag, mm."""
+        """Return the corners (4n, 2), tag by tag, mm."""
         return self.corners_mm.reshape(-1, 2)
 
     def symmetries(self) -> list[Rigid]:
-        """None: its tags differ."""
+        """Return an empty list: the tags differ."""
         return []
 
 
 @dataclass(frozen=True, slots=True)
 class AprilGridDesign:
-    """``rows`` × ``columns`` AprilTags of ``tag_mm`` (outer edge of the black border), as Kalibr prints them.
+    """An AprilGrid of ``rows`` × ``columns`` AprilTags of ``tag_mm`` (outer edge of the black border), as of Kalibr.
 
-    From tag to tag ``tag_mm`` · (1 + ``spacing``). Ids count up from ``first_id`` along the bottom row, then row by row
-    upwards. X along a row, Y down the columns, Z into the board, origin at the bottom left corner of the first tag:
-    Kalibr's frame, turned by half a turn about X, so that tag (row i from below, column j) has its bottom left corner
-    at (j · step, −i · step). ``border_bits`` : width of the black border in cells, Kalibr's 2 or the usual 1; None
-    where images are to tell. ``upright`` : tags stand as OpenCV draws them, where Kalibr prints them turned by half a
-    turn. ``sigma_mm`` : σ of a corner about the grid, per axis.
+    The step from tag to tag is ``tag_mm`` · (1 + ``spacing``). Ids count up from ``first_id`` along the bottom row,
+    then row by row upwards. X along a row, Y down the columns, Z into the board, origin at the bottom left corner of
+    the first tag: Kalibr's frame, turned by half a turn about X, so that tag (row i from below, column j) has its
+    bottom left corner at (j · step, −i · step). ``border_bits`` : width of the black border in cells, Kalibr's 2 or the
+    usual 1; None if it is to be determined from images. ``upright`` : True if tags stand as OpenCV draws them; Kalibr
+    prints them rotated by half a turn. ``sigma_mm`` : σ of a corner about the grid, per axis.
     """
 
     rows: int
@@ -121,11 +123,11 @@ class AprilGridDesign:
     sigma_mm: float = 0.01
 
     def tag_ids(self) -> range:
-        """Ids of its tags."""
+        """Return the ids of the board's tags."""
         return range(self.first_id, self.first_id + self.rows * self.columns)
 
     def layout(self) -> "TagLayout":
-        """Its tags one by one, corners in the order in which detectors name them."""
+        """Return the board's tags one by one, with corners in the order of the detectors."""
         row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
         first = self.tag_mm * (1 + self.spacing) * np.column_stack([column, -row])
         square = self.tag_mm * np.array([[0, -1], [1, -1], [1, 0], [0, 0]], float)
@@ -134,33 +136,34 @@ class AprilGridDesign:
         return TagLayout(tags, first[:, None] + square, self.sigma_mm)
 
     def xy_mm(self) -> np.ndarray:
-        """(4·rows·columns, 2), tag by tag, corners as detectors name them, mm."""
+        """Return the corners (4·rows·columns, 2), tag by tag, in the order of the detectors, mm."""
         return self.layout().xy_mm()
 
     def symmetries(self) -> list[Rigid]:
-        """None: its tags differ."""
+        """Return an empty list: the tags differ."""
         return []
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatticePart(BoardDesign):
-    """A grid of dots of which only some places are taken. ``taken`` : (n, 2) their rows and columns."""
+    """A grid of dots in which only some places have a dot. ``taken`` : (n, 2) rows and columns of these places."""
 
     taken: np.ndarray | None = None
 
     def cells(self) -> np.ndarray:
-        """Row and column of every dot, (n, 2)."""
+        """Return row and column of every dot, (n, 2)."""
         return BoardDesign.cells(self) if self.taken is None else self.taken
 
 
 @dataclass(frozen=True, slots=True)
 class AsymmetricCirclesDesign:
-    """``rows`` rows of ``columns`` circles, every second row shifted by half a step: OpenCV's asymmetric circle grid.
+    """OpenCV's asymmetric circle grid: ``rows`` rows of ``columns`` circles, every second row shifted by half a step.
 
-    Circle (i, j), row i from 0 and place j in it from 0, lies at x = (2 j + i mod 2) · ``spacing_mm``, y = i ·
+    Circle (i, j), row i and place j in it, both from 0, lies at x = (2 j + i mod 2) · ``spacing_mm``, y = i ·
     ``spacing_mm``: neighbours in a row are two spacings apart, rows one. X along a row, Y down the columns, Z into the
-    board, origin at circle (0, 0). OpenCV's own pattern has 11 rows and 4 columns. ``radius_mm`` of all circles, None
-    where images are to tell; ``polarity`` : circles against the board; ``sigma_mm`` : σ of a circle about the grid.
+    board, origin at circle (0, 0). OpenCV's own pattern has 11 rows and 4 columns. ``radius_mm`` : radius of all
+    circles, None if it is to be determined from images; ``polarity`` : circles against the board; ``sigma_mm`` : σ of a
+    circle about the grid.
     """
 
     rows: int
@@ -175,15 +178,15 @@ class AsymmetricCirclesDesign:
         return np.column_stack([2 * place + row % 2, row])
 
     def xy_mm(self) -> np.ndarray:
-        """Centres, (rows·columns, 2), row-major, mm."""
+        """Return the centres, (rows·columns, 2), row-major, mm."""
         return self.spacing_mm * self._steps().astype(float)
 
     def symmetries(self) -> list[Rigid]:
-        """A half turn where rows are even in number: it takes the last row to the first, and either is shifted."""
+        """Return a half turn if the number of rows is even, so that first and last row differ in their shift."""
         return [] if self.rows % 2 else turns(self.xy_mm(), [2])
 
     def radii_mm(self) -> np.ndarray:
-        """Radii, (rows·columns,), mm.
+        """Return the radii, (rows·columns,), mm.
 
         Raises
         ------
@@ -195,7 +198,7 @@ class AsymmetricCirclesDesign:
         return np.full(self.rows * self.columns, self.radius_mm)
 
     def lattice(self) -> LatticePart:
-        """The square lattice that stands on its corner, of which the circles are a part."""
+        """Return the square lattice, rotated by 45°, of which the circles occupy some places."""
         x, y = self._steps().T
         cells = np.column_stack([y - x, y + x]) // 2
         cells = cells - cells.min(0)
@@ -209,10 +212,10 @@ FlatBoard = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign | Asy
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardSet:
-    """Several boards that do not move against one another.
+    """A set of several boards that are fixed relative to one another.
 
-    ``names`` : what messages call each; ``boards`` : flat ones that images tell apart, none of which looks the same
-    turned; ``common_from_board`` : their places in the frame of the set, which stands for the board's frame.
+    ``names`` : name of each board in messages; ``boards`` : flat boards that look different in images, each without
+    rotational symmetry; ``common_from_board`` : their poses in the frame of the set, which acts as the board frame.
     """
 
     names: tuple[str, ...]
@@ -220,38 +223,38 @@ class BoardSet:
     common_from_board: tuple[Rigid, ...]
 
     def first_ids(self) -> list[int]:
-        """Number of the first point of each board in :meth:`xyz_mm`."""
+        """Return the index of the first point of each board in :meth:`xyz_mm`."""
         return np.cumsum([0, *(len(board.xy_mm()) for board in self.boards)])[:-1].tolist()
 
     def xyz_mm(self) -> np.ndarray:
-        """Points of all boards, one behind the other, (n, 3) mm in the frame of the set."""
+        """Return the points of all boards, board by board, (n, 3) mm in the frame of the set."""
         parts = zip(self.common_from_board, self.boards, strict=True)
         return np.concatenate([place @ np.pad(board.xy_mm(), ((0, 0), (0, 1))) for place, board in parts])
 
     def symmetries(self) -> list[Rigid]:
-        """None: none of its boards has one."""
+        """Return an empty list: none of the boards has a symmetry."""
         return []
 
 
 def turns(xy_mm: np.ndarray, quarters: list[int]) -> list[Rigid]:
-    """Turns by so many quarters about the middle of a board's points (n, 2), as board_from_board."""
+    """Return the rotations by these numbers of quarter turns about the middle of points (n, 2), as board_from_board."""
     middle = np.append((xy_mm.min(0) + xy_mm.max(0)) / 2, 0.0)
-    found = []
+    rotations = []
     for quarter in quarters:
         cosine, sine = [(1, 0), (0, 1), (-1, 0), (0, -1)][quarter % 4]
         rotation = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1.0]])
-        found.append(Rigid(rotation, middle - rotation @ middle))
-    return found
+        rotations.append(Rigid(rotation, middle - rotation @ middle))
+    return rotations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardView:
     """The points of a board in one image.
 
-    ``image`` : its name; ``ids`` : (k,) rows of the design's ``xy_mm`` (of a set's ``xyz_mm``); ``xyz_board`` : (k, 3)
-    mm; ``xy_px`` : (k, 2); ``covariance_px2`` : (k, 2, 2), or None where the detector has no idea of it; ``normal`` :
-    (k, 3) unit normals of the planes that the points lie in, None where that is Z of all; ``unused`` : what was seen of
-    the board and not used, each with its reason.
+    ``image`` : name of the image; ``ids`` : (k,) rows of the design's ``xy_mm`` (of a set's ``xyz_mm``); ``xyz_board``
+    : (k, 3) mm; ``xy_px`` : (k, 2); ``covariance_px2`` : (k, 2, 2), or None if the detector does not estimate it;
+    ``normal`` : (k, 3) unit normals of the planes of the points, None if all normals are Z; ``unused`` : parts of the
+    board that were seen but not used, each with its reason.
     """
 
     image: str
@@ -277,6 +280,6 @@ class BoardView:
 
 
 def view_of(image: str, board: FlatBoard, ids: np.ndarray, xy_px: np.ndarray, covariance_px2=None) -> BoardView:
-    """The view of those points of a flat board."""
+    """Return the view of the points ``ids`` of a flat board."""
     xy = board.xy_mm()[ids]
     return BoardView(image, ids, np.column_stack([xy, np.zeros(len(xy))]), xy_px, covariance_px2)

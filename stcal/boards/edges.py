@@ -1,8 +1,8 @@
-"""Corners of a tag from its four edges: lines through edge points, and where they meet.
+"""Corners of a tag as the intersections of its four edges, each a line through edge points.
 
-``cv2.cornerSubPix`` balances gradients about a point. That is right where two dark squares meet in a corner of a
-chessboard, but at the outer corner of a tag it lies inside, by 0.1 to 0.2 px with ordinary blur. The edges' middles do
-not move with a symmetrical blur, so that lines through them meet in the corner.
+``cv2.cornerSubPix`` balances gradients about a point. This is correct where two dark squares of a chessboard meet, but
+at the outer corner of a tag its result lies inside the tag, by 0.1 to 0.2 px with ordinary blur. A symmetrical blur
+does not move the middles of edges, so that lines through them meet in the corner.
 """
 
 from dataclasses import dataclass
@@ -13,32 +13,34 @@ import numpy as np
 from stcal.geometry.robust import median_length
 
 SAMPLES = 25
-"""Of a profile across an edge."""
+"""Number of samples of a profile across an edge."""
 POINTS = 32
-"""Profiles of an edge; where they are nearer than a pixel they count as many as there are pixels."""
+"""Number of profiles of an edge; if they are closer than a pixel, only one per pixel counts as independent."""
 ALONG = (0.08, 0.92)
-"""Part of an edge that is used: near its ends the other edge's blur is in the profile."""
+"""Range of an edge that is used, as shares of its length: near its ends the next edge's blur disturbs the profile."""
 CELLS_ACROSS = 0.8
-"""How far a profile reaches to either side, in cells; the border of a tag, and the white about it, is one cell wide."""
+"""Reach of a profile to either side, in cells; the border of a tag, and the white around it, is one cell wide."""
 REACH_PX = (1.5, 6.0)
 MIN_RISE = 0.15
-"""Noise rises too, everywhere alike: what is below this share of a profile's steepest step is not the edge."""
+"""Smallest step that counts as a part of the edge, as a share of a profile's steepest step; smaller ones are noise."""
 MIN_CONTRAST = 0.3
-"""Of a profile, as a share of the tag's; less is another tag's edge, a stain, a shadow's rim."""
+"""Smallest contrast of a profile, as a share of the tag's; a lower one is another tag's edge, a stain or a shadow."""
 MIN_SHARE = 0.25
-"""Of an edge's profiles; with fewer it is not seen."""
+"""Smallest share of good profiles of a visible edge."""
 MIN_CELL_PX = 2.0
 CUT = 2.5
-"""Points farther off the line than so many robust σ are left out."""
+"""Largest distance of a point from the line, in robust σ; points beyond it are outliers."""
 CUT_ROUNDS = 4
 MIN_SIGMA_PX = 0.01
-"""Below this the noise of edge points is not what limits a corner: printing, flatness and the lens are."""
+"""Smallest σ of edge points: below it printing, flatness and the lens limit the accuracy of a corner, not noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeCorners:
-    """``corners_px`` : (n, 4, 2); ``covariance_px2`` : (n, 4, 2, 2); ``seen`` : (n,) whether all four edges are; of
-    the other tags the values mean nothing."""
+    """The refined corners ``corners_px`` (n, 4, 2), with ``covariance_px2`` (n, 4, 2, 2).
+
+    ``seen`` : (n,) True if all four edges of a tag are visible; otherwise its values are meaningless.
+    """
 
     corners_px: np.ndarray
     covariance_px2: np.ndarray
@@ -46,27 +48,27 @@ class EdgeCorners:
 
 
 def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> EdgeCorners:
-    """Refine the corners (n, 4, 2), in order around, of dark tags with ``cells`` (n,) cells a side, border included.
+    """Refine the corners (n, 4, 2), in cyclic order, of dark tags with ``cells`` (n,) cells per side, border included.
 
-    An edge is not seen where it is too short, hidden, outside of the image, or without contrast.
+    An edge is not visible if it is too short, hidden, outside of the image, or without contrast.
     """
     n = len(corners)
     if not n:
         return EdgeCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros(0, bool))
     frame = _frame(np.asarray(corners, float), cells)
     offset, good = _profiles(grey, frame)
-    with np.errstate(divide="ignore", invalid="ignore"):  # of edges that are not seen
+    with np.errstate(divide="ignore", invalid="ignore"):  # edges that are not visible
         lines = _fit(frame.place, offset, good)
-        found, covariance = _meet(frame, lines)
+        meeting, covariance = _meet(frame, lines)
     seen = good.mean(2) >= MIN_SHARE
     seen &= np.isfinite(covariance).all((2, 3)) & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
-    return EdgeCorners(found, covariance, seen.all(1))
+    return EdgeCorners(meeting, covariance, seen.all(1))
 
 
 def corners_by_edges(corners: np.ndarray) -> np.ndarray:
-    """How far the corners (..., 4, 2) of tags, in order around, go when all four edges move outwards by one.
+    """Return the shifts of the corners (..., 4, 2) of tags, in cyclic order, if all four edges move outwards by one.
 
-    Edges move alike where an image is over-exposed, where ink has spread, and where a camera's response is not linear.
+    Over-exposure, spread ink and a nonlinear response of the camera move all edges alike.
     """
     along = np.roll(corners, -1, axis=-2) - corners
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
@@ -79,8 +81,11 @@ def corners_by_edges(corners: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Frame:
-    """Of each edge: ``middle``, ``along``, ``normal`` outwards (n, 4, 2), ``length`` and ``reach`` of the profiles
-    (n, 4), and their ``place`` from the middle (n, 4, POINTS); px."""
+    """Geometry of the edges, px.
+
+    ``middle`` : (n, 4, 2) of each edge; ``along`` : (n, 4, 2) direction; ``normal`` : (n, 4, 2) outwards; ``length`` :
+    (n, 4); ``reach`` : (n, 4) of the profiles; ``place`` : (n, 4, POINTS) of the profiles from the middle.
+    """
 
     middle: np.ndarray
     along: np.ndarray
@@ -92,8 +97,10 @@ class _Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """Points p with ``normal @ (p − middle) = offset + slope · along @ (p − middle)``, (n, 4); ``covariance`` of the
-    two, (n, 4, 2, 2)."""
+    """Lines of points p with ``normal @ (p − middle) = offset + slope · along @ (p − middle)``.
+
+    ``offset``, ``slope`` : (n, 4); ``covariance`` : (n, 4, 2, 2) of the two.
+    """
 
     offset: np.ndarray
     slope: np.ndarray
@@ -101,7 +108,7 @@ class _Lines:
 
 
 def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
-    """Edges from each corner to the next."""
+    """Return the edges from each corner to the next."""
     end = np.roll(corners, -1, axis=1)
     length = np.linalg.norm(end - corners, axis=2)
     along = (end - corners) / length[..., None]
@@ -115,7 +122,7 @@ def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
 
 
 def _profiles(grey: np.ndarray, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Where each profile rises, px from the frame's line, and whether it is one of the edge, (n, 4, POINTS)."""
+    """Return the edge in each profile, px from the frame's line, and a mask of good profiles, (n, 4, POINTS)."""
     n = len(frame.length)
     across = np.linspace(-1, 1, SAMPLES) * frame.reach[..., None]
     base = frame.middle[:, :, None] + frame.place[..., None] * frame.along[:, :, None]
@@ -135,7 +142,7 @@ def _profiles(grey: np.ndarray, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
-    """Straight lines by least squares without what is far off them."""
+    """Fit straight lines by least squares, with removal of outliers."""
     keep = good
     for _ in range(CUT_ROUNDS):
         value, spread = _line(place, offset, keep)
@@ -157,7 +164,7 @@ def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
 
 
 def _line(place: np.ndarray, offset: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Offset and slope (n, 4, 2) of the points kept, and the inverse of their normal matrix (n, 4, 2, 2)."""
+    """Return offset and slope (n, 4, 2) of the points ``keep``, and their inverse normal matrix (n, 4, 2, 2)."""
     s0, s1, s2 = keep.sum(2), (place * keep).sum(2), (place**2 * keep).sum(2)
     y0, y1 = (offset * keep).sum(2), (offset * place * keep).sum(2)
     inverse = np.stack([np.stack([s2, -s1], -1), np.stack([-s1, s0.astype(float)], -1)], -2)
@@ -166,7 +173,7 @@ def _line(place: np.ndarray, offset: np.ndarray, keep: np.ndarray) -> tuple[np.n
 
 
 def _meet(frame: _Frame, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
-    """Where each edge meets the one before, (n, 4, 2), and its covariance (n, 4, 2, 2)."""
+    """Return the intersection of each edge with the previous one, (n, 4, 2), and its covariance (n, 4, 2, 2)."""
     row = frame.normal - lines.slope[..., None] * frame.along
     right = lines.offset + (row * frame.middle).sum(2)
     pair = np.stack([np.roll(row, 1, axis=1), row], axis=2)
@@ -177,8 +184,10 @@ def _meet(frame: _Frame, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
     variance = np.zeros_like(pair)
     for side, turn in enumerate((1, 0)):
         middle, along = np.roll(frame.middle, turn, axis=1), np.roll(frame.along, turn, axis=1)
-        by = np.stack([np.ones(point.shape[:2]), ((point - middle) * along).sum(2)], axis=-1)
-        variance[..., side, side] = np.einsum("nki,nkij,nkj->nk", by, np.roll(lines.covariance, turn, axis=1), by)
+        gradient = np.stack([np.ones(point.shape[:2]), ((point - middle) * along).sum(2)], axis=-1)
+        variance[..., side, side] = np.einsum(
+            "nki,nkij,nkj->nk", gradient, np.roll(lines.covariance, turn, axis=1), gradient
+        )
     covariance = inverse @ variance @ np.swapaxes(inverse, 2, 3)
     covariance[bad] = np.nan
     return point, covariance

@@ -1,4 +1,4 @@
-"""Board files of every kind: dots (``stcal.io.design``), chessboards, ChArUco boards, tags, and Kalibr's."""
+"""Readers of board files of every kind: dots (``stcal.io.design``), chessboards, ChArUco boards, tags, and Kalibr's."""
 
 import tomllib
 from pathlib import Path
@@ -28,27 +28,27 @@ from stcal.io.plain_yaml import load_yaml
 from stcal.io.toml import Finite, Positive, Strict, validated
 
 KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles")
-"""Of flat boards."""
+"""Types of flat boards."""
 SET = "boards"
 REMEDY = (
     'a file with type = "chessboard", "charuco", "tags", "aprilgrid" or "asymmetric-circles" needed, one of dots, or '
     "one of Kalibr, see data_layout.md"
 )
 MOST_MARKER = 0.99
-"""Side of a ChArUco tag over that of its square: a tag needs white around it to be seen."""
+"""Largest ratio of a ChArUco tag's side to its square's: detection needs white around a tag."""
 LEAST_AREA = 1e-6
-"""Of a tag, over its longest side squared: less is a line."""
+"""Smallest area of a tag over its longest side squared; below it the corners lie on a line."""
 OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_mm", "board"}
-"""Keys that no board of dots has."""
+"""Keys that occur only in files of other boards than dots."""
 
 
 def known_dictionary(name: str) -> str:
-    """The name of a dictionary of ``cv2.aruco``, with or without ``DICT_``, in any case.
+    """Return the full name of a dictionary of ``cv2.aruco``; ``name`` may lack ``DICT_``, and be in any case.
 
     Raises
     ------
     ValueError
-        Unknown; the message lists what is alike.
+        The name is unknown; the message lists similar names.
     """
     plain = name.strip().upper()
     plain = plain if plain.startswith("DICT_") else f"DICT_{plain}"
@@ -109,8 +109,11 @@ class _AsymmetricCircles(Strict):
 
 
 class TagEntry(Strict):
-    """One tag of a layout: ``x_mm``, ``y_mm`` of its middle, turned by ``angle_deg``; or its four corners as measured;
-    or neither, when its place is to be found."""
+    """One tag of a layout.
+
+    Its place is given by ``x_mm``, ``y_mm`` of its middle and the rotation ``angle_deg``, or by its four measured
+    corners; both are absent if the place is to be determined.
+    """
 
     dictionary: Dictionary
     id: TagId
@@ -123,7 +126,7 @@ class TagEntry(Strict):
     )
 
     def corners(self, where: str) -> np.ndarray | None:
-        """(4, 2) mm in the layout's frame; None where the place is unknown."""
+        """Return the corners (4, 2), mm, in the layout's frame; None if the place is unknown."""
         if self.corners_mm is not None:
             return np.array(self.corners_mm)
         if self.x_mm is None and self.y_mm is None:
@@ -138,7 +141,7 @@ class TagEntry(Strict):
 
 
 class TagsFile(Strict):
-    """A layout of tags; what ``stcal locate`` adds, a board does without."""
+    """A layout of tags; a board does not need the keys that ``stcal locate`` adds."""
 
     type: Literal["tags"]
     name: str = "tags"
@@ -150,7 +153,7 @@ class TagsFile(Strict):
     tag: list[TagEntry] = Field(min_length=1)
 
     def covariance(self) -> np.ndarray | None:
-        """(8n, 8n) mm² of the corners' coordinates; None where the file states none."""
+        """Return the covariance (8n, 8n), mm², of the corners' coordinates; None if the file states none."""
         if self.covariance_mm2 is None:
             return None
         full = np.zeros((len(self.covariance_mm2),) * 2)
@@ -174,27 +177,27 @@ class TagsFile(Strict):
 
 
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
-    """Read a file of one board of any kind (form: ``data_layout.md``); one without ``type`` is of dots.
+    """Read a file of one board of any kind (form: ``data_layout.md``); without ``type`` it is a board of dots.
 
     Raises
     ------
     InputError
-        Unreadable, not as its kind needs it, or of several boards; the message names file, place and reason.
+        The file is unreadable, invalid for its kind, or of several boards; the message names file, place and reason.
     """
     return design_of(path, board_content(path))
 
 
 def design_of(path: str | Path, content: dict[str, Any] | None) -> BoardDesign | FlatBoard:
-    """The board of a file's content; errors as :func:`load_flat_board`."""
+    """Return the board of a file's content; errors as :func:`load_flat_board`."""
     if content is None:
-        return load_board(path)  # no TOML: says why
+        return load_board(path)  # no TOML: the error states why
     if "type" not in content and not OF_OTHERS.isdisjoint(content):
         raise InputError("E-BOARD-TYPE", f"board file {path}: no type; {REMEDY}")
     return flat_board(content, f"board file {path}")
 
 
 def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
-    """The board that keys and values say; errors as :func:`load_flat_board`, beginning with ``where``."""
+    """Return the board of keys and values; errors as :func:`load_flat_board`, with ``where`` in front."""
     if "target_type" in content:
         return kalibr.board_of(content, where)
     kind = content.get("type", "circles")
@@ -219,12 +222,12 @@ def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
 
 
 def board_content(path: str | Path) -> dict[str, Any] | None:
-    """Keys and values of a board file, TOML or Kalibr's YAML; None where it is neither.
+    """Return keys and values of a board file, TOML or Kalibr's YAML; None if it is neither.
 
     Raises
     ------
     InputError
-        Unreadable.
+        The file is unreadable.
     """
     try:
         text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")
@@ -269,12 +272,14 @@ def _charuco(data: _Charuco, where: str) -> CharucoDesign:
 def _tags(data: TagsFile, where: str) -> TagLayout:
     corners = [tag.corners(where) for tag in data.tag]
     for tag, place in zip(data.tag, corners, strict=True):
-        own = f"{where}: tag {tag.id}"
+        place_of_tag = f"{where}: tag {tag.id}"
         if place is None:
-            raise InputError("E-TAG-PLACE", f"{own}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
-        if tag.id >= (there := _tags_of(tag.dictionary)):
-            raise InputError("E-TAG-ID-RANGE", f"{own}: {tag.dictionary} has 0 … {there - 1}; correct id or dictionary")
-        _require_convex(place, own)
+            raise InputError("E-TAG-PLACE", f"{place_of_tag}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
+        if tag.id >= (count := _tags_of(tag.dictionary)):
+            raise InputError(
+                "E-TAG-ID-RANGE", f"{place_of_tag}: {tag.dictionary} has 0 … {count - 1}; correct id or dictionary"
+            )
+        _require_convex(place, place_of_tag)
     try:
         return TagLayout(tuple((tag.dictionary, tag.id) for tag in data.tag), np.array(corners), data.sigma_mm)
     except InputError as error:
@@ -282,7 +287,7 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
 
 
 def _require_convex(corners: np.ndarray, where: str) -> None:
-    """Refuse corners (4, 2) of a tag that are not in order around it, clockwise with Y downwards, as printed."""
+    """Refuse corners (4, 2) of a tag that are not in cyclic order, clockwise with Y downwards, as printed."""
     side = np.roll(corners, -1, axis=0) - corners
     following = np.roll(side, -1, axis=0)
     turn = side[:, 0] * following[:, 1] - side[:, 1] * following[:, 0]
@@ -311,18 +316,18 @@ def _aprilgrid(data: _AprilGrid, where: str) -> AprilGridDesign:
 
 
 def _require_tags(board: CharucoDesign | AprilGridDesign, where: str) -> None:
-    """Refuse a board that needs more tags than there are."""
+    """Refuse a board that needs more tags than its dictionary has."""
     ids = board.tag_ids()
-    if ids.stop > (there := _tags_of(board.dictionary)):
+    if ids.stop > (count := _tags_of(board.dictionary)):
         raise InputError(
             "E-TAG-ID-RANGE",
-            f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {there - 1}; correct rows, "
+            f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {count - 1}; correct rows, "
             "columns, first_id or dictionary",
         )
 
 
 def _tags_of(dictionary: str) -> int:
-    """How many there are."""
+    """Return the number of tags in a dictionary."""
     return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)).bytesList)
 
 

@@ -12,9 +12,9 @@ from stcal.io.toml import Positive, Strict, validated
 
 METRE_MM = 1000.0
 MOST_M = 100.0
-"""Longest tag, square or spacing: more is a slip of the unit."""
+"""Longest tag, square or spacing, m; a larger value is a wrong unit."""
 SAME_WITHIN = 1e-6
-"""Relative, of the sides of a square."""
+"""Largest relative difference between the sides of a square."""
 FAMILY = "DICT_APRILTAG_36h11"
 KINDS = ("aprilgrid", "checkerboard", "circlegrid")
 
@@ -48,24 +48,25 @@ class _CircleGrid(Strict):
 
 
 def board_of(content: dict[str, Any], where: str) -> AprilGridDesign | ChessboardDesign | AsymmetricCirclesDesign:
-    """The board that such a file says; ``where`` begins what an InputError says.
+    """Return the board of a file of Kalibr; the message of an InputError begins with ``where``.
 
-    Kalibr's frames differ: of an AprilGrid by half a turn about X (:class:`AprilGridDesign`). Of its asymmetric circle
-    grids nothing says how large circles are; images tell.
+    Kalibr's frame of an AprilGrid differs by half a turn about X (:class:`AprilGridDesign`). Its asymmetric circle
+    grids do not state the radius of circles, which is determined from images.
 
     Raises
     ------
     InputError
-        Keys missing or unknown, another kind, oblong squares, or a grid of circles that lacks what is needed.
+        Keys are missing or unknown, the kind is another one, squares are oblong, or a grid of circles is not
+        asymmetric.
     """
     kind = content["target_type"]
     if kind == "aprilgrid":
         data = validated(content, _AprilGrid, where)
-        there = len(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11).bytesList)
-        if (count := data.codeOffset + data.tagRows * data.tagCols) > there:
+        available = len(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11).bytesList)
+        if (count := data.codeOffset + data.tagRows * data.tagCols) > available:
             raise InputError(
                 "E-TAG-ID-RANGE",
-                f"{where}: tags up to {count - 1}, tag36h11 has 0 … {there - 1}; correct tagRows, tagCols",
+                f"{where}: tags up to {count - 1}, tag36h11 has 0 … {available - 1}; correct tagRows, tagCols",
             )
         size = METRE_MM * data.tagSize
         return AprilGridDesign(data.tagRows, data.tagCols, size, data.tagSpacing, None, data.codeOffset, FAMILY)

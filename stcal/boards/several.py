@@ -1,4 +1,4 @@
-"""Files of several boards that are fixed in one frame, and what must tell these boards apart."""
+"""Files of several boards that are fixed in one frame, and the check that images can distinguish these boards."""
 
 from itertools import combinations
 from pathlib import Path
@@ -31,19 +31,19 @@ class _BoardsFile(Strict):
 
 
 class _Place(PoseEntry):
-    """Where a board is: a pose, its rotation also as ``rpy_deg`` about the fixed axes X, Y, Z; or a 4×4 matrix."""
+    """The pose of a board: position and quaternion, or ``rpy_deg`` about the fixed axes X, Y, Z; or a 4×4 matrix."""
 
     rpy_deg: list[Finite] | None = Field(default=None, min_length=3, max_length=3)
     common_from_board: list[list[Finite]] | None = None
 
     def common(self, where: str) -> Rigid:
-        """common_from_board."""
-        said = self.model_fields_set
+        """Return common_from_board."""
+        given_keys = self.model_fields_set
         if self.common_from_board is not None:
-            if len(said) > 1:
-                other = min(said - {"common_from_board"})
+            if len(given_keys) > 1:
+                conflicting = min(given_keys - {"common_from_board"})
                 raise InputError(
-                    "E-BOARD-KEY-CONFLICT", f"{where}: common_from_board and {other}; the place needed once"
+                    "E-BOARD-KEY-CONFLICT", f"{where}: common_from_board and {conflicting}; the place needed once"
                 )
             if [len(row) for row in self.common_from_board] != [4] * 4:
                 raise InputError("E-BOARD-PLACE", f"{where}: common_from_board: 4 rows of 4 numbers needed")
@@ -53,7 +53,7 @@ class _Place(PoseEntry):
                 raise InputError("E-BOARD-PLACE", f"{where}: common_from_board: {error}") from error
         if self.rpy_deg is None:
             return self.rigid(where)
-        if said & {"qw", "qx", "qy", "qz"}:
+        if given_keys & {"qw", "qx", "qy", "qz"}:
             raise InputError("E-BOARD-KEY-CONFLICT", f"{where}: rpy_deg and a quaternion; one of them needed")
         turn = Rotation.from_euler("xyz", self.rpy_deg, degrees=True)
         return Rigid(turn.as_matrix(), [self.x_mm, self.y_mm, self.z_mm])
@@ -65,8 +65,8 @@ def load_boards(path: str | Path) -> BoardDesign | FlatBoard | BoardSet:
     Raises
     ------
     InputError
-        As :func:`~stcal.boards.file.load_flat_board`; boards of a set that images do not tell apart, or that look the
-        same turned.
+        As :func:`~stcal.boards.file.load_flat_board`; or boards of a set look alike in images, or have a rotational
+        symmetry.
     """
     content = board_content(path)
     if content is None or content.get("type") != SET:
@@ -74,15 +74,17 @@ def load_boards(path: str | Path) -> BoardDesign | FlatBoard | BoardSet:
     where = f"board file {path}"
     names, boards, places = [], [], []
     for number, entry in enumerate(validated(content, _BoardsFile, where).board, 1):
-        own = f"{where}: board {number}"
+        entry_place = f"{where}: board {number}"
         place = {key: value for key, value in entry.items() if key in _Place.model_fields}
-        rest = {key: value for key, value in entry.items() if key not in place}
-        places.append(validated(place, _Place, own).common(own))
-        boards.append(_board(Path(path), rest, own))
-        names.append(f"board {number} ({Path(rest['file']).name})" if "file" in rest else f"board {number}")
-    found = BoardSet(tuple(names), tuple(boards), tuple(places))
-    _require_told_apart(found, where)
-    return found
+        entry_board = {key: value for key, value in entry.items() if key not in place}
+        places.append(validated(place, _Place, entry_place).common(entry_place))
+        boards.append(_board(Path(path), entry_board, entry_place))
+        names.append(
+            f"board {number} ({Path(entry_board['file']).name})" if "file" in entry_board else f"board {number}"
+        )
+    board_set = BoardSet(tuple(names), tuple(boards), tuple(places))
+    _require_told_apart(board_set, where)
+    return board_set
 
 
 def _board(path: Path, entry: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
@@ -101,7 +103,7 @@ def _board(path: Path, entry: dict[str, Any], where: str) -> BoardDesign | FlatB
 
 
 def _require_told_apart(found: BoardSet, where: str) -> None:
-    """Refuse what an image cannot decide: which of two boards, or which way round."""
+    """Refuse boards that look alike in an image, and boards that look the same after a rotation."""
     for name, board in zip(found.names, found.boards, strict=True):
         if _turnable(board):
             raise InputError(
@@ -109,9 +111,9 @@ def _require_told_apart(found: BoardSet, where: str) -> None:
                 f"{where}: {name} looks the same turned, so that its points have no numbers in the common frame; "
                 "a chessboard of an odd and an even side, a larger corner dot, or tags needed",
             )
-    for (one, first), (two, second) in combinations(zip(found.names, found.boards, strict=True), 2):
-        if said := _alike(first, second):
-            raise InputError("E-BOARD-AMBIGUOUS", f"{where}: {one} and {two} look alike: {said}")
+    for (first_name, first), (second_name, second) in combinations(zip(found.names, found.boards, strict=True), 2):
+        if reason := _alike(first, second):
+            raise InputError("E-BOARD-AMBIGUOUS", f"{where}: {first_name} and {second_name} look alike: {reason}")
 
 
 def _turnable(board: BoardDesign | FlatBoard) -> bool:
@@ -119,7 +121,7 @@ def _turnable(board: BoardDesign | FlatBoard) -> bool:
 
 
 def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> str:
-    """Why images cannot tell two boards apart, and what to do; empty where they can."""
+    """Return why two boards look alike in images, and what to do; empty if they differ."""
     if (colour := _circles(first)) and colour == _circles(second):
         return f"both have {colour} circles; one of them bright and one dark, or tags, needed"
     for whole, part in ((first, second), (second, first)):
@@ -138,19 +140,19 @@ def _circles(board: BoardDesign | FlatBoard) -> str:
 
 
 def _inner(board: BoardDesign | FlatBoard) -> tuple[int, int] | None:
-    """Rows and columns of inner corners of squares."""
+    """Return rows and columns of inner corners of a board of squares, else None."""
     if isinstance(board, ChessboardDesign):
         return board.rows, board.columns
     return (board.rows - 1, board.columns - 1) if isinstance(board, CharucoDesign) else None
 
 
 def _fits(part: ChessboardDesign, inner: tuple[int, int]) -> bool:
-    """Whether a chessboard is found in a larger one, or among the squares of a ChArUco board."""
+    """Return True if a chessboard fits into a grid of ``inner`` corners, of a larger one or a ChArUco board."""
     return all(a <= b for a, b in zip(sorted((part.rows, part.columns)), sorted(inner), strict=True))
 
 
 def _tags(board: BoardDesign | FlatBoard) -> set[tuple[str, int]]:
-    """Dictionary and id of each of its tags."""
+    """Return dictionary and id of each of the board's tags."""
     if isinstance(board, TagLayout):
         return set(board.tags)
     if isinstance(board, CharucoDesign | AprilGridDesign):

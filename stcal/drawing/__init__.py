@@ -1,5 +1,5 @@
 """Drawings of targets and boards, 1:1 in mm, as PDF, SVG and DXF.
 
-``parts`` : what a face or a board is drawn as; ``dimensions`` : what is written around it; ``sheets`` : pages, and how
-a part is split over several; ``svg``, ``pdf``, ``dxf`` : the files.
+``parts`` : the drawing of a face or a board; ``dimensions`` : annotations around it; ``sheets`` : pages, and the
+splitting of a part over several; ``svg``, ``pdf``, ``dxf`` : the files.
 """

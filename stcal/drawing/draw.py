@@ -1,4 +1,4 @@
-"""From a file of a target or a board to a drawing of it."""
+"""Drawing of a target or a board from its file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +19,13 @@ from stcal.io.saving import save
 
 SUFFIXES = (".pdf", ".svg", ".dxf")
 OWN = "own"
-"""In place of a paper: pages as large as what they show."""
+"""Value of ``paper`` for pages as large as their content."""
 MARGIN_MM = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """What was written: ``parts`` and ``sheets``; ``paper`` : its name, or ``own``."""
+    """A drawing that was written: its ``parts`` and ``sheets``; ``paper`` : name of the paper, or ``own``."""
 
     path: Path
     parts: list[Part]
@@ -36,31 +36,31 @@ class Drawn:
 def draw(
     design: str | Path, path: str | Path, paper: str = "", margin_mm: float = MARGIN_MM, net: bool = False
 ) -> Drawn:
-    """Draw a target or a board 1:1 to a file, whose suffix tells the form.
+    """Draw a target or a board 1:1 to a file, whose suffix gives the form.
 
     Parameters
     ----------
     design : path
         A ``target.toml`` or a board file of any kind.
     paper : str
-        Of :data:`~stcal.drawing.sheets.PAPERS`, or ``own``; if not given A4 for PDF, ``own`` for SVG and DXF.
+        One of :data:`~stcal.drawing.sheets.PAPERS`, or ``own``; if not given, A4 for PDF, ``own`` for SVG and DXF.
     margin_mm : float
-        From the outermost circles to the edge of a plate, where the design has no outline.
+        Distance from the outermost circles to the edge of a plate, if the design has no outline.
     net : bool
-        The plates of a target unfolded into one plane, by their outlines and rough poses.
+        True unfolds the plates of a target into one plane, by their outlines and rough poses.
 
     Raises
     ------
     InputError
-        The design cannot be read or drawn, the file has another suffix, or the paper does not go with it.
+        The design cannot be read or drawn, the file has another suffix, or the paper does not suit the form.
     """
     path = Path(path)
     paper = _paper(path, paper)
-    what = load_design(design)
-    if net and not isinstance(what, TargetDesign):
+    loaded = load_design(design)
+    if net and not isinstance(loaded, TargetDesign):
         raise InputError("E-DRAW-DESIGN", f"--net: {design} is a board; nets are of targets")
-    parts = net_parts(what) if net and isinstance(what, TargetDesign) else _parts(what, margin_mm)
-    title = what.name if isinstance(what, TargetDesign) else parts[0].name if len(parts) == 1 else "boards"
+    parts = net_parts(loaded) if net and isinstance(loaded, TargetDesign) else _parts(loaded, margin_mm)
+    title = loaded.name if isinstance(loaded, TargetDesign) else parts[0].name if len(parts) == 1 else "boards"
     sheets = sheets_of(parts, paper, title, apart=path.suffix.lower() == ".pdf")
     save(path, content_of(sheets, path))
     return Drawn(path, parts, sheets, paper)
@@ -71,7 +71,7 @@ def _parts(what: TargetDesign | BoardDesign | FlatBoard | BoardSet, margin_mm: f
 
 
 def load_design(path: str | Path) -> TargetDesign | BoardDesign | FlatBoard | BoardSet:
-    """A target, or a board or boards of any kind."""
+    """Read a target, or a board or boards of any kind."""
     if not Path(path).exists():
         raise InputError(
             "E-DRAW-DESIGN", f"{path}: no such file; give a target.toml or a board file (`stcal-sfm init` writes both)"
@@ -81,7 +81,7 @@ def load_design(path: str | Path) -> TargetDesign | BoardDesign | FlatBoard | Bo
 
 
 def sheets_of(parts: list[Part], paper: str, title: str, apart: bool) -> list[Sheet]:
-    """On that paper, or pages of their own size: one for each part where they stand ``apart``."""
+    """Return the sheets of a paper, or of the parts' own size: then one for all parts, or one for each if ``apart``."""
     if paper != OWN:
         return paper_sheets(parts, paper, title)
     if not apart:
@@ -90,12 +90,12 @@ def sheets_of(parts: list[Part], paper: str, title: str, apart: bool) -> list[Sh
 
 
 def content_of(sheets: list[Sheet], path: Path) -> str | bytes:
-    """Of a file with that suffix.
+    """Return the content of a file in the form of its suffix.
 
     Raises
     ------
     InputError
-        More sheets than it holds, or larger ones.
+        There are more or larger sheets than the form holds.
     """
     suffix = path.suffix.lower()
     if suffix == ".pdf":
@@ -114,7 +114,7 @@ def content_of(sheets: list[Sheet], path: Path) -> str | bytes:
 
 
 def _paper(path: Path, paper: str) -> str:
-    """The paper's name as it is listed."""
+    """Return the listed name of a paper, or the default for the suffix; refuse combinations that do not work."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(

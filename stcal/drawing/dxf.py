@@ -1,5 +1,7 @@
-"""A sheet as DXF in mm for laser and mill: circles and outlines, on a layer for each use. Through ``ezdxf``, which
-``stcal[cad]`` installs."""
+"""DXF of a sheet in mm for laser and mill: circles and outlines, with one layer for each use.
+
+It needs ``ezdxf``, which ``stcal[cad]`` installs.
+"""
 
 import io
 
@@ -10,12 +12,12 @@ from stcal.drawing.sheets import Sheet
 from stcal.errors import InputError
 
 COLOURS = {"GROUND": 9, "PATTERN": 7, "CUT": 1, "FOLD": 3, "DIMENSIONS": 8, "LABELS": 8}
-"""Of layers, AutoCAD's numbers."""
+"""AutoCAD's colour numbers of the layers."""
 APPLICATION = "STCAL"
 
 
 def new_drawing():
-    """An empty drawing, R2010, mm.
+    """Return an empty drawing, R2010, mm.
 
     Raises
     ------
@@ -31,15 +33,17 @@ def new_drawing():
 
 
 def dxf_text(drawing) -> str:
-    """The drawing as the text of a file."""
+    """Return the drawing as the text of a file."""
     stream = io.StringIO()
     drawing.write(stream)
     return stream.getvalue()
 
 
 def dxf(sheet: Sheet) -> str:
-    """Text of the file, R2010: ``CIRCLE``, closed ``LWPOLYLINE`` (what is between it and those within it is inked),
-    ``TEXT``; labels of circles and the ink as extended data ``STCAL``.
+    """Return the text of the file, R2010.
+
+    It holds ``CIRCLE``, closed ``LWPOLYLINE`` (the area between it and those inside it is inked) and ``TEXT``. Labels
+    of circles and the ink are extended data ``STCAL``.
 
     Raises
     ------
@@ -62,16 +66,16 @@ def dxf(sheet: Sheet) -> str:
 
 
 def _entities(space, shape: Shape) -> list:
-    own = {"layer": shape.layer}
+    attribs = {"layer": shape.layer}
     if isinstance(shape, Disc):
-        return [space.add_circle((shape.x, shape.y), shape.radius, dxfattribs=own)]
+        return [space.add_circle((shape.x, shape.y), shape.radius, dxfattribs=attribs)]
     if isinstance(shape, Area):
-        return [space.add_lwpolyline(np.asarray(line).tolist(), close=True, dxfattribs=own) for line in shape.lines]
+        return [space.add_lwpolyline(np.asarray(line).tolist(), close=True, dxfattribs=attribs) for line in shape.lines]
     if isinstance(shape, Text):
         from ezdxf.enums import TextEntityAlignment
 
-        text = space.add_text(shape.words, height=shape.height, rotation=90 if shape.turned else 0, dxfattribs=own)
+        text = space.add_text(shape.words, height=shape.height, rotation=90 if shape.turned else 0, dxfattribs=attribs)
         align = {"start": "LEFT", "middle": "CENTER", "end": "RIGHT"}[shape.anchor]
         text.set_placement((shape.x, shape.y), align=TextEntityAlignment[align])
         return [text]
-    return [space.add_lwpolyline(shape.points.tolist(), close=shape.closed, dxfattribs=own)]
+    return [space.add_lwpolyline(shape.points.tolist(), close=shape.closed, dxfattribs=attribs)]

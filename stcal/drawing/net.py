@@ -1,6 +1,6 @@
-"""A folding net: plates that share an edge in space, unfolded into one plane, with tabs to glue the other edges.
+"""A folding net: plates that share an edge in space, unfolded into one plane, with glue tabs on the other edges.
 
-Plates are the faces' ``outline_mm``, placed by their rough poses.
+The plates are the faces' ``outline_mm``, placed by their rough poses.
 """
 
 from collections.abc import Iterable
@@ -15,41 +15,41 @@ from stcal.errors import InputError
 from stcal.io.design import ROUGH_KEYS
 
 TOGETHER_MM, TOGETHER_SHARE = 1.0, 0.01
-"""Ends of an edge that two plates share lie so near to one another, also in parts of its length."""
+"""Largest distance between the ends of an edge that two plates share, mm, and as a share of its length."""
 TAB_MM, TAB_SHARE = 10.0, 0.25
-"""Width of a tab, at most that and that part of its edge."""
+"""Largest width of a tab, mm, and as a share of its edge."""
 SKETCH = 1 / 8
 """Scale of the sketch that names the faces."""
 APART = 15.0
 LETTERS = 2.0
 TOUCH = 1e-3
-"""By which plates may overlap, mm: rounding."""
+"""Overlap of plates that counts as rounding, mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Plate:
-    """``net_from_face`` : turn (2, 2) and shift (2,) into the net's plane."""
+    """A face with net_from_face: rotation ``turn`` (2, 2) and ``shift`` (2,) into the net's plane."""
 
     face: FaceDesign
     turn: np.ndarray
     shift: np.ndarray
 
     def place(self, xy) -> np.ndarray:
-        """In the net."""
+        """Return points of the face in the net's plane."""
         return np.asarray(xy) @ self.turn.T + self.shift
 
     def corners(self) -> np.ndarray:
-        """Of its outline, (k, 2), in the net."""
+        """Return the corners of the outline, (k, 2), in the net's plane."""
         return self.place(self.face.outline_mm)
 
 
 def net_parts(target: TargetDesign) -> list[Part]:
-    """The net in as few pieces as fold flat without covering one another.
+    """Return the net in few pieces, in each of which no plates overlap.
 
     Raises
     ------
     InputError
-        A face without outline or rough pose, or no two plates that share an edge.
+        A face has no outline or rough pose, or no two plates share an edge.
     """
     for face in target.faces:
         if face.outline_mm is None or face.rough_target_from_face is None:
@@ -64,43 +64,46 @@ def net_parts(target: TargetDesign) -> list[Part]:
             "E-DRAW-NET", "--net: no two plates share an edge; correct outline_mm and rough_pose, or draw without --net"
         )
     faces = [replace(face, outline_mm=_against_the_clock(face)) for face in target.faces]
-    left = sorted(faces, key=lambda face: -sum(face.id == one for one, _ in shared))
+    remaining = sorted(faces, key=lambda face: -sum(face.id == face_id for face_id, _ in shared))
     pieces: list[list[_Plate]] = []
     folds: set[tuple[tuple[str, int], tuple[str, int]]] = set()
-    while left:
-        piece = [_Plate(left[0], np.eye(2), np.zeros(2))]
-        free = {face.id for face in left[1:]}
+    while remaining:
+        piece = [_Plate(remaining[0], np.eye(2), np.zeros(2))]
+        free = {face.id for face in remaining[1:]}
         for plate in piece:  # grows
             for edge in range(len(plate.corners())):
-                other = shared.get((plate.face.id, edge))
-                if other is None or other[0] not in free:
+                partner = shared.get((plate.face.id, edge))
+                if partner is None or partner[0] not in free:
                     continue
-                unfolded = _unfolded(plate, edge, target.face(other[0]), other[1])
+                unfolded = _unfolded(plate, edge, target.face(partner[0]), partner[1])
                 if _is_clear(unfolded.corners(), piece):
                     piece.append(unfolded)
-                    free.remove(other[0])
-                    folds |= {((plate.face.id, edge), other), (other, (plate.face.id, edge))}
+                    free.remove(partner[0])
+                    folds |= {((plate.face.id, edge), partner), (partner, (plate.face.id, edge))}
         pieces.append(piece)
-        left = [face for face in left if face.id in free]
+        remaining = [face for face in remaining if face.id in free]
     names = [f"net {n} of {len(pieces)}" for n in range(1, len(pieces) + 1)] if len(pieces) > 1 else ["net"]
     return [_part(name, piece, target, shared, folds) for name, piece in zip(names, pieces, strict=True)]
 
 
 def _shared_edges(target: TargetDesign) -> dict[tuple[str, int], tuple[str, int]]:
-    """Face and number of an edge that lies where another's does, both ways round; edges run against the clock."""
+    """Return pairs of shared edges, in both directions: face and edge number of one edge, by those of the other.
+
+    Edges are numbered anticlockwise.
+    """
     ends = {}
     for face in target.faces:
         assert face.rough_target_from_face is not None
         outline = _against_the_clock(face)
         place = face.rough_target_from_face @ np.pad(outline, ((0, 0), (0, 1)))
         ends |= {(face.id, k): (place[k], place[(k + 1) % len(place)]) for k in range(len(place))}
-    found = {}
-    for one, (a, b) in ends.items():
+    nearest = {}
+    for edge, (a, b) in ends.items():
         near = max(TOGETHER_MM, TOGETHER_SHARE * float(np.linalg.norm(b - a)))
-        for other, (c, d) in ends.items():
-            if one[0] != other[0] and max(np.linalg.norm(a - d), np.linalg.norm(b - c)) < near:
-                found[one] = other
-    return {one: other for one, other in found.items() if found.get(other) == one}
+        for candidate, (c, d) in ends.items():
+            if edge[0] != candidate[0] and max(np.linalg.norm(a - d), np.linalg.norm(b - c)) < near:
+                nearest[edge] = candidate
+    return {edge: candidate for edge, candidate in nearest.items() if nearest.get(candidate) == edge}
 
 
 def _against_the_clock(face: FaceDesign) -> np.ndarray:
@@ -111,7 +114,7 @@ def _against_the_clock(face: FaceDesign) -> np.ndarray:
 
 
 def _unfolded(plate: _Plate, edge: int, face: FaceDesign, own: int) -> _Plate:
-    """The face laid beside a plate, its edge along the plate's, the other way round."""
+    """Return the face as a plate beside ``plate``, with its edge ``own`` along that plate's ``edge``, reversed."""
     corners, outline = plate.corners(), _against_the_clock(face)
     start, end = corners[edge], corners[(edge + 1) % len(corners)]
     last, first = outline[own], outline[(own + 1) % len(outline)]
@@ -122,12 +125,12 @@ def _unfolded(plate: _Plate, edge: int, face: FaceDesign, own: int) -> _Plate:
 
 
 def _is_clear(corners: np.ndarray, plates: Iterable[_Plate]) -> bool:
-    """Whether a polygon covers none of the plates; of polygons with dents their hulls count."""
+    """Return True if a polygon overlaps none of the plates; concave polygons may count with their hulls."""
     return not any(_overlap(corners, plate.corners()) for plate in plates)
 
 
 def _overlap(one: np.ndarray, other: np.ndarray) -> bool:
-    """By separating axes along the normals of the sides."""
+    """Return True if two polygons overlap, by separating axes along the normals of the sides."""
     for polygon in (one, other):
         side = np.roll(polygon, -1, axis=0) - polygon
         normals = np.column_stack([side[:, 1], -side[:, 0]]) / np.linalg.norm(side, axis=1)[:, None]
@@ -143,8 +146,8 @@ def _part(name: str, piece: list[_Plate], target: TargetDesign, shared, folds) -
     lines: list[Line] = []
     tabs: list[np.ndarray] = []
     for plate in piece:
-        own = face_part(plate.face, target.polarity, 0.0)
-        for shape in own.shapes:
+        plate_part = face_part(plate.face, target.polarity, 0.0)
+        for shape in plate_part.shapes:
             if isinstance(shape, Disc):
                 x, y = plate.place([shape.x, shape.y]).tolist()
                 shapes.append(replace(shape, x=x, y=y))
@@ -152,22 +155,22 @@ def _part(name: str, piece: list[_Plate], target: TargetDesign, shared, folds) -
                 grounds.append(replace(shape, lines=tuple(plate.place(line) for line in shape.lines)))
         corners = plate.corners()
         for edge in range(len(corners)):
-            this, other = (plate.face.id, edge), shared.get((plate.face.id, edge))
+            edge_id, partner = (plate.face.id, edge), shared.get((plate.face.id, edge))
             ends = np.array([corners[edge], corners[(edge + 1) % len(corners)]])
-            folded = (this, other) in folds
+            folded = (edge_id, partner) in folds
             if folded:
-                if this < other:
+                if edge_id < partner:
                     lines.append(Line(ends, "FOLD", "grey", dashed=True))
                 continue
-            tab = _tab(ends) if other and this < other else None
-            if tab is None or not _is_clear(tab, piece) or any(_overlap(tab, each) for each in tabs):
+            tab = _tab(ends) if partner and edge_id < partner else None
+            if tab is None or not _is_clear(tab, piece) or any(_overlap(tab, drawn_tab) for drawn_tab in tabs):
                 lines.append(Line(ends, "CUT", width=0.1))
                 continue
             tabs.append(tab)
             lines += [Line(ends, "FOLD", "grey", dashed=True), Line(tab, "CUT", width=0.1)]
             x, y = tab.mean(0).tolist()
             level = abs(ends[0, 1] - ends[1, 1]) < abs(ends[0, 0] - ends[1, 0])
-            words = f"under {other[0]}"
+            words = f"under {partner[0]}"
             at = (x, y - LETTERS / 2) if level else (x + LETTERS / 2, y)
             shapes.append(Text(*at, words, LETTERS, "middle", turned=not level))
     every = np.concatenate([*(plate.corners() for plate in piece), *tabs])
@@ -177,7 +180,7 @@ def _part(name: str, piece: list[_Plate], target: TargetDesign, shared, folds) -
 
 
 def _tab(ends: np.ndarray) -> np.ndarray:
-    """A trapezium to the right of an edge, which is outside; (4, 2), open at the edge."""
+    """Return a trapezium (4, 2) to the right of an edge, its outer side; it is open at the edge."""
     along = ends[1] - ends[0]
     length = float(np.linalg.norm(along))
     along = along / length
@@ -187,7 +190,7 @@ def _tab(ends: np.ndarray) -> np.ndarray:
 
 
 def _sketch(piece: list[_Plate], left: float, above: float) -> list[Shape]:
-    """The plates small, each with its face's name."""
+    """Return a small sketch of the plates, each with the name of its face."""
     every = np.concatenate([plate.corners() for plate in piece])
     shift = np.array([left, above]) - SKETCH * np.array([every[:, 0].min(), every[:, 1].max()])
     shapes: list[Shape] = []

@@ -1,4 +1,4 @@
-"""What is drawn: a plate for each face of a target, a sheet for each board."""
+"""Parts of a drawing: a plate for each face of a target, a sheet for each board."""
 
 from dataclasses import dataclass
 
@@ -21,9 +21,9 @@ from stcal.drawing.shapes import Area, Disc, Line, Shape, extent, said_mm
 class Part:
     """A flat piece, seen from the side that is photographed, Y upwards.
 
-    ``name``; ``outline`` : (k, 2) where it is cut; ``shapes`` : what it shows; ``spans`` : lengths within it that are
-    written beside it, as (axis, from, to, words); ``table`` : rows of words, the first a note, the second the heads;
-    ``lines`` : where it is cut and folded, in place of the outline, which is then what all of it lies in.
+    ``outline`` : (k, 2) cutting line; ``shapes`` : content; ``spans`` : lengths that are dimensioned, as (axis, from,
+    to, words); ``table`` : rows of words, the first a note, the second the heads; ``lines`` : lines to cut and fold, if
+    they replace the outline, which then only encloses the part.
     """
 
     name: str
@@ -34,17 +34,17 @@ class Part:
     lines: tuple[Line, ...] = ()
 
     def pattern(self) -> list[Shape]:
-        """What it shows but for the ground."""
+        """Return the shapes of the pattern, without the ground."""
         return [shape for shape in self.shapes if shape.layer == "PATTERN"]
 
 
 def target_parts(target: TargetDesign, margin_mm: float) -> list[Part]:
-    """A plate for each face: its own outline, or ``margin_mm`` beyond the rims of its circles."""
+    """Return a plate for each face, with the face's outline, or ``margin_mm`` beyond the rims of its circles."""
     return [face_part(face, target.polarity, margin_mm) for face in target.faces]
 
 
 def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Part:
-    """The plate of a face, in the face's frame."""
+    """Return the plate of a face, in the face's frame."""
     shapes = _discs(face.xy_mm, face.radius_mm, face.labels(), polarity)
     head = ("circle", "x", "y", "diameter")
     rows = [
@@ -57,19 +57,21 @@ def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Part:
 
 
 def board_parts(board: BoardDesign | FlatBoard | BoardSet, margin_mm: float) -> list[Part]:
-    """The sheet of a board, or of each board of a set; at least ``margin_mm`` around it."""
+    """Return the sheet of a board, or of each board of a set, with a margin of at least ``margin_mm``."""
     if isinstance(board, BoardSet):
-        return [board_part(each, name, margin_mm) for name, each in zip(board.names, board.boards, strict=True)]
+        return [
+            board_part(one_board, name, margin_mm) for name, one_board in zip(board.names, board.boards, strict=True)
+        ]
     return [board_part(board, "board", margin_mm)]
 
 
 def board_part(board: BoardDesign | FlatBoard, name: str, margin_mm: float) -> Part:
-    """The sheet of a board; its Y, which goes down, is turned round."""
+    """Return the sheet of a board; the board's Y, which points down, is inverted."""
     if isinstance(board, BoardDesign | AsymmetricCirclesDesign):
         return _dots(board, name, margin_mm)
     areas = [Area(tuple(line * [1, -1] for line in lines), "black") for lines in black_areas(board)]
-    said, spans = _squares_said(board)
-    return _part(f"{name}: {said}", areas, "dark", max(margin_mm, clear_mm(board)), spans)
+    description, spans = _squares_said(board)
+    return _part(f"{name}: {description}", areas, "dark", max(margin_mm, clear_mm(board)), spans)
 
 
 def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: float) -> Part:
@@ -81,30 +83,35 @@ def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: fl
         low, high = float(xy[:, axis].min()), float(xy[:, axis].max())
         spans.append((axis, low, high, f"{round((high - low) / pitch)} × {said_mm(pitch)} = {said_mm(high - low)}"))
     sizes = " and ".join(said_mm(2 * radius) for radius in sorted(set(radii.tolist())))
-    said = f"{name}: {board.rows} × {board.columns} dots, diameter {sizes} mm"
-    return _part(said, _discs(xy, radii, names, board.polarity), board.polarity, margin_mm, tuple(spans))
+    description = f"{name}: {board.rows} × {board.columns} dots, diameter {sizes} mm"
+    return _part(description, _discs(xy, radii, names, board.polarity), board.polarity, margin_mm, tuple(spans))
 
 
 def _squares_said(board: SquaresOrTags) -> tuple[str, tuple[tuple[int, float, float, str], ...]]:
-    """What it is, and the lengths to check."""
+    """Return the description of a board, and the lengths to check as :attr:`Part.spans`."""
     if isinstance(board, ChessboardDesign):
         columns, rows, first = board.columns - 1, board.rows - 1, 0.0
-        said = f"chessboard, {board.rows} × {board.columns} inner corners"
+        description = f"chessboard, {board.rows} × {board.columns} inner corners"
     elif isinstance(board, CharucoDesign):
         columns, rows, first = board.columns - 2, board.rows - 2, board.square_mm
-        said = (
+        description = (
             f"ChArUco, {board.rows} × {board.columns} squares, tags {said_mm(board.marker_mm)} mm, {board.dictionary}"
         )
     elif isinstance(board, AprilGridDesign):
         step = board.tag_mm * (1 + board.spacing)
         words = f"{said_mm(board.tag_mm)}, step {said_mm(step)}"
-        said = f"AprilGrid, {board.rows} × {board.columns} tags of {said_mm(board.tag_mm)} mm, {board.dictionary}"
-        return said, ((0, 0.0, board.tag_mm, words), (1, 0.0, board.tag_mm, words))
+        description = (
+            f"AprilGrid, {board.rows} × {board.columns} tags of {said_mm(board.tag_mm)} mm, {board.dictionary}"
+        )
+        return description, ((0, 0.0, board.tag_mm, words), (1, 0.0, board.tag_mm, words))
     else:
         return f"{len(board.tags)} tags", ()
     side = board.square_mm
     across = (0, first, first + side * columns, f"{columns} × {said_mm(side)} = {said_mm(side * columns)}")
-    return said, (across, (1, -first - side * rows, -first, f"{rows} × {said_mm(side)} = {said_mm(side * rows)}"))
+    return description, (
+        across,
+        (1, -first - side * rows, -first, f"{rows} × {said_mm(side)} = {said_mm(side * rows)}"),
+    )
 
 
 def _discs(xy, radii, names, polarity: Polarity) -> list[Shape]:

@@ -1,7 +1,7 @@
-"""Sheets as the pages of a PDF, through matplotlib, which the figures of reports need anyway.
+"""PDF of sheets as pages, through matplotlib, which the figures of reports need anyway.
 
-reportlab and fpdf2 do as much in a further library; cairo draws as well and is no wheel. matplotlib's circles are of
-eight Bézier curves: 4 · 10⁻⁶ of the radius off at most.
+reportlab and fpdf2 would be a further dependency; cairo is not available as a wheel. matplotlib's circles consist of
+eight Bézier curves, which deviate by at most 4 · 10⁻⁶ of the radius.
 """
 
 import io
@@ -17,12 +17,12 @@ from stcal.drawing.svg import CAPITAL_SHARE, COLOURS
 INCH_MM = 25.4
 POINT_MM = INCH_MM / 72
 DASH = (0, (20, 10))
-"""In widths of the line."""
+"""Dash pattern, in widths of the line."""
 ANCHORS = {"start": "left", "middle": "center", "end": "right"}
 
 
 def pdf(sheets: Sequence[Sheet]) -> bytes:
-    """Bytes of the file, the same for the same sheets."""
+    """Return the bytes of the file; equal sheets give equal bytes."""
     import matplotlib
     from matplotlib.backends.backend_pdf import PdfPages
 
@@ -37,7 +37,7 @@ def pdf(sheets: Sequence[Sheet]) -> bytes:
 
 
 def figure_of(sheet: Sheet):
-    """The page as a figure of its size, a millimetre in data a millimetre on paper."""
+    """Return the page as a figure of its size; a millimetre in data is a millimetre on paper."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(sheet.width / INCH_MM, sheet.height / INCH_MM), facecolor="white")
@@ -47,7 +47,7 @@ def figure_of(sheet: Sheet):
     axes.set_ylim(0, sheet.height)
     for placed in sheet.placed:
         for layer in LAYERS:
-            for shape in (each for each in placed.shapes if each.layer == layer):
+            for shape in (layer_shape for layer_shape in placed.shapes if layer_shape.layer == layer):
                 _add(axes, shape, placed.clip)
     return figure
 
@@ -60,10 +60,10 @@ def _add(axes, shape: Shape, clip: np.ndarray | None) -> None:
     colour = COLOURS[shape.ink]
     if isinstance(shape, Text):
         size = shape.height / CAPITAL_SHARE / POINT_MM
-        how = {"ha": ANCHORS[shape.anchor], "va": "baseline", "rotation": 90 if shape.turned else 0}
+        options = {"ha": ANCHORS[shape.anchor], "va": "baseline", "rotation": 90 if shape.turned else 0}
         artist = axes.text(
             *(shape.x, shape.y, shape.words.replace("$", r"\$")),
-            fontsize=size, color=colour, rotation_mode="anchor", clip_on=clip is not None, **how,
+            fontsize=size, color=colour, rotation_mode="anchor", clip_on=clip is not None, **options,
         )  # fmt: skip
     elif isinstance(shape, Disc):
         artist = axes.add_patch(Circle((shape.x, shape.y), shape.radius, facecolor=colour, linewidth=0))
@@ -72,10 +72,12 @@ def _add(axes, shape: Shape, clip: np.ndarray | None) -> None:
         artist = axes.add_patch(PathPatch(Path.make_compound_path(*paths), facecolor=colour, linewidth=0))
     else:
         points = np.vstack([shape.points, shape.points[:1]]) if shape.closed else shape.points
-        how = {"linestyle": DASH} if shape.dashed else {}
+        options = {"linestyle": DASH} if shape.dashed else {}
         line = Path(points, closed=shape.closed)
         width = shape.width / POINT_MM
-        artist = axes.add_patch(PathPatch(line, fill=False, edgecolor=colour, linewidth=width, capstyle="butt", **how))
+        artist = axes.add_patch(
+            PathPatch(line, fill=False, edgecolor=colour, linewidth=width, capstyle="butt", **options)
+        )
     if clip is not None:
         (x, y), (right, top) = clip.tolist()
         artist.set_clip_path(Rectangle((x, y), right - x, top - y, transform=axes.transData))

@@ -1,4 +1,4 @@
-"""What drawings are made of: discs, areas, lines, words; mm, X to the right, Y upwards."""
+"""Elements of drawings: discs, areas, lines, words; mm, X to the right, Y upwards."""
 
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
@@ -8,15 +8,15 @@ import numpy as np
 Ink = Literal["black", "white", "grey"]
 Layer = Literal["GROUND", "PATTERN", "CUT", "FOLD", "DIMENSIONS", "LABELS"]
 LAYERS: tuple[Layer, ...] = ("GROUND", "PATTERN", "CUT", "FOLD", "DIMENSIONS", "LABELS")
-"""``GROUND`` : what is inked behind a bright pattern; ``CUT`` : outlines and cut marks; ``DIMENSIONS`` : dimensions,
+"""Layers. ``GROUND`` : ink behind a bright pattern; ``CUT`` : outlines and cut marks; ``DIMENSIONS`` : dimensions,
 scale bars, registration marks; ``LABELS`` : words beside the parts."""
 WIDTH_PER_HEIGHT = 0.85
-"""Of a letter, about: for room, not for setting."""
+"""Approximate width of a letter over its height: for reserving space, not for typesetting."""
 
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """A circle, filled. ``name`` : its label."""
+    """A filled circle. ``name`` : its label."""
 
     x: float
     y: float
@@ -26,20 +26,20 @@ class Disc:
     name: str = ""
 
     def box(self) -> np.ndarray:
-        """Least and largest place, (2, 2)."""
+        """Return the bounding box, (2, 2): smallest and largest coordinates."""
         return np.array([[self.x - self.radius, self.y - self.radius], [self.x + self.radius, self.y + self.radius]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Area:
-    """Filled between closed ``lines`` (k, 2); lines within lines are holes."""
+    """A filled area between closed ``lines`` (k, 2); lines inside others are holes."""
 
     lines: tuple[np.ndarray, ...]
     ink: Ink
     layer: Layer = "PATTERN"
 
     def box(self) -> np.ndarray:
-        """Least and largest place, (2, 2)."""
+        """Return the bounding box, (2, 2): smallest and largest coordinates."""
         return _box(np.concatenate(self.lines))
 
 
@@ -55,13 +55,13 @@ class Line:
     dashed: bool = False
 
     def box(self) -> np.ndarray:
-        """Least and largest place, (2, 2)."""
+        """Return the bounding box, (2, 2): smallest and largest coordinates."""
         return _box(self.points)
 
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """Words with capitals of that ``height``, from (x, y) on the base line; ``turned`` : upwards, not along X."""
+    """Words from (x, y) on the base line; ``height`` : of capitals; ``turned`` : upwards instead of along X."""
 
     x: float
     y: float
@@ -73,26 +73,26 @@ class Text:
     layer: Layer = "LABELS"
 
     def box(self) -> np.ndarray:
-        """Least and largest place, (2, 2), about."""
+        """Return the approximate bounding box, (2, 2): smallest and largest coordinates."""
         length = WIDTH_PER_HEIGHT * self.height * len(self.words)
         before = {"start": 0.0, "middle": length / 2, "end": length}[self.anchor]
-        own = np.array([[-before, -0.4 * self.height], [length - before, 1.2 * self.height]])
+        box = np.array([[-before, -0.4 * self.height], [length - before, 1.2 * self.height]])
         if self.turned:
-            own = np.array([[-own[1, 1], own[0, 0]], [-own[0, 1], own[1, 0]]])
-        return own + np.array([self.x, self.y])
+            box = np.array([[-box[1, 1], box[0, 0]], [-box[0, 1], box[1, 0]]])
+        return box + np.array([self.x, self.y])
 
 
 Shape: TypeAlias = Disc | Area | Line | Text
 
 
 def extent(shapes) -> np.ndarray:
-    """Least and largest place of all, (2, 2)."""
+    """Return the bounding box of all shapes, (2, 2): smallest and largest coordinates."""
     boxes = np.array([shape.box() for shape in shapes])
     return np.array([boxes[:, 0].min(0), boxes[:, 1].max(0)])
 
 
 def moved(shape: Shape, x: float, y: float) -> Shape:
-    """The shape somewhere else."""
+    """Return the shape shifted by (x, y)."""
     if isinstance(shape, Disc | Text):
         return replace(shape, x=shape.x + x, y=shape.y + y)
     if isinstance(shape, Area):
@@ -105,6 +105,6 @@ def _box(points: np.ndarray) -> np.ndarray:
 
 
 def said_mm(value: float) -> str:
-    """A length without needless digits; µm are the last."""
+    """Return the text of a length in mm to the µm, without trailing zeros."""
     text = f"{value:.3f}".rstrip("0").rstrip(".")
     return "0" if text == "-0" else text

@@ -1,4 +1,4 @@
-"""Pages of drawings: as large as what they show, or of a paper, over several of which a part is split."""
+"""Pages of drawings: as large as their content, or of a paper, with parts split over several pages."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,27 +24,27 @@ PAPERS = {
 }
 """Width and height, mm."""
 EDGE = 8.0
-"""That printers leave white, mm."""
+"""Width of the border that printers leave white, mm."""
 SIDE, FOOT = 10.0, 14.0
-"""For the scale bars and what is written beside them, mm."""
+"""Widths at the left and the bottom of a page for the scale bars and their text, mm."""
 FURNITURE = np.array([2 * EDGE + SIDE, 2 * EDGE + FOOT])
-"""Of a page's width and height, what is not for parts."""
+"""Part of a page's width and height that is not available for parts, mm."""
 OVERLAP = 10.0
-"""Of neighbouring sheets, mm."""
+"""Overlap of neighbouring sheets, mm."""
 CROSS = 2.5
 """Half the length of a registration mark, mm."""
 CLEAR = 1.0
-"""From a seam to the circles and squares that it runs between, mm."""
+"""Distance from a seam to the circles and squares that it passes, mm."""
 BETWEEN = 12.0
-"""Parts on one sheet, mm."""
+"""Distance of parts on one sheet, mm."""
 MOST_SHEETS = 500
 MOST_MM = 5000.0
-"""Side of a page: PDF knows none that are larger."""
+"""Largest side of a page in a PDF, mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """Shapes in the sheet's frame, drawn within ``clip`` (2, 2) where it is given."""
+    """Shapes in the sheet's frame, clipped to the box ``clip`` (2, 2) if it is given."""
 
     shapes: tuple[Shape, ...]
     clip: np.ndarray | None = None
@@ -52,7 +52,7 @@ class Placed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sheet:
-    """A page, origin below on the left."""
+    """A page with its origin at the bottom left."""
 
     title: str
     width: float
@@ -60,12 +60,12 @@ class Sheet:
     placed: tuple[Placed, ...]
 
     def shapes(self) -> list[Shape]:
-        """All of them."""
-        return [shape for each in self.placed for shape in each.shapes]
+        """Return all shapes of the page."""
+        return [shape for item in self.placed for shape in item.shapes]
 
 
 def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
-    """All parts on one sheet that is as large as they need."""
+    """Return one sheet with all parts, as large as needed."""
     drawn = [[*framed(part), *table(part, below=False)] for part in parts]
     boxes = [extent(shapes) for shapes in drawn]
     widest = max(np.sqrt(sum(np.prod(box[1] - box[0] + BETWEEN) for box in boxes)), *(np.ptp(b, 0)[0] for b in boxes))
@@ -84,12 +84,12 @@ def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
 
 
 def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
-    """Each part on sheets of a paper, as few of them as may be.
+    """Return the sheets of a paper for all parts, as few as possible for each part.
 
     Raises
     ------
     InputError
-        Far too many.
+        There would be more than :data:`MOST_SHEETS`.
     """
     split = [min(_ways(part, paper), key=lambda way: way.count()) for part in parts]
     total = sum(way.count() for way in split)
@@ -106,7 +106,7 @@ def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Way:
-    """A part on a paper: what is drawn, its extent, the paper's size, and the seams along X and Y."""
+    """A layout of a part on a paper: the shapes, their extent, the paper's size, and the seams along X and Y."""
 
     shapes: list[Shape]
     box: np.ndarray
@@ -114,12 +114,12 @@ class _Way:
     seams: tuple[list[float], list[float]]
 
     def count(self) -> int:
-        """Of sheets."""
+        """Return the number of sheets."""
         return (len(self.seams[0]) + 1) * (len(self.seams[1]) + 1)
 
 
 def _ways(part: Part, paper: str) -> list[_Way]:
-    """Upright and across, its table beside and below."""
+    """Return the layouts of a part: portrait and landscape, with the table beside and below."""
     ways = []
     taken = np.array([shape.box() for shape in part.pattern()])
     for below, turned in product((True, False), (False, True)):
@@ -136,8 +136,10 @@ def _ways(part: Part, paper: str) -> list[_Way]:
 
 
 def seams_between(low: float, high: float, room: float, taken: np.ndarray) -> list[float]:
-    """Places where a length is split so that no piece, with half the overlap on either side, is longer than ``room``;
-    between what is ``taken`` (n, 2) where half a piece has such a place."""
+    """Return the places that split a length so that no piece, with half the overlap at either end, exceeds ``room``.
+
+    Seams avoid the intervals ``taken`` (n, 2) if the second half of a piece has a free place.
+    """
     seams, start = [], low
     while high - start > room:
         last = place = start + room - OVERLAP / 2
@@ -166,24 +168,24 @@ def _tiles(way: _Way, title: str) -> list[Sheet]:
             inside = [
                 s for s, b in zip(shapes, boxes, strict=True) if (b[0] <= clip[1]).all() and (b[1] >= clip[0]).all()
             ]
-            own = tuple(moved(shape, *shift) for shape in inside)
+            shapes_of_sheet = tuple(moved(shape, *shift) for shape in inside)
             place = f"sheet {len(sheets) + 1} of {way.count()}: row {row}, column {column}"
-            sheets.append(_sheet(f"{title}; {place}", *way.size, own, clip + shift))
+            sheets.append(_sheet(f"{title}; {place}", *way.size, shapes_of_sheet, clip + shift))
     return sheets
 
 
 def _pieces(low: float, high: float, seams: list[float]) -> list[tuple[float, float]]:
-    """From where to where each goes."""
+    """Return start and end of each piece."""
     begins = [low, *(seam - OVERLAP / 2 for seam in seams)]
     return list(zip(begins, [*(seam + OVERLAP / 2 for seam in seams), high], strict=True))
 
 
 def _registration(way: _Way) -> list[Shape]:
-    """Crosses where seams meet one another and the border; on both sheets that meet there."""
+    """Return crosses where seams meet each other and the border; they appear on both sheets."""
     places = []
     for k in (0, 1):
-        others = [way.box[0, 1 - k] + CROSS, *way.seams[1 - k], way.box[1, 1 - k] - CROSS]
-        places += [(seam, other)[:: 1 - 2 * k] for seam in way.seams[k] for other in others]
+        crossings = [way.box[0, 1 - k] + CROSS, *way.seams[1 - k], way.box[1, 1 - k] - CROSS]
+        places += [(seam, crossing)[:: 1 - 2 * k] for seam in way.seams[k] for crossing in crossings]
     marks: list[Shape] = []
     for x, y in dict.fromkeys(places):
         for step in ([CROSS, 0.0], [0.0, CROSS]):
@@ -194,10 +196,10 @@ def _registration(way: _Way) -> list[Shape]:
 
 
 def _sheet(title: str, width: float, height: float, shapes: tuple[Shape, ...], clip=None) -> Sheet:
-    """With its scale bars and its title."""
+    """Return a sheet with its scale bars and its title."""
     bars = [moved(shape, EDGE, EDGE) for shape in scale_bars(width - 2 * EDGE, height - 2 * EDGE)]
-    said = "1:1: print at 100 %, not fitted to the page, and measure the bars"
+    instruction = "1:1: print at 100 %, not fitted to the page, and measure the bars"
     if clip is not None:
-        said += "; cut one of two sheets from cross to cross and lay it on the other's crosses"
-    words = [Text(EDGE + SIDE, EDGE + 10.0, title, LETTERS), Text(EDGE + SIDE, EDGE + 7.0, said, 1.6)]
+        instruction += "; cut one of two sheets from cross to cross and lay it on the other's crosses"
+    words = [Text(EDGE + SIDE, EDGE + 10.0, title, LETTERS), Text(EDGE + SIDE, EDGE + 7.0, instruction, 1.6)]
     return Sheet(title, width, height, (Placed(shapes, clip), Placed((*bars, *words))))

@@ -1,4 +1,4 @@
-"""A sheet as SVG in mm."""
+"""SVG of a sheet in mm."""
 
 from html import escape
 
@@ -9,12 +9,12 @@ from stcal.drawing.sheets import Sheet
 
 COLOURS = {"black": "#000000", "white": "#ffffff", "grey": "#808080"}
 CAPITAL_SHARE = 0.72
-"""Height of a capital in parts of the font's size."""
+"""Height of a capital as a share of the font's size."""
 DASH = "3 1.5"
 
 
 def svg(sheet: Sheet) -> str:
-    """Text of the file: width, height and all lengths in mm; a group for each layer that is used, bottom one first."""
+    """Return the text of the file, all lengths in mm, with a group for each layer in use, the bottom layer first."""
     width, height = _number(sheet.width), _number(sheet.height)
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
@@ -29,8 +29,8 @@ def svg(sheet: Sheet) -> str:
             )
         clip = "" if placed.clip is None else f' clip-path="url(#clip{number})"'
         for layer in LAYERS:
-            if own := [shape for shape in placed.shapes if shape.layer == layer]:
-                lines += [f'<g class="{layer}"{clip}>', *(_element(shape, sheet.height) for shape in own), "</g>"]
+            if shapes := [shape for shape in placed.shapes if shape.layer == layer]:
+                lines += [f'<g class="{layer}"{clip}>', *(_element(shape, sheet.height) for shape in shapes), "</g>"]
     return "\n".join([*lines, "</svg>", ""])
 
 
@@ -44,8 +44,8 @@ def _element(shape: Shape, height: float) -> str:
         x, y = _number(shape.x), _number(height - shape.y)
         turn = f' transform="rotate(-90 {x} {y})"' if shape.turned else ""
         font = f'font-family="sans-serif" font-size="{_number(shape.height / CAPITAL_SHARE)}"'
-        how = f'{font} text-anchor="{shape.anchor}" fill="{colour}"{turn}'
-        return f'<text x="{x}" y="{y}" {how}>{escape(shape.words)}</text>'
+        attributes = f'{font} text-anchor="{shape.anchor}" fill="{colour}"{turn}'
+        return f'<text x="{x}" y="{y}" {attributes}>{escape(shape.words)}</text>'
     if isinstance(shape, Area):
         path = " ".join(_path(line, height) for line in shape.lines)
         return f'<path d="{path}" fill="{colour}" fill-rule="evenodd"/>'
@@ -65,5 +65,5 @@ def _path(points: np.ndarray, height: float, closed: bool = True) -> str:
 
 
 def _number(value: float) -> str:
-    """A length to the nanometre, without needless digits."""
+    """Return the text of a length to the nanometre, without trailing zeros."""
     return f"{value:.6f}".rstrip("0").rstrip(".")

@@ -1,4 +1,4 @@
-"""What was drawn, in words."""
+"""Text about a drawing for the terminal."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from stcal.drawing.shapes import said_mm
 
 
 def drawn_text(drawn: Drawn) -> str:
-    """Parts and sheets, and what to do with them."""
+    """Return the parts and sheets of a drawing, and how to use them, as text."""
     lines = []
     for part in drawn.parts:
         width, height = np.ptp(part.outline, axis=0).tolist()

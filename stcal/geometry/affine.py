@@ -29,18 +29,18 @@ class Affine:
         freeze(self, "translation", (3,), "translation")
 
     def matrix(self) -> np.ndarray:
-        """Homogeneous 4×4 matrix."""
+        """Return the homogeneous 4×4 matrix."""
         m = np.eye(4)
         m[:3, :3], m[:3, 3] = self.linear, self.translation
         return m
 
     def inverse(self) -> "Affine":
-        """b_from_a.
+        """Return b_from_a.
 
         Raises
         ------
         DegenerateError
-            The linear part flattens space.
+            The linear part is singular.
         """
         if np.linalg.cond(self.linear) > 1e12:
             raise DegenerateError(
@@ -54,7 +54,7 @@ class Affine:
     @overload
     def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
-        """a_from_c of b_from_c, or points (..., 3) of frame a of such of frame b, mm."""
+        """Return a_from_c for a transform b_from_c, or points in frame a for points (..., 3) in frame b, mm."""
         if isinstance(other, Affine):
             return Affine(self.linear @ other.linear, self.linear @ other.translation + self.translation)
         return np.asarray(other, float) @ self.linear.T + self.translation

@@ -8,7 +8,7 @@ from stcal.geometry.rigid import Rigid, Similarity
 
 
 def align_rigid(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Rigid:
-    """a_from_b that minimises Σ wᵢ‖aᵢ − a_from_b bᵢ‖² (Kabsch 1976, with Umeyama's sign).
+    """Return the a_from_b that minimises Σ wᵢ‖aᵢ − a_from_b bᵢ‖² (Kabsch 1976, with Umeyama's sign).
 
     Parameters
     ----------
@@ -25,12 +25,12 @@ def align_rigid(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None
 
 
 def align_similarity(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Similarity:
-    """a_from_b with scale (Umeyama 1991); arguments and errors as :func:`align_rigid`."""
+    """Return a_from_b with scale (Umeyama 1991); arguments and errors as :func:`align_rigid`."""
     return _align(xyz_a, xyz_b, weights, with_scale=True)
 
 
 def align_affine(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Affine:
-    """a_from_b of twelve parameters by linear least squares; arguments as :func:`align_rigid`.
+    """Return a_from_b with twelve parameters by linear least squares; arguments as :func:`align_rigid`.
 
     Raises
     ------
@@ -49,9 +49,9 @@ def align_affine(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | Non
 
 
 def best_rotations(cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations R, (..., 3, 3), that maximise tr(Rᵀ cross), and these maxima, (...).
+    """Return the rotations R, (..., 3, 3), that maximise tr(Rᵀ cross), and these maxima, (...).
 
-    ``cross`` : (..., 3, 3), Σ wᵢ aᵢ bᵢᵀ of centred points; then R is the rotation of a_from_b (Kabsch 1976).
+    ``cross`` : (..., 3, 3). If it is Σ wᵢ aᵢ bᵢᵀ of centred points, R is the rotation of a_from_b (Kabsch 1976).
     """
     u, s, vt = np.linalg.svd(cross)
     sign = np.ones(s.shape)
@@ -60,7 +60,7 @@ def best_rotations(cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _checked(xyz_a, xyz_b, weights, needed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points as arrays, and weights of sum 1."""
+    """Return the points as arrays, and the weights normalised to sum 1; refuse too few points and invalid weights."""
     a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
     if a.shape != b.shape or len(a) < needed:
         raise DegenerateError("E-POINTS-FEW", f"alignment: {len(a)} and {len(b)} points, {needed} or more pairs needed")
@@ -72,7 +72,7 @@ def _checked(xyz_a, xyz_b, weights, needed: int) -> tuple[np.ndarray, np.ndarray
 
 def _collinear(centred: np.ndarray) -> bool:
     values = np.linalg.eigvalsh(centred.T @ centred)
-    if values[1] > 1e-12 * values[2]:  # plain without the singular values, which a million points take long for
+    if values[1] > 1e-12 * values[2]:  # clear without the SVD, which is slow for a million points
         return False
     s = np.linalg.svd(centred, compute_uv=False)
     return len(s) < 2 or s[1] <= 1e-9 * s[0]

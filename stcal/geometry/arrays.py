@@ -12,9 +12,9 @@ Shape = tuple[int | None, ...]
 if TYPE_CHECKING:
 
     class Array:
-        """Type of a dataclass field that takes anything like an array and holds what :func:`freeze` makes of it.
+        """Type of a dataclass field that accepts any array-like and holds the read-only array of :func:`freeze`.
 
-        To a type checker it is a descriptor: the constructor accepts lists and tuples of numbers, reading gives an
+        To a type checker it is a descriptor: the constructor accepts lists and tuples of numbers, reading returns an
         ``np.ndarray``. At run time it is ``np.ndarray``. Only for fields; an optional one is ``np.ndarray | None``.
         """
 
@@ -32,9 +32,9 @@ def frozen(values: ArrayLike, shape: Shape | None = None, what: str = "array", d
     ----------
     values : array-like
     shape : tuple of int or None, optional
-        The shape needed; ``None`` in it admits any length. Any shape where not given.
+        Required shape; ``None`` in it admits any length. If it is not given, any shape is accepted.
     what : str
-        Names the values in messages.
+        Name of the values in messages.
     dtype : data type
 
     Returns
@@ -51,7 +51,7 @@ def frozen(values: ArrayLike, shape: Shape | None = None, what: str = "array", d
         array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
     ):
         raise InputError("E-ARRAY-SHAPE", f"{what}: shape {array.shape}, {shape} needed")
-    if array.dtype.kind == "f" and b"\0" in np.isfinite(array).tobytes():  # a third of the time of all() on few numbers
+    if array.dtype.kind == "f" and b"\0" in np.isfinite(array).tobytes():  # three times as fast as all() on few numbers
         raise InputError("E-ARRAY-NOT-FINITE", f"{what}: holds values that are not finite")
     array.flags.writeable = False
     return array
@@ -66,9 +66,9 @@ def freeze(
     ----------
     instance : dataclass instance
     field : str
-        Name of its field.
+        Name of the field.
     shape, what, dtype :
-        As of :func:`frozen`.
+        See :func:`frozen`.
 
     Raises
     ------

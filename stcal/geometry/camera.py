@@ -9,23 +9,24 @@ from stcal.geometry.arrays import Array, freeze
 
 MAX_NEWTON_STEPS = 50
 COEFFICIENTS = 12
-"""Of the distortion."""
+"""Number of distortion coefficients."""
 WIDEST_RAD = np.radians(89.0)
-"""From the axis, of what an equidistant camera may see: points of the plane Z = 1 are no further than 57."""
+"""Largest angle from the axis that an equidistant camera may see: points of the plane Z = 1 are within 57 of it."""
 NEAR_AXIS = 1e-8
-"""Squared, below which series are exact to rounding."""
+"""Largest squared radius at which the series expansion is exact to rounding."""
 UNDISTORT_TOLERANCE = 1e-12
 """Largest error of the inverse distortion, in normalised coordinates (1e-8 px at f = 10 000 px)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """A central camera with OpenCV's lens model, of perspective or of equidistant projection.
+    """A central camera with OpenCV's lens model and perspective or equidistant projection.
 
     Perspective: the ideal point (x, y) = (X, Y) / Z is distorted by OpenCV's rational model with thin prisms (its first
-    twelve coefficients; COLMAP's FULL_OPENCV without prisms). Equidistant: the point is put at its angle θ from the
-    axis, (x, y) θ / r, and distorted by 1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸, p1, p2, s1 and s3 (Kannala & Brandt 2006;
-    OpenCV's fisheye; COLMAP's THIN_PRISM_FISHEYE). Points are seen at less than 90° from the axis only.
+    twelve coefficients; COLMAP's FULL_OPENCV without prisms). Equidistant: the point is moved to the radius θ, its
+    angle from the axis: (x, y) θ / r. It is then distorted by 1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸, p1, p2, s1 and s3
+    (Kannala & Brandt 2006; OpenCV's fisheye; COLMAP's THIN_PRISM_FISHEYE). Only points at less than 90° from the axis
+    are seen.
 
     Parameters
     ----------
@@ -38,7 +39,7 @@ class Camera:
     distortion : (12,) array
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 in OpenCV's order; or the first eight.
     fisheye : bool
-        Equidistant; k5, k6, s2, s4 are 0 then.
+        True for equidistant projection; k5, k6, s2 and s4 must then be 0.
     """
 
     width: int
@@ -66,24 +67,24 @@ class Camera:
             )
 
     def same_as(self, other: "Camera") -> bool:
-        """Whether all numbers are equal."""
+        """Return True if size, projection and all parameters are equal."""
         kind = (self.width, self.height, self.fisheye) == (other.width, other.height, other.fisheye)
         return kind and bool((self.parameters() == other.parameters()).all())
 
     def parameters(self) -> np.ndarray:
-        """fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, (16,)."""
+        """Return fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, (16,)."""
         return np.concatenate([self.focal, self.centre, self.distortion])
 
     def coefficients(self) -> np.ndarray:
-        """The distortion, (8,) where there are no prisms, else (12,)."""
+        """Return the distortion coefficients, (8,) if all prism terms are zero, else (12,)."""
         return self.distortion if self.distortion[8:].any() else self.distortion[:8]
 
     def with_parameters(self, parameters: np.ndarray) -> "Camera":
-        """The camera of the same size and projection with other :meth:`parameters`."""
+        """Return a camera of the same size and projection with these :meth:`parameters`."""
         return Camera(self.width, self.height, parameters[:2], parameters[2:4], parameters[4:], self.fisheye)
 
     def parameter_jacobian(self, xy: np.ndarray) -> np.ndarray:
-        """Derivative (n, 2, 16) of the pixels of ideal normalised coordinates (n, 2) by :meth:`parameters`."""
+        """Return the derivative (n, 2, 16) of pixels by :meth:`parameters`, at ideal normalised coordinates (n, 2)."""
         jacobian = np.zeros((len(xy), 2, 4 + COEFFICIENTS))
         jacobian[:, [0, 1], [0, 1]] = self.distort(xy)
         jacobian[:, [0, 1], [2, 3]] = 1
@@ -107,7 +108,7 @@ class Camera:
         return jacobian
 
     def distort(self, xy: np.ndarray) -> np.ndarray:
-        """Distort.
+        """Apply the lens distortion to ideal normalised coordinates.
 
         Parameters
         ----------
@@ -128,30 +129,33 @@ class Camera:
         return np.stack(self._moved(x, y, r2, top / bottom), axis=-1)
 
     def distort_jacobian(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distort, with the derivative.
+        """Apply the lens distortion and return its derivative, too.
 
         Parameters
         ----------
-        xy
-            As of :meth:`distort`, which returns the first.
+        xy : (..., 2) array
+            Ideal normalised coordinates.
 
         Returns
         -------
         distorted : (..., 2) array
+            Result of :meth:`distort`.
         jacobian : (..., 2, 2) array
-            Their derivative by the ideal ones.
+            Derivative of the distorted by the ideal coordinates.
         """
         xy = ideal = np.asarray(xy, float)
         if self.fisheye:
             xy = _equidistant(ideal)
         distorted, jacobian = np.empty(xy.shape), np.empty((*xy.shape, 2))
-        distorted[..., 0], distorted[..., 1], *by = self._distorted_parts(xy[..., 0], xy[..., 1])
-        jacobian[..., 0, 0], jacobian[..., 0, 1], jacobian[..., 1, 0], jacobian[..., 1, 1] = by
+        distorted[..., 0], distorted[..., 1], *derivatives = self._distorted_parts(xy[..., 0], xy[..., 1])
+        jacobian[..., 0, 0], jacobian[..., 0, 1], jacobian[..., 1, 0], jacobian[..., 1, 1] = derivatives
         return distorted, jacobian @ _equidistant_jacobian(ideal) if self.fisheye else jacobian
 
     def _distorted_parts(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Distorted x and y, and their derivatives: x by x, x by y, y by x, y by y; all (...). Of an equidistant camera
-        by the point at its angle."""
+        """Return distorted x and y, and their derivatives: x by x, x by y, y by x, y by y; all (...).
+
+        For an equidistant camera ``x`` and ``y``, by which is differentiated, are the result of :func:`_equidistant`.
+        """
         k1, k2, p1, p2, k3, k4, k5, k6, *prisms = self.distortion.tolist()
         r2 = x * x + y * y
         top, bottom = self._radial(r2)
@@ -172,14 +176,14 @@ class Camera:
         return *self._moved(x, y, r2, radial), x_by_x, x_by_y, y_by_x, y_by_y
 
     def _radial(self, r2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Top and bottom, (...), of the factor by which the model moves points outwards; ``r2`` : (...)."""
+        """Return numerator and denominator, (...), of the radial distortion factor at squared radii ``r2`` (...)."""
         k1, k2, _, _, k3, k4, k5, k6 = self.distortion[:8].tolist()
         if self.fisheye:
             return 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4))), np.ones_like(r2)
         return 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
 
     def _moved(self, x, y, r2, radial) -> tuple[np.ndarray, np.ndarray]:
-        """Distorted x and y, (...)."""
+        """Return distorted x and y, (...), by radial factor, tangential terms and prisms."""
         p1, p2 = self.distortion[2:4].tolist()
         prisms = self.distortion[8:].tolist()
         moved_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
@@ -190,7 +194,7 @@ class Camera:
         return moved_x, moved_y
 
     def undistort(self, xy_distorted: np.ndarray) -> np.ndarray:
-        """Inverse of :meth:`distort` by Newton's method to 1e-12.
+        """Invert :meth:`distort` by Newton's method to 1e-12.
 
         Raises
         ------
@@ -206,7 +210,7 @@ class Camera:
             )
         x, y = start_x, start_y = target[..., 0].copy(), target[..., 1].copy()
         steps = 0
-        with np.errstate(over="ignore", invalid="ignore"):  # where it diverges; reported below
+        with np.errstate(over="ignore", invalid="ignore"):  # divergence is reported below
             while True:
                 now_x, now_y, x_by_x, x_by_y, y_by_x, y_by_y = self._distorted_parts(x, y)
                 off_x, off_y = now_x - start_x, now_y - start_y
@@ -230,8 +234,11 @@ class Camera:
         )
 
     def _perspective(self, xy: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Ideal coordinates (..., 2) of points without distortion, which are at their angle if the camera is
-        equidistant; ``target`` : (..., 2) of the pixels."""
+        """Return ideal normalised coordinates (..., 2) of undistorted points ``xy``.
+
+        For an equidistant camera the radius of ``xy`` is the angle. ``target`` : (..., 2) the distorted points, which
+        an error message converts to pixels.
+        """
         if not self.fisheye:
             return xy
         theta = np.hypot(xy[..., 0], xy[..., 1])
@@ -245,33 +252,33 @@ class Camera:
         return xy * np.where(theta > 0, np.tan(theta) / np.where(theta > 0, theta, 1.0), 1.0)[..., None]
 
     def pixel_from_normalised(self, xy: np.ndarray) -> np.ndarray:
-        """Pixels (..., 2) of ideal normalised coordinates (..., 2), lens distortion applied."""
+        """Return the pixels (..., 2) of ideal normalised coordinates (..., 2), lens distortion applied."""
         return self.distort(xy) * self.focal + self.centre
 
     def normalised_from_pixel(self, xy_px: np.ndarray) -> np.ndarray:
-        """Ideal normalised coordinates (..., 2) of pixels (..., 2), lens distortion removed."""
+        """Return ideal normalised coordinates (..., 2) of pixels (..., 2), lens distortion removed."""
         return self.undistort((np.asarray(xy_px, float) - self.centre) / self.focal)
 
     def project(self, xyz_camera: np.ndarray) -> np.ndarray:
-        """Pixels (..., 2) of points (..., 3) in the camera frame."""
+        """Return the pixels (..., 2) of points (..., 3) in the camera frame."""
         xyz = np.asarray(xyz_camera, float)
         return self.pixel_from_normalised(xyz[..., :2] / xyz[..., 2:])
 
 
 def _equidistant(xy: np.ndarray) -> np.ndarray:
-    """Points (..., 2) of the plane Z = 1 at their angles from the axis, rad."""
+    """Return points (..., 2) of the plane Z = 1 with their radius replaced by the angle from the axis, rad."""
     xy = np.asarray(xy, float)
     return xy * _angle_share((xy**2).sum(-1))[..., None]
 
 
 def _angle_share(r2: np.ndarray) -> np.ndarray:
-    """arctan(r) / r."""
+    """Return arctan(r) / r for squared radii ``r2``."""
     r = np.sqrt(r2)
     return np.where(r2 > NEAR_AXIS, np.arctan(r) / np.where(r2 > NEAR_AXIS, r, 1.0), 1 - r2 / 3)
 
 
 def _equidistant_jacobian(xy: np.ndarray) -> np.ndarray:
-    """(..., 2, 2) derivative of :func:`_equidistant`."""
+    """Return the derivative (..., 2, 2) of :func:`_equidistant`."""
     r2 = (xy**2).sum(-1)
     share, near = _angle_share(r2), r2 <= NEAR_AXIS
     along = np.where(near, -2 / 3 + 4 / 5 * r2, (1 / (1 + r2) - share) / np.where(near, 1.0, r2))

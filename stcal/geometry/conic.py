@@ -6,7 +6,7 @@ from stcal.errors import DegenerateError
 
 
 def circle_image_offset(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
-    """Points whose ordinary projection is the centre of the ellipse that each circle projects to.
+    """Return points whose ordinary projection is the centre of the ellipse that each circle projects to.
 
     With centre C, unit normal n and radius r the ellipse centre is the projection of
     ``C + (r²/C_z)(n_z·n − e_z)`` (from the dual conic M·diag(r², r², −1)·Mᵀ, M = [e₁ e₂ C];
@@ -25,7 +25,7 @@ def circle_image_offset(xyz_camera: np.ndarray, normal_camera: np.ndarray, radiu
 
 
 def circle_images(xyz_camera: np.ndarray, axes_camera: np.ndarray, radius_mm: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Ellipses of n circles of one plane before the camera, by the dual conic of :func:`circle_image_offset`.
+    """Return the image ellipses of n circles of one plane, by the dual conic of :func:`circle_image_offset`.
 
     Parameters
     ----------
@@ -48,13 +48,16 @@ def circle_images(xyz_camera: np.ndarray, axes_camera: np.ndarray, radius_mm: np
 
 
 def shape_of_square(square: np.ndarray) -> np.ndarray:
-    """Symmetric shapes S of ellipses, (..., 2, 2), from S·Sᵀ; negative eigenvalues count as zero."""
+    """Return the symmetric shapes S of ellipses, (..., 2, 2), from S·Sᵀ; negative eigenvalues count as zero."""
     value, vector = np.linalg.eigh(square)
     return (vector * np.sqrt(np.maximum(value, 0))[..., None, :]) @ np.swapaxes(vector, -1, -2)
 
 
 def circle_conic(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: float) -> np.ndarray:
-    """Conic matrix (3, 3), xᵀ Q x = 0 in normalised coordinates, of one circle's image; Q[0, 0] + Q[1, 1] > 0."""
+    """Return the conic matrix Q (3, 3) of one circle's image.
+
+    xᵀ Q x = 0 in normalised coordinates, and Q[0, 0] + Q[1, 1] > 0.
+    """
     n = np.asarray(normal_camera, float)
     e1 = np.cross(n, [1.0, 0, 0] if abs(n[0]) < 0.9 else [0, 1.0, 0])
     e1 /= np.linalg.norm(e1)
@@ -65,12 +68,12 @@ def circle_conic(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: f
 
 
 def ellipse_of_conic(conic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centre (2,) and shape (2, 2) of an ellipse; the rim is ``centre + shape @ unit circle``, shape symmetric.
+    """Return centre (2,) and shape (2, 2) of an ellipse; the rim is ``centre + shape @ unit circle``, shape symmetric.
 
     Raises
     ------
     DegenerateError
-        The conic is no real ellipse: a parabola, a hyperbola, a point, or empty.
+        The conic is no real ellipse but a parabola, a hyperbola, a point, or empty.
     """
     q = conic[:2, :2]
     if np.linalg.det(q) <= 0:
@@ -87,7 +90,7 @@ def ellipse_of_conic(conic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def conic_of_ellipse(centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Conic matrix (3, 3) of the ellipse ``centre + shape @ unit circle``; inverse of :func:`ellipse_of_conic`."""
+    """Return the conic matrix (3, 3) of the ellipse ``centre + shape @ unit circle``; see :func:`ellipse_of_conic`."""
     inverse = np.linalg.inv(shape)
     to_unit = np.column_stack([inverse, -inverse @ centre])
     m = np.vstack([to_unit, [0, 0, 1.0]])

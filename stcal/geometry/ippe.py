@@ -1,4 +1,4 @@
-"""The two poses that a plane seen from afar leaves (IPPE: Collins & Bartoli 2014, Infinitesimal plane-based pose
+"""The two candidate poses of a plane seen from afar (IPPE: Collins & Bartoli 2014, Infinitesimal plane-based pose
 estimation, IJCV 109, sec. 3)."""
 
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from stcal.geometry.rigid import Rigid, skew
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanePoses:
-    """Two poses camera_from_plane that agree with a homography about one point to first order.
+    """The two poses camera_from_plane that agree with a homography about one point to first order.
 
-    ``poses`` : both; ``determinant`` : of the homography's derivative at the point, normalised coordinates by units of
-    the plane, squared; ``foreshortening`` : the same for a plane at unit distance that is looked at straight: the
-    cosine of the angle between its normal and the line of sight, whatever its size and distance.
+    ``poses`` : both poses; ``determinant`` : determinant of the homography's derivative at the point, in (normalised
+    coordinates per unit of the plane)²; ``foreshortening`` : cosine of the angle between the plane's normal and the
+    line of sight, independent of the size and distance of the plane.
     """
 
     poses: tuple[Rigid, Rigid]
@@ -25,51 +25,51 @@ class PlanePoses:
 
 
 def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePoses:
-    """Both poses from n ≥ 4 points (n, 2) of a plane and their ideal normalised coordinates (n, 2).
+    """Return both poses from n ≥ 4 points (n, 2) of a plane and their ideal normalised coordinates (n, 2).
 
-    The homography is that of the normalised DLT, its derivative the one at the mean of the points. The frame of the
-    plane has its Z away from the camera.
+    The homography is computed by the normalised DLT, its derivative at the mean of the points. The Z axis of the plane
+    points away from the camera.
 
     Raises
     ------
     DegenerateError
-        Points that fix no homography, or a plane that is seen edge-on or from behind.
+        The points do not determine a homography, or the plane is seen edge-on or from behind.
     """
-    xy, seen = np.asarray(xy_plane, float), np.asarray(xy_normalised, float)
+    xy, xy_image = np.asarray(xy_plane, float), np.asarray(xy_normalised, float)
     middle = xy.mean(0)
-    homography = fit_homography(xy - middle, seen)
+    homography = fit_homography(xy - middle, xy_image)
     jacobian = homography_jacobian(homography, np.zeros((1, 2)))[0]
     determinant = float(np.linalg.det(jacobian))
     if determinant <= 0:
         raise DegenerateError(
             "E-POINTS-MIRRORED", "plane: its points are seen mirrored; seen from behind, or numbered wrongly"
         )
-    at = homography[:2, 2] / homography[2, 2]
-    camera_from_sight = _turn_to(np.append(at, 1.0))
-    # What a step of the plane is on a screen square to the line of sight, at unit distance.
-    flat = np.linalg.solve(np.column_stack([np.eye(2), -at]) @ camera_from_sight[:, :2], jacobian)
+    sight_point = homography[:2, 2] / homography[2, 2]
+    camera_from_sight = _turn_to(np.append(sight_point, 1.0))
+    # Derivative of the projection onto a screen perpendicular to the line of sight, at unit distance.
+    flat = np.linalg.solve(np.column_stack([np.eye(2), -sight_point]) @ camera_from_sight[:, :2], jacobian)
     large, small = np.linalg.svd(flat, compute_uv=False)
     upper = flat / large
-    rest = np.eye(2) - upper.T @ upper
-    low = np.sqrt(np.maximum(np.diag(rest), 0)) * [1.0, -1.0 if rest[0, 1] < 0 else 1.0]
+    remainder = np.eye(2) - upper.T @ upper
+    low = np.sqrt(np.maximum(np.diag(remainder), 0)) * [1.0, -1.0 if remainder[0, 1] < 0 else 1.0]
     poses = []
     for sign in (1.0, -1.0):
         first, second = np.append(upper[:, 0], sign * low[0]), np.append(upper[:, 1], sign * low[1])
         turn = np.column_stack([first, second, np.cross(first, second)])
         u, _, vt = np.linalg.svd(camera_from_sight @ turn)
-        poses.append(_placed(u @ vt, xy, seen))
+        poses.append(_placed(u @ vt, xy, xy_image))
     return PlanePoses((poses[0], poses[1]), determinant, float(small / large))
 
 
 def _turn_to(sight: np.ndarray) -> np.ndarray:
-    """Rotation that takes Z to the direction ``sight``, the shortest way; it lies before the camera."""
+    """Return the smallest rotation that takes Z to the direction ``sight``, which points forwards (z > 0)."""
     x, y, z = sight / np.linalg.norm(sight)
     cross = skew(np.array([-y, x, 0.0]))
     return np.eye(3) + cross + cross @ cross / (1 + z)
 
 
 def _placed(rotation: np.ndarray, xy: np.ndarray, seen: np.ndarray) -> Rigid:
-    """With the translation that fits the points best, linear in the depths."""
+    """Return the pose with this rotation and the translation that fits the points best (linear least squares)."""
     turned = xy @ rotation[:, :2].T
     rows = np.zeros((len(xy), 2, 3))
     rows[:, 0, 0] = rows[:, 1, 1] = 1

@@ -1,9 +1,8 @@
-"""Least squares on a manifold: the one descent of the package, of one problem or of many at once.
+"""Least squares on a manifold: the package's only descent, for one problem or many at once.
 
-The state moves; the parameters are always small motions about it. Levenberg's damping, scaled by the diagonal
-(Marquardt 1963), shrinks with every step that lowers the cost and grows with every one that does not. A minimum is
-reached when the next whole step promises to lower the cost, in units of σ², by no more than a share of the cost that
-rounding hides.
+The parameters are always small motions about the current state. Levenberg's damping, scaled by the diagonal
+(Marquardt 1963), shrinks when a step lowers the cost as predicted and grows when it does not. A minimum is reached
+when the predicted decrease of the next undamped step, in units of σ², is a share of the cost that rounding hides.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,38 +16,39 @@ from stcal.geometry.rigid import Rigid
 
 MAX_STEPS = 200
 SETTLED = 1e-12
-"""Share of the cost that the last step may promise: with a cost of 10⁴ it moves no parameter by more than 1e-4 σ, and
-what is left after it is far less."""
+"""Largest predicted decrease of the last step, as a share of the cost. At a cost of 10⁴ such a step moves no parameter
+by more than 1e-4 σ, and the remaining error is far smaller."""
 LEAST_GAIN = 1e-12
-"""In units of σ²: what exact data still promise by rounding, a millionth of σ."""
+"""Decrease that rounding alone predicts for exact data, in units of σ²: a step of a millionth of σ."""
 ROUNDING = 1e-12
-"""Share of the cost by which a step at the minimum seems to raise it."""
+"""Share of the cost by which rounding may seem to raise the cost at the minimum."""
 MAX_DAMPING = 1e12
 UNKEPT, KEPT = 1e-8, 0.1
-"""A promise of so little, in units of σ², of which not even that share is kept, is the last: the rest is rounding."""
+"""A descent ends if the predicted decrease is at most ``UNKEPT``, in units of σ², and the actual decrease is less than
+the share ``KEPT`` of it: what remains is rounding."""
 TRUSTED = 0.5
-"""Share of a promise that was kept, from which on the damping shrinks; below ``KEPT`` it grows."""
+"""Ratio of actual to predicted decrease above which the damping shrinks; below ``KEPT`` it grows."""
 DAMPED = 1e-4
-"""Where derivatives neglect how residuals bend, only damped steps lower the cost. They may be trusted to have ended
-when the whole step promises no more than this, in units of σ²: a hundredth of σ."""
+"""Largest predicted decrease of an undamped step at which a damped descent counts as ended, in units of σ²: a step of a
+hundredth of σ. Where the derivatives neglect the curvature of the residuals, only damped steps lower the cost."""
 NEARLY_WHOLE = 1e-3
-"""Damping up to which a step's promise stands for that of the whole step."""
+"""Largest damping at which a step's predicted decrease stands for that of the undamped step."""
 SLOW = 0.01
-"""A problem behind the best one by ``hopeless``, of which a step promises less than this share of that distance, is
-not followed further: with large residuals the last steps are many, and short."""
+"""A problem whose cost exceeds the best one by more than ``hopeless`` is given up when its predicted decrease is less
+than this share of the excess: with large residuals the last steps are many and short."""
 TINY = 1e-300
 
 
 class Linear(Protocol):
-    """A least-squares problem about a state, linear in the parameters."""
+    """A least-squares problem, linearised about a state."""
 
     @property
     def cost(self) -> float | np.ndarray:
-        """Of the state, in units of σ²; (h,) for h problems at once; infinite where the state is impossible."""
+        """Cost of the state, in units of σ²; (h,) for h problems at once; infinite where the state is impossible."""
         ...
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float | np.ndarray]:
-        """The damped step, (k,) or (h, k), and by how much it promises to lower the cost."""
+        """Return the damped step, (k,) or (h, k), and the predicted decrease of the cost."""
         ...
 
 
@@ -58,8 +58,11 @@ L = TypeVar("L", bound=Linear)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalEquations:
-    """``cost`` ; ``normal`` : (k, k); ``gradient`` : (k,) half of the cost's; or (h,), (h, k, k) and (h, k) of h
-    problems. A parameter that nothing determines stays where it is."""
+    """Normal equations of one problem, or of h problems at once.
+
+    ``cost`` : number, or (h,); ``normal`` : (k, k), or (h, k, k); ``gradient`` : (k,), or (h, k), half the gradient of
+    the cost. A parameter that nothing determines is not moved.
+    """
 
     cost: float | np.ndarray
     normal: np.ndarray
@@ -67,17 +70,17 @@ class NormalEquations:
 
     @classmethod
     def of(cls, residual: np.ndarray, jacobian: np.ndarray) -> "NormalEquations":
-        """Of residuals (n,) over their σ and their derivatives (n, k)."""
+        """Return the normal equations of residuals (n,) and their derivatives (n, k), both divided by σ."""
         return cls(float(residual @ residual), jacobian.T @ jacobian, jacobian.T @ residual)
 
     @classmethod
     def impossible(cls, count: int) -> "NormalEquations":
-        """Of a state that must not be taken, with this many parameters."""
+        """Return the equations of an inadmissible state with ``count`` parameters: the cost is infinite."""
         return cls(np.inf, np.eye(count), np.zeros(count))
 
     @classmethod
     def stacked(cls, each: Sequence["NormalEquations"]) -> "NormalEquations":
-        """Of h problems, from those of one each."""
+        """Return h problems as one, from the normal equations of single problems."""
         cost, normal, gradient = (np.array([getattr(one, name) for one in each]) for name in cls.__slots__)
         return cls(cost, normal, gradient)
 
@@ -96,10 +99,11 @@ class NormalEquations:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum(Generic[S, L]):
-    """Where a descent ended.
+    """End of a descent.
 
-    ``linear`` : the problem about ``state``; ``converged`` : whether it is a minimum, (h,) for h problems; ``promised``
-    : by how much the last step was to lower the cost, in units of σ²; ``steps`` : that were tried.
+    ``linear`` : the problem linearised about ``state``; ``converged`` : True if the state is a minimum, (h,) for h
+    problems; ``promised`` : predicted decrease of the cost by the last step, in units of σ²; ``steps`` : number of
+    steps tried.
     """
 
     state: S
@@ -109,12 +113,12 @@ class Minimum(Generic[S, L]):
     steps: int
 
     def required(self, what: str, remedy: str, accepted: float = 0.0) -> "Minimum[S, L]":
-        """This, if it is a minimum, or if no step promises more than ``accepted``, in units of σ².
+        """Return this result if it is a minimum, or if the last predicted decrease is at most ``accepted``, in σ².
 
         Raises
         ------
         ConvergenceError
-            It is none; ``what`` and ``remedy`` begin and end the message.
+            It is no minimum; the message begins with ``what`` and ends with ``remedy``.
         """
         if not (self.converged | (self.promised <= accepted)).all():
             raise ConvergenceError(
@@ -126,7 +130,7 @@ class Minimum(Generic[S, L]):
 
 
 def _one(take: np.ndarray, new, old):
-    """The new state or the old one, of a single problem."""
+    """Return the new state if ``take``, else the old one; for a single problem."""
     return new if take else old
 
 
@@ -143,76 +147,78 @@ def minimise(
     max_steps: int = MAX_STEPS,
     hopeless: float = np.inf,
 ) -> Minimum[S, L]:
-    """State of least cost, from a start.
+    """Return the state of least cost, found by descent from a start.
 
     Parameters
     ----------
     state
-        The start; of h problems at once where the costs of ``linearise`` are (h,).
+        Start of the descent; of h problems at once if the costs of ``linearise`` are (h,).
     linearise
-        The problem about a state.
+        Returns the problem linearised about a state.
     moved
-        The state after a step (k,), or (h, k).
+        Returns the state after a step (k,), or (h, k).
     cost
-        Cost of a state, if it comes cheaper than ``linearise``, which is then called at accepted states only; of a
-        single problem.
+        Returns the cost of a state, for a single problem. To be given if it is cheaper than ``linearise``, which is
+        then called at accepted states only.
     select
-        Of (take (h,), new, old) for h problems: the new state and :class:`Linear` where ``take``, else the old ones.
+        Given (take (h,), new, old) for h problems, returns the new state or :class:`Linear` where ``take``, else the
+        old one.
     damping, least_damping
-        At the start, and at least: what keeps directions regular that nothing determines.
+        Damping at the start, and its lower limit, which regularises directions that nothing determines.
     settled, least_gain
-        A minimum is reached when the next whole step promises no more than this share of the cost plus this much, σ².
+        A minimum is reached when the predicted decrease of the next undamped step is at most ``settled`` times the
+        cost plus ``least_gain``, in σ².
     max_steps
-        That are tried.
+        Largest number of steps tried.
     hopeless
-        By how much a problem may be worse than the best of all and still be followed to its end; see :data:`SLOW`.
+        Excess of a problem's cost over the best one up to which it is followed to its end; see :data:`SLOW`.
 
     Returns
     -------
     Minimum
-        It says whether it converged; see :meth:`Minimum.required`.
+        Holds whether the descent converged; see :meth:`Minimum.required`.
     """
-    here = linearise(state)
-    damp = np.full(np.shape(here.cost), float(damping))
+    current = linearise(state)
+    damp = np.full(np.shape(current.cost), float(damping))
     done = np.zeros(damp.shape, bool)
     converged, promised = done.copy(), np.full(damp.shape, np.inf)
     for steps in range(max_steps + 1):
-        step, gain = here.step(damp)
-        limit = settled * np.asarray(here.cost) + least_gain
-        small = (gain <= limit) & np.isfinite(here.cost)
+        step, gain = current.step(damp)
+        limit = settled * np.asarray(current.cost) + least_gain
+        small = (gain <= limit) & np.isfinite(current.cost)
         if (small & ~done & (damp > NEARLY_WHOLE)).any():
-            whole = here.step(np.full(damp.shape, least_damping))[1]
+            whole = current.step(np.full(damp.shape, least_damping))[1]
             small &= (damp <= NEARLY_WHOLE) | (whole <= np.maximum(limit, DAMPED))
         promised = np.where(done, promised, gain)
         if steps == max_steps:
             break
-        with np.errstate(invalid="ignore"):  # two that are impossible
-            behind = here.cost - np.min(here.cost)
+        with np.errstate(invalid="ignore"):  # both costs may be infinite
+            behind = current.cost - np.min(current.cost)
         done |= (behind > hopeless) & (gain < SLOW * behind)
         last = done | small | (damp > MAX_DAMPING)
         trial = moved(state, np.where(done[..., None], 0.0, step))
         if cost:
-            there, reached = None, cost(trial)
+            trial_linear, reached = None, cost(trial)
         else:
-            there = linearise(trial)
-            reached = there.cost
-        better = (reached <= np.asarray(here.cost) * (1 + ROUNDING)) & ~done
+            trial_linear = linearise(trial)
+            reached = trial_linear.cost
+        better = (reached <= np.asarray(current.cost) * (1 + ROUNDING)) & ~done
         with np.errstate(invalid="ignore"):
-            fall = here.cost - reached
+            fall = current.cost - reached
         unkept = (gain <= UNKEPT) & (fall < KEPT * gain) & (damp <= NEARLY_WHOLE)
         converged |= (small | unkept) & ~done
         done = last | unkept
         if better.any():
-            here = select(better, linearise(trial) if there is None else there, here)
+            current = select(better, linearise(trial) if trial_linear is None else trial_linear, current)
             state = select(better, trial, state)
         if done.all():
             break
         damp = np.where(fall < KEPT * gain, np.maximum(10 * damp, NEARLY_WHOLE), damp)
         damp = np.where(fall > TRUSTED * gain, np.maximum(damp / 10, least_damping), damp)
-    return Minimum(state, here, converged, promised, steps)
+    return Minimum(state, current, converged, promised, steps)
 
 
 def perturbed(pose: Rigid, step: np.ndarray) -> Rigid:
-    """A pose after a left perturbation (6,), rotation rad and translation."""
+    """Return a pose after a left perturbation (6,): rotation (rad) and translation."""
     turn = Rigid.exp(step)
     return Rigid(turn.rotation @ pose.rotation, pose.translation + turn.translation)

@@ -1,4 +1,4 @@
-"""Normal equations: unknowns reduced away (Schur complement), free directions held, inverses of what is determined."""
+"""Normal equations: elimination of unknowns (Schur complement), inner constraints, and generalised inverses."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,17 @@ import numpy as np
 from stcal.geometry.rigid import skew
 
 SINGULAR = 1e-11
-"""Eigenvalue of a normal matrix of unit diagonal below which a direction is not determined."""
+"""Eigenvalue of a normal matrix of unit diagonal below which a direction counts as undetermined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reduction:
-    """m blocks of unknowns, a in each, reduced away from normal equations over k others.
+    """Elimination of m blocks of ``a`` unknowns each from the normal equations of k other unknowns.
 
-    ``normal`` : (k, k) and ``right`` : (k,) what has to be subtracted from those of the others; ``step`` : (m, a) of
-    the blocks where the others stay, ``from_kept`` : (m, a, k) what a step of the others takes from it; ``inverse`` :
-    (m, a, a) of the blocks; ``gain`` : by how much ``step`` alone lowers the cost.
+    ``normal`` : (k, k) and ``right`` : (k,) are to be subtracted from normal matrix and right-hand side of the other
+    unknowns; ``step`` : (m, a) step of the blocks if the others stay; ``from_kept`` : (m, a, k) is multiplied by the
+    step of the others and subtracted from ``step``; ``inverse`` : (m, a, a) inverses of the blocks; ``gain`` : decrease
+    of the cost by ``step`` alone.
     """
 
     normal: np.ndarray
@@ -27,21 +28,21 @@ class Reduction:
     gain: float
 
     def back(self, kept: np.ndarray) -> np.ndarray:
-        """Steps (m, a) of the blocks beside a step (k,) of the others."""
+        """Return the steps (m, a) of the blocks that belong to a step (k,) of the other unknowns."""
         return self.step - self.from_kept @ kept
 
 
 def reduce(block: np.ndarray, right: np.ndarray, cross: np.ndarray) -> Reduction:
-    """Reduce independent blocks of unknowns.
+    """Eliminate independent blocks of unknowns.
 
     Parameters
     ----------
     block
-        (m, a, a) their normal matrices.
+        (m, a, a) normal matrices of the blocks.
     right
-        (m, a) their right-hand sides.
+        (m, a) right-hand sides of the blocks.
     cross
-        (m, a, k) between them and the others.
+        (m, a, k) mixed parts of the normal matrix, blocks by other unknowns.
 
     Raises
     ------
@@ -61,16 +62,16 @@ def reduce(block: np.ndarray, right: np.ndarray, cross: np.ndarray) -> Reduction
 def blocks_of(
     jacobian: np.ndarray, residual: np.ndarray, index: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Diagonal blocks (count, k, k) of a normal matrix and right-hand side (count, k).
+    """Return the diagonal blocks (count, k, k) of a normal matrix and the right-hand sides (count, k).
 
     Parameters
     ----------
     jacobian
-        (n, c, k) derivatives of each observation by the unknowns of one block, over σ.
+        (n, c, k) derivatives of each observation by the unknowns of its block, divided by σ.
     residual
-        (n, c) observed minus computed, over σ.
+        (n, c) observed minus computed, divided by σ.
     index
-        (n,) which block.
+        (n,) block of each observation.
     """
     k = jacobian.shape[2]
     block, right = np.zeros((count, k, k)), np.zeros((count, k))
@@ -80,7 +81,7 @@ def blocks_of(
 
 
 def free_motions(xyz: np.ndarray, scale: bool) -> np.ndarray:
-    """Orthonormal directions (3n, 6) in which points (n, 3) move as one, or (3n, 7) with a change of scale."""
+    """Return orthonormal directions (3n, 6) of rigid motions of points (n, 3), or (3n, 7) with a change of scale."""
     middle = xyz - xyz.mean(0)
     parts = [-skew(middle), np.broadcast_to(np.eye(3), (len(xyz), 3, 3))] + [middle[:, :, None]] * scale
     columns = np.concatenate(parts, axis=2)
@@ -88,7 +89,7 @@ def free_motions(xyz: np.ndarray, scale: bool) -> np.ndarray:
 
 
 def constrained_inverse(normal: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Inverse of a normal matrix (k, k) with inner constraints: of all datums that of smallest trace over the points.
+    """Return the inverse of a normal matrix (k, k) with inner constraints: the datum of smallest trace over the points.
 
     Parameters
     ----------
@@ -100,6 +101,6 @@ def constrained_inverse(normal: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 
 def generalised_inverse(normal: np.ndarray) -> np.ndarray:
-    """Inverse of a normal matrix (k, k), scaled; what nothing determines gets no part in it."""
+    """Return the pseudo-inverse of a normal matrix (k, k), scaled by its diagonal; undetermined directions are 0."""
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     return np.linalg.pinv(normal / scale[:, None] / scale, rcond=SINGULAR, hermitian=True) / scale[:, None] / scale

@@ -11,7 +11,8 @@ from stcal.geometry.rigid import Rigid, skew
 
 MAX_STEPS = 100
 EXACT = 1e-22
-"""What the last step of a pose may promise, in squared normalised coordinates: a hundred-billionth of the distance."""
+"""Largest predicted decrease at the minimum of a pose, in squared normalised coordinates: a step of a hundred-billionth
+of the distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,16 +30,16 @@ class Plane:
         freeze(self, "normal", (3,), "plane normal")
 
     def distance(self, xyz: np.ndarray) -> np.ndarray:
-        """Signed distances, (n,), of points (n, 3)."""
+        """Return the signed distances, (n,), of points (n, 3)."""
         return np.asarray(xyz, float) @ self.normal - self.offset
 
     def project(self, xyz: np.ndarray) -> np.ndarray:
-        """Foot points on the plane, same shape as ``xyz``."""
+        """Return the foot points on the plane, same shape as ``xyz``."""
         return xyz - np.multiply.outer(self.distance(xyz), self.normal)
 
 
 def fit_plane(xyz: np.ndarray, towards: np.ndarray | None = None) -> Plane:
-    """Total-least-squares plane through (n, 3) points, normal on the side of direction ``towards``.
+    """Return the total-least-squares plane through (n, 3) points, its normal on the side of direction ``towards``.
 
     Raises
     ------
@@ -50,7 +51,10 @@ def fit_plane(xyz: np.ndarray, towards: np.ndarray | None = None) -> Plane:
 
 
 def fit_planes(xyz: np.ndarray, towards: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """:func:`fit_plane` of each of k sets of points, (k, n, 3): normals (k, 3), offsets (k,) and spreads (k,)."""
+    """Fit a plane to each of k sets of points, (k, n, 3); see :func:`fit_plane`.
+
+    Returns normals (k, 3), offsets (k,) and RMS distances (k,).
+    """
     n = xyz.shape[1]
     if n < 3:
         raise DegenerateError("E-POINTS-FEW", f"plane: {n} points, 3 needed")
@@ -65,7 +69,7 @@ def fit_planes(xyz: np.ndarray, towards: np.ndarray | None = None) -> tuple[np.n
 
 
 def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
-    """3×3 homography a_from_b from n ≥ 4 point pairs, (n, 2): normalised DLT (Hartley & Zisserman, alg. 4.2).
+    """Return the 3×3 homography a_from_b of n ≥ 4 point pairs (n, 2): normalised DLT (Hartley & Zisserman, alg. 4.2).
 
     Raises
     ------
@@ -75,17 +79,19 @@ def fit_homography(xy_b: np.ndarray, xy_a: np.ndarray) -> np.ndarray:
     b, a = np.asarray(xy_b, float), np.asarray(xy_a, float)
     if len(b) < 4:
         raise DegenerateError("E-POINTS-FEW", f"homography: {len(b)} point pairs, 4 needed")
-    (found,) = fit_homographies(b[None], a[None], np.ones((1, len(b)), bool))
-    if not np.isfinite(found).all():
+    (homography,) = fit_homographies(b[None], a[None], np.ones((1, len(b)), bool))
+    if not np.isfinite(homography).all():
         raise DegenerateError(
             "E-POINTS-COLLINEAR", "homography: the points do not determine it (three of four on a line)"
         )
-    return found
+    return homography
 
 
 def fit_homographies(xy_b: np.ndarray, xy_a: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """:func:`fit_homography` of each of k sets of point pairs, (k, n, 2), of which four or more are ``used``, a mask
-    (k, n): (k, 3, 3), NaN where they do not determine one."""
+    """Return the homographies (k, 3, 3) of k sets of point pairs, (k, n, 2); see :func:`fit_homography`.
+
+    ``used`` : (k, n) mask of the pairs to use, four or more per set. A homography that they do not determine is NaN.
+    """
     count, on = used.sum(1), used[..., None]
 
     def normalised(p):
@@ -106,7 +112,8 @@ def fit_homographies(xy_b: np.ndarray, xy_a: np.ndarray, used: np.ndarray) -> np
     rows = np.where(on[..., None], rows, 0).reshape(len(b), -1, 9)
     _, s, vt = np.linalg.svd(rows, full_matrices=rows.shape[1] < 9)
     normal = vt[:, 8].reshape(-1, 3, 3)
-    # Three of four on a line in both planes leave it open; in one plane only, they force a singular matrix.
+    # Three of four points on a line in both planes leave the homography undetermined; in one plane only, they force a
+    # singular matrix.
     ok = (s[:, 7] >= 1e-9 * s[:, 0]) & (np.linalg.cond(normal) <= 1e9)
     h = np.full((len(b), 3, 3), np.nan)
     h[ok] = np.linalg.inv(na[ok]) @ normal[ok] @ nb[ok]
@@ -116,27 +123,27 @@ def fit_homographies(xy_b: np.ndarray, xy_a: np.ndarray, used: np.ndarray) -> np
 
 
 def apply_homography(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
-    """Map points (..., 2); (k, n, 2) by k homographies (k, 3, 3) at once."""
+    """Return points (..., 2) mapped by a homography, or (k, n, 2) mapped by k homographies (k, 3, 3)."""
     mapped = _mapped(a_from_b, xy_b)
     return mapped[..., :2] / mapped[..., 2:]
 
 
 def _mapped(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
-    """Homogeneous images (..., 3)."""
-    there = a_from_b[:, 2] if a_from_b.ndim == 2 else a_from_b[:, None, :, 2]
-    return np.asarray(xy_b, float) @ np.swapaxes(a_from_b[..., :2], -1, -2) + there
+    """Return the homogeneous images (..., 3) of points."""
+    constant = a_from_b[:, 2] if a_from_b.ndim == 2 else a_from_b[:, None, :, 2]
+    return np.asarray(xy_b, float) @ np.swapaxes(a_from_b[..., :2], -1, -2) + constant
 
 
 def homography_jacobian(a_from_b: np.ndarray, xy_b: np.ndarray) -> np.ndarray:
-    """Jacobians of :func:`apply_homography`, (..., 2, 2), at points (..., 2); of k homographies likewise."""
+    """Return the Jacobians (..., 2, 2) of :func:`apply_homography` at points (..., 2); also for k homographies."""
     mapped = _mapped(a_from_b, xy_b)
     w = mapped[..., 2, None, None]
-    each = a_from_b if a_from_b.ndim == 2 else a_from_b[:, None]
-    return (each[..., :2, :2] - mapped[..., :2, None] / w * each[..., 2:, :2]) / w
+    homography = a_from_b if a_from_b.ndim == 2 else a_from_b[:, None]
+    return (homography[..., :2, :2] - mapped[..., :2, None] / w * homography[..., 2:, :2]) / w
 
 
 def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
-    """Pose of a plane with a metric frame from its homography into normalised image coordinates.
+    """Return the pose of a plane with a metric frame from its homography into normalised image coordinates.
 
     Zhang (2000), closed form: the first two columns are the plane's axes up to scale. The pattern lies in
     front of the camera (positive depth of the plane's origin where the homography has that sign).
@@ -150,12 +157,12 @@ def camera_from_plane(normalised_from_plane: np.ndarray) -> Rigid:
 
 
 def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normalised: np.ndarray) -> Rigid:
-    """Pose of least reprojection error of a plane's points.
+    """Return the pose that minimises the reprojection error of a plane's points.
 
     Parameters
     ----------
     camera_from_plane : Rigid
-        To start from, mm.
+        Start of the descent, mm.
     xy_plane : (n, 2) array
         Points in the plane's frame, mm.
     xy_normalised : (n, 2) array
@@ -169,7 +176,7 @@ def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normal
     Raises
     ------
     DegenerateError
-        At the start, points lie behind the camera.
+        Points lie behind the camera at the start.
     ConvergenceError
         No minimum is reached.
     """
@@ -188,5 +195,5 @@ def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normal
 
     if not np.isfinite(linearise(camera_from_plane).cost):
         raise DegenerateError("E-POINTS-BEHIND", "planar pose: points behind the camera")
-    found = minimise(camera_from_plane, linearise, perturbed, least_gain=EXACT, max_steps=MAX_STEPS)
-    return found.required("planar pose", "check that the points are numbered rightly").state
+    minimum = minimise(camera_from_plane, linearise, perturbed, least_gain=EXACT, max_steps=MAX_STEPS)
+    return minimum.required("planar pose", "check that the points are numbered rightly").state

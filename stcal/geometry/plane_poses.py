@@ -1,9 +1,9 @@
-"""The two poses that a plane seen from afar leaves: both minima of its residuals over the pose, and which one holds.
+"""The two candidate poses of a plane seen from afar: both minima of the reprojection error, and the choice of one.
 
 A plane seen from afar looks the same tilted to either side of the line of sight (Oberkampf, DeMenthon & Davis 1996,
 Iterative pose estimation using coplanar feature points, CVIU 63; Schweighofer & Pinz 2006, Robust pose estimation from
-a planar target, IEEE TPAMI 28): the reprojection error has two minima. Both are found here, by the residuals of single
-points with Huber's loss, and compared in σ.
+a planar target, IEEE TPAMI 28): the reprojection error has two minima. This module finds both, with Huber's
+loss on the residuals of single points, and compares them in units of σ.
 """
 
 from collections.abc import Callable
@@ -18,25 +18,27 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
 
 OUTLIER = 6.0
-"""In σ, or the residuals' robust σ if that is larger: by chance one point in 6·10⁷ (Rayleigh)."""
+"""Length of an outlier, in stated σ or the residuals' robust σ, whichever is larger; chance exceeds it for one point in
+6·10⁷ (Rayleigh)."""
 MAX_OUTLIER_SHARE = 1 / 3
-"""Of what was seen: beyond it, the rest is no majority that could be believed."""
+"""Largest share of outliers among the observed points; beyond it the inliers are no trustworthy majority."""
 SAME = 1.0
-"""Minima nearer than this, in σ, are one: its covariance covers both."""
+"""Distance, in σ, below which two minima count as one: the covariance covers both."""
 WIDER = 1.1
-"""Residuals whose robust σ is larger by this factor change what Huber's loss damps: the descent is repeated."""
+"""Factor of increase of the residuals' robust σ beyond which the descent is repeated with a new limit of Huber's
+loss."""
 MAX_SIGMA_RAD = 0.5
-"""A rotation whose σ is larger is none: linear propagation says nothing any more."""
+"""Largest σ of a usable rotation; beyond it linear error propagation is meaningless."""
 Descend = Callable[[PoseStack, float], Minima]
-"""From h poses and the limit of Huber's loss, in σ, to the h minima next to them."""
+"""Function that descends from h poses, with the limit of Huber's loss in σ, to the h minima next to them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneMinima:
-    """The distinct minima by single points.
+    """The distinct minima of the residuals of single points.
 
-    ``minima`` : one or two, the better one first; ``robust_sigma`` : of the residuals, in units of their stated σ, 1 or
-    more.
+    ``minima`` : one or two, the better one first; ``robust_sigma`` : robust σ of the residuals in units of their stated
+    σ, 1 or more.
     """
 
     minima: Minima
@@ -44,12 +46,12 @@ class PlaneMinima:
 
     @property
     def outlier_limit(self) -> float:
-        """Length, in stated σ, of a residual that contradicts the others."""
+        """Length, in stated σ, beyond which a residual is an outlier."""
         return OUTLIER * self.robust_sigma
 
 
 def mirrored(poses: PoseStack, target_from_plane: Rigid) -> PoseStack:
-    """h poses camera_from_target mirrored at the line of sight to the plane's origin: its depths change their sign."""
+    """Return h poses camera_from_target with the depths about the plane's origin mirrored along the line of sight."""
     middle = poses.rotation @ target_from_plane.translation + poses.translation
     sight = middle / np.linalg.norm(middle, axis=1, keepdims=True)
     mirror = np.eye(3) - 2 * sight[:, :, None] * sight[:, None, :]
@@ -59,20 +61,20 @@ def mirrored(poses: PoseStack, target_from_plane: Rigid) -> PoseStack:
 
 
 def step_between(pose: PoseStack, second: PoseStack) -> np.ndarray:
-    """(6,) left perturbation, rad and mm, that leads from the one pose to the second, stacks of one each."""
+    """Return the left perturbation (6,), rad and mm, from one pose to a second; both are stacks of one pose."""
     turn = Rotation.from_matrix(second.rotation[0] @ pose.rotation[0].T).as_rotvec()
     return np.concatenate([turn, second.translation[0] - pose.translation[0]])
 
 
 def distinct(poses: PoseStack, normal: np.ndarray, robust_sigma: float = 1.0) -> bool:
-    """Whether the second of two poses is another than the first.
+    """Return True if the second of two poses differs significantly from the first.
 
     Parameters
     ----------
-    poses : two of them
-    normal : (6, 6) normal matrix of the first, by the stated σ
-    robust_sigma : of the residuals, in stated σ. Where it is more than 1, the stated σ are too small, and so is the
-        pose's: two minima that the residuals themselves cannot tell apart would count as two.
+    poses : the two poses
+    normal : (6, 6) normal matrix of the first pose, by the stated σ
+    robust_sigma : robust σ of the residuals, in stated σ. If it exceeds 1, the stated σ are too small, and so is the σ
+        of the pose: without this factor two minima that the residuals cannot tell apart would count as two.
     """
     step = step_between(poses[[0]], poses[[1]])
     return bool(step @ normal @ step > (SAME * robust_sigma) ** 2)
@@ -85,17 +87,17 @@ def two_minima(
     failure: str,
     planar: bool = True,
 ) -> PlaneMinima:
-    """One or two distinct minima of the residuals of single points.
+    """Return one or two distinct minima of the residuals of single points.
 
     Parameters
     ----------
-    descend_near : the descent with residuals whitened near a stack of one pose, the same for both minima, so that
-        their costs compare
-    start : one pose, to which its mirror image is added, or two, the likelier one first
-    target_from_plane : origin in the middle of the points, Z the plane's normal
-    failure : what a ConvergenceError says
-    planar : whether all points lie in the plane. If so, and the two starts end in one minimum, they may have been on
-        one side, and the minimum's own mirror image is tried.
+    descend_near : returns the descent with residuals whitened near a stack of one pose; the whitening is the same for
+        both minima, so that their costs are comparable
+    start : one pose, to which its mirror image is added, or two poses, the likelier one first
+    target_from_plane : frame with the origin in the middle of the points, Z along the plane's normal
+    failure : message of the ConvergenceError
+    planar : True if all points lie in the plane. If the two starts then end in the same minimum, they may have been on
+        the same side, and the mirror image of the minimum is tried as a further start.
 
     Raises
     ------
@@ -106,20 +108,20 @@ def two_minima(
     sigma = 1.0
     for _ in range(2):  # the second time with the residuals' robust σ, if that is larger
         descend = descend_near(poses[[0]])
-        found = _ordered(descend(poses, HUBER * sigma))
-        poses = found.poses
-        wider = robust_sigma(found.length[0], 2)
+        minima = _ordered(descend(poses, HUBER * sigma))
+        poses = minima.poses
+        wider = robust_sigma(minima.length[0], 2)
         if wider <= WIDER * sigma:
             break
         sigma = wider
-    if not np.isfinite(found.cost[0]) or not found.settled[0]:
+    if not np.isfinite(minima.cost[0]) or not minima.settled[0]:
         raise ConvergenceError("E-NO-MINIMUM", failure)
-    two = distinct(found.poses, found.normal[0], sigma)
-    if planar and not two:
-        again = descend(mirrored(found.poses[[0]], target_from_plane), HUBER * sigma)
-        found = _ordered(found.rows([0]).plus(again))
-        two = distinct(found.poses, found.normal[0], sigma)
-    return PlaneMinima(found if two and np.isfinite(found.cost[1]) else found.rows([0]), sigma)
+    is_double = distinct(minima.poses, minima.normal[0], sigma)
+    if planar and not is_double:
+        again = descend(mirrored(minima.poses[[0]], target_from_plane), HUBER * sigma)
+        minima = _ordered(minima.rows([0]).plus(again))
+        is_double = distinct(minima.poses, minima.normal[0], sigma)
+    return PlaneMinima(minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), sigma)
 
 
 def _ordered(found: Minima) -> Minima:
@@ -127,32 +129,35 @@ def _ordered(found: Minima) -> Minima:
 
 
 def weights_of(length: np.ndarray) -> np.ndarray:
-    """Huber's weights of points, same shape, whose residuals have these lengths in σ."""
+    """Return Huber's weights of points, same shape, from the lengths of their residuals in σ."""
     return huber_weights(length, HUBER)
 
 
 def deciding_delta(flip_odds: float, sigma_margin: float, variance_factor: float) -> float:
-    """Δχ² of the second solution that decides for the first: −2 ln of the odds, times the variance factor to allow for.
+    """Return the Δχ² of the second solution that decides for the first: −2 ln of the odds, times a variance factor.
 
     Parameters
     ----------
-    flip_odds : at most these odds of the second solution, for Gaussian errors
-    sigma_margin : by which all σ may be too small without that becoming untrue
-    variance_factor : χ² over redundancy, which counts where it is more than the margin's square
+    flip_odds : largest odds of the second solution, for Gaussian errors
+    sigma_margin : factor by which all σ may be too small without exceeding these odds
+    variance_factor : χ² over redundancy; it counts if it exceeds the margin's square
     """
     return -2 * float(np.log(flip_odds)) * max(sigma_margin**2, variance_factor)
 
 
 def covariance_of_both(covariance: np.ndarray, away: np.ndarray, delta_chi2: float) -> np.ndarray:
-    """Second moment (6, 6) about a pose when the second solution, ``away`` (6,) from it, may hold too."""
+    """Return the second moment (6, 6) about a pose if a second pose, ``away`` (6,) from it, may be the true one."""
     odds = np.exp(-delta_chi2 / 2)
     return covariance + odds / (1 + odds) * np.outer(away, away)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weighed:
-    """One step of generalised least squares from h poses: the ``poses`` after it, ``residual`` (h, n, 2) that it leaves
-    to first order, ``normal`` (h, 6, 6), ``chi2`` (h,); ``moved2`` : (h,) square of the step in σ."""
+    """Result of one step of generalised least squares from h poses.
+
+    ``poses`` : poses after the step; ``residual`` : (h, n, 2) after the step, to first order; ``normal`` : (h, 6, 6);
+    ``chi2`` : (h,); ``moved2`` : (h,) squared length of the step in σ.
+    """
 
     poses: PoseStack
     residual: np.ndarray
@@ -162,12 +167,12 @@ class Weighed:
 
 
 def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, poses: PoseStack) -> Weighed:
-    """The step that weighs the points of h poses by the whole covariance of their residuals.
+    """Return the step of h poses that weights the points by the full covariance of their residuals.
 
     Parameters
     ----------
     residual : (h, n, 2) measured minus projected
-    by_pose : (h, n, 2, 6) minus their derivative by left perturbations
+    by_pose : (h, n, 2, 6) negative derivative of the residuals by left perturbations
     covariance : (h, 2n, 2n)
     """
     h = len(residual)
@@ -178,5 +183,5 @@ def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, pos
     step = np.linalg.solve(normal, right)[..., 0]
     square = (np.swapaxes(r, 1, 2) @ solved[..., 6:])[:, 0, 0]
     gain = (step * right[..., 0]).sum(1)
-    left = residual - (a @ step[..., None]).reshape(residual.shape)
-    return Weighed(poses.moved(step), left, normal, square - gain, gain)
+    remaining = residual - (a @ step[..., None]).reshape(residual.shape)
+    return Weighed(poses.moved(step), remaining, normal, square - gain, gain)

@@ -12,30 +12,34 @@ from stcal.geometry.robust import huber_cost, huber_weights
 
 MAX_STEPS = 60
 ACCEPTED = 1e-2
-"""What is still settled after all steps: a tenth of σ. In a flat valley steps are many, and short."""
+"""Largest predicted decrease, in σ², that counts as settled after the last step: a tenth of σ. In a flat valley steps
+are many and short."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseStack:
-    """h poses: (h, 3, 3) and (h, 3). Unlike :class:`~stcal.geometry.rigid.Poses` not checked, for inner loops."""
+    """A stack of h poses, ``rotation`` (h, 3, 3) and ``translation`` (h, 3), for inner loops.
+
+    Unlike :class:`~stcal.geometry.rigid.Poses` it is not checked.
+    """
 
     rotation: np.ndarray
     translation: np.ndarray
 
     @classmethod
     def of(cls, *poses: Rigid) -> "PoseStack":
-        """From single poses."""
+        """Return the stack of single poses."""
         return cls(np.array([pose.rotation for pose in poses]), np.array([pose.translation for pose in poses]))
 
     def rigid(self, row: int) -> Rigid:
-        """One of them."""
+        """Return the pose of one row."""
         return Rigid(self.rotation[row], self.translation[row])
 
     def __len__(self) -> int:
         return len(self.translation)
 
     def moved(self, step: np.ndarray) -> "PoseStack":
-        """After left perturbations (h, 6)."""
+        """Return the poses after left perturbations (h, 6)."""
         turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
         return PoseStack(turn @ self.rotation, self.translation + step[:, 3:])
 
@@ -57,8 +61,11 @@ class Normal(NormalEquations):
 
     @classmethod
     def of(cls, residual: np.ndarray, by_pose: np.ndarray, possible: np.ndarray, huber: float) -> "Normal":
-        """Huber's loss on the lengths of whitened residuals (h, n, 2), with minus their derivative (h, n, 2, 6); of
-        infinite cost where the pose is not ``possible``, (h,)."""
+        """Return the normal equations of Huber's loss on the lengths of whitened residuals (h, n, 2).
+
+        ``by_pose`` : (h, n, 2, 6) negative derivative of the residuals; ``possible`` : (h,) mask, the cost of other
+        poses is infinite.
+        """
         length = np.sqrt((residual**2).sum(2))
         cost = np.where(possible, huber_cost(length, huber).sum(1), np.inf)
         h = len(residual)
@@ -79,13 +86,13 @@ class Minima:
     settled: np.ndarray
 
     def rows(self, index) -> "Minima":
-        """Those of a list, a mask or a slice."""
+        """Return the minima that a list, a mask or a slice selects."""
         return Minima(self.poses[index], self.cost[index], self.normal[index], self.length[index], self.settled[index])
 
     def plus(self, other: "Minima") -> "Minima":
-        """These, and the other's after them."""
-        rest = ("cost", "normal", "length", "settled")
-        both = (np.concatenate([getattr(self, name), getattr(other, name)]) for name in rest)
+        """Return these minima followed by those of ``other``."""
+        names = ("cost", "normal", "length", "settled")
+        both = (np.concatenate([getattr(self, name), getattr(other, name)]) for name in names)
         return Minima(self.poses.plus(other.poses), *both)
 
 
@@ -95,20 +102,20 @@ def descend(
     settled: float,
     hopeless: float = np.inf,
 ) -> Minima:
-    """Minima from h poses at once.
+    """Return the minima reached from h poses at once.
 
     Parameters
     ----------
     evaluate
-        Normal equations at h poses.
+        Returns the normal equations at h poses.
     poses
-        The starts.
+        Starts of the descent.
     settled
-        A step that lowers χ² by less, or by less than that share, is the last.
+        A step is the last if it lowers χ² by less than this value, or by less than this share of χ².
     hopeless
-        By how much χ² of a pose may be worse than of the best and still be followed to its end.
+        Excess of a pose's χ² over the best one up to which the pose is followed to its end.
     """
-    found = minimise(
+    result = minimise(
         poses,
         evaluate,
         lambda stack, step: stack.moved(step),
@@ -119,13 +126,13 @@ def descend(
         max_steps=MAX_STEPS,
         hopeless=hopeless,
     )
-    last = found.linear
-    ended = found.converged | (found.promised < ACCEPTED) | (last.cost - last.cost.min() > hopeless)
-    return Minima(found.state, last.cost, last.normal, last.length, ended)
+    last = result.linear
+    ended = result.converged | (result.promised < ACCEPTED) | (last.cost - last.cost.min() > hopeless)
+    return Minima(result.state, last.cost, last.normal, last.length, ended)
 
 
 def select_rows(take: np.ndarray, new, old):
-    """Rows of the new poses, or normal equations, where ``take`` (h,), else of the old ones."""
+    """Return the rows of the new poses, or normal equations, where ``take`` (h,) is True, else of the old ones."""
 
     def rows(name: str) -> np.ndarray:
         a, b = getattr(new, name), getattr(old, name)
@@ -135,7 +142,7 @@ def select_rows(take: np.ndarray, new, old):
 
 
 def block_diagonal(blocks: np.ndarray) -> np.ndarray:
-    """(…, an, bn) of (…, n, a, b)."""
+    """Return block-diagonal matrices (…, n·a, n·b) of blocks (…, n, a, b)."""
     *stack, n, a, b = blocks.shape
     full = np.zeros((*stack, n, a, n, b))
     every = np.arange(n)

@@ -13,11 +13,11 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze, frozen
 
 UNIT_WITHIN = 1e-3
-"""A quaternion's length may differ so much from 1: what four printed digits make of it."""
+"""Largest deviation of a quaternion's length from 1, as rounding to four printed digits may cause."""
 
 
 def skew(v: ArrayLike) -> np.ndarray:
-    """Cross-product matrices, shape (..., 3, 3), of vectors of shape (..., 3)."""
+    """Return the cross-product matrices, shape (..., 3, 3), of vectors of shape (..., 3)."""
     v = np.asarray(v, float)
     m = np.zeros((*v.shape[:-1], 3, 3))
     m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
@@ -33,9 +33,9 @@ def _no_shift() -> Any:
 
 
 def _off_proper(x: list[float], y: list[float], z: list[float]) -> float:
-    """Largest |R Rᵀ − 1| of a matrix of these rows, infinite where it is left-handed.
+    """Return the largest |R Rᵀ − 1| of a matrix with these rows, infinite if it is left-handed.
 
-    In plain numbers: transforms are made by the thousand, and for nine numbers numpy takes ten times as long.
+    Plain Python numbers, since transforms are made by the thousand, and for nine numbers numpy takes ten times as long.
     """
     (a, b, c), (d, e, f), (g, h, i) = x, y, z
     if a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) < 0:
@@ -73,13 +73,13 @@ class Rigid:
             raise InputError(
                 "E-ROTATION-IMPROPER", "rotation: not a proper rotation matrix; orthogonal with determinant +1 needed"
             )
-        if deviation > 1e-12:  # brought onto SO(3), or a product of accepted rotations could fail the check above
+        if deviation > 1e-12:  # projected onto SO(3), or a product of accepted rotations could fail the check above
             u, _, vt = np.linalg.svd(self.rotation)
             object.__setattr__(self, "rotation", frozen(u @ vt))
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> "Rigid":
-        """From a 4×4 (or 3×4) homogeneous matrix; the rotation part is projected onto SO(3)."""
+        """Return the transform of a 4×4 (or 3×4) homogeneous matrix; the rotation part is projected onto SO(3)."""
         m = frozen(matrix, what="rigid transform")
         if m.shape not in ((4, 4), (3, 4)):
             raise InputError("E-ARRAY-SHAPE", f"rigid transform: shape {m.shape}, 4×4 needed")
@@ -97,23 +97,26 @@ class Rigid:
 
     @classmethod
     def exp(cls, twist: ArrayLike) -> "Rigid":
-        """From a rotation vector (rad) and a translation (mm), (6,): not the SE(3) exponential of the twist,
-        but the product perturbation ``(exp(w), t)`` in which the package states pose covariances."""
+        """Return the transform of a rotation vector (rad) and a translation (mm), (6,).
+
+        It is not the SE(3) exponential of the twist, but the product perturbation ``(exp(w), t)`` in which the package
+        states pose covariances.
+        """
         motion = np.asarray(twist, float)
         return cls(Rotation.from_rotvec(motion[:3]).as_matrix(), motion[3:])
 
     def log(self) -> np.ndarray:
-        """Inverse of :meth:`exp`: rotation vector (rad) and translation (mm), (6,)."""
+        """Return rotation vector (rad) and translation (mm), (6,): the inverse of :meth:`exp`."""
         return np.concatenate([Rotation.from_matrix(np.array(self.rotation)).as_rotvec(), self.translation])
 
     def matrix(self) -> np.ndarray:
-        """Homogeneous 4×4 matrix."""
+        """Return the homogeneous 4×4 matrix."""
         m = np.eye(4)
         m[:3, :3], m[:3, 3] = self.rotation, self.translation
         return m
 
     def inverse(self) -> "Rigid":
-        """b_from_a."""
+        """Return b_from_a."""
         return Rigid(self.rotation.T, -self.rotation.T @ self.translation)
 
     @overload
@@ -121,7 +124,7 @@ class Rigid:
     @overload
     def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
-        """a_from_c of b_from_c, or points (..., 3) of frame a of such of frame b, mm."""
+        """Return a_from_c for a transform b_from_c, or points in frame a for points (..., 3) in frame b, mm."""
         if isinstance(other, Rigid):
             return Rigid(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
         if isinstance(other, Similarity | Poses):
@@ -129,7 +132,7 @@ class Rigid:
         return np.asarray(other, float) @ self.rotation.T + self.translation
 
     def angle_rad(self) -> float:
-        """Angle of the rotation, in [0, π]."""
+        """Return the angle of the rotation, in [0, π]."""
         return float(Rotation.from_matrix(np.array(self.rotation)).magnitude())
 
 
@@ -148,7 +151,7 @@ class Similarity:
             raise InputError("E-SCALE-VALUE", f"similarity: scale {self.scale}, a positive number needed")
 
     def inverse(self) -> "Similarity":
-        """b_from_a."""
+        """Return b_from_a."""
         inverse = self.rigid.inverse()
         return Similarity(1 / self.scale, Rigid(inverse.rotation, inverse.translation / self.scale))
 
@@ -157,7 +160,7 @@ class Similarity:
     @overload
     def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
-        """a_from_c of b_from_c, or points (..., 3) of frame a of such of frame b."""
+        """Return a_from_c for a transform b_from_c, or points in frame a for points (..., 3) in frame b."""
         if isinstance(other, Similarity):
             return Similarity(
                 self.scale * other.scale,
@@ -175,7 +178,7 @@ class Similarity:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """m transforms a_from_b.
+    """A stack of m transforms a_from_b.
 
     ``rotation`` : (m, 3, 3), proper to 1e-6; ``translation`` : (m, 3), origin of b in a, mm.
     """
@@ -195,14 +198,14 @@ class Poses:
 
     @classmethod
     def of(cls, transforms: Iterable[Rigid]) -> "Poses":
-        """From single transforms."""
+        """Return the stack of single transforms."""
         transforms = list(transforms)
         rotation = np.array([t.rotation for t in transforms]).reshape(-1, 3, 3)
         return cls(rotation, np.array([t.translation for t in transforms]).reshape(-1, 3))
 
     @classmethod
     def from_quaternions(cls, wxyz: ArrayLike, translation: ArrayLike) -> "Poses":
-        """From quaternions (m, 4), w first, unit to 1e-3, and translations (m, 3), mm."""
+        """Return the transforms of quaternions (m, 4), w first, unit to 1e-3, and translations (m, 3), mm."""
         wxyz = np.asarray(wxyz, float)
         off = np.abs(np.linalg.norm(wxyz, axis=1) - 1)
         if len(off) and off.max() > UNIT_WITHIN:
@@ -213,13 +216,13 @@ class Poses:
         return cls(Rotation.from_quat(wxyz[:, [1, 2, 3, 0]]).as_matrix(), translation)
 
     def matrix(self) -> np.ndarray:
-        """Homogeneous matrices, (m, 4, 4)."""
+        """Return the homogeneous matrices, (m, 4, 4)."""
         m = np.tile(np.eye(4), (len(self), 1, 1))
         m[:, :3, :3], m[:, :3, 3] = self.rotation, self.translation
         return m
 
     def quaternions(self) -> np.ndarray:
-        """(m, 4), w first and not negative."""
+        """Return the quaternions (m, 4), w first and not negative."""
         return Rotation.from_matrix(np.array(self.rotation)).as_quat(canonical=True)[:, [3, 0, 1, 2]]
 
     def __len__(self) -> int:
@@ -230,7 +233,7 @@ class Poses:
     @overload
     def __getitem__(self, index: slice | np.ndarray | Sequence[int]) -> "Poses": ...
     def __getitem__(self, index):
-        """One :class:`Rigid` for an integer, :class:`Poses` for a slice, mask or list."""
+        """Return one :class:`Rigid` for an integer, :class:`Poses` for a slice, mask or list."""
         if np.ndim(index) == 0 and not isinstance(index, slice):
             return Rigid(self.rotation[index], self.translation[index])
         return Poses(self.rotation[index], self.translation[index])
@@ -239,12 +242,12 @@ class Poses:
         return (self[i] for i in range(len(self)))
 
     def moved(self, step: np.ndarray) -> "Poses":
-        """After left perturbations (m, 6), rad and mm: exp(w) R, t + dt."""
+        """Return the transforms after left perturbations (m, 6), rad and mm: exp(w) R, t + dt."""
         turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
         return Poses(turn @ self.rotation, self.translation + step[:, 3:])
 
     def inverse(self) -> "Poses":
-        """b_from_a."""
+        """Return b_from_a."""
         back = np.swapaxes(self.rotation, 1, 2)
         return Poses(back, -np.einsum("mij,mj->mi", back, self.translation))
 
@@ -253,7 +256,7 @@ class Poses:
     @overload
     def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
     def __matmul__(self, other):
-        """With :class:`Rigid` or as many :class:`Poses`: a_from_c; with one point (3,) or m: (m, 3)."""
+        """Return a_from_c for a :class:`Rigid` or m :class:`Poses` b_from_c; points (m, 3) for one or m points."""
         if isinstance(other, Rigid | Poses):
             translation = np.einsum(
                 "mij,...j->mi" if other.translation.ndim == 1 else "mij,mj->mi", self.rotation, other.translation
@@ -268,6 +271,6 @@ class Poses:
         return NotImplemented
 
     def difference(self, other: "Poses") -> np.ndarray:
-        """What leads from ``other`` to these, (m, 6): rotation vector (rad) and translation (mm) in frame a."""
+        """Return the motions (m, 6) from ``other`` to these: rotation vector (rad) and translation (mm) in frame a."""
         turn = self.rotation @ np.swapaxes(other.rotation, 1, 2)
         return np.hstack([Rotation.from_matrix(turn).as_rotvec(), self.translation - other.translation])

@@ -1,5 +1,7 @@
-"""Poses with covariance, chained: rotation (rad) and translation (mm), left perturbation in the outer frame; how well
-one fits its image."""
+"""Poses with covariance, and the fit of a pose to its image.
+
+Covariances are those of rotation (rad) and translation (mm), left perturbation in the outer frame.
+"""
 
 from dataclasses import dataclass
 
@@ -11,7 +13,7 @@ from stcal.geometry.rigid import Rigid, skew
 
 
 class ImageFit:
-    """What a pose's residuals in an image say."""
+    """Statistics of a pose's residuals in an image."""
 
     __slots__ = ()
     residuals_px: np.ndarray
@@ -19,21 +21,24 @@ class ImageFit:
     redundancy: int
 
     def rms_px(self) -> float:
-        """Of the residuals, per coordinate."""
+        """Return the RMS of the residuals per coordinate."""
         return float(np.sqrt((self.residuals_px**2).mean()))
 
     def chi2_per_redundancy(self) -> float:
-        """About 1 where the σ of points, target and intrinsics are true."""
+        """Return χ² per redundancy; it is about 1 if the σ of points, target and intrinsics are true."""
         return self.chi2 / self.redundancy
 
     def p_value(self) -> float:
-        """Probability of residuals as large, with those σ."""
+        """Return the probability of residuals at least as large if the stated σ are true."""
         return float(chdtrc(self.redundancy, self.chi2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UncertainRigid:
-    """a_from_b with ``covariance`` (6, 6): R' = exp(w) R, t' = t + dt; exact where it is zero."""
+    """A transform a_from_b with ``covariance`` (6, 6) of its errors: R' = exp(w) R, t' = t + dt.
+
+    A covariance of zero means an exact transform.
+    """
 
     rigid: Rigid
     covariance: Array
@@ -43,11 +48,11 @@ class UncertainRigid:
 
     @classmethod
     def exact(cls, rigid: Rigid) -> "UncertainRigid":
-        """Without error."""
+        """Return the transform with a covariance of zero."""
         return cls(rigid, np.zeros((6, 6)))
 
     def __matmul__(self, other: "UncertainRigid") -> "UncertainRigid":
-        """a_from_c, the errors of both independent, to first order."""
+        """Return a_from_c with its covariance to first order, the errors of both transforms being independent."""
         arm = self.rigid.rotation @ other.rigid.translation
         by_self, by_other = np.eye(6), np.zeros((6, 6))
         by_self[3:, :3] = -skew(arm)

@@ -1,7 +1,7 @@
-"""Variance components: how much each kind of observation errs, from residuals that adjusted parameters have shortened.
+"""Variance components: σ of each group of observations, estimated from the residuals of an adjustment.
 
-Restricted maximum likelihood (REML, Patterson & Thompson 1971), of parts that each have a σ or of covariances that are
-sums of components; and Förstner's (1979) step towards it.
+Restricted maximum likelihood (REML, Patterson & Thompson 1971), for groups that each have one σ or for covariances that
+are sums of components; and Förstner's (1979) step towards it.
 """
 
 from collections.abc import Sequence
@@ -15,12 +15,12 @@ from stcal.geometry.least_squares import NormalEquations
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """An adjustment, linear about a state, in p parts of which each has a σ; x is log (σ / present σ).
+    """A linearised adjustment in p parts, each with its own σ; the unknowns are x = log (σ / present σ).
 
-    ``each`` : p problems, each over its present σ; ``count`` : (p,) of their numbers; ``fixed`` : what has no σ to be
-    estimated; ``expected``, ``doubt`` : (p,) mean and σ of what is known of x beforehand, ``doubt`` infinite where
-    nothing is; ``caution`` : (p,) redundancies that are not counted; ``held`` : share of each parameter's information
-    that is added, so that what nothing determines is not singular.
+    ``each`` : normal equations of the p parts, each scaled by its present σ; ``count`` : (p,) numbers of observations;
+    ``fixed`` : normal equations of the observations whose σ is not estimated; ``expected``, ``doubt`` : (p,) mean and σ
+    of the prior of x, ``doubt`` infinite without a prior; ``caution`` : (p,) redundancy that is not counted; ``held`` :
+    share of each parameter's information that is added, so that undetermined parameters do not make it singular.
     """
 
     each: NormalEquations
@@ -32,8 +32,11 @@ class Parts:
     held: float = 0.0
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """At x (m, p): log posterior density (m,), its gradient (m, p), parameters (m, k) beyond the state and their
-        covariance (m, k, k)."""
+        """Evaluate the posterior at x (m, p).
+
+        Returns log posterior density (m,), its gradient (m, p), the step of the parameters (m, k) from the state, and
+        their covariance (m, k, k).
+        """
         share, normals = np.exp(-2 * x), self.each.normal
         p, k = self.each.gradient.shape
         normal = (share @ normals.reshape(p, -1)).reshape(-1, k, k) + self.fixed.normal
@@ -52,10 +55,10 @@ class Parts:
         return value, share * (square + taken) - counted - away / self.doubt, step, inverse
 
     def best(self, low: np.ndarray, high: np.ndarray, starts: Sequence[np.ndarray]) -> np.ndarray:
-        """(p,) x of highest density within bounds (p,), looked for from ``starts`` (p,)."""
+        """Return the x (p,) of highest density within bounds (p,), by descents from several ``starts`` (p,)."""
 
         def downhill(logs: np.ndarray) -> tuple[float, np.ndarray]:
-            """Of the logarithms of the weights, -2x: minus twice the log density."""
+            """Return minus twice the log density, and its gradient, at the logarithms of the weights, -2x."""
             value, gradient, _, _ = self.at(-logs[None] / 2)
             return -2 * float(value[0]), gradient[0]
 
@@ -73,24 +76,24 @@ def component_variances(
     bounds: tuple[np.ndarray, np.ndarray],
     caution: float = 0.0,
 ) -> np.ndarray:
-    """Restricted maximum-likelihood variances (f,) of covariances that are sums of components.
+    """Return restricted maximum-likelihood variances (f,) of covariances that are sums of components.
 
     Parameters
     ----------
     residuals
-        (m, a) near a solution.
+        (m, a) residuals near a solution.
     jacobian
-        (m, a, k) their derivative by the parameters solved for; dependent columns do no harm.
+        (m, a, k) derivative of the residuals by the parameters solved for; dependent columns do no harm.
     known
-        (m, a, a) the part of their covariances that is known.
+        (m, a, a) known part of the covariances.
     free
-        (f, m, a, a) what is multiplied by each variance.
+        (f, m, a, a) components, each to be multiplied by its variance.
     first
-        (f,) first guess.
+        (f,) initial variances.
     bounds
-        (f,) least and greatest variances.
+        (f,) smallest and largest variances.
     caution
-        Redundancies of each variance that are not counted.
+        Redundancy of each variance that is not counted.
     """
     jacobian = _independent(jacobian)
 
@@ -101,28 +104,30 @@ def component_variances(
         weighted = inverse @ jacobian
         normal = np.einsum("mai,maj->ij", jacobian, weighted)
         covariance = np.linalg.inv(normal)
-        left = residuals - jacobian @ (covariance @ np.einsum("mai,ma->i", weighted, residuals))
-        fitted = np.einsum("mab,mb->ma", inverse, left)
-        value = np.linalg.slogdet(spread)[1].sum() + np.linalg.slogdet(normal)[1] + (fitted * left).sum()
-        by = np.einsum("mab,kmba->k", inverse, free)
-        taken = np.einsum("kmab,mbj->kmaj", free, weighted)
-        by = by - np.einsum("mai,kmaj,ij->k", weighted, taken, covariance, optimize=True)
-        by = by - np.einsum("ma,kmab,mb->k", fitted, free, fitted, optimize=True)
-        return float(value - caution * logs.sum()), by * theta - caution
+        remaining = residuals - jacobian @ (covariance @ np.einsum("mai,ma->i", weighted, residuals))
+        fitted = np.einsum("mab,mb->ma", inverse, remaining)
+        value = np.linalg.slogdet(spread)[1].sum() + np.linalg.slogdet(normal)[1] + (fitted * remaining).sum()
+        gradient = np.einsum("mab,kmba->k", inverse, free)
+        weighted_free = np.einsum("kmab,mbj->kmaj", free, weighted)
+        gradient = gradient - np.einsum("mai,kmaj,ij->k", weighted, weighted_free, covariance, optimize=True)
+        gradient = gradient - np.einsum("ma,kmab,mb->k", fitted, free, fitted, optimize=True)
+        return float(value - caution * logs.sum()), gradient * theta - caution
 
     limits = np.log(np.column_stack(bounds))
-    found = minimize(cost, np.log(first), jac=True, method="L-BFGS-B", bounds=limits, options={"ftol": 1e-12})
-    return np.exp(found.x)
+    optimum = minimize(cost, np.log(first), jac=True, method="L-BFGS-B", bounds=limits, options={"ftol": 1e-12})
+    return np.exp(optimum.x)
 
 
 def _independent(jacobian: np.ndarray) -> np.ndarray:
-    """Directions (m, a, r) that span the same changes of the residuals as the columns of ``jacobian``."""
+    """Return an orthonormal basis (m, a, r) of the space that the columns of ``jacobian`` span."""
     flat = jacobian.reshape(-1, jacobian.shape[2])
     u, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
     return u[:, s > 1e-7 * s[0]].reshape(*jacobian.shape[:2], -1)
 
 
 def sigma_factor(square: float, redundancy: float) -> float:
-    """Factor on a σ with which the squares of residuals over it, ``square``, are as many as their redundancy (Förstner
-    1979); it is a step of an iteration where there are other σ."""
+    """Return the factor on a σ that makes the normalised sum of squares equal its redundancy (Förstner 1979).
+
+    ``square`` : sum of squared residuals over σ². If other σ are estimated too, this is one step of an iteration.
+    """
     return float(np.sqrt(square / max(redundancy, 1.0)))

@@ -1,4 +1,4 @@
-"""Which robot poses would lower the worst σ of a hand-eye transform most."""
+"""Robot poses to take next: those that would lower the worst σ of a hand-eye transform most."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,31 +16,32 @@ from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.result import HandEye
 
 CANDIDATES = 2000
-"""Views of the board that are looked at for each pose that is named."""
+"""Number of candidate views of the board for each pose that is planned."""
 ASKED = 64
-"""Poses at a time of which is asked whether the robot reaches them."""
+"""Number of poses per call of ``reachable``."""
 MOST_TILT = np.radians(40)
-"""Of the board against the line of sight: beyond, dots and corners lose accuracy."""
+"""Largest tilt of the board against the line of sight, in rad. Beyond it dots and corners lose accuracy."""
 MARGIN = 0.1
-"""Of the image's sides that the board's outermost points keep off the border."""
+"""Margin that the board's outermost points keep from the image border, as a share of the image's sides."""
 ABOUT = 0.25
-"""Points at which σ is judged lie so many distances of the board about it, and at it."""
+"""Distance from the board's mean place to the other points at which σ is judged, in distances of the board from the
+camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NextPoses:
-    """k poses to take next, in order.
+    """The k poses to take next, in order.
 
     Parameters
     ----------
     base_from_flange : Poses
-        Where the flange is to be, mm.
+        Planned poses of the flange, mm.
     camera_from_board : Poses
-        How the camera would see the board there, mm.
+        Poses of the board that the camera would see, mm.
     sigma_mm : (k + 1,) array
-        Worst σ of a point at the board by the transform: now, and after each of them.
+        Worst σ of a point at the board due to the transform: now, and after each planned pose.
     turn_rad : (k,) array
-        Rotation of the flange against the pose of those taken that is nearest in rotation.
+        Smallest rotation of the flange against any earlier pose, planned poses included.
     """
 
     base_from_flange: Poses
@@ -63,31 +64,32 @@ def plan_poses(
     reachable: Callable[[Poses], np.ndarray] | None = None,
     seed: int = 0,
 ) -> NextPoses:
-    """The poses that lower the worst σ of a point at the board most, one after the other.
+    """Plans the poses that lower the worst σ of a point at the board most, one after the other.
 
-    Candidates show the board as near and as far as it was seen, tilted by up to 40° and turned about the line of sight
-    at will; each adds its information, with the σ of robot and camera that the result states or estimated, to that of
-    the poses taken (so that the wide rotations of Tsai & Lenz 1989 come out by themselves). σ are of independent errors
-    of the poses alone: without what the camera file errs, and without the scatter of :func:`~.scatter.scatter`, which
-    further poses do not lower alike.
+    Candidates show the board at the distances at which it was seen, tilted by up to 40° and turned about the line of
+    sight at random. Each candidate adds its information to that of the poses taken, with the σ of robot and camera that
+    the result states or estimated; the wide rotations of Tsai & Lenz 1989 follow from this. The σ cover independent
+    errors of the poses only. They contain neither errors of the camera file nor the scatter of
+    :func:`~.scatter.scatter`, which further poses do not lower alike.
 
     Parameters
     ----------
     pairs : HandEyePoses
-        Taken so far.
+        Poses taken so far.
     result : HandEye
-        Of them.
+        Result from these poses.
     count : int
-        Poses wanted.
+        Number of poses to plan.
     outline : (n, 3) array, optional
-        Points of the board that are to be in the image, mm; its origin where None.
+        Points of the board that must be in the image, mm; the board's origin if None.
     camera : Camera, optional
-        Whose image they are to be in; without it they stay where the board's origin was seen.
+        Camera whose image must hold the outline. If None, the board is placed along lines of sight on which its origin
+        was seen.
     reachable : callable, optional
-        Which of base_from_flange (n poses) the robot reaches, (n,) bool; all where None. It is asked for
-        :data:`ASKED` at a time, the best first.
+        Returns for n poses base_from_flange whether the robot reaches them, (n,) bool; all are reachable if None. It is
+        called with :data:`ASKED` poses at a time, the best first.
     seed : int
-        Of the candidates.
+        Seed of the random candidates.
 
     Returns
     -------
@@ -100,20 +102,20 @@ def plan_poses(
     """
     if result.covariance is None:
         raise InputError("E-PLAN-NO-SIGMA", f"plan: {result.method} gives no σ; give a result of pose or reprojection")
-    kept = np.flatnonzero(~result.outliers)
-    loop = Loop.of(pairs, result.setup)[kept]
+    inliers = np.flatnonzero(~result.outliers)
+    loop = Loop.of(pairs, result.setup)[inliers]
     errors, rng = _Errors.of(loop, result), np.random.default_rng(seed)
     x, z = result.mount_from_camera, result.stand_from_board
     normal = _information(loop, errors, result).sum(0)
-    eye = loop.camera_from_board
-    seen = Poses(eye.rotation, result.scale * eye.translation)
+    board_poses = loop.camera_from_board
+    seen_views = Poses(board_poses.rotation, result.scale * board_poses.translation)
     outline = np.zeros((1, 3)) if outline is None else result.scale * np.asarray(outline, float)
-    points = judged_at(seen.rotation @ outline.mean(0) + seen.translation)
+    points = judged_at(seen_views.rotation @ outline.mean(0) + seen_views.translation)
     sigma, flanges, views, turns = [worst_sigma(normal, x, points)], [], [], []
-    taken = pairs.base_from_flange.rotation[kept]
+    taken = pairs.base_from_flange.rotation[inliers]
     for _ in range(count):
-        ahead = _views(rng, seen, outline, camera)
-        stand_from_mount = z @ ahead.inverse() @ x.inverse()
+        candidate_views = _views(rng, seen_views, outline, camera)
+        stand_from_mount = z @ candidate_views.inverse() @ x.inverse()
         flange = stand_from_mount.inverse() if loop.inverted else stand_from_mount
         if not len(flange):
             raise InputError(
@@ -121,14 +123,14 @@ def plan_poses(
                 f"plan: none of {CANDIDATES} views as near and as far as the board was seen holds all of it and "
                 f"{MARGIN:.0%} of the image around; take it from farther away, or give a smaller board",
             )
-        unscaled = Poses(ahead.rotation, ahead.translation / result.scale)
-        each = normal + _information(Loop(stand_from_mount, unscaled, loop.inverted), errors, result)
-        after = np.array([worst_sigma(own, x, points) for own in each])
-        row = _first_reachable(flange, np.argsort(after), reachable)
-        normal = each[row]
-        sigma.append(float(after[row]))
+        unscaled = Poses(candidate_views.rotation, candidate_views.translation / result.scale)
+        normals = normal + _information(Loop(stand_from_mount, unscaled, loop.inverted), errors, result)
+        sigma_after = np.array([worst_sigma(candidate, x, points) for candidate in normals])
+        row = _first_reachable(flange, np.argsort(sigma_after), reachable)
+        normal = normals[row]
+        sigma.append(float(sigma_after[row]))
         flanges.append(flange[row])
-        views.append(ahead[row])
+        views.append(candidate_views[row])
         cosine = (np.einsum("mab,ab->m", taken, flange.rotation[row]) - 1) / 2
         turns.append(float(np.arccos(np.clip(cosine, -1, 1)).min()))
         taken = np.concatenate([taken, flange.rotation[row][None]])
@@ -136,22 +138,22 @@ def plan_poses(
 
 
 def worst_sigma(normal: np.ndarray, mount_from_camera: Rigid, points: np.ndarray) -> float:
-    """Largest σ, mm, in any direction, of points (n, 3) in the camera's frame that are carried to the mount."""
+    """Returns the largest σ in any direction, mm, of ``points`` (n, 3) in the camera's frame, moved to the mount's."""
     covariance = generalised_inverse(normal)[:6, :6]
-    by = np.zeros((len(points), 3, 6))
-    by[:, :, :3], by[:, :, 3:] = -skew(points @ mount_from_camera.rotation.T), np.eye(3)
-    return float(np.sqrt(np.linalg.eigvalsh(by @ covariance @ np.swapaxes(by, 1, 2)).max()))
+    jacobian = np.zeros((len(points), 3, 6))
+    jacobian[:, :, :3], jacobian[:, :, 3:] = -skew(points @ mount_from_camera.rotation.T), np.eye(3)
+    return float(np.sqrt(np.linalg.eigvalsh(jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)).max()))
 
 
 def _first_reachable(flange: Poses, order: np.ndarray, reachable: Callable[[Poses], np.ndarray] | None) -> int:
-    """Row of the first pose, in this order (n,), that the robot reaches."""
+    """Returns the row of the first pose that the robot reaches, in the given ``order`` (n,)."""
     if reachable is None:
         return int(order[0])
     for start in range(0, len(order), ASKED):
-        part = order[start : start + ASKED]
-        within = np.flatnonzero(reachable(flange[part]))
-        if len(within):
-            return int(part[within[0]])
+        batch = order[start : start + ASKED]
+        in_reach = np.flatnonzero(reachable(flange[batch]))
+        if len(in_reach):
+            return int(batch[in_reach[0]])
     raise InputError(
         "E-PLAN-OUT-OF-REACH",
         f"plan: none of {len(flange)} views of the whole board is in the robot's reach; check robot file, board and "
@@ -168,7 +170,7 @@ class _Errors:
 
     @classmethod
     def of(cls, loop: Loop, result: HandEye) -> "_Errors":
-        """As stated with the poses, their mean, or as the result states or estimated them."""
+        """Returns the means of the covariances stated with the poses, or those from the σ of the result."""
         sigma = result.sigma
         robot, camera = (
             np.diag(np.square([sigma.get(f"{side}_rad", 0.0)] * 3 + [sigma.get(f"{side}_mm", 0.0)] * 3))
@@ -182,7 +184,7 @@ class _Errors:
 
 
 def _information(loop: Loop, errors: _Errors, result: HandEye) -> np.ndarray:
-    """(m, 12, 12) of each pose about X and Z."""
+    """Returns the information of each pose about X and Z, (m, 12, 12)."""
     x, scale = result.mount_from_camera, result.scale
     robot, camera = loop.by_robot(x, scale), loop.by_camera(x, scale)
     spread = robot @ errors.robot @ np.swapaxes(robot, 1, 2) + camera @ errors.camera @ np.swapaxes(camera, 1, 2)
@@ -191,14 +193,14 @@ def _information(loop: Loop, errors: _Errors, result: HandEye) -> np.ndarray:
 
 
 def judged_at(board_mm: np.ndarray) -> np.ndarray:
-    """Points (7, 3) in the camera's frame at which σ is judged: the board's mean place (m, 3), and about it."""
+    """Returns seven points in the camera's frame at which σ is judged: the mean of ``board_mm``, and six about it."""
     middle = board_mm.mean(0)
     reach = ABOUT * float(np.linalg.norm(board_mm, axis=1).mean())
     return middle + reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
 
 
 def _views(rng: np.random.Generator, seen: Poses, outline: np.ndarray, camera: Camera | None) -> Poses:
-    """Views of the board (camera_from_board): its middle as near and far as it was seen, tilted and turned."""
+    """Returns random views of the board (camera_from_board): at the distances seen so far, tilted and turned."""
     middle = outline.mean(0)
     places = seen.rotation @ middle + seen.translation
     distance = np.linalg.norm(places, axis=1)
@@ -210,10 +212,12 @@ def _views(rng: np.random.Generator, seen: Poses, outline: np.ndarray, camera: C
         sight = np.column_stack([camera.normalised_from_pixel(pixel), np.ones(CANDIDATES)])
     sight = sight / np.linalg.norm(sight, axis=1)[:, None]
     place = rng.uniform(distance.min(), distance.max(), (CANDIDATES, 1)) * sight
-    # As it was seen once, then turned about the line of sight, and tilted from where it faces the camera.
-    of = rng.integers(len(seen), size=CANDIDATES)
-    facing = seen.rotation[of, :, 2] * np.sign(np.einsum("ma,ma->m", seen.rotation[of, :, 2], places[of]))[:, None]
-    straight = _turned_onto(facing, sight) @ seen.rotation[of]
+    # Start from a view that was seen, turn it to face the camera, roll it about the line of sight, then tilt it.
+    base = rng.integers(len(seen), size=CANDIDATES)
+    facing = (
+        seen.rotation[base, :, 2] * np.sign(np.einsum("ma,ma->m", seen.rotation[base, :, 2], places[base]))[:, None]
+    )
+    straight = _turned_onto(facing, sight) @ seen.rotation[base]
     roll = Rotation.from_rotvec(rng.uniform(-np.pi, np.pi, (CANDIDATES, 1)) * sight).as_matrix()
     across = np.cross(sight, rng.normal(size=(CANDIDATES, 3)))
     across /= np.linalg.norm(across, axis=1)[:, None]
@@ -230,7 +234,7 @@ def _views(rng: np.random.Generator, seen: Poses, outline: np.ndarray, camera: C
 
 
 def _turned_onto(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(m, 3, 3) the smallest rotations that turn unit vectors (m, 3) onto others (m, 3)."""
+    """Returns the smallest rotations (m, 3, 3) that turn the unit vectors ``first`` (m, 3) onto ``second`` (m, 3)."""
     axis = np.cross(first, second)
     sine = np.linalg.norm(axis, axis=1)
     angle = np.arctan2(sine, np.einsum("ma,ma->m", first, second))

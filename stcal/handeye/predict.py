@@ -1,4 +1,4 @@
-"""The last motions, predicted by the solution of the poses before them."""
+"""Prediction of the last motions by the solution from the poses before them."""
 
 from dataclasses import dataclass
 
@@ -18,16 +18,16 @@ from stcal.parallel import one_thread
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOutMotions:
-    """Errors of the last k motions as predicted by the solution of the poses before them: Jin et al., eqs. 24–26.
+    """Errors of the last k motions, predicted by the solution from the poses before them: Jin et al., eqs. 24–26.
 
     Parameters
     ----------
     fitted : int
-        Motions that the solution rests on.
+        Number of motions that the solution uses.
     names : tuple of (str, str)
-        Poses that each motion leads from and to.
+        Names of the poses from which and to which each motion leads.
     rotation_rad, translation_mm : (k,) arrays
-        Of Â = X B X⁻¹ against A.
+        Errors of Â = X B X⁻¹ against A.
     """
 
     fitted: int
@@ -41,22 +41,22 @@ class HeldOutMotions:
 
 
 def motion_errors(mount_from_camera: Rigid, motions: Motions) -> np.ndarray:
-    """Errors of Â = X B X⁻¹ against A: Jin et al., eqs. 24–26.
+    """Returns the errors of Â = X B X⁻¹ against A: Jin et al., eqs. 24–26.
 
     Parameters
     ----------
     mount_from_camera
         X.
     motions
-        k of them: A of the mount, B of the camera.
+        The k motions: A of the mount, B of the camera.
 
     Returns
     -------
     (k, 2) array
         Angle of the difference, rad; distance of the translations, mm.
     """
-    off = (mount_from_camera @ motions.camera @ mount_from_camera.inverse()).difference(motions.mount)
-    return np.column_stack([np.linalg.norm(off[:, :3], axis=1), np.linalg.norm(off[:, 3:], axis=1)])
+    difference = (mount_from_camera @ motions.camera @ mount_from_camera.inverse()).difference(motions.mount)
+    return np.column_stack([np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)])
 
 
 @one_thread()
@@ -68,16 +68,16 @@ def predict_motions(
     options: HandEyeOptions | None = None,
     count: int = 6,
 ) -> HeldOutMotions:
-    """Solve with the poses before the last ``count`` motions from pose to pose, and predict these.
+    """Solves with the poses before the last ``count`` motions from pose to pose, and predicts these motions.
 
-    Jin et al. do so with the last 6 of 24.
+    Jin et al. hold out the last 6 of 24 motions.
 
     Parameters
     ----------
     pairs, setup, method, views, options
-        As of :func:`~stcal.handeye.handeye`.
+        See :func:`~stcal.handeye.handeye`.
     count : int
-        Motions to hold out.
+        Number of motions to hold out.
 
     Returns
     -------
@@ -88,17 +88,17 @@ def predict_motions(
     InputError
         Too few poses are left.
     StcalError
-        As of :func:`~stcal.handeye.handeye`.
+        The solution fails; see :func:`~stcal.handeye.handeye`.
     """
-    left = len(pairs) - count
-    if count < 1 or left < LEAST_LEFT:
+    remaining = len(pairs) - count
+    if count < 1 or remaining < LEAST_LEFT:
         raise InputError(
             "E-OPTION-RANGE",
             f"--motions-held-out {count}: of {max(len(pairs) - 1, 0)} motions, 1 to {max(len(pairs) - LEAST_LEFT, 0)} "
             "can be held out; give another number, or more poses",
         )
-    kept = np.arange(left)
-    result = handeye(pairs[kept], setup, method, None if views is None else views[kept], options)
-    errors = motion_errors(result.mount_from_camera, Motions.consecutive(Loop.of(pairs, setup))[left - 1 :])
-    names = tuple(zip(pairs.names[left - 1 : -1], pairs.names[left:], strict=True))
-    return HeldOutMotions(left - 1, names, errors[:, 0], errors[:, 1])
+    first_poses = np.arange(remaining)
+    result = handeye(pairs[first_poses], setup, method, None if views is None else views[first_poses], options)
+    errors = motion_errors(result.mount_from_camera, Motions.consecutive(Loop.of(pairs, setup))[remaining - 1 :])
+    names = tuple(zip(pairs.names[remaining - 1 : -1], pairs.names[remaining:], strict=True))
+    return HeldOutMotions(remaining - 1, names, errors[:, 0], errors[:, 1])

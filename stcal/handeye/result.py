@@ -1,4 +1,4 @@
-"""What every hand-eye method returns."""
+"""Result of every hand-eye method."""
 
 from dataclasses import dataclass, field, replace
 
@@ -19,39 +19,38 @@ class HandEye:
     Parameters
     ----------
     method : str
-        By which of :data:`~stcal.handeye.METHODS`.
+        Name of the method, one of :data:`~stcal.handeye.METHODS`.
     setup : str
         ``eye-in-hand`` or ``eye-to-hand``.
     mount_from_camera, stand_from_board : Rigid
-        The two unknowns, mm; what mount and stand are tells :mod:`stcal.handeye.data.loop`. See :attr:`transforms`.
+        The two unknowns, mm. :mod:`stcal.handeye.data.loop` defines mount and stand. See :attr:`transforms`.
     residuals : (m, 6) array
-        Of each pose: by how much its chain misses ``stand_from_board``, rotation vector (rad), and translation (mm)
-        at the board's origin, axes of the stand.
+        Deviation of each pose's chain from ``stand_from_board``: rotation vector (rad), and translation (mm) at the
+        board's origin, in the axes of the stand.
     names : tuple of str
-        Of the poses.
+        Names of the poses.
     outliers : (m,) bool array
         Poses that were left out of the solution because they contradict the others.
     covariance, stand_covariance : (6, 6) arrays, optional
-        Of ``mount_from_camera`` and ``stand_from_board``: rotation (rad), translation (mm), left perturbation. None
-        where the method gives none.
+        Covariances of ``mount_from_camera`` and ``stand_from_board``: rotation (rad), translation (mm), left
+        perturbation. None if the method gives no covariance.
     scale : float
-        The board's true size over its stated size, where it was solved for; else 1.
+        The board's true size over its stated size, if it was solved for; else 1.
     sigma_scale : float, optional
-        Its σ.
+        σ of the scale.
     sigma : dict of str to float
-        σ by which poses or corners were weighted: ``robot_rad``, ``robot_mm``, ``camera_rad``, ``camera_mm``,
-        ``corner_px``, ``board_mm``, where the method weights; ``camera_factor``, by which the σ that came with
-        camera_from_board were multiplied; ``camera_focal``, ``camera_centre``, ``camera_radial``, ``camera_tangential``
-        (``camera_all`` where their covariance is stated): factors, 1 or more, by which the σ of the stated intrinsics
-        were widened.
+        σ by which poses or corners were weighted, if the method weights: ``robot_rad``, ``robot_mm``, ``camera_rad``,
+        ``camera_mm``, ``corner_px``, ``board_mm``. ``camera_factor`` is the factor on the σ that were stated with
+        camera_from_board. ``camera_focal``, ``camera_centre``, ``camera_radial``, ``camera_tangential`` (``camera_all``
+        if their covariance is stated) are the factors, 1 or more, by which the σ of the stated intrinsics were widened.
     estimated : tuple of str
-        Which of them were estimated from the residuals.
+        Keys of ``sigma`` that were estimated from the residuals.
     reprojection : Reprojection, optional
-        Camera, board and robot as adjusted, where corners were.
+        Adjusted camera, board and robot, if corners were adjusted.
     observability : Observability, optional
-        What the poses tell.
+        What the poses determine.
     notes : tuple of str
-        What should be known about the result, one line each.
+        Notes on the result, one line each.
     """
 
     method: str
@@ -87,12 +86,12 @@ class HandEye:
 
     @property
     def flange_from_camera(self) -> Rigid:
-        """Of the eye-in-hand setup."""
+        """The transform flange_from_camera of the eye-in-hand setup; raises InputError in the other setup."""
         return self._named("flange_from_camera")
 
     @property
     def base_from_camera(self) -> Rigid:
-        """Of the eye-to-hand setup."""
+        """The transform base_from_camera of the eye-to-hand setup; raises InputError in the other setup."""
         return self._named("base_from_camera")
 
     def _named(self, name: str) -> Rigid:
@@ -104,12 +103,12 @@ class HandEye:
         return self.transforms[name]
 
     def widened(self, factor: float) -> "HandEye":
-        """With all σ of the two unknowns times ``factor``."""
+        """Returns the result with all σ of the two unknowns multiplied by ``factor``."""
         square, stand = factor**2, self.stand_covariance
-        own = None if self.covariance is None else square * self.covariance
-        return replace(self, covariance=own, stand_covariance=None if stand is None else square * stand)
+        mount = None if self.covariance is None else square * self.covariance
+        return replace(self, covariance=mount, stand_covariance=None if stand is None else square * stand)
 
     def rms(self) -> tuple[float, float]:
-        """RMS lengths of the residuals of the poses used: rad, mm."""
+        """Returns the RMS lengths of the residuals of all poses except outliers: rad, mm."""
         squared = (self.residuals[~self.outliers].reshape(-1, 2, 3) ** 2).sum(2).mean(0)
         return float(np.sqrt(squared[0])), float(np.sqrt(squared[1]))

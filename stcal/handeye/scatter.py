@@ -1,4 +1,4 @@
-"""Whether solutions of parts of the poses scatter as σ say, and σ that hold what they do."""
+"""Scatter of the solutions from subsets of the poses against their σ, and σ widened to cover it."""
 
 from dataclasses import replace
 
@@ -11,42 +11,42 @@ from stcal.handeye.result import HandEye
 from stcal.handeye.validate import HeldOutPoses
 
 SCATTERED = 1.5
-"""Times by which solutions scatter that are told of: of twelve simulated poses that err as is assumed, one set in a
-hundred does so."""
+"""Scatter, in units of what σ predict, from which on there is a note. One in a hundred sets of twelve simulated poses
+scatters as much if the poses err as assumed."""
 
 
 def scatter(result: HandEye, held_out: HeldOutPoses) -> float:
-    """By how much solutions without some of the poses scatter about the one of all, in units of what its σ say.
+    """Returns how much solutions without some poses scatter about the solution of all, relative to what its σ predict.
 
-    Of m poses with independent errors of which k are held out, the difference has the covariance C k / (m − k), where C
-    is the solution's (the jackknife of Shao & Wu, Ann. Statist. 17, 1989, with several left out at once); a little
-    more where few are left, for what they see differs (as the mean of an inverse Wishart matrix exceeds the inverse of
-    the mean). Errors that are not independent, or not as large in all poses, show as more.
+    If k of m poses with independent errors are held out, the difference has the covariance C k / (m − k), where C is
+    the covariance of the solution (the delete-k jackknife of Shao & Wu, Ann. Statist. 17, 1989). It is a little larger
+    if few poses are left, because their information varies (the mean of an inverse Wishart matrix exceeds the inverse
+    of the mean). Errors that are correlated, or not equally large in all poses, make the scatter larger.
 
     Parameters
     ----------
     result : HandEye
-        Of all poses.
+        Solution from all poses.
     held_out : HeldOutPoses
-        Of the same poses, with ``mount_from_camera``.
+        Cross-validation of the same poses, with ``mount_from_camera``.
 
     Returns
     -------
     float
-        RMS over splits and the six numbers; 1 is expected, NaN where a covariance or the solutions are missing.
+        RMS over splits and the six parameters. 1 is expected; NaN if the covariance or the solutions are missing.
     """
     if result.covariance is None or held_out.mount_from_camera is None or not len(held_out.rows):
         return float("nan")
-    four, k = held_out.mount_from_camera, held_out.rows.shape[1]
-    each = Poses(four[:, :3, :3], four[:, :3, 3])
-    off = each.difference(Poses.of([result.mount_from_camera] * len(each)))
-    squared = np.einsum("sa,ab,sb->s", off, generalised_inverse(result.covariance), off)
-    left = 6 * (len(result.names) - k) - UNKNOWNS - 1
-    return float(np.sqrt(squared.mean() / 6 * left / (6 * k)))
+    matrices, k = held_out.mount_from_camera, held_out.rows.shape[1]
+    solutions = Poses(matrices[:, :3, :3], matrices[:, :3, 3])
+    differences = solutions.difference(Poses.of([result.mount_from_camera] * len(solutions)))
+    squared = np.einsum("sa,ab,sb->s", differences, generalised_inverse(result.covariance), differences)
+    dof = 6 * (len(result.names) - k) - UNKNOWNS - 1
+    return float(np.sqrt(squared.mean() / 6 * dof / (6 * k)))
 
 
 def widened_by_scatter(result: HandEye, held_out: HeldOutPoses) -> HandEye:
-    """With σ that reach the :func:`scatter` of solutions without some of the poses; a note where that is much."""
+    """Returns the result with σ widened by the :func:`scatter`, if that exceeds 1, and a note if it is large."""
     factor = scatter(result, held_out)
     if not factor > 1:
         return result

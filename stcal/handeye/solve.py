@@ -1,4 +1,4 @@
-"""One call for every method."""
+"""Hand-eye calibration: one function for every method."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -36,9 +36,9 @@ from stcal.parallel import one_thread
 S = TypeVar("S", PoseSolution, AdjustedViews)
 OTHERS = ("zhao", "de", "de-polished", "pose", "reprojection")
 METHODS = (*AX_XB, *AX_ZB, *OTHERS)
-"""Names of the methods."""
+"""Names of all methods."""
 UNIT_MM = 1000.0
-"""Length that weighs like one radian where no σ are stated: errors of 1 mm go with errors of 1 mrad."""
+"""Length that weighs like one radian if no σ are stated, in mm: an error of 1 mm weighs like one of 1 mrad."""
 FACTORS = {
     "camera_focal": "focal length",
     "camera_centre": "principal point",
@@ -47,43 +47,45 @@ FACTORS = {
     "camera_all": "all",
 }
 LEAST_WITH_SCALE = 4
-"""Three poses leave five redundancies, with which no σ can be told."""
+"""Least number of poses if the scale is unknown: three leave a redundancy of five, too little to estimate σ."""
 WIDENED = 2.0
-"""Factor of the σ of a camera file, or of the poses by it, from which on the file is doubted."""
+"""Factor on the σ of a camera file, or of poses computed with it, beyond which a note questions the file."""
 ROBOT_BEYOND, BY_CHANCE = 2.0, 5e-4
-"""A robot's stated σ are doubted from so many times on, where chance makes as much so rarely."""
+"""Smallest ratio of estimated to stated σ at which a robot's stated σ are doubted, and the probability with which
+chance may exceed the ratio that is required."""
 REST_WORSE = 1.2
-"""Times by which corners fit worse if a robot that is called exact is."""
+"""Factor by which corners must fit worse with an exact robot before a robot that is stated as exact is doubted."""
 ROBOT = ("robot_rad", "robot_mm")
 HELD_MM = 1e-6
-"""σ by which X is held where it slides along the one axis of a robot of four axes."""
+"""σ that holds X along the one axis of rotation of a four-axis robot, where the poses do not determine it, in mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandEyeOptions:
-    """What is known, and what is to be solved for.
+    """Options of a hand-eye calibration: known errors, and further unknowns.
 
     Parameters
     ----------
     noise : Noise
-        What is known of the errors; the rest is estimated.
+        Known σ of the errors; unknown σ are estimated.
     intrinsics : CameraPrior, optional
-        Solve for the camera's parameters too, held by this; ``reprojection`` only.
+        Prior of the camera's parameters; if given, they are solved for. ``reprojection`` only.
     with_scale : bool
         Solve for the board's true size too; ``pose`` and ``reprojection`` only.
     symmetries : tuple of Rigid
-        All board_from_board after which the board looks the same, but for the identity: views that were numbered from
-        another end are put right.
+        All board_from_board except the identity that map the board onto itself. Views whose corners were numbered from
+        another end are renumbered.
     four_dof : bool
-        The flange turns about one axis only: solve for all but X along it; ``pose`` and ``reprojection`` only.
+        The flange turns about one axis only: solve for everything except X along this axis. ``pose`` and
+        ``reprojection`` only.
     evolution : EvolutionOptions
-        Of ``de`` and ``de-polished``.
+        Options of ``de`` and ``de-polished``.
     camera : CameraPrior, optional
-        What is known of the camera's parameters where they are not solved for: their errors become part of σ, with
-        views. They are exact where None.
+        Uncertainty of the camera's parameters if they are not solved for. With views, it is propagated into σ. The
+        parameters are exact if None.
     arm : ArmModel, optional
-        With the joint vectors of the same poses: solve for its parameters too, held by σ that are estimated;
-        ``reprojection`` only. Its poses replace those of the pairs.
+        Model of the arm, with the joint vectors of the same poses. Its parameters are solved for too, held by σ that
+        are estimated. Its poses replace those of the pairs. ``reprojection`` only.
     """
 
     noise: Noise = field(default_factory=Noise)
@@ -98,8 +100,11 @@ class HandEyeOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
-    """One call's input: ``pairs`` and ``views`` repaired; ``guess`` : of a loop, and whether the board's scale is free,
-    first X, Z and scale; ``seen`` : observability; ``notes`` : so far."""
+    """Input of one call.
+
+    ``pairs``, ``views`` : after repair of the numbering; ``guess`` : function of a loop and ``with_scale`` that returns
+    the first X, Z and scale; ``seen`` : observability; ``notes`` : notes so far.
+    """
 
     pairs: HandEyePoses
     loop: Loop
@@ -112,7 +117,7 @@ class _Task:
 
 
 def _guess(options: HandEyeOptions, seen: Observability, loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
-    """First X, Z and scale."""
+    """Returns the first X, Z and scale."""
     if options.four_dof:
         return start.about_one_axis(loop, seen.mount_axis, with_scale)
     return start.robust(loop, with_scale)
@@ -126,7 +131,7 @@ def handeye(
     views: Views | None = None,
     options: HandEyeOptions | None = None,
 ) -> HandEye:
-    """Where the camera sits on the flange, or in the robot's base.
+    """Returns where the camera is on the flange, or in the robot's base frame.
 
     Parameters
     ----------
@@ -136,21 +141,22 @@ def handeye(
     setup : str
         ``eye-in-hand``: the camera on the flange; ``eye-to-hand``: the board on the flange.
     method : str, optional
-        One of :data:`METHODS`; ``reprojection`` with views, else ``pose`` where none is named.
+        One of :data:`METHODS`; if None, ``reprojection`` with views, else ``pose``.
     views : Views, optional
-        The corners that ``pairs`` come from; only ``reprojection`` uses them.
+        The corners from which ``pairs`` were computed. ``reprojection`` adjusts them; with ``pose`` they carry the
+        camera's errors into σ.
     options : HandEyeOptions, optional
-        What is known of errors and camera, and what else to solve for; the defaults where None.
+        Known errors of robot and camera, and further unknowns; the defaults if None.
 
     Returns
     -------
     HandEye
-        X and Z with covariances, residuals, outliers, and notes on what is doubtful.
+        X and Z with covariances, residuals, outliers, and notes on anything doubtful.
 
     Raises
     ------
     InputError
-        Unknown method or setup, ``reprojection`` without views, or poses in another convention.
+        The method or setup is unknown, ``reprojection`` has no views, or the poses follow another convention.
     DegenerateError
         The poses do not determine the answer; the message says which motion is missing.
     ConvergenceError
@@ -187,8 +193,8 @@ def handeye(
 
 
 def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions) -> _Task:
-    """Checks that all methods share."""
-    seen = check(Loop.of(pairs, setup), setup, pairs.where, options.four_dof)
+    """Runs the checks that all methods share."""
+    observability = check(Loop.of(pairs, setup), setup, pairs.where, options.four_dof)
     if options.with_scale and len(pairs) < LEAST_WITH_SCALE:
         raise DegenerateError(
             "E-HANDEYE-FEW-POSES",
@@ -196,15 +202,15 @@ def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandE
         )
     notes: tuple[str, ...] = ()
     if options.symmetries:
-        mended = repair(pairs, setup, options.symmetries, views)
-        pairs, views, notes = mended.pairs, mended.views, mended.notes()
-    loop, guess = Loop.of(pairs, setup), cache(partial(_guess, options, seen))
+        repaired = repair(pairs, setup, options.symmetries, views)
+        pairs, views, notes = repaired.pairs, repaired.views, repaired.notes()
+    loop, guess = Loop.of(pairs, setup), cache(partial(_guess, options, observability))
     notes += check_conventions(pairs, loop, setup, guess, options.with_scale, views is not None)
-    return _Task(pairs, loop, setup, views, options, guess, seen, notes)
+    return _Task(pairs, loop, setup, views, options, guess, observability, notes)
 
 
 def _by_equations(task: _Task, method: str) -> HandEye:
-    """The methods that solve AX = XB or AX = ZB."""
+    """Solves AX = XB or AX = ZB by the named method."""
     if task.options.four_dof:
         raise DegenerateError(
             "E-HANDEYE-AXES", f"hand-eye: {method} needs rotations about two axes; with four_dof use method pose"
@@ -228,7 +234,7 @@ def _by_equations(task: _Task, method: str) -> HandEye:
         if method == "de":
             notes = (*notes, Aside(task.options.evolution.in_words(unit_mm)))
         z = start.mean_pose(task.loop.chain(x))
-    none = np.zeros(len(task.loop), bool)
+    outliers = np.zeros(len(task.loop), bool)
     residuals = task.loop.residuals(x, z)
     return HandEye(
         method=method,
@@ -237,21 +243,21 @@ def _by_equations(task: _Task, method: str) -> HandEye:
         stand_from_board=z,
         residuals=residuals,
         names=task.pairs.names,
-        outliers=none,
+        outliers=outliers,
         observability=task.seen,
         notes=notes,
     )
 
 
 def _by_motions(loop: Loop, method: str, unit_mm: float, options: EvolutionOptions) -> Rigid:
-    """X from the motions from each pose to the next."""
+    """Returns X from the motions between consecutive poses."""
     motions = Motions.consecutive(loop)
     if method == "zhao":
         return convex(motions, unit_mm)
     objective = Objective(motions.with_log(method), unit_mm, options.weight)
     farthest = max(np.linalg.norm(p.translation, axis=1).max() for p in (loop.camera_from_board, loop.stand_from_mount))
-    known = closed_form(loop, "park-martin", unit_mm)[0] if options.needs_closed_form() else None
-    x = evolve(objective, options, float(farthest), known)
+    known_x = closed_form(loop, "park-martin", unit_mm)[0] if options.needs_closed_form() else None
+    x = evolve(objective, options, float(farthest), known_x)
     return polish(objective, x) if method == "de-polished" else x
 
 
@@ -319,8 +325,8 @@ def _by_views(task: _Task, views: Views) -> HandEye:
         x, z, covariance, notes = _without_slide(task, x, z, solution.normal)
     if solution.camera_error is not None:
         covariance = solution.camera_error.covariance(covariance)
-    seen = replace(solution.loop, camera_from_board=resected(names, views, solution.found))
-    residuals = seen.residuals(x, z)
+    adjusted = replace(solution.loop, camera_from_board=resected(names, views, solution.found))
+    residuals = adjusted.residuals(x, z)
     notes += _remarks(task, solution.outliers, residuals, solution.scale_hint)
     notes += of_camera_file(solution.camera_gain, solution.sigma)
     return HandEye(
@@ -344,7 +350,10 @@ def _by_views(task: _Task, views: Views) -> HandEye:
 
 
 def of_camera_file(camera_gain: float, sigma: dict[str, float]) -> tuple[str, ...]:
-    """Notes on a camera file that the corners contradict, by what other intrinsics gain, and by its widened σ."""
+    """Returns notes on a camera file that the corners contradict.
+
+    ``camera_gain`` : gain of other intrinsics; ``sigma`` : holds the factors by which the file's σ were widened.
+    """
     notes: tuple[str, ...] = ()
     if camera_gain > CAMERA_GAIN:
         notes += (
@@ -358,24 +367,24 @@ def of_camera_file(camera_gain: float, sigma: dict[str, float]) -> tuple[str, ..
 
 
 def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, tuple[str, ...]]:
-    """Solved with the robot's σ as stated, or, where its poses contradict these, as estimated; and a note.
+    """Solves with the robot's stated σ, or with estimated σ and a note if the poses contradict the stated σ.
 
-    A robot that is held too tightly is not seen in its own residuals: the camera and the board are blamed instead.
+    A robot that is held too tightly does not show in its own residuals: its errors appear in camera and board instead.
     """
     noise, loop = task.options.noise, task.loop
-    given, own = solved(loop, noise), loop.robot_covariance
-    if own is not None:
-        rad, mm = np.sqrt(np.diagonal(own, axis1=1, axis2=2).reshape(-1, 2, 3).mean((0, 2))).tolist()
+    solution, stated = solved(loop, noise), loop.robot_covariance
+    if stated is not None:
+        rad, mm = np.sqrt(np.diagonal(stated, axis1=1, axis2=2).reshape(-1, 2, 3).mean((0, 2))).tolist()
     elif noise.robot_rad is not None and noise.robot_mm is not None:
         rad, mm = noise.robot_rad, noise.robot_mm
     else:
-        return given, ()
+        return solution, ()
     free = solved(replace(loop, robot_covariance=None), replace(noise, robot_rad=None, robot_mm=None))
-    found = tuple(free.sigma.get(name, 0.0) for name in ROBOT)
-    if not _contradicted((rad, mm), found, given.sigma, free.sigma, len(loop)):
-        return given, ()
+    estimated = tuple(free.sigma.get(name, 0.0) for name in ROBOT)
+    if not _contradicted((rad, mm), estimated, solution.sigma, free.sigma, len(loop)):
+        return solution, ()
     return free, (
-        f"the robot's poses err by {np.degrees(found[0]):.2g}° and {found[1]:.2g} mm an axis, where "
+        f"the robot's poses err by {np.degrees(estimated[0]):.2g}° and {estimated[1]:.2g} mm an axis, where "
         f"{np.degrees(rad):.2g}° and {mm:.2g} mm are stated: its σ are estimated instead; check the robot's poses",
     )
 
@@ -383,28 +392,31 @@ def _by_true_robot(task: _Task, solved: Callable[[Loop, Noise], S]) -> tuple[S, 
 def _contradicted(
     stated: tuple[float, ...], found: tuple[float, ...], given: dict[str, float], free: dict[str, float], poses: int
 ) -> bool:
-    """Whether the robot errs by more than is stated: its own σ are larger, or all else fits worse if it is exact."""
+    """True if the robot errs by more than is stated.
+
+    Its estimated σ are larger, or, if it is stated as exact, corners or board poses fit worse with an exact robot.
+    """
     dof = max(3 * (poses - LEAST_WITH_SCALE), 3)
     limit = max(ROBOT_BEYOND, float(np.sqrt(chi2.ppf(1 - BY_CHANCE, dof) / dof)))
     if all(stated):
         return any(own > limit * value for own, value in zip(found, stated, strict=True))
-    rest = [name for name in ("corner_px", "camera_factor") if given.get(name) and free.get(name)]
-    worse = max((given[name] / free[name] for name in rest), default=1.0)
+    shared = [name for name in ("corner_px", "camera_factor") if given.get(name) and free.get(name)]
+    worse = max((given[name] / free[name] for name in shared), default=1.0)
     return any(found) and worse > REST_WORSE
 
 
 def _remarks(task: _Task, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]) -> tuple[str, ...]:
-    """On poses and board."""
+    """Returns notes on outliers, groups of poses, the board's size, and distances."""
     names = tuple(name for name, bad in zip(task.pairs.names, outliers, strict=True) if not bad)
-    found = remarks.of_outliers(task.pairs.names, outliers, residuals)
-    found += remarks.of_groups(names, residuals[~outliers])
+    notes = remarks.of_outliers(task.pairs.names, outliers, residuals)
+    notes += remarks.of_groups(names, residuals[~outliers])
     if not (task.options.with_scale or task.options.four_dof):
-        found += remarks.of_size(task.loop[~outliers], hint, task.options.noise)
-    return found + remarks.of_distance(task.loop)
+        notes += remarks.of_size(task.loop[~outliers], hint, task.options.noise)
+    return notes + remarks.of_distance(task.loop)
 
 
 def _without_slide(task: _Task, x: Rigid, z: Rigid, normal: np.ndarray):
-    """X with nothing along the axis about which all poses turn; covariance given that; notes with what is unknown."""
+    """Returns X with no translation along the one axis of rotation, Z, the covariance given that, and all notes."""
     axis, frames = task.seen.mount_axis, FRAMES[task.setup]
     x, z = start.slid(x, z, axis, task.loop)
     held = normal.copy()

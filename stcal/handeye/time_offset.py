@@ -1,4 +1,4 @@
-"""The offset between the robot's clock and the camera's, from poses that were taken while the robot moved.
+"""Offset between the clocks of robot and camera, from images that were taken while the robot moved.
 
 The trajectory's derivative is a further column of the pose adjustment (as in Kelly & Sukhatme, Int. J. Robotics Res.
 30, 2011, and Furgale, Rehder & Siegwart, IROS 2013, for a camera beside an inertial sensor; here the trajectory is the
@@ -22,43 +22,43 @@ from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
 from stcal.handeye.result import HandEye
 
 WITHIN_S, SCAN_S = 1.0, 0.05
-"""Offsets that are tried before, and their steps: what a robot does within a step is smooth."""
+"""Range and step of the scan for a first offset, in s. A robot's motion within one step is smooth."""
 MOST_STEP_S = 0.05
 ROUNDS = 30
 SETTLED = 1e-3
-"""Share of σ that a last step may have."""
+"""Largest last step as a share of σ."""
 WINDOW_S = 0.1
-"""About an image, in which the flange must move …"""
+"""Time window around an image in which the flange must move, in s."""
 MOVED = 5.0
-"""… by so many times what samples of the stream err by."""
+"""Least motion of the flange within the window, in multiples of the noise of the stream's samples."""
 MOST_SIGMA_S = 0.1
-"""σ beyond which an offset is not told."""
+"""Largest σ with which an offset is reported, in s."""
 LEAST_KEPT = 2 / 3
-"""Share of the images that must lie in the stream with an offset that is tried."""
+"""Least share of the images that must lie within the stream for an offset to be tried."""
 LEAST_POSES = 4
-"""Three poses of six numbers leave too little beside thirteen unknowns to tell σ."""
+"""Least number of poses: three of six numbers each leave too little redundancy for σ beside thirteen unknowns."""
 UNKNOWNS = 12
-"""Of X and Z."""
+"""Number of unknowns of X and Z."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeOffset:
-    """By how much the robot's clock is ahead of the camera's.
+    """Lead of the robot's clock over the camera's.
 
     Parameters
     ----------
     seconds : float
         Robot's clock minus camera's: an image stamped t was taken when the robot's clock showed t + ``seconds``.
     sigma_s : float
-        Its σ, from an adjustment of X, Z and the offset.
+        σ of the offset, from an adjustment of X, Z and the offset.
     slope : (12,) array
-        By how much X and Z, (rotation rad, translation mm) of each, change with a second of offset.
+        Change of X and Z, (rotation rad, translation mm) of each, per second of offset.
     kept : (m,) bool array
-        Poses whose time lies within the stream with the offset.
+        Poses whose time, corrected by the offset, lies within the stream.
     base_from_flange : Poses
-        Of those kept, at that time, mm.
+        The robot's poses at the corrected times of the poses kept, mm.
     speed_rad_s, speed_mm_s : float
-        Of the flange at the images, RMS.
+        RMS speed of the flange at the images.
     """
 
     seconds: float
@@ -74,21 +74,21 @@ class TimeOffset:
         object.__setattr__(self, "kept", frozen(self.kept, (None,), "kept", bool))
 
     def in_words(self) -> str:
-        """The offset with its sign, and what it rests on."""
-        way = "ahead of" if self.seconds >= 0 else "behind"
+        """Returns the offset with its sign, σ, and the speed of the flange as one sentence."""
+        order = "ahead of" if self.seconds >= 0 else "behind"
         speed = f"{self.speed_mm_s:.3g} mm/s and {np.degrees(self.speed_rad_s):.3g}°/s"
         return (
             f"time offset: {1e3 * self.seconds:.2f} ± {1e3 * self.sigma_s:.2g} ms, robot's clock minus camera's: the "
-            f"robot's is {way} the camera's, an image stamped t was taken at t {'+' if self.seconds >= 0 else '-'} "
+            f"robot's is {order} the camera's, an image stamped t was taken at t {'+' if self.seconds >= 0 else '-'} "
             f"{1e3 * abs(self.seconds):.2f} ms of the robot's; the flange moves by {speed} at the images (RMS)"
         )
 
     def carried(self, result: HandEye) -> HandEye:
-        """The result of poses at the offset, with σ that hold the offset's."""
+        """Returns ``result``, which was solved at the offset, with the offset's σ propagated into its covariances."""
         shift = self.sigma_s**2 * np.outer(self.slope, self.slope)
-        own, stand = result.covariance, result.stand_covariance
-        own = None if own is None else own + shift[:6, :6]
-        return replace(result, covariance=own, stand_covariance=None if stand is None else stand + shift[6:, 6:])
+        mount, stand = result.covariance, result.stand_covariance
+        mount = None if mount is None else mount + shift[:6, :6]
+        return replace(result, covariance=mount, stand_covariance=None if stand is None else stand + shift[6:, 6:])
 
 
 def estimate_offset(
@@ -99,22 +99,22 @@ def estimate_offset(
     noise: Noise | None = None,
     with_scale: bool = False,
 ) -> TimeOffset:
-    """Offset, X and Z by least squares of the loop's residuals, with σ estimated as by method ``pose``.
+    """Estimates offset, X and Z by least squares of the loop's residuals, with σ estimated as by method ``pose``.
 
     Parameters
     ----------
     pairs : HandEyePoses
-        m of them, of which the board's poses are used.
+        The m pairs; only their poses of the board are used.
     stream : Stream
-        The robot's poses by its clock.
+        The robot's poses over time by its clock.
     seconds : (m,) array
         Times of the pairs after the stream's origin, by the camera's clock, s.
     setup : {"eye-in-hand", "eye-to-hand"}
         What carries the camera.
     noise : Noise, optional
-        What is known of the errors.
+        Known σ of the errors.
     with_scale : bool
-        The board's size is free.
+        True if the board's size is an unknown.
 
     Returns
     -------
@@ -123,11 +123,11 @@ def estimate_offset(
     Raises
     ------
     InputError
-        Too few poses, or too few of them within the stream.
+        There are too few poses, or too few of them lie within the stream.
     DegenerateError
-        The flange stands still at the images, or its motions do not tell the offset.
+        The flange stands still at the images, or its motions do not determine the offset.
     ConvergenceError
-        No offset is settled upon.
+        The offset does not converge.
     """
     noise = noise or Noise()
     if len(pairs) < LEAST_POSES:
@@ -140,14 +140,14 @@ def estimate_offset(
     offset = _scanned(pairs, stream, seconds, setup, with_scale)
     state = None
     for _ in range(ROUNDS):
-        kept = _inside(stream, seconds + offset)
-        if kept.sum() < LEAST_POSES:
+        within = _inside(stream, seconds + offset)
+        if within.sum() < LEAST_POSES:
             raise InputError(
                 "E-TIME-OFFSET-RANGE",
-                f"{stream.where}: {kept.sum()} images within it at an offset of {offset:.3g} s; give more",
+                f"{stream.where}: {within.sum()} images within it at an offset of {offset:.3g} s; give more",
             )
-        at = seconds[kept] + offset
-        loop = Loop.of(replace(pairs[kept], base_from_flange=stream.at(at)), setup)
+        at = seconds[within] + offset
+        loop = Loop.of(replace(pairs[within], base_from_flange=stream.at(at)), setup)
         state = state or LoopState(*start.robust(loop, with_scale))
         solution = adjust_poses(loop, state, noise, with_scale)
         state, speed = solution.state, stream.velocity(at)
@@ -169,11 +169,11 @@ def estimate_offset(
             )
         offset += float(np.clip(step, -MOST_STEP_S, MOST_STEP_S))
         if abs(step) < SETTLED * sigma:
-            kept = _inside(stream, seconds + offset)
-            turn, way = np.sqrt((speed.reshape(-1, 2, 3) ** 2).sum(2).mean(0))
+            within = _inside(stream, seconds + offset)
+            turn, travel = np.sqrt((speed.reshape(-1, 2, 3) ** 2).sum(2).mean(0))
             slope = inverse[:UNKNOWNS, count] / inverse[count, count]
-            at = stream.at(seconds[kept] + offset)
-            return TimeOffset(offset, sigma, slope, kept, at, float(turn), float(way))
+            at = stream.at(seconds[within] + offset)
+            return TimeOffset(offset, sigma, slope, within, at, float(turn), float(travel))
     raise ConvergenceError(
         "E-TIME-OFFSET-UNSETTLED",
         f"{stream.where}: the time offset does not settle, last {offset:.4g} ± {sigma:.2g} s; check times and poses",
@@ -181,12 +181,12 @@ def estimate_offset(
 
 
 def _inside(stream: Stream, seconds: np.ndarray) -> np.ndarray:
-    """Whether times (m,) lie within the stream."""
+    """Returns for times (m,) whether they lie within the stream."""
     return (seconds >= 0) & (seconds <= stream.seconds[-1])
 
 
 def _require_motion(stream: Stream, seconds: np.ndarray) -> None:
-    """Refuse a flange that stands still: what its samples err by would pass for motion."""
+    """Raises DegenerateError if the flange stands still, where the noise of the samples would pass for motion."""
     noise, moved = stream.rest(), stream.travel(seconds[_inside(stream, seconds)], WINDOW_S)
     if any(way > MOVED * max(np.nan_to_num(own), 1e-9) for own, way in zip(noise, moved, strict=True)):
         return
@@ -199,13 +199,13 @@ def _require_motion(stream: Stream, seconds: np.ndarray) -> None:
 
 
 def _scanned(pairs: HandEyePoses, stream: Stream, seconds: np.ndarray, setup: Setup, with_scale: bool) -> float:
-    """The offset at which a first solution fits best, to a step of the scan."""
+    """Returns the offset at which a first solution fits best, to one step of the scan."""
     best, least = 0.0, np.inf
     for offset in np.arange(-WITHIN_S, WITHIN_S + SCAN_S / 2, SCAN_S):
-        kept = _inside(stream, seconds + offset)
-        if kept.sum() < max(LEAST_POSES, LEAST_KEPT * len(seconds)):
+        within = _inside(stream, seconds + offset)
+        if within.sum() < max(LEAST_POSES, LEAST_KEPT * len(seconds)):
             continue
-        loop = Loop.of(replace(pairs[kept], base_from_flange=stream.at(seconds[kept] + offset)), setup)
+        loop = Loop.of(replace(pairs[within], base_from_flange=stream.at(seconds[within] + offset)), setup)
         miss = loop.residuals(*start.robust(loop, with_scale)).reshape(-1, 2, 3)
         cost = float(np.log(np.median(np.linalg.norm(miss, axis=2), axis=0) + 1e-12).sum())
         if cost < least:

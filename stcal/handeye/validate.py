@@ -1,4 +1,4 @@
-"""How good a hand-eye calibration is: on poses that it has not seen, by every method."""
+"""Cross-validation of hand-eye calibrations: errors on held-out poses, by every method."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,31 +20,31 @@ from stcal.held_out import repeated_splits
 from stcal.parallel import one_thread, run_parallel
 
 SETUP_SPLITS = 6
-"""Splits that tell which setup is meant."""
+"""Number of splits that decide which setup is meant."""
 SETUP_BETTER = 4.0
-"""Times by which the product of both errors must be smaller in the other setup."""
+"""Factor by which the product of rotation and translation error must be smaller in the other setup."""
 LEAST_LEFT = 3
-"""Poses that must be left to solve with."""
+"""Least number of poses that must remain to solve with."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOutPoses:
-    """Errors on s times k poses that were held out. One row of an array is one split.
+    """Errors on held-out poses, in s splits of k poses. One row of an array is one split.
 
     Parameters
     ----------
     rows : (s, k) int array
-        Which poses were held out.
+        Rows of the poses that were held out.
     rotation_rad, translation_mm : (s, k) arrays
-        By how much the chain through robot and camera misses the board's pose: angle, and distance of the origins.
+        Deviation of the chain through robot and camera from the board's pose: angle, and distance of the origins.
     board_mm : (s, k) array, or None without corners
-        3-D error at the board: how far from each corner the ray on which the camera saw it pierces the board where the
-        robot's chain has put it; mean over the corners of a view.
+        3-D error at the board: the board is placed by the robot's chain, and each corner's line of sight is intersected
+        with it. Distance of the intersection from the corner, mean over the corners of a view.
     pose_mm : (s, k) array, or None without corners
-        Mean distance of the corners by the robot's chain from those by the pose that the view gives by itself; holds
-        the error of that pose, mostly along the line of sight.
+        Distance between the corners as placed by the robot's chain and by the pose from the view alone, mean over the
+        corners. It contains the error of the latter pose, mostly along the line of sight.
     mount_from_camera : (s, 4, 4) array, optional
-        The solution of the other poses of each split, mm.
+        Solution from the other poses of each split, mm.
     """
 
     rows: np.ndarray
@@ -60,33 +60,35 @@ class HeldOutPoses:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, frozen(getattr(self, name), self.rows.shape, name))
         if self.mount_from_camera is not None:
-            four = frozen(self.mount_from_camera, (len(self.rows), 4, 4), "solutions")
-            object.__setattr__(self, "mount_from_camera", four)
+            matrices = frozen(self.mount_from_camera, (len(self.rows), 4, 4), "solutions")
+            object.__setattr__(self, "mount_from_camera", matrices)
 
     def means(self, of: np.ndarray | None = None) -> dict[str, float]:
-        """Means over all splits of every error there is; ``of`` : which poses (m,) count, all where
-        None; empty where none of these was held out."""
+        """Returns the mean of every available error over all splits, by name.
+
+        ``of`` : mask (m,) of the poses that count, all if None. Empty if none of these was held out.
+        """
         names = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
-        rows = np.ones(self.rows.shape, bool) if of is None else of[self.rows]
-        if not rows.any():
+        mask = np.ones(self.rows.shape, bool) if of is None else of[self.rows]
+        if not mask.any():
             return {}
-        return {name: float(getattr(self, name)[rows].mean()) for name in names if getattr(self, name) is not None}
+        return {name: float(getattr(self, name)[mask].mean()) for name in names if getattr(self, name) is not None}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compared:
-    """One method beside the others.
+    """Result and errors of one method in a comparison.
 
     Parameters
     ----------
     method : str
         One of :data:`~stcal.handeye.METHODS`.
     result : HandEye or None
-        Of all poses; None where the method fails.
+        Solution from all poses; None if the method fails.
     held_out : HeldOutPoses or None
-        Errors on poses that were held out; None where the method fails, or none were.
+        Errors on held-out poses; None if the method fails, or no poses were held out.
     reason : str
-        Why it fails; empty where it does not.
+        Why the method fails; empty if it does not.
     """
 
     method: str
@@ -96,18 +98,18 @@ class Compared:
 
 
 def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int = 0) -> np.ndarray:
-    """Poses to hold out: at random, in rounds in each of which every pose comes about once.
+    """Draws the poses to hold out: at random, in rounds, each of which holds out every pose about once.
 
     Parameters
     ----------
     count : int
-        Poses there are.
+        Number of poses.
     held_out : int, optional
-        Poses to hold out at once, k; a quarter of them, at least one, where None.
+        Number of poses k to hold out at once; if None, a quarter of the poses, at least one.
     repeats : int
-        Splits wanted.
+        Number of splits.
     seed : int
-        Of the random order.
+        Seed of the random order.
 
     Returns
     -------
@@ -117,7 +119,7 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
     Raises
     ------
     InputError
-        Fewer than three would be left.
+        Fewer than three poses would remain.
     """
     k = held_out or max(1, count // 4)
     if count - k < LEAST_LEFT:
@@ -139,18 +141,18 @@ def cross_validate(
     workers: int | None = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> HeldOutPoses:
-    """Solve without some of the poses and predict these.
+    """Solves without some of the poses and predicts these, split by split.
 
     Parameters
     ----------
     pairs, setup, method, views, options
-        As of :func:`~stcal.handeye.handeye`.
+        See :func:`~stcal.handeye.handeye`.
     rows : (s, k) int array, optional
-        Poses to hold out, from :func:`splits`, which is also what None means.
+        Poses to hold out; those of :func:`splits` if None.
     workers : int or None
-        Processes for adjustments of corners, as many as cores where None.
+        Number of processes for adjustments of corners; as many as cores if None.
     progress : callable, optional
-        Called with the number of splits done, and that of all.
+        Called with the number of splits done, and the number of all splits.
 
     Returns
     -------
@@ -159,21 +161,23 @@ def cross_validate(
     Raises
     ------
     StcalError
-        As of :func:`~stcal.handeye.handeye`, where a split cannot be solved.
+        A split cannot be solved; see :func:`~stcal.handeye.handeye`.
     """
     options = options or HandEyeOptions()
     if options.symmetries:
-        mended = repair(pairs, setup, options.symmetries, views)
-        pairs, views, options = mended.pairs, mended.views, replace(options, symmetries=())
+        repaired = repair(pairs, setup, options.symmetries, views)
+        pairs, views, options = repaired.pairs, repaired.views, replace(options, symmetries=())
     rows = splits(len(pairs)) if rows is None else rows
     jobs = [(pairs, setup, method, views, options, out) for out in rows]
-    found: list[dict[str, np.ndarray]] = [{}] * len(jobs)
+    errors_of_split: list[dict[str, np.ndarray]] = [{}] * len(jobs)
     slow = views is not None and method in (None, "reprojection")
     for done, (i, errors) in enumerate(run_parallel(errors_without, jobs, workers if slow else 1), 1):
-        found[i] = errors
+        errors_of_split[i] = errors
         if progress:
             progress(done, len(jobs))
-    return HeldOutPoses(rows, **{name: np.array([errors[name] for errors in found]) for name in found[0]})
+    return HeldOutPoses(
+        rows, **{name: np.array([errors[name] for errors in errors_of_split]) for name in errors_of_split[0]}
+    )
 
 
 def errors_without(
@@ -184,12 +188,12 @@ def errors_without(
     options: HandEyeOptions,
     out: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Of :class:`HeldOutPoses`, by name, on the poses ``out``, (k,): errors of the solution of the others, and it."""
-    kept, arm = np.setdiff1d(np.arange(len(pairs)), out), options.arm
+    """Solves without the poses ``out``, (k,). Returns the fields of :class:`HeldOutPoses` for these poses, by name."""
+    remaining, arm = np.setdiff1d(np.arange(len(pairs)), out), options.arm
     if arm is not None:
-        options = replace(options, arm=arm[kept])
+        options = replace(options, arm=arm[remaining])
     try:
-        result = handeye(pairs[kept], setup, method, None if views is None else views[kept], options)
+        result = handeye(pairs[remaining], setup, method, None if views is None else views[remaining], options)
     except DegenerateError as error:
         names = ", ".join(pairs.names[i] for i in out)
         raise DegenerateError(error.code, f"without {names}: {error}") from error
@@ -201,59 +205,65 @@ def errors_without(
 
 
 def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict[str, np.ndarray]:
-    """Errors of :class:`HeldOutPoses` by name, (k,) each, on pairs and views that the result has not seen."""
+    """Returns the errors of :class:`HeldOutPoses` by name, (k,) each, on pairs and views unknown to the result."""
     scale, loop = result.scale, Loop.of(pairs, result.setup)
     if views is None:
-        off = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)
+        residuals = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)
         return {
-            "rotation_rad": np.linalg.norm(off[:, :3], axis=1),
-            "translation_mm": np.linalg.norm(off[:, 3:], axis=1),
+            "rotation_rad": np.linalg.norm(residuals[:, :3], axis=1),
+            "translation_mm": np.linalg.norm(residuals[:, 3:], axis=1),
         }
     board = result.reprojection
     camera = views.camera if board is None else board.camera
-    seen = [
+    adjusted_views = [
         view.moved(scale * view.xyz_board if board is None else board.board(view.xyz_board)) for view in views.views
     ]
-    by_view = resect(Views(camera, tuple(seen)), pairs.names).camera_from_board
-    off = replace(loop, camera_from_board=by_view).residuals(result.mount_from_camera, result.stand_from_board)
-    by_robot = result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
+    pose_by_view = resect(Views(camera, tuple(adjusted_views)), pairs.names).camera_from_board
+    residuals = replace(loop, camera_from_board=pose_by_view).residuals(
+        result.mount_from_camera, result.stand_from_board
+    )
+    pose_by_robot = result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
     return {
-        "rotation_rad": np.linalg.norm(off[:, :3], axis=1),
-        "translation_mm": np.linalg.norm(off[:, 3:], axis=1),
-        "board_mm": np.array([_beside(view, camera, pose) for view, pose in zip(seen, by_robot, strict=True)]),
-        "pose_mm": np.array([_apart(view, *two) for view, *two in zip(seen, by_robot, by_view, strict=True)]),
+        "rotation_rad": np.linalg.norm(residuals[:, :3], axis=1),
+        "translation_mm": np.linalg.norm(residuals[:, 3:], axis=1),
+        "board_mm": np.array(
+            [_beside(view, camera, pose) for view, pose in zip(adjusted_views, pose_by_robot, strict=True)]
+        ),
+        "pose_mm": np.array(
+            [_apart(view, *poses) for view, *poses in zip(adjusted_views, pose_by_robot, pose_by_view, strict=True)]
+        ),
     }
 
 
 @one_thread()
 def better_setup(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, rows: np.ndarray) -> str:
-    """Whether poses held out are predicted far better in the other setup, by method ``pose``; empty where not.
+    """Returns a note if method ``pose`` predicts held-out poses far better in the other setup, else an empty string.
 
     Parameters
     ----------
     pairs, setup, options
-        As of :func:`~stcal.handeye.handeye`.
+        See :func:`~stcal.handeye.handeye`.
     rows : (s, k) int array
         Poses to hold out.
 
     Returns
     -------
     str
-        A note, with both errors.
+        The note, with the errors in both setups, or an empty string.
     """
-    other: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
+    opposite: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
     plain = replace(options, intrinsics=None, symmetries=())
     rows = rows[:SETUP_SPLITS]
     try:
-        means = [cross_validate(pairs, each, "pose", None, plain, rows).means() for each in (setup, other)]
-    except StcalError:  # of the one, which was told before, or of the other, which is none then
+        means = [cross_validate(pairs, each, "pose", None, plain, rows).means() for each in (setup, opposite)]
+    except StcalError:  # the stated setup failed, which was reported before, or the other setup is none
         return ""
     (turn, shift), (other_turn, other_shift) = ((m["rotation_rad"], m["translation_mm"]) for m in means)
     if not (turn * shift > SETUP_BETTER * other_turn * other_shift and turn > other_turn and shift > other_shift):
         return ""
     return Grave(
         f"poses held out are missed by {np.degrees(turn):.2g}° and {shift:.2g} mm as {setup}, by "
-        f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {other}: give --setup {other} if it is that"
+        f"{np.degrees(other_turn):.2g}° and {other_shift:.2g} mm as {opposite}: give --setup {opposite} if it is that"
     )
 
 
@@ -268,38 +278,38 @@ def compare(
     workers: int | None = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Compared, ...]:
-    """Every method on the same poses and the same splits.
+    """Solves by every method on the same poses and the same splits.
 
     Parameters
     ----------
     pairs, setup, views, options
-        As of :func:`~stcal.handeye.handeye`; without views, ``reprojection`` is passed over.
+        See :func:`~stcal.handeye.handeye`; without views, ``reprojection`` is skipped.
     methods : tuple of str
-        Of :data:`~stcal.handeye.METHODS`.
+        Names out of :data:`~stcal.handeye.METHODS`.
     rows, workers
-        As of :func:`cross_validate`; nothing is held out where ``rows`` is empty.
+        See :func:`cross_validate`; nothing is held out if ``rows`` is empty.
     progress : callable, optional
-        Called with the number of methods done, and that of all.
+        Called with the number of methods done, and the number of all methods.
 
     Returns
     -------
     tuple of Compared
-        In the order of ``methods``; a method that fails says why.
+        One per method, in the order of ``methods``; a method that fails has a reason.
 
     Raises
     ------
     InputError
-        Poses in another convention.
+        The poses follow another convention.
     DegenerateError
-        Poses that no method can solve.
+        No method can solve these poses.
     """
     options = options or HandEyeOptions()
     if options.symmetries:
-        mended = repair(pairs, setup, options.symmetries, views)
-        pairs, views, options = mended.pairs, mended.views, replace(options, symmetries=())
-    handeye(pairs, setup, "pose", views, options)  # what is wrong with the poses is wrong for all methods
+        repaired = repair(pairs, setup, options.symmetries, views)
+        pairs, views, options = repaired.pairs, repaired.views, replace(options, symmetries=())
+    handeye(pairs, setup, "pose", views, options)  # raises if the poses themselves are at fault, whatever the method
     rows = splits(len(pairs)) if rows is None else rows
-    found = []
+    compared = []
     for done, method in enumerate(methods):
         if progress:
             progress(done, len(methods))
@@ -312,21 +322,21 @@ def compare(
                 held_out = cross_validate(pairs, setup, method, views, options, rows, workers)
         except StcalError as error:
             reason = str(error)
-        found.append(Compared(method, result, held_out, reason))
+        compared.append(Compared(method, result, held_out, reason))
     if progress:
         progress(len(methods), len(methods))
-    return tuple(found)
+    return tuple(compared)
 
 
 def _beside(view: View, camera: Camera, camera_from_board: Rigid) -> float:
-    """Mean distance of the corners from where their rays pierce the plane of the board at their height."""
+    """Returns the mean distance of the corners from where their rays meet the board's plane at the corner's height."""
     ray = np.column_stack([camera.normalised_from_pixel(view.xy_px), np.ones(len(view))]) @ camera_from_board.rotation
-    eye = camera_from_board.inverse().translation
+    camera_centre = camera_from_board.inverse().translation
     normal = view.normals()
-    length = ((view.xyz_board - eye) * normal).sum(1) / (ray * normal).sum(1)
-    return float(np.linalg.norm(eye + length[:, None] * ray - view.xyz_board, axis=1).mean())
+    length = ((view.xyz_board - camera_centre) * normal).sum(1) / (ray * normal).sum(1)
+    return float(np.linalg.norm(camera_centre + length[:, None] * ray - view.xyz_board, axis=1).mean())
 
 
 def _apart(view: View, first: Rigid, second: Rigid) -> float:
-    """Mean distance of the corners by two poses."""
+    """Returns the mean distance between the corners as placed by two poses."""
     return float(np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean())

@@ -1,1 +1,1 @@
-"""Files: cameras, designs, TOML, tables, images; read with every mistake named, and written whole or not at all."""
+"""Files: cameras, designs, TOML, tables, images. Readers name every mistake; writing is all or nothing."""

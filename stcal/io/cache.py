@@ -1,4 +1,4 @@
-"""Results kept between runs: arrays and plain values in one file; what is damaged is made anew."""
+"""Cache of results between runs: arrays and plain values in one file; a damaged file is ignored."""
 
 import io
 import json
@@ -17,23 +17,23 @@ from stcal.io.saving import save
 R = TypeVar("R")
 META = "meta"
 DAMAGE = (OSError, ValueError, LookupError, EOFError, TypeError, zipfile.BadZipFile, zlib.error, StcalError)
-"""What reading, or making the result anew, raises where a file is absent, cut or of another form."""
+"""Exceptions of reading a file, or of rebuilding its result, if the file is missing, truncated or of another form."""
 
 
 def packed(arrays: Mapping[str, Any], meta: dict[str, Any]) -> bytes:
-    """Arrays by name, and plain values, as the content of a file that :func:`kept` reads."""
+    """Return the content of a file that :func:`kept` reads: arrays by name, and plain values ``meta``."""
     stream = io.BytesIO()
     np.savez(stream, **{**arrays, META: np.frombuffer(json.dumps(meta).encode(), np.uint8)})
     return stream.getvalue()
 
 
 def keep(path: Path, arrays: Mapping[str, Any], meta: dict[str, Any]) -> None:
-    """Save arrays by name, and plain values."""
+    """Save arrays by name, and plain values ``meta``, to a file that :func:`kept` reads."""
     save(path, packed(arrays, meta))
 
 
 def kept(path: Path, make: Callable[[Mapping[str, np.ndarray], dict[str, Any]], R]) -> R | None:
-    """What ``make`` makes of the arrays and values of a file; None where there is none, or a damaged one."""
+    """Return the result that ``make`` builds from the arrays and values of a file; None if it is missing or damaged."""
     try:
         with np.load(io.BytesIO(read_bytes(path, TABLE_BYTES))) as stored:
             if sum(part.file_size for part in stored.zip.infolist()) > TABLE_BYTES:

@@ -1,4 +1,4 @@
-"""What a covariance is: the one place where those that come in are judged."""
+"""Validation of covariances: the only place where covariances from outside are checked."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -8,32 +8,32 @@ import numpy as np
 from stcal.errors import InputError
 
 ROUNDING = 1e-5
-"""By which correlations may be off, times their number of rows: files state six digits, and 1.00000 is 5e-6 off."""
+"""Tolerance of a correlation per row of its matrix: files state six digits, so that 1.00000 may be off by 5e-6."""
 LARGEST = 1e24
-"""Variance in any unit: σ of 1e12 is more than all that is measured."""
+"""Largest variance in any unit: a σ of 1e12 exceeds anything that is measured."""
 TINY = 1e-300
-"""In place of a variance of zero, so that there is no division by it."""
+"""Value that replaces a variance of zero, to avoid division by zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """What the rows of a covariance are of: ``names``; ``nothing`` : variance of each that is zero but for rounding."""
+    """The rows of a covariance: ``names``; ``nothing`` : variance of each row that counts as zero (rounding)."""
 
     names: tuple[str, ...]
     nothing: float | tuple[float, ...] = 0.0
 
     @classmethod
     def of(cls, names: Iterable[str], axes: str) -> "Rows":
-        """Of the coordinates, in mm, of several points."""
+        """Return the rows for the coordinates, in mm, of several named points."""
         return cls(tuple(f"{axis} of {name}" for name in names for axis in axes), NANOMETRE)
 
 
 TWIST = ("rx", "ry", "rz", "x", "y", "z")
 """Rows of the covariance of a pose: rotation vector (rad) and translation (mm), left perturbation."""
 NANOMETRE = 1e-12
-"""Its square in mm²."""
+"""Square of a nanometre in mm²."""
 NANORADIAN = 1e-18
-"""Its square: what is a metre away moves by a nanometre."""
+"""Square of a nanoradian in rad²: a point at a distance of a metre moves by a nanometre."""
 OF_POSE = Rows(TWIST, (*[NANORADIAN] * 3, *[NANOMETRE] * 3))
 OF_POINT = Rows(("x", "y", "z"), NANOMETRE)
 OF_PIXEL = Rows(("x", "y"))
@@ -41,30 +41,30 @@ OF_PIXEL = Rows(("x", "y"))
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """``row`` : which of the matrices is none, from 0; ``reason`` : measured and needed."""
+    """An invalid covariance. ``row`` : index of the matrix, from 0; ``reason`` : measured and needed values."""
 
     row: int
     reason: str
 
 
 def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fault | None:
-    """The first of many matrices that is no covariance.
+    """Return the fault of the first of many matrices that is not a covariance.
 
-    A covariance is finite, symmetric and without negative eigenvalues, up to rounding. Eigenvalues are those of the
-    correlations, since the units of the rows differ.
+    A covariance is finite, symmetric and without negative eigenvalues, up to rounding. The eigenvalues of the
+    correlation matrix are tested, since the units of the rows differ.
 
     Parameters
     ----------
     matrices : (m, n, n) array
     rows : Rows
-        Names of its rows, and which variances are no more than rounding.
+        Names of the rows, and the variances that count as zero.
     definite : bool
-        Eigenvalues must be positive: it will be inverted.
+        True if eigenvalues must be positive, since the matrix will be inverted.
 
     Returns
     -------
     Fault or None
-        None where all are covariances.
+        None if all matrices are covariances.
     """
     size = matrices.shape[-1]
     nothing = np.zeros(size) if definite else np.resize(rows.nothing, size)
@@ -76,26 +76,26 @@ def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fau
         correlation[:, range(size), range(size)] = variance / scale**2
         odd = np.abs(matrices - np.swapaxes(matrices, 1, 2)) - np.sqrt(np.outer(nothing, nothing))
         odd /= scales
-        plain = (variance >= 0).all(axis=1) & (variance <= LARGEST).all(axis=1)
-        plain &= (odd <= ROUNDING * size).all(axis=(1, 2))
-        plain &= (np.abs(correlation) <= 1 + ROUNDING * size).all(axis=(1, 2))
+        acceptable = (variance >= 0).all(axis=1) & (variance <= LARGEST).all(axis=1)
+        acceptable &= (odd <= ROUNDING * size).all(axis=(1, 2))
+        acceptable &= (np.abs(correlation) <= 1 + ROUNDING * size).all(axis=(1, 2))
     lowest = np.full(len(matrices), -np.inf)
-    lowest[plain] = np.linalg.eigvalsh(correlation[plain])[:, 0]
+    lowest[acceptable] = np.linalg.eigvalsh(correlation[acceptable])[:, 0]
     bad = np.flatnonzero(~(lowest > 0 if definite else lowest >= -ROUNDING * size))
     if not len(bad):
         return None
     row = int(bad[0])
-    more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-    return Fault(row, _reason(matrices[row], odd[row], correlation[row], float(lowest[row]), rows, definite) + more)
+    suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+    return Fault(row, _reason(matrices[row], odd[row], correlation[row], float(lowest[row]), rows, definite) + suffix)
 
 
 def require_covariance(matrix: np.ndarray, size: int, rows: Rows, definite: bool = False) -> None:
-    """Refuse what is no covariance of ``size`` rows, see :func:`first_fault`.
+    """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`.
 
     Raises
     ------
     InputError
-        Says what is measured and needed; whose covariance it is, is for the caller to say.
+        The message states measured and needed values; the caller adds whose covariance it is.
     """
     if matrix.shape != (size, size):
         raise InputError(
@@ -107,7 +107,7 @@ def require_covariance(matrix: np.ndarray, size: int, rows: Rows, definite: bool
 
 
 def _reason(matrix, odd, correlation, lowest: float, rows: Rows, definite: bool) -> str:
-    """Why it is none; of one matrix, ``odd`` : by how much correlations differ from those across the diagonal."""
+    """Return why one matrix is not a covariance; ``odd`` : asymmetry of its correlations."""
     variance, needed = np.diagonal(matrix), "a positive number" if definite else "0 or more"
     if not np.isfinite(matrix).all():
         return "a value is not finite, finite numbers needed"

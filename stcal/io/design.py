@@ -1,4 +1,4 @@
-"""``target.toml`` and ``board.toml``: read with every mistake named, and written with comments to edit."""
+"""Readers of ``target.toml`` and ``board.toml`` that name every mistake, and writers that add comments for editing."""
 
 from dataclasses import fields
 from pathlib import Path
@@ -24,19 +24,20 @@ from stcal.likeness import MAX_GAP, MAX_RADIUS_RATIO, whole_likeness
 
 REMEDY = "`stcal-sfm init DIR` writes one"
 ROUGH_KEYS = "rough_pose = { origin_mm, x, normal }"
-"""What a face of a target file may say of where it is."""
+"""Form of the entry in which a face of a target file may state its rough pose."""
 MIN_SINE = 0.02
 """Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
 
 
 MIN_DIRECTION = 1e-6
 MAX_SKEW_DEG = 5.0
-"""By which X and normal of a rough pose may miss a right angle."""
+"""Largest deviation from a right angle between X and normal of a rough pose."""
 
 Vector = tuple[Finite, Finite, Finite]
 Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
 Squares = Annotated[int, Field(ge=3, le=1000, strict=True)]
-"""Of a row of a chessboard: fewer inner corners are not recognised as one, fewer squares have all corners on a line."""
+"""Number in a row of a chessboard. A grid with fewer inner corners is not recognised as a chessboard; fewer squares
+have all inner corners on one line."""
 Index = Annotated[int, Field(ge=0, strict=True)]
 Name = Annotated[
     str,
@@ -53,7 +54,7 @@ class _CircleFile(Strict):
 
 
 class _RoughPoseFile(Strict):
-    """Of a face's drawing, in a frame that all faces share."""
+    """Rough pose of a face's drawing, in a frame that all faces share."""
 
     origin_mm: Vector
     x: Vector
@@ -89,7 +90,7 @@ Kelvin = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False, strict=True)]
 
 
 class SizeEntry(Strict):
-    """Keys of :class:`StatedSize` but the pitch: of any body."""
+    """The keys of :class:`StatedSize` without the pitch, for any body."""
 
     expansion_ppm_per_k: Expansion | None = None
     expansion_sigma_ppm_per_k: Ppm | None = None
@@ -98,19 +99,19 @@ class SizeEntry(Strict):
     reference_temperature_c: Celsius | None = None
 
     def stated(self) -> StatedSize:
-        """As the budget takes it."""
-        own = {each.name: getattr(self, each.name, None) for each in fields(StatedSize)}
-        return StatedSize(**{key: None if value is None else float(value) for key, value in own.items()})
+        """Return the values as a :class:`StatedSize`, the input of the error budget."""
+        values = {entry.name: getattr(self, entry.name, None) for entry in fields(StatedSize)}
+        return StatedSize(**{key: None if value is None else float(value) for key, value in values.items()})
 
 
 class BoardSizeEntry(SizeEntry):
-    """Keys of :class:`StatedSize`."""
+    """All keys of :class:`StatedSize`."""
 
     pitch_sigma_ppm: Ppm | None = None
 
 
 class BoardEntry(BoardSizeEntry):
-    """A board of dots; ``type`` may say so."""
+    """A board of dots; ``type`` is optional."""
 
     type: Literal["circles"] = "circles"
     rows: Count
@@ -148,7 +149,7 @@ def load_board(path: str | Path) -> BoardDesign:
 
 
 def board_design(data: BoardEntry, where: str) -> BoardDesign:
-    """The board of an entry; ``where`` begins what an InputError says."""
+    """Return the board of an entry; the message of an InputError begins with ``where``."""
     if 2 * data.radius_mm >= data.pitch_mm:
         raise InputError(
             "E-BOARD-RADIUS", f"{where}: radius {data.radius_mm:g} mm, under half the pitch {data.pitch_mm:g} mm needed"
@@ -181,12 +182,12 @@ def board_design(data: BoardEntry, where: str) -> BoardDesign:
 
 
 def target_of(given: str | Path | TargetDesign | None) -> TargetDesign:
-    """The target that is given, or that a file holds; the reference design where None."""
+    """Return the given target, or the target of a file; the reference design if ``given`` is None."""
     return reference_target() if given is None else given if isinstance(given, TargetDesign) else load_target(given)
 
 
 def board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
-    """The board that is given, or that a file holds; the reference board where None."""
+    """Return the given board, or the board of a file; the reference board if ``given`` is None."""
     return reference_board() if given is None else given if isinstance(given, BoardDesign) else load_board(given)
 
 
@@ -246,7 +247,7 @@ def _face(face: _FaceFile, where: str) -> FaceDesign:
 
 
 def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline: np.ndarray, where: str) -> None:
-    """Refuse circles that reach over the edge of their plate."""
+    """Refuse circles that extend beyond the outline of their plate."""
     side = np.roll(outline, -1, axis=0) - outline
     length = np.linalg.norm(side, axis=1)
     if length.min() == 0:
@@ -270,33 +271,33 @@ def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline:
 
 
 def _require_distinct(faces: tuple[FaceDesign, ...], where: str) -> None:
-    """Refuse faces that no photograph tells apart, and a face that looks the same when it is turned."""
-    for i, one in enumerate(faces):
-        for other in faces[i:]:
-            few, many = (one, other) if len(one.ids) <= len(other.ids) else (other, one)
+    """Refuse faces that look alike in photographs, and a face that looks the same after a rotation."""
+    for i, face in enumerate(faces):
+        for second in faces[i:]:
+            few, many = (face, second) if len(face.ids) <= len(second.ids) else (second, face)
             like = whole_likeness(
                 few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm, np.arange(len(few.ids)) if few is many else None
             )
             if like is None:
                 continue
             size = "" if abs(like.scale - 1) < 0.005 else f" at {like.scale:.2f} times the size"
-            off = f"places differ by up to {round(like.gap_mm, 3):g} mm, radii by {round(like.radius_mm, 3):g} mm"
+            deviation = f"places differ by up to {round(like.gap_mm, 3):g} mm, radii by {round(like.radius_mm, 3):g} mm"
             if few is many:
-                what = f"face {one.id} looks the same after a turn by {abs(np.degrees(like.turn_rad)):.0f}°"
+                finding = f"face {face.id} looks the same after a turn by {abs(np.degrees(like.turn_rad)):.0f}°"
             elif len(few.ids) == len(many.ids):
-                what = f"faces {one.id} and {other.id} have the same pattern{size}"
+                finding = f"faces {face.id} and {second.id} have the same pattern{size}"
             else:
-                what = f"the {len(few.ids)} circles of face {few.id} are all on face {many.id} too{size}"
+                finding = f"the {len(few.ids)} circles of face {few.id} are all on face {many.id} too{size}"
             raise InputError(
                 "E-TARGET-LIKENESS",
-                f"{where}: {what} ({off}); "
+                f"{where}: {finding} ({deviation}); "
                 f"change a circle on {'it' if few is many else 'one of them'}, its place by more than "
                 f"{MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}",
             )
 
 
 def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
-    """target_from_drawing; X is turned to a right angle with the normal."""
+    """Return target_from_drawing; X is made perpendicular to the normal."""
     directions = []
     for key in ("x", "normal"):
         direction = np.array(getattr(pose, key))
@@ -321,7 +322,7 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
 
 
 def target_toml(target: TargetDesign) -> str:
-    """Text of a ``target.toml`` for ``target``, with comments."""
+    """Return the text of a ``target.toml`` for ``target``, with comments."""
     lines = [
         "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
         "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
@@ -371,11 +372,11 @@ def _outline_lines(outline: np.ndarray | None) -> list[str]:
 
 
 def board_toml(board: BoardDesign) -> str:
-    """Text of a ``board.toml`` for ``board``, with comments."""
+    """Return the text of a ``board.toml`` for ``board``, with comments."""
     corner = board.corner or (0, 0)
     corner_radius = board.corner_radius_mm or 1.5 * board.radius_mm
-    off = "" if board.corner else "# "
-    sizes = [(each.name, getattr(board.stated, each.name)) for each in fields(StatedSize)]
+    prefix = "" if board.corner else "# "
+    sizes = [(entry.name, getattr(board.stated, entry.name)) for entry in fields(StatedSize)]
     return (
         "\n".join(
             [
@@ -390,10 +391,10 @@ def board_toml(board: BoardDesign) -> str:
                 "",
                 "# One larger dot in a corner of the grid tells the orientation; without it the board looks the",
                 "# same after half a turn, which a run settles by comparing the images of a group.",
-                f"{off}[corner]",
-                f"{off}row = {corner[0]}",
-                f"{off}column = {corner[1]}",
-                f"{off}radius_mm = {_number(corner_radius)}",
+                f"{prefix}[corner]",
+                f"{prefix}row = {corner[0]}",
+                f"{prefix}column = {corner[1]}",
+                f"{prefix}radius_mm = {_number(corner_radius)}",
             ]
         )
         + "\n"

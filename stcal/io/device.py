@@ -1,4 +1,4 @@
-"""Cameras of this machine, over V4L2 or UVC through OpenCV, and simulated ones."""
+"""Image sources: cameras of this machine, over V4L2 or UVC through OpenCV, and simulated cameras."""
 
 import re
 import time
@@ -14,23 +14,26 @@ from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode, find_images, grey_8bit
 
 MANUAL_V4L2, MANUAL_OTHERS = 1.0, 0.25
-"""What OpenCV's AUTO_EXPOSURE means by manual: V4L2's menu, and the convention of the other back ends."""
+"""Values of OpenCV's AUTO_EXPOSURE that mean manual: V4L2's menu, and the convention of the other back ends."""
 SATURATED = 250
 DARK = 5
 FULL_SCALE = 255
 SIMULATED_NOISE = 1.0
-"""σ of a pixel of the simulated camera, grey values."""
+"""Noise σ of a pixel of the simulated camera, grey values."""
 READINGS = 3
-"""Frames that a driver may still have in its queue when it is told another exposure."""
+"""Number of frames that a driver may still have in its queue after the exposure was changed."""
 
 
 class Source(Protocol):
-    """What takes images."""
+    """A device that takes images."""
 
     name: str
 
     def expose(self, exposure: float | None, settle_s: float) -> tuple[np.ndarray, float]:
-        """A grey image (h, w) at an exposure, in the driver's unit, as it is where None; and what was really set."""
+        """Return a grey image (h, w), and the exposure at which it was taken.
+
+        ``exposure`` : in the driver's unit; None leaves it unchanged.
+        """
         ...
 
     def close(self) -> None:
@@ -44,23 +47,23 @@ class OpenCVSource:
     Parameters
     ----------
     device
-        Number, or place such as ``/dev/video0``.
+        Number, or path such as ``/dev/video0``.
     gain
-        In the driver's unit; as it is where None.
+        In the driver's unit; None leaves it unchanged.
     by_hand
-        Whether exposures are set by hand, or left to the camera.
+        True if exposures are set manually, False for the camera's automatic exposure.
 
     Raises
     ------
     InputError
-        No such camera, or one that takes no gain.
+        There is no such camera, or its driver accepts no gain.
     """
 
     def __init__(self, device: str, gain: float | None = None, by_hand: bool = True):
         self.name = f"camera {device}"
         place = int(device) if device.isdigit() else device
         before = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(0)  # what OpenCV says of a camera that is not there is said below
+        cv2.utils.logging.setLogLevel(0)  # a missing camera is reported below
         self._capture = cv2.VideoCapture(place)
         cv2.utils.logging.setLogLevel(before)
         if not self._capture.isOpened():
@@ -80,7 +83,7 @@ class OpenCVSource:
             )
 
     def expose(self, exposure: float | None, settle_s: float) -> tuple[np.ndarray, float]:
-        """As of :class:`Source`; frames are passed over until the settle time is over."""
+        """Return an image and its exposure, see :class:`Source`; frames during the settle time are dropped."""
         if exposure is not None and not self._capture.set(cv2.CAP_PROP_EXPOSURE, exposure):
             raise InputError(
                 "E-DEVICE-SETTING",
@@ -90,9 +93,9 @@ class OpenCVSource:
         until, frame = time.monotonic() + settle_s, None
         read = 0
         while read < READINGS or time.monotonic() < until:
-            there, frame = self._capture.read()
+            received, frame = self._capture.read()
             read += 1
-            if not there or frame is None:
+            if not received or frame is None:
                 raise InputError(
                     "E-DEVICE-NO-IMAGE", f"{self.name}: gives no image any more; check its cable and other programs"
                 )
@@ -107,21 +110,21 @@ class OpenCVSource:
 
 
 class SimulatedSource:
-    """A camera that sees given images, which were taken at exposure 1: at others they are that many times as bright.
+    """A simulated camera that shows given images. They belong to exposure 1; brightness is proportional to exposure.
 
     Parameters
     ----------
     images
-        An image, which it sees for ever; or a folder, whose images it sees one after another, by name.
+        An image that is shown for ever, or a folder whose images are shown one after another, by name.
     gain
-        By which they are brighter; 1 where None.
+        Factor on the brightness; 1 if None.
     seed
-        Of its noise.
+        Seed of the noise.
 
     Raises
     ------
     InputError
-        No image, or one that cannot be read.
+        There is no image, or one cannot be read.
     """
 
     def __init__(self, images: str | Path, gain: float | None = None, seed: int = 0):
@@ -132,7 +135,7 @@ class SimulatedSource:
         self._rng = np.random.default_rng(seed)
 
     def expose(self, exposure: float | None, settle_s: float) -> tuple[np.ndarray, float]:
-        """As of :class:`Source`; there is nothing to settle."""
+        """Return the next image and its exposure, see :class:`Source`; there is no settle time."""
         image = next(self._next, None)
         if image is None:
             raise InputError(
@@ -144,27 +147,27 @@ class SimulatedSource:
             raise InputError(
                 "E-IMAGE-UNREADABLE", f"{image}: {error.strerror or error}; an image needed to simulate a camera"
             ) from error
-        really = 1.0 if exposure is None else exposure
-        seen = really * self._gain * grey_8bit(decode(content, str(image))).astype(float)
-        seen += self._rng.normal(0, SIMULATED_NOISE, seen.shape)
-        return np.clip(np.round(seen), 0, FULL_SCALE).astype(np.uint8), really
+        exposure_set = 1.0 if exposure is None else exposure
+        grey = exposure_set * self._gain * grey_8bit(decode(content, str(image))).astype(float)
+        grey += self._rng.normal(0, SIMULATED_NOISE, grey.shape)
+        return np.clip(np.round(grey), 0, FULL_SCALE).astype(np.uint8), exposure_set
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Do nothing: a simulated camera holds no device."""
 
 
 def png(image: np.ndarray) -> bytes:
-    """A file of a grey image."""
+    """Return the bytes of a PNG file of a grey image."""
     return cv2.imencode(".png", image)[1].tobytes()
 
 
 def checked_name(name: str, what: str) -> str:
-    """The name of a folder.
+    """Return ``name`` if it is a valid name of a folder.
 
     Raises
     ------
     InputError
-        One that is none.
+        The name is not valid.
     """
     if not re.fullmatch(r"[\w][\w .-]{0,99}", name):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Bytes of a file that the user names, as many as its kind can have."""
+"""Reading of files that the user names, with a size limit for each kind of file."""
 
 import errno
 import os
@@ -6,41 +6,41 @@ from pathlib import Path
 
 MB = 1_000_000
 SETTINGS_BYTES = 10 * MB
-"""Most that a file has which people write: camera, designs, robot, layout."""
+"""Largest size of a file that people write: camera, designs, robot, layout."""
 TABLE_BYTES = 100 * MB
-"""Most that tables and result files have."""
+"""Largest size of tables and result files."""
 IMAGE_BYTES = 500 * MB
-"""Most that an image file has: 80 megapixels, 16 bit, colour, as they are."""
+"""Largest size of an image file: 80 megapixels, 16 bit, colour, uncompressed."""
 MODEL_BYTES = 1000 * MB
-"""Most that a file of a COLMAP model has."""
+"""Largest size of a file of a COLMAP model."""
 
 
 def read_bytes(path: str | Path, most: int) -> bytes:
-    """All of a file.
+    """Return the whole content of a file.
 
     Raises
     ------
     OSError
         It cannot be read, or is larger than ``most`` bytes.
     """
-    chunks, left = [], most + 1
+    chunks, remaining = [], most + 1
     with open(path, "rb") as stream:
-        step = max(os.fstat(stream.fileno()).st_size + 1, MB)  # `read` takes memory for as much as it is asked for
-        while chunk := stream.read(min(step, left)):
+        step = max(os.fstat(stream.fileno()).st_size + 1, MB)  # `read` allocates as much memory as it is asked for
+        while chunk := stream.read(min(step, remaining)):
             chunks.append(chunk)
-            left -= len(chunk)
-        if not left:
+            remaining -= len(chunk)
+        if not remaining:
             raise _too_large(path, most)
     return b"".join(chunks)
 
 
 def require_size(path: str | Path, most: int) -> None:
-    """Of a file that another program's library reads.
+    """Refuse a file that is too large; for files that another program's library reads.
 
     Raises
     ------
     OSError
-        It is larger than ``most`` bytes.
+        The file is larger than ``most`` bytes.
     """
     if Path(path).stat().st_size > most:
         raise _too_large(path, most)

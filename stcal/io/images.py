@@ -24,40 +24,45 @@ from stcal.io.saving import RUN_MARKER
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 EXCLUDED = "taken out with --exclude"
 HOLDS_IMAGES = "it holds images"
-"""In the reason why a folder is left out."""
+"""Part of the reason why a folder is left out."""
 TOP_GROUP = "."
 """Name of the group that images lying directly in the folder form."""
 
 NOISE_BLUR_PX = 1.5
-"""σ of the blur that takes noise away."""
+"""σ of the blur that removes noise."""
 SAME_NOISE = 1.2
-"""RMS difference of two forms of one photograph, in RMS of its noise, at most: a JPEG of low quality differs by 1.1,
-two exposures by 1.5."""
+"""Largest RMS difference between two files of one photograph, in units of its RMS noise: a JPEG of low quality differs
+by 1.1, two exposures by 1.5."""
 SAME_GREY = 1.0
-"""And grey values of 255: what rounding and compression change where there is no noise."""
+"""Lower limit of the allowed RMS difference, grey values of 255: rounding and compression without noise cause as
+much."""
 SAME_EDGES = 1.5
-"""So much more at most over the whole image: compression changes edges a little, a camera that moved much."""
+"""Factor on the allowed RMS difference over the whole image, edges included: compression changes edges a little, a
+motion of the camera changes them much."""
 
 THUMBNAIL_PX = 1400
 THUMBNAIL_QUALITY = 80
 MOST_JPEG_SIDE = 65_000
-"""px; a JPEG holds 65 535."""
+"""Largest height of a thumbnail, px; the JPEG format is limited to 65 535."""
 
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
-"""A marker other than a restart, which stands inside a scan."""
+"""A JPEG marker other than a restart marker, which occurs inside a scan."""
 _DAMAGE = re.compile(
     rb"(Corrupt JPEG data(?!: \d+ extraneous bytes before marker 0xd9)|Premature end|TIFF_Error)[^\n]*"
 )
-"""What decoders write to standard error and then go on; stray bytes before the end of a JPEG do no harm."""
+"""Messages that decoders write to standard error without failing; stray bytes before the end of a JPEG do no harm."""
 
 _STANDARD_ERROR = threading.Lock()
-"""Held while it is led elsewhere."""
+"""Lock that is held while standard error is redirected."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageFile:
-    """One file: ``name`` is its path below the image folder, with forward slashes; ``content`` where it is carried
-    along, to a machine that does not see the path."""
+    """An image file.
+
+    ``name`` : path below the image folder, with forward slashes; ``content`` : bytes of the file if they are carried
+    along to a machine that does not see the path, else None.
+    """
 
     path: Path
     name: str
@@ -65,17 +70,17 @@ class ImageFile:
     content: bytes | None = field(default=None, repr=False)
 
     def read(self) -> bytes:
-        """The content.
+        """Return the content of the file.
 
         Raises
         ------
         OSError
-            It cannot be read, or is too large for an image.
+            The file cannot be read, or is too large for an image.
         """
         return read_bytes(self.path, IMAGE_BYTES) if self.content is None else self.content
 
     def carried(self) -> "ImageFile":
-        """With its content; as it is where that cannot be read, which is then told where it is wanted."""
+        """Return the file with its content. An unreadable file is unchanged: its later read reports the error."""
         try:
             return replace(self, content=self.read())
         except OSError:
@@ -84,7 +89,7 @@ class ImageFile:
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """A file that is not used, and why: its ``value`` is not what ``gate`` asks for, ``limit``."""
+    """A file that is not used, and the reason: its ``value`` does not meet the ``limit`` of the check ``gate``."""
 
     name: str
     reason: str
@@ -94,7 +99,7 @@ class Skipped:
 
 
 def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
-    """Image files below ``folder``, sorted by group and name, and the files that are none.
+    """Return the image files below ``folder``, sorted by group and name, and the files that are skipped.
 
     Raises
     ------
@@ -118,9 +123,9 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
         else:
             _sort_in(path, path.name, TOP_GROUP, files, skipped)
     if not files:
-        # A folder in a folder says most: the images lie deeper than they should.
-        left_out = sorted(skipped, key=lambda s: (s.gate != "folder", HOLDS_IMAGES not in s.reason))[:1]
-        hint = "".join(f" (left out {s.name}: {s.reason})" for s in left_out)
+        # A nested folder is the most helpful hint: the images lie deeper than they should.
+        most_telling = sorted(skipped, key=lambda s: (s.gate != "folder", HOLDS_IMAGES not in s.reason))[:1]
+        hint = "".join(f" (left out {s.name}: {s.reason})" for s in most_telling)
         raise InputError(
             "E-IMAGES-NONE",
             f"image folder {root}: no image, one of {', '.join(s[1:] for s in SUFFIXES)}{hint}; "
@@ -130,31 +135,32 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
 
 
 def chosen_images(folder: str | Path, exclude: Sequence[str] = ()) -> tuple[list[ImageFile], list[Skipped]]:
-    """What :func:`find_images` finds, with those taken out that are named: by their name in results
-    (``12/IMG_1003.jpg``), or by their path.
+    """Return the result of :func:`find_images` with the images ``exclude`` moved to the skipped files.
+
+    ``exclude`` : names of images in results (``12/IMG_1003.jpg``), or their paths.
 
     Raises
     ------
     InputError
-        As of :func:`find_images`; there is no image of a name, or no other image.
+        As for :func:`find_images`; an excluded image does not exist, or no image is left.
     """
     files, skipped = find_images(folder)
-    out: set[str] = set()
+    excluded: set[str] = set()
     for word in exclude:
-        found = {file.name for file in files if word == file.name or Path(word).absolute() == file.path.absolute()}
-        if not found:
+        matching = {file.name for file in files if word == file.name or Path(word).absolute() == file.path.absolute()}
+        if not matching:
             raise InputError(
                 "E-OPTION-EXCLUDE",
                 f"--exclude {word}: no such image in {folder}; give its name as results have it, such as "
                 f"{files[0].name}",
             )
-        out |= found
-    kept = [file for file in files if file.name not in out]
-    if not kept:
+        excluded |= matching
+    remaining = [file for file in files if file.name not in excluded]
+    if not remaining:
         raise InputError(
             "E-OPTION-EXCLUDE", f"image folder {folder}: --exclude takes out all {len(files)} images; leave some in"
         )
-    return kept, [*skipped, *(Skipped(f.name, EXCLUDED, "excluded") for f in files if f.name in out)]
+    return remaining, [*skipped, *(Skipped(f.name, EXCLUDED, "excluded") for f in files if f.name in excluded)]
 
 
 def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> None:
@@ -163,7 +169,7 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
     plain = name.encode("utf-8", "backslashreplace").decode()
     if path.is_dir():
         reason = "a folder inside a group; images lie in <group>/ directly"
-        with contextlib.suppress(OSError):  # of a folder that cannot be read
+        with contextlib.suppress(OSError):  # the folder cannot be read
             if any(inner.suffix.lower() in SUFFIXES for inner in path.iterdir()):
                 reason += f"; {HOLDS_IMAGES}: did you mean {path.parent}?"
         skipped.append(Skipped(plain, reason, "folder"))
@@ -171,7 +177,7 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
         kinds = ", ".join(SUFFIXES)
         skipped.append(Skipped(plain, "not an image file", "file_type", path.suffix or "no suffix", kinds))
     elif plain != name or name_fault(name):
-        # No file of results could hold such a name.
+        # Result files cannot store such a name.
         reason = f"its name {name_fault(name) or 'is not UTF-8'}; rename it"
         skipped.append(Skipped(repr(plain)[1:-1], reason, "file_name"))
     elif not path.is_file():
@@ -181,7 +187,7 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
 
 
 def name_fault(name: str) -> str | None:
-    """What is wrong with an image's name, which must lie below the folder of images on any system; None if nothing."""
+    """Return what is wrong with an image's name, or None; on any system it must lie below the folder of images."""
     if any(unicodedata.category(character) == "Cc" for character in name):
         return "holds a control character"
     for path in (PurePosixPath(name), PureWindowsPath(name)):
@@ -191,12 +197,12 @@ def name_fault(name: str) -> str | None:
 
 
 def decode(data: bytes, name: str) -> np.ndarray:
-    """Grey image (height, width), uint8 or uint16, of an image file's bytes; EXIF orientation is ignored.
+    """Return the grey image (height, width), uint8 or uint16, of an image file's bytes; EXIF orientation is ignored.
 
     Raises
     ------
     InputError
-        Empty, truncated or unreadable data.
+        The data are empty, truncated or unreadable.
     """
     if not data:
         raise InputError("E-IMAGE-EMPTY", f"{name}: empty file (0 bytes); copy it again")
@@ -225,12 +231,12 @@ def decode(data: bytes, name: str) -> np.ndarray:
 
 
 def stated_size(data: bytes, name: str) -> tuple[int, int]:
-    """Width and height, px, as the head of an image file states them, before anything is decoded.
+    """Return width and height, px, from the header of an image file, without decoding it.
 
     Raises
     ------
     InputError
-        Not an image, or one of more pixels than any camera's.
+        The data are no image, or have more pixels than any camera.
     """
     try:
         with warnings.catch_warnings():
@@ -241,63 +247,65 @@ def stated_size(data: bytes, name: str) -> tuple[int, int]:
         raise InputError(
             "E-IMAGE-TOO-LARGE", f"{name}: more pixels than any camera has; send it as the camera took it"
         ) from error
-    except Exception as error:  # what is no image fails in many ways
+    except Exception as error:  # data that are no image fail in many ways
         raise InputError(
             "E-IMAGE-UNREADABLE", f"{name}: not readable as an image; convert it to {', '.join(SUFFIXES)}"
         ) from error
 
 
 def grey_8bit(image: np.ndarray) -> np.ndarray:
-    """The image in 8 bit; deeper images are scaled so that their bright end just fits."""
+    """Return the image in 8 bit; deeper images are scaled so that their bright end just fits."""
     if image.dtype == np.uint8:
         return image
     return cv2.convertScaleAbs(image, alpha=255.0 / _bright_end(image))
 
 
 def grey_fine(image: np.ndarray) -> np.ndarray:
-    """The image in the grey values of :func:`grey_8bit`, not rounded to them."""
+    """Return the image in the grey values of :func:`grey_8bit`, but without rounding."""
     return image if image.dtype == np.uint8 else image * np.float32(255.0 / _bright_end(image))
 
 
 def same_photograph(image: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two grey images are of one exposure, kept in two forms: their noise is the same, as far as a form with
-    losses leaves it. Two exposures from one place have noise of their own, and differ by √2 of it.
+    """Return True if two grey images are two files of one exposure.
+
+    Such files share their noise, except for losses by compression. The noise of two exposures from one place is
+    independent: they differ by √2 times the noise.
 
     Parameters
     ----------
     image, other : (height, width) uint8 or uint16
-        They may differ in brightness by a factor and a constant.
+        Their brightness may differ by a factor and a constant.
     """
     if image.shape != other.shape:
         return False
-    one, two = (grey_8bit(each).astype(np.float32) for each in (image, other))
-    one, two = one - one.mean(), two - two.mean()
-    one *= float((one * two).mean()) / max(float((one * one).mean()), 1e-9)
-    smooth = [cv2.GaussianBlur(each, (0, 0), NOISE_BLUR_PX) for each in (one, two)]
+    first, second = (grey_8bit(grey).astype(np.float32) for grey in (image, other))
+    first, second = first - first.mean(), second - second.mean()
+    first *= float((first * second).mean()) / max(float((first * first).mean()), 1e-9)
+    smooth = [cv2.GaussianBlur(grey, (0, 0), NOISE_BLUR_PX) for grey in (first, second)]
     slope = np.hypot(*np.gradient(smooth[0]))
-    flat = slope <= np.median(slope)  # edges would hide it
+    flat = slope <= np.median(slope)  # edges would hide the noise
 
     def rms(values: np.ndarray) -> float:
         return float(np.sqrt((values[flat] ** 2).mean()))
 
-    allowed = max(SAME_GREY, SAME_NOISE * max(rms(one - smooth[0]), rms(two - smooth[1])))
-    return rms(two - one) < allowed and float(np.sqrt(((two - one) ** 2).mean())) < SAME_EDGES * allowed
+    allowed = max(SAME_GREY, SAME_NOISE * max(rms(first - smooth[0]), rms(second - smooth[1])))
+    return rms(second - first) < allowed and float(np.sqrt(((second - first) ** 2).mean())) < SAME_EDGES * allowed
 
 
 def shrunk(image: np.ndarray, scale: float) -> np.ndarray:
-    """The image at a scale of at most 1, at least one pixel wide and high."""
+    """Return the image at a scale of at most 1, at least one pixel wide and high."""
     height, width = image.shape[:2]
-    if min(height, width) * scale <= 0.5:  # rounded, there would be no pixel
+    if min(height, width) * scale <= 0.5:  # rounding would leave no pixel
         size = max(1, round(width * scale)), max(1, round(height * scale))
         return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
 def thumbnail(grey: np.ndarray, width_px: int = THUMBNAIL_PX) -> tuple[np.ndarray, float]:
-    """A small JPEG (bytes as a uint8 array) of an 8-bit grey image, and its size over the image's."""
+    """Return a small JPEG (bytes as a uint8 array) of an 8-bit grey image, and its scale relative to the image."""
     height, width = grey.shape
     scale = min(1.0, width_px / width, MOST_JPEG_SIDE / height)
-    while scale < 0.5:  # halving is cheap, and takes most of the pixels away
+    while scale < 0.5:  # halving is cheap, and removes most of the pixels
         grey, scale = shrunk(grey, 0.5), 2 * scale
     small = shrunk(grey, scale)
     _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, THUMBNAIL_QUALITY])
@@ -305,10 +313,10 @@ def thumbnail(grey: np.ndarray, width_px: int = THUMBNAIL_PX) -> tuple[np.ndarra
 
 
 def percentiles(grey: np.ndarray, percent: list[float]) -> np.ndarray:
-    """``np.percentile`` of unsigned integers, from their counts: in a tenth of its time."""
+    """Return the percentiles of unsigned integers from their histogram, ten times as fast as ``np.percentile``."""
     below = np.cumsum(np.bincount(grey.ravel()))
     place = (below[-1] - 1) * np.asarray(percent) / 100
-    low, high = (np.searchsorted(below, each(place), side="right") for each in (np.floor, np.ceil))
+    low, high = (np.searchsorted(below, rounding(place), side="right") for rounding in (np.floor, np.ceil))
     return low + (high - low) * (place % 1)
 
 
@@ -318,14 +326,14 @@ def _bright_end(image: np.ndarray) -> float:
 
 @contextlib.contextmanager
 def _decoder_messages() -> Iterator[bytearray]:
-    """What libraries in C write to standard error meanwhile: the only sign that a decoder made something up.
+    """Collect the messages that C libraries write to standard error: the only sign that a decoder made up pixels.
 
-    One thread at a time: a second one would keep the first one's file as the standard error to put back.
+    Only one thread at a time may do this: a second one would restore the first one's file as standard error.
     """
     messages = bytearray()
     try:
-        kept = os.dup(2)
-    except OSError:  # there is no standard error
+        standard_error = os.dup(2)
+    except OSError:  # the process has no standard error
         yield messages
         return
     with tempfile.TemporaryFile() as caught:
@@ -333,8 +341,8 @@ def _decoder_messages() -> Iterator[bytearray]:
         try:
             yield messages
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(standard_error, 2)
+            os.close(standard_error)
             caught.seek(0)
             messages += caught.read()
 
@@ -344,7 +352,7 @@ def _is_png(data: bytes) -> bool:
 
 
 def _png_intact(data: bytes) -> bool:
-    """Whether every chunk has the checksum that it states."""
+    """Return True if the checksums of all chunks are right."""
     at = 8
     while at + 12 <= len(data):
         end = at + 8 + int.from_bytes(data[at : at + 4], "big")
@@ -357,7 +365,7 @@ def _png_intact(data: bytes) -> bool:
 
 
 def _ends_properly(data: bytes) -> bool:
-    """Whether a JPEG, PNG or BMP is there to its end: decoders fill up what is missing without a word."""
+    """Return True if a JPEG, PNG or BMP is complete: decoders silently fill in missing data."""
     if data[:2] == b"\xff\xd8":
         return _jpeg_ends(data)
     if _is_png(data):
@@ -368,7 +376,7 @@ def _ends_properly(data: bytes) -> bool:
 
 
 def _jpeg_ends(data: bytes) -> bool:
-    """Whether the image's own end marker is there; a thumbnail before it, or a video after it, has others."""
+    """Return True if the end marker of the main image exists; an embedded thumbnail or appended video has its own."""
     at = 2
     while marker := _JPEG_MARKER.search(data, at):
         kind, at = data[marker.end() - 1], marker.end()

@@ -1,4 +1,4 @@
-"""Two tables as one: rows of the same key side by side, columns renamed to what a command reads."""
+"""Joins of tables: rows of the same key side by side, columns renamed as a command needs them."""
 
 import re
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ SHOWN = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joined:
-    """``table`` ; ``notes`` : rows that stand in one file alone."""
+    """A joined ``table``, and ``notes`` on the rows that occur in only one of the files."""
 
     table: Table
     notes: tuple[str, ...]
@@ -32,50 +32,51 @@ def join(
     quaternions: Order = "wxyz",
     columns: str | Path | None = None,
 ) -> Joined:
-    """Rows of two CSV files whose ``key`` is the same.
+    """Return the rows of two CSV files that have the same ``key``, joined.
 
     Parameters
     ----------
     a, b
-        Files with a column ``key``, each value once; or what was read from them.
+        Files with a column ``key`` that holds each value once; or tables read from them.
     key
-        Name of the column.
+        Name of the key column.
     prefixes
-        Put before the columns of a pose or a position of each file, ``x_mm`` to ``qz`` and covariances, unless they
-        have it; other columns keep their names, those of ``a`` where both have one.
+        Prefix for the columns of a pose or a position in each file, ``x_mm`` to ``qz`` and covariances. Other columns
+        keep their names; if both files have a column of that name, the one of ``a`` is used.
     quaternions
-        As of :func:`~stcal.io.table.read_table`.
+        See :func:`~stcal.io.table.read_table`.
     columns
-        Map of the columns of ``b``, as of :func:`~stcal.io.poses.mapped.read_mapped`.
+        Map of the columns of ``b``, see :func:`~stcal.io.poses.mapped.read_mapped`.
 
     Returns
     -------
     Joined
-        In the order of ``a``; lines are its.
+        The rows have the order and the line numbers of ``a``.
 
     Raises
     ------
     InputError
-        A file that is none, no such column, a key twice, none in common, or one column for both.
+        A file is no table or lacks the key column, a key occurs twice, no key is common to both, or both files have
+        the same pose column.
     """
     if columns and not isinstance(b, Table):
         second = read_mapped(b, columns, "table", quaternions)
     else:
         second = read_table(b, "table", quaternions)
     tables = [read_table(a, "table", quaternions), second]
-    a, b = (each.where if isinstance(each, Table) else each for each in (a, b))
+    a, b = (source.where if isinstance(source, Table) else source for source in (a, b))
     places = [_places(table, key) for table in tables]
     common = [name for name in places[0] if name in places[1]]
     if not common:
-        first = [next(iter(own)) for own in places]
+        first = [next(iter(row_of_key)) for row_of_key in places]
         raise InputError(
             "E-TABLES-UNMATCHED",
             f"{a}, {b}: no {key} in common: {first[0]} … in the one, {first[1]} … in the other; correct them, or give "
             "another --key",
         )
     joined: dict[str, list[str] | np.ndarray] = {}
-    for table, own, prefix in zip(tables, places, prefixes, strict=True):
-        rows = [own[name] for name in common]
+    for table, row_of_key, prefix in zip(tables, places, prefixes, strict=True):
+        rows = [row_of_key[name] for name in common]
         for name, values in table.columns.items():
             posed = bool(_OF_POSES.fullmatch(name))
             new = prefix + name if posed else name
@@ -87,23 +88,27 @@ def join(
             joined.setdefault(new, values[rows] if isinstance(values, np.ndarray) else [values[i] for i in rows])
     lines = [tables[0].lines[places[0][name]] for name in common]
     notes = []
-    for path, own, other in ((a, places[0], places[1]), (b, places[1], places[0])):
-        alone = [name for name in own if name not in other]
-        if alone:
-            more = ", …" if len(alone) > SHOWN else ""
-            notes.append(f"{len(alone)} rows of {path} have no partner: {key} {', '.join(alone[:SHOWN])}{more}")
+    for path, row_of_key, rows_of_other in ((a, places[0], places[1]), (b, places[1], places[0])):
+        unmatched = [name for name in row_of_key if name not in rows_of_other]
+        if unmatched:
+            ellipsis = ", …" if len(unmatched) > SHOWN else ""
+            notes.append(
+                f"{len(unmatched)} rows of {path} have no partner: {key} {', '.join(unmatched[:SHOWN])}{ellipsis}"
+            )
     where = f"{Path(a).name} with {Path(b).name}"
     return Joined(Table(where, joined, lines, tables[0].quaternions), tuple(notes))
 
 
 def stack(tables: Sequence[Table], names: Sequence[str], called: dict[str, str], column: str = "set") -> Table:
-    """Tables below each other, the columns that all of them have, those of ``called`` by a second name too; ``column``
-    holds each one's name.
+    """Return several tables below each other, with the columns that all of them have.
+
+    ``names`` : name of each table, written into the new column ``column``; ``called`` : second names of some columns,
+    which are added as copies.
 
     Raises
     ------
     InputError
-        A name twice.
+        A name occurs twice.
     """
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -111,16 +116,18 @@ def stack(tables: Sequence[Table], names: Sequence[str], called: dict[str, str],
             "E-TABLES-NAMES",
             f"{tables[0].where}: two files are called {twice}; rename one, {column}s are called like them",
         )
-    common = [name for name in tables[0].columns if name != column and all(name in each for each in tables)]
+    common = [name for name in tables[0].columns if name != column and all(name in table for table in tables)]
     columns: dict[str, list[str] | np.ndarray] = {}
     for name in common:
-        parts = [each.columns[name] for each in tables]
-        numeric = all(isinstance(part, np.ndarray) for part in parts)
-        columns[name] = np.concatenate(parts) if numeric else [v for each in tables for v in each.text(name)]
+        values_of_table = [table.columns[name] for table in tables]
+        numeric = all(isinstance(part, np.ndarray) for part in values_of_table)
+        columns[name] = (
+            np.concatenate(values_of_table) if numeric else [v for table in tables for v in table.text(name)]
+        )
     columns |= {second: columns[first] for second, first in called.items()}
-    columns[column] = [name for name, each in zip(names, tables, strict=True) for _ in range(len(each))]
-    lines = [line for each in tables for line in each.lines]
-    return Table(", ".join(each.where for each in tables), columns, lines, tables[0].quaternions)
+    columns[column] = [name for name, table in zip(names, tables, strict=True) for _ in range(len(table))]
+    lines = [line for table in tables for line in table.lines]
+    return Table(", ".join(table.where for table in tables), columns, lines, tables[0].quaternions)
 
 
 def _places(table: Table, key: str) -> dict[str, int]:
@@ -129,13 +136,13 @@ def _places(table: Table, key: str) -> dict[str, int]:
             "E-TABLE-COLUMN-MISSING",
             f"{table.where}: no column {key}; the header is {table.header()}; give another --key",
         )
-    found: dict[str, int] = {}
+    row_of: dict[str, int] = {}
     for row, name in enumerate(table.text(key)):
-        if name in found:
+        if name in row_of:
             raise InputError(
                 "E-TABLE-ROW-REPEATED",
-                f"{table.where}: line {table.lines[row]}: {key} {name} stands on line {table.lines[found[name]]} too; "
+                f"{table.where}: line {table.lines[row]}: {key} {name} stands on line {table.lines[row_of[name]]} too; "
                 "every one once needed",
             )
-        found[name] = row
-    return found
+        row_of[name] = row
+    return row_of

@@ -1,7 +1,7 @@
-"""Result files: pydantic models that say every key, its type and its meaning, written and read as JSON.
+"""Result files: pydantic models that define every key, its type and its meaning, written and read as JSON.
 
-A model is written with the keys that it was given, in the order of its fields: a key that does not apply is left out by
-not giving it, and is null where it is given as None. Arrays and poses are lists of numbers in the file.
+A file holds the keys that the model was given, in the order of the fields. A key that was not given is left out; a key
+that was given as None is null. Arrays and poses are lists of numbers in the file.
 """
 
 import json
@@ -20,20 +20,20 @@ from stcal.io.covariance import OF_POINT, OF_POSE, Rows, require_covariance
 from stcal.io.files import TABLE_BYTES, read_bytes
 
 LONGEST = 80
-"""Characters of a value that are shown."""
+"""Largest number of characters of a value that a message shows."""
 WITHOUT_VALUE = "without value"
-"""Type of a mistake whose message says enough: of a matrix the first numbers tell nothing."""
+"""Type of a mistake whose message omits the value: the first numbers of a matrix, for example, are no help."""
 
 
 def mistake(reason: object) -> PydanticCustomError:
-    """To be raised by a validator; ``reason`` stands in the message as it is, without the value."""
+    """Return an error for a validator to raise; its message is ``reason``, without the value."""
     return PydanticCustomError(WITHOUT_VALUE, "{reason}", {"reason": str(reason)})
 
 
 def first_mistake(error: ValidationError, where: str = "", missing: str = "key missing; add it") -> InputError:
-    """Returns the error that names the first mistake, ``where: place: reason``, and how many more there are.
+    """Return the error that names the first mistake, ``where: place: reason``, and the number of further mistakes.
 
-    ``missing`` : what is said of a key that is not there.
+    ``missing`` : reason for a key that is missing.
     """
     first = error.errors()[0]
     place = ".".join(str(part + 1 if isinstance(part, int) else part) for part in first["loc"])
@@ -51,12 +51,12 @@ def first_mistake(error: ValidationError, where: str = "", missing: str = "key m
         shown = " ".join(repr(first["input"]).split())
         shown = shown if len(shown) <= LONGEST else shown[: LONGEST - 1] + "…"
         code, reason = "E-KEY-VALUE", f"{shown}: {first['msg'][0].lower()}{first['msg'][1:]}"
-    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-    return InputError(code, ": ".join(part for part in (where, place, reason + more) if part))
+    suffix = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    return InputError(code, ": ".join(part for part in (where, place, reason + suffix) if part))
 
 
 class Part(BaseModel):
-    """An object inside a result file; ``from_attributes``: a dataclass with these fields will do."""
+    """An object inside a result file; ``from_attributes`` : a dataclass with the same fields is accepted, too."""
 
     model_config = ConfigDict(
         frozen=True,
@@ -70,15 +70,15 @@ class Part(BaseModel):
 
 
 class ResultFile(Part):
-    """A result file as a whole; ``format`` of a model is the name of its format and its version."""
+    """A whole result file; the field ``format`` of a model holds name and version of its format."""
 
     def content(self) -> dict[str, Any]:
-        """Plain values: the keys given, in the order of the fields."""
+        """Return the content as plain values: the keys that were given, in the order of the fields."""
         return self.model_dump(exclude_unset=True, warnings=False)
 
 
 class NamedReason(Part):
-    """What was left out, and why."""
+    """The name of something that was left out, and the reason."""
 
     name: str
     reason: str
@@ -89,7 +89,7 @@ F = TypeVar("F", bound=Part)
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """An array of this shape, None for any length: a list of lists in the file, (…) float64 in Python."""
+    """An array with sides of these lengths, None for any length: nested lists in the file, float64 in Python."""
 
     sides: tuple[int | None, ...]
 
@@ -105,7 +105,7 @@ class Shape:
             raise PydanticCustomError("array", "{reason}", {"reason": reason}) from error
 
     def words(self) -> str:
-        """For the tables of the documents."""
+        """Return the shape in words, for the tables of the documentation."""
         if len(self.sides) == 1:
             return "list of numbers" if self.sides[0] is None else f"{self.sides[0]} numbers"
         return "×".join("n" if n is None else str(n) for n in self.sides)
@@ -113,7 +113,7 @@ class Shape:
 
 @dataclass(frozen=True, slots=True)
 class PoseShape(Shape):
-    """A rigid transform: 4×4 in the file; a :class:`Rigid` will do."""
+    """A rigid transform: 4×4 in the file; a :class:`Rigid` is accepted, too."""
 
     def checked(self, value: Any) -> np.ndarray:
         if isinstance(value, Rigid):
@@ -127,7 +127,7 @@ class PoseShape(Shape):
 
 @dataclass(frozen=True, slots=True)
 class CovarianceShape(Shape):
-    """A covariance: positive semi-definite up to rounding; ``rows`` : what its rows are of."""
+    """A covariance: positive semi-definite up to rounding; ``rows`` : names and variances of its rows."""
 
     rows: Rows
 
@@ -143,7 +143,7 @@ class CovarianceShape(Shape):
 Finite = Annotated[
     float | None, BeforeValidator(lambda value: None if value is None or not np.isfinite(value) else value)
 ]
-"""JSON knows no infinity: null in its place, and in that of what is no number."""
+"""A number, or null in place of infinity and NaN, which JSON lacks."""
 Pose = Annotated[np.ndarray, PoseShape((4, 4))]
 Matrix3 = Annotated[np.ndarray, Shape((3, 3))]
 Matrix4 = Annotated[np.ndarray, Shape((4, 4))]
@@ -161,16 +161,16 @@ ByLabel = Annotated[str, "label"]
 ByGroup = Annotated[str, "group"]
 ByImage = Annotated[str, "image"]
 ByName = Annotated[str, "name"]
-"""Keys of objects; the word stands in the documents: ``faces.<face>``."""
+"""Types of the keys of objects; the documentation shows the word, as in ``faces.<face>``."""
 
 
 def read_json(path: str | Path, what: str, remedy: str) -> dict[str, Any]:
-    """The object in a JSON file; ``what`` names the kind of file, ``remedy`` what to do about a file that is none.
+    """Return the object in a JSON file; messages name the kind of file, ``what``, and the ``remedy``.
 
     Raises
     ------
     InputError
-        Unreadable, not JSON, or not an object with named keys.
+        The file is unreadable, not JSON, or not an object with named keys.
     """
     where = f"{what} {path}".lstrip()
     try:
@@ -189,12 +189,12 @@ def read_json(path: str | Path, what: str, remedy: str) -> dict[str, Any]:
 
 
 def checked(content: dict[str, Any], model: type[F]) -> F:
-    """What a file holds as ``model`` has it; keys that the model does not know are passed over.
+    """Return the content of a file as a ``model``; keys that the model does not know are ignored.
 
     Raises
     ------
     InputError
-        Another format, a key missing or a value that is not as needed; the message names place and reason.
+        The file has another format, lacks a key or holds an invalid value; the message names place and reason.
     """
     try:
         return model.model_validate(content, extra="ignore")
@@ -204,7 +204,7 @@ def checked(content: dict[str, Any], model: type[F]) -> F:
 
 
 def read_result(path: str | Path, model: type[F], what: str, remedy: str) -> F:
-    """Read a result file; see :func:`read_json` and :func:`checked`, which raise."""
+    """Read a result file; errors are those of :func:`read_json` and :func:`checked`."""
     content = read_json(path, what, remedy)
     try:
         return checked(content, model)

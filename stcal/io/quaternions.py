@@ -1,4 +1,4 @@
-"""Quaternions in four columns: the order in which they stand, and what else their columns may hold."""
+"""Quaternions in four columns: the order of their components, and mistakes in it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,40 +10,40 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses
 
 Order = Literal["wxyz", "xyzw"]
-"""``wxyz`` : as the columns are named; ``xyzw`` : x, y, z, w in the order in which the columns stand."""
+"""Order of the components. ``wxyz`` : as the columns are named; ``xyzw`` : x, y, z, w in the order of the columns."""
 COLUMNS = ("qw", "qx", "qy", "qz")
 EXPLAINS = 0.2
-"""A mistake explains a misfit when mending it leaves less than this share of it."""
+"""A mistake explains a misfit if its correction reduces the misfit below this share."""
 
 
 def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, remedy: str) -> None:
     """Refuse quaternions (m, 4) that are not of unit length.
 
-    ``place`` : where row i stands in ``where``; ``remedy`` : the end of the message.
+    ``place`` : returns the place of row i in ``where``; ``remedy`` : end of the message.
 
     Raises
     ------
     InputError
-        Names the first, its length, and how many more there are.
+        The message names the first such quaternion, its length, and the number of further ones.
     """
-    with np.errstate(over="ignore"):  # of what is refused
+    with np.errstate(over="ignore"):  # quaternions that are refused
         length = np.linalg.norm(wxyz, axis=1)
     bad = np.flatnonzero(~(np.abs(length - 1) <= UNIT_WITHIN))
     if len(bad):
-        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
         raise InputError(
             "E-QUATERNION-LENGTH",
-            f"{where}: {place(bad[0])}: quaternion of length {length[bad[0]]:.4g}, 1 ± {UNIT_WITHIN:g} needed{more}; "
+            f"{where}: {place(bad[0])}: quaternion of length {length[bad[0]]:.4g}, 1 ± {UNIT_WITHIN:g} needed{suffix}; "
             f"{remedy}",
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What columns read as w, x, y, z may hold.
+    """A hypothesis on the true content of columns that were read as w, x, y, z.
 
-    ``held`` : in words; ``remedy`` : what to do then; ``order`` : of each of w, x, y, z the place among those read;
-    ``conjugated`` : whether the vector part has the other sign.
+    ``held`` : true content, in words; ``remedy`` : correction, in words; ``order`` : indices of the true w, x, y, z
+    among the components read; ``conjugated`` : True if the sign of the vector part is inverted.
     """
 
     held: str
@@ -52,13 +52,13 @@ class Reading:
     conjugated: bool = False
 
     def rotations(self, read: np.ndarray) -> np.ndarray:
-        """(m, 3, 3) of rotations as they were read (m, 3, 3)."""
+        """Return the rotations (m, 3, 3) that this hypothesis makes of the rotations ``read`` (m, 3, 3)."""
         wxyz = Poses(read, np.zeros((len(read), 3))).quaternions()[:, self.order]
-        right = Poses.from_quaternions(wxyz, np.zeros((len(read), 3))).rotation
-        return np.swapaxes(right, 1, 2) if self.conjugated else right
+        corrected = Poses.from_quaternions(wxyz, np.zeros((len(read), 3))).rotation
+        return np.swapaxes(corrected, 1, 2) if self.conjugated else corrected
 
     def poses(self, read: Poses) -> Poses:
-        """Poses that were read, places as they are."""
+        """Return the poses ``read`` with corrected rotations; translations are unchanged."""
         return Poses(self.rotations(read.rotation), read.translation)
 
 
@@ -80,11 +80,11 @@ READINGS = (
 
 
 def explaining(read: np.ndarray, misfit: Callable[[np.ndarray], float]) -> tuple[Reading, float] | None:
-    """The reading of rotations (m, 3, 3) that leaves less than :data:`EXPLAINS` of their misfit, with what it leaves.
+    """Return the reading of rotations (m, 3, 3) that explains their misfit, and its misfit; None if no reading does.
 
-    ``misfit`` : of rotations (m, 3, 3), one number. None where no reading does: also where all fit alike, as of one
-    orientation in all rows.
+    ``misfit`` : returns one number for rotations (m, 3, 3). A reading explains the misfit if it reduces it below the
+    share :data:`EXPLAINS`. No reading does if all fit alike, as with the same orientation in all rows.
     """
-    left = {each: misfit(each.rotations(read)) for each in READINGS}
-    best = min(left, key=left.__getitem__)
-    return (best, left[best]) if left[best] < EXPLAINS * misfit(read) else None
+    misfit_of = {reading: misfit(reading.rotations(read)) for reading in READINGS}
+    best = min(misfit_of, key=misfit_of.__getitem__)
+    return (best, misfit_of[best]) if misfit_of[best] < EXPLAINS * misfit(read) else None

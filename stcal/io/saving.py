@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all, and that replace no input."""
+"""Output files: written completely or not at all, and never over an input."""
 
 import json
 import os
@@ -11,13 +11,13 @@ from pathlib import Path
 from stcal.errors import InputError
 
 RUN_MARKER = "stcal-run.json"
-"""Tells a run's folder from others."""
+"""Name of the file that marks the folder of a run."""
 CAMERA, TARGET, BOARD = "cameras.txt", "target.toml", "board.toml"
-"""Copies of what a run was given."""
+"""Names of the copies of a run's inputs."""
 REFINED_CAMERA = "refined_cameras.txt"
-"""As a run adjusted it, where it did, with σ."""
+"""Name of the camera file with the intrinsics that a run refined, and their σ."""
 REPORT_PDF = "report.pdf"
-"""Of a run's report.html, where one was asked for."""
+"""Name of the optional PDF of a run's report.html."""
 RUN_ENTRIES = (
     RUN_MARKER,
     "faces.json",
@@ -35,22 +35,22 @@ RUN_ENTRIES = (
     "target_model",
     "overlays",
 )
-"""What a run makes, in the order in which it takes its place: the marker says what the rest is."""
+"""Files and folders of a run, in the order in which they are put in place; the marker file describes the others."""
 UNFINISHED, ADDED, READY, CACHE = "unfinished", "added", "ready", "cache"
-"""Folders in it: of a run that is going on, of files that a command adds to a finished one, of results about to take
-their places, of what later runs take up."""
+"""Folders inside a run's folder: files of an unfinished run, files that a command adds to a finished run, results that
+are ready to be put in place, and the cache for later runs."""
 NEVER_READ = (".csv", ".json", ".html", ".pdf", ".svg")
-"""Suffixes of outputs; but for a run's entries, what commands read from a folder are images, YAML poses, and COLMAP's
-models and databases."""
+"""Suffixes of outputs that no command reads from a folder. Besides a run's entries, commands read images, YAML poses,
+and COLMAP's models and databases from folders."""
 
 
 def save(path: Path, content: str | bytes) -> None:
-    """Write a file at once, its folder too where there is none.
+    """Write a file atomically; a missing folder is made.
 
     Raises
     ------
     InputError
-        It cannot be written.
+        The file cannot be written.
     """
     if not path.name or path.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{path}: is a folder; the name of a file needed")
@@ -66,17 +66,17 @@ def save(path: Path, content: str | bytes) -> None:
             "another place",
         ) from error
     finally:
-        with suppress(OSError):  # where a file stands in the folder's place there is none to remove
+        with suppress(OSError):  # if the folder's path is a file, there is nothing to remove
             partial.unlink(missing_ok=True)
 
 
 def require_new_folder(out: Path, images: Path) -> None:
-    """Refuse, before the work, a place that holds anything, that lies among the photographs or cannot be written.
+    """Refuse, before the work, an output folder that is not empty, lies among the photographs, or cannot be written.
 
     Raises
     ------
     InputError
-        Which.
+        The message names the reason.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError("E-OUTPUT-EXISTS", f"--out {out}: is not a new or empty folder; give another place")
@@ -84,7 +84,7 @@ def require_new_folder(out: Path, images: Path) -> None:
         raise InputError(
             "E-OUTPUT-PLACE", f"--out {out}: lies in the folder of the photographs {images}; give another place"
         )
-    above = next(each for each in out.absolute().parents if each.exists())
+    above = next(parent for parent in out.absolute().parents if parent.exists())
     try:
         tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=above).cleanup()
     except OSError as error:
@@ -94,12 +94,12 @@ def require_new_folder(out: Path, images: Path) -> None:
 
 
 def save_folder(out: Path, files: dict[str, str]) -> None:
-    """Write all files into a new folder, or none.
+    """Write all files into a new folder, or none of them.
 
     Raises
     ------
     InputError
-        They cannot be written.
+        The files cannot be written.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
@@ -115,7 +115,7 @@ def save_folder(out: Path, files: dict[str, str]) -> None:
 
 
 def json_text(content) -> str:
-    """As all JSON files of the package are written: of a dict, or of a result file (``stcal.io.json.ResultFile``)."""
+    """Return the text of a JSON file in the package's form; ``content`` : dict or ``stcal.io.json.ResultFile``."""
     plain = content if isinstance(content, dict) else content.content()
     return _indented(plain, "\n") + "\n"
 
@@ -126,11 +126,14 @@ PLAIN = {float, int, bool, type(None)}
 
 
 def _indented(value, line: str) -> str:
-    """The text of ``json.dumps`` with ``indent=1``, whose writer works on one number after the other: lists of numbers,
-    and lists of such lists, are written at once. ``line`` : a line's end and the indent of what follows."""
+    """Return the text of ``json.dumps`` with ``indent=1``, but faster.
+
+    The standard writer handles one number after the other; here lists of numbers, and lists of such lists, are encoded
+    at once. ``line`` : line break with the present indent.
+    """
     inner = line + " "
     if isinstance(value, dict):
-        items = [f"{_key(key)}: {_indented(each, inner)}" for key, each in value.items()]
+        items = [f"{_key(key)}: {_indented(item, inner)}" for key, item in value.items()]
         return f"{{{inner}{f',{inner}'.join(items)}{line}}}" if items else "{}"
     if not isinstance(value, list | tuple):
         return _encode(value)
@@ -143,16 +146,16 @@ def _indented(value, line: str) -> str:
         ends, between = f"{inner}]", f"{inner} "
         rows = _encode(value)[2:-2].replace(",", f",{between}").replace(f"],{between}[", f"{ends},{inner}[{between}")
         return f"[{inner}[{between}{rows}{ends}{line}]"
-    return f"[{inner}{f',{inner}'.join([_indented(each, inner) for each in value])}{line}]"
+    return f"[{inner}{f',{inner}'.join([_indented(item, inner) for item in value])}{line}]"
 
 
 def _key(key) -> str:
-    """As ``json.dumps`` writes it: numbers in quotes."""
+    """Return a key as ``json.dumps`` writes it: numbers in quotes."""
     return _encode(key) if isinstance(key, str) else _encode({key: 0})[1:-3]
 
 
 def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, Path]]) -> None:
-    """Refuse, before the work, files that would replace an input, a file among the inputs, or each other.
+    """Refuse, before the work, outputs that would replace an input, a file in an input folder, or each other.
 
     Parameters
     ----------
@@ -161,18 +164,18 @@ def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, 
     Raises
     ------
     InputError
-        Which, and what it would replace.
+        The message names the output, and what it would replace.
     """
     places: dict[Path, str] = {}
     for option, path in outputs:
         place = real_place(path)
         for given, read in inputs:
-            own = real_place(read)
-            if place == own:
+            input_place = real_place(read)
+            if place == input_place:
                 raise InputError(
                     "E-OUTPUT-IS-INPUT", f"{option} {path}: is an input of this command; give another name"
                 )
-            if own in place.parents and place.exists() and not _is_ours(place, own):
+            if input_place in place.parents and place.exists() and not _is_ours(place, input_place):
                 raise InputError(
                     "E-OUTPUT-IS-INPUT", f"{option} {path}: is a file of {given} {read}; give another name"
                 )
@@ -186,13 +189,16 @@ def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, 
 
 
 def real_place(path: str | Path) -> Path:
-    """Where a path leads; links that lead to themselves stay as they are, for who reads to say."""
+    """Return the path with all links resolved; a circular link stays as it is, and is reported when it is read."""
     return Path(os.path.realpath(path))
 
 
 def _is_ours(place: Path, folder: Path) -> bool:
-    """Whether no command reads a file that lies in an input folder: in a run's folder whatever no run makes, in one of
-    images what has a table's or a page's suffix."""
+    """Return True if no command reads this file of an input folder, so that it may be replaced.
+
+    In a run's folder these are the files that no run makes; in a folder of images, those with the suffix of a table or
+    a page.
+    """
     if (folder / RUN_MARKER).exists():
         return place.relative_to(folder).parts[0] not in {*RUN_ENTRIES, UNFINISHED, ADDED, READY, CACHE}
     return place.name not in RUN_ENTRIES and place.suffix.lower() in NEVER_READ

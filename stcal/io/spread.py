@@ -1,4 +1,4 @@
-"""Jobs on images: by processes of this machine, or handed to an executor, of a cluster say."""
+"""Jobs on images, run by processes of this machine or by an executor, for example of a cluster."""
 
 import contextlib
 import socket
@@ -29,17 +29,17 @@ _current: ContextVar[_Spread | None] = ContextVar("spread", default=None)
 
 @contextlib.contextmanager
 def spread(executor: Executor, at_once: int = AT_ONCE, send_images: bool = False) -> Iterator[None]:
-    """Hand what is done image by image meanwhile, detection and ``measure``, to an executor; it is left open.
+    """Let an executor run the jobs on single images, detection and ``measure``, inside the ``with`` block.
 
-    Results are the same, bit by bit, as by processes of this machine, where the libraries are the same.
+    The executor stays open. With the same libraries, results equal those of local processes bit by bit.
 
     Parameters
     ----------
     executor : concurrent.futures.Executor
     at_once : int
-        So many images are handed over at a time, which bounds the memory that their contents take.
+        Number of images that are handed over at a time; it bounds the memory for their contents.
     send_images : bool
-        Images go with their content; by their paths, on storage that all machines share, where False.
+        True sends images with their content; False sends paths on storage that all machines share.
     """
     token = _current.set(_Spread(executor, at_once, send_images))
     try:
@@ -51,13 +51,14 @@ def spread(executor: Executor, at_once: int = AT_ONCE, send_images: bool = False
 def run_on_images(
     function: Callable[..., R], jobs: Sequence[tuple], workers: int | None = None, kept: bool = False
 ) -> Iterator[tuple[int, R]]:
-    """:func:`stcal.parallel.run_parallel` of jobs whose first argument is an image file, or a list of them, and which
-    need nothing else of this machine; by the executor of :func:`spread` where there is one.
+    """Yield index and result of each job, run by :func:`stcal.parallel.run_parallel` or the executor of :func:`spread`.
+
+    The first argument of a job is an image file, or a list of them; a job needs nothing else of this machine.
 
     Parameters
     ----------
     kept : bool
-        The caller keeps what is finished; a second try goes on there.
+        True if the caller keeps finished results, so that a second try continues there.
 
     Raises
     ------
@@ -66,26 +67,25 @@ def run_on_images(
     InputError
         A worker does not see the folder of an image that it should read.
     """
-    now = _current.get()
+    current = _current.get()
     try:
-        if now is None:
+        if current is None:
             yield from run_parallel(function, jobs, workers)
         else:
-            sent = _Sent(function, jobs, now.send_images)
-            yield from run_parallel(_on_worker, sent, executor=now.executor, at_once=now.at_once)
+            sent = _Sent(function, jobs, current.send_images)
+            yield from run_parallel(_on_worker, sent, executor=current.executor, at_once=current.at_once)
     except BrokenExecutor as error:
-        here = isinstance(error, BrokenProcessPool)
-        what = "a process was ended from outside, for lack of memory perhaps" if here else str(error)
+        local = isinstance(error, BrokenProcessPool)
+        reason = "a process was ended from outside, for lack of memory perhaps" if local else str(error)
         raise DetectionError(
             "E-WORKER-DIED",
-            f"images, {len(jobs)} of them: {what}; run the same command again{', with fewer --workers' * here}"
+            f"images, {len(jobs)} of them: {reason}; run the same command again{', with fewer --workers' * local}"
             f"{', finished detections are kept' * kept}",
         ) from error
 
 
 class _Sent(Sequence):
-    """Jobs as a worker gets them: by absolute paths, or with the images' contents from the moment when one is asked
-    for."""
+    """Jobs as a worker gets them: images as absolute paths, or with their contents, read when the job is fetched."""
 
     def __init__(self, function: Callable, jobs: Sequence[tuple], with_content: bool):
         self._function, self._jobs, self._with_content = function, jobs, with_content
@@ -94,9 +94,9 @@ class _Sent(Sequence):
         return len(self._jobs)
 
     def __getitem__(self, i):
-        files, *rest = self._jobs[i]
-        sent = self._sent(files) if isinstance(files, ImageFile) else [self._sent(each) for each in files]
-        return (self._function, sent, *rest)
+        files, *arguments = self._jobs[i]
+        sent = self._sent(files) if isinstance(files, ImageFile) else [self._sent(file) for file in files]
+        return (self._function, sent, *arguments)
 
     def _sent(self, file: ImageFile) -> ImageFile:
         return file.carried() if self._with_content else replace(file, path=file.path.absolute())

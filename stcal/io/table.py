@@ -1,4 +1,4 @@
-"""CSV files with a header: numbers with their unit in the column's name, every bad row named by its line."""
+"""CSV files with a header: units stand in the names of the columns, and messages name the line of a bad row."""
 
 import csv
 import io
@@ -18,23 +18,23 @@ from stcal.io.quaternions import Order, require_unit
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
 UNIT_WORDS = {"m": "metres", "in": "inches", "cm": "centimetres"}
-"""Units in which lengths come by mistake, in words."""
+"""Names of units in which lengths are stated by mistake."""
 ANGLES = {"rad": 1.0, "deg": np.pi / 180}
 FARTHEST = 1e12
-"""In any unit: farther than all that is measured, and its square is still a number."""
+"""Largest value in any unit: it exceeds anything that is measured, and its square does not overflow."""
 COVARIANCE = tuple(f"cov_{a}_{b}" for i, a in enumerate(TWIST) for b in TWIST[i:])
 """Upper triangle of a pose covariance, rows first: rotation vector (rad) and translation (mm), left perturbation."""
 COMMON = re.compile(r"common\d+_.+")
-"""Columns of errors that all poses have in common."""
+"""Names of columns with errors that all poses have in common."""
 POSE = ("x_mm", "y_mm", "z_mm", *QUATERNION)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """Rows of a CSV file.
+    """The rows of a CSV file.
 
-    ``lines`` : (m,) line of the file that each row stands on, from 1; ``quaternions`` : what their columns hold;
-    ``rows`` : (m,) the lines themselves where all columns are numbers: 01 is a name, too.
+    ``lines`` : (m,) line number of each row in the file, from 1; ``quaternions`` : order of quaternion components;
+    ``rows`` : (m,) text of the lines if all columns are numbers, since a name such as 01 must be kept.
     """
 
     where: str
@@ -50,7 +50,7 @@ class Table:
         return column in self.columns
 
     def text(self, column: str) -> list[str]:
-        """A column as it stands, without white space around."""
+        """Return the text of a column, without surrounding white space."""
         self._need(column)
         values = self.columns[column]
         if isinstance(values, list):
@@ -61,7 +61,7 @@ class Table:
         return [f"{v:.15g}" for v in values]
 
     def numbers(self, column: str) -> np.ndarray:
-        """(m,) finite numbers."""
+        """Return the finite numbers (m,) of a column."""
         self._need(column)
         values = self.columns[column]
         if not isinstance(values, np.ndarray):
@@ -72,20 +72,20 @@ class Table:
         bad = np.flatnonzero(~np.isfinite(values))
         if len(bad):
             shown = self.columns[column][bad[0]]
-            more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+            suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
             raise InputError(
                 "E-TABLE-NUMBER",
-                f"{self.where}: line {self.lines[bad[0]]}: {column} is {str(shown)!r}, a finite number needed{more}",
+                f"{self.where}: line {self.lines[bad[0]]}: {column} is {str(shown)!r}, a finite number needed{suffix}",
             )
         return values
 
     def quantity(self, name: str, units: dict[str, float]) -> np.ndarray:
-        """(m,) of the column ``name_unit``, in mm or rad."""
+        """Return the values (m,) of the column ``name_unit``, in mm or rad."""
         column = f"{name}_{self.unit(name, units)}"
         return self._near(column) * units[self.unit(name, units)]
 
     def _near(self, column: str) -> np.ndarray:
-        """(m,) of a column whose squares are numbers still."""
+        """Return the values (m,) of a column; refuse values whose squares may overflow."""
         values = self.numbers(column)
         far = np.flatnonzero(np.abs(values) > FARTHEST)
         if len(far):
@@ -96,60 +96,61 @@ class Table:
         return values
 
     def unit(self, name: str, units: dict[str, float]) -> str:
-        """In which of the units ``name`` is given."""
+        """Return the unit in which ``name`` is given."""
         given = [unit for unit in units if f"{name}_{unit}" in self.columns]
         if len(given) != 1:
             wanted = " or ".join(f"{name}_{unit}" for unit in units)
-            found = "no such column" if not given else f"{len(given)} of them"
+            finding = "no such column" if not given else f"{len(given)} of them"
             raise InputError(
-                "E-TABLE-COLUMN-MISSING", f"{self.where}: {found}, {wanted} needed; the header is {self.header()}"
+                "E-TABLE-COLUMN-MISSING", f"{self.where}: {finding}, {wanted} needed; the header is {self.header()}"
             )
         return given[0]
 
     def has(self, name: str, units: dict[str, float]) -> bool:
-        """Whether there is a column ``name_unit``."""
+        """Return True if there is a column ``name_unit``."""
         return any(f"{name}_{unit}" in self.columns for unit in units)
 
     def points(self, prefix: str = "") -> np.ndarray:
-        """(m, 3) mm of ``prefix + x``, ``y``, ``z``."""
+        """Return the points (m, 3), mm, of the columns ``prefix + x``, ``y``, ``z``."""
         return np.column_stack([self.quantity(prefix + axis, LENGTHS) for axis in "xyz"])
 
     def has_rotation(self, prefix: str = "") -> bool:
-        """Whether there are quaternions; an error when only some of their columns are there."""
-        there = [prefix + c for c in QUATERNION if prefix + c in self.columns]
-        if there and len(there) < 4:
+        """Return True if there are quaternions; raise an error if only some of their columns exist."""
+        present = [prefix + c for c in QUATERNION if prefix + c in self.columns]
+        if present and len(present) < 4:
             missing = ", ".join(prefix + c for c in QUATERNION if prefix + c not in self.columns)
             raise InputError(
-                "E-TABLE-COLUMN-MISSING", f"{self.where}: {', '.join(there)} without {missing}; all four or none needed"
+                "E-TABLE-COLUMN-MISSING",
+                f"{self.where}: {', '.join(present)} without {missing}; all four or none needed",
             )
-        return bool(there)
+        return bool(present)
 
     def _order(self, prefix: str) -> list[str]:
-        """Columns, without prefix, that hold w, x, y and z."""
-        standing = [c.removeprefix(prefix) for c in self.columns if c in {prefix + q for q in QUATERNION}]
-        if self.quaternions == "wxyz" or len(standing) < len(QUATERNION):
+        """Return the names, without prefix, of the columns that hold w, x, y and z."""
+        quaternion_columns = [c.removeprefix(prefix) for c in self.columns if c in {prefix + q for q in QUATERNION}]
+        if self.quaternions == "wxyz" or len(quaternion_columns) < len(QUATERNION):
             return list(QUATERNION)
-        return [standing[3], *standing[:3]]
+        return [quaternion_columns[3], *quaternion_columns[:3]]
 
     def poses(self, prefix: str = "") -> Poses:
-        """m transforms of ``prefix + x`` … and ``prefix + qw`` …."""
+        """Return the m transforms of the columns ``prefix + x`` … and ``prefix + qw`` …."""
         self.has_rotation(prefix)
         wxyz = np.column_stack([self._near(prefix + c) for c in self._order(prefix)])
         require_unit(wxyz, lambda i: f"line {self.lines[i]}", self.where, "is the order qw, qx, qy, qz?")
         return Poses.from_quaternions(wxyz, self.points(prefix))
 
     def pose_covariances(self, prefix: str = "") -> np.ndarray | None:
-        """(m, 6, 6) of the columns :data:`COVARIANCE`; None where there are none.
+        """Return the covariances (m, 6, 6) of the columns :data:`COVARIANCE`; None if there are no such columns.
 
         Raises
         ------
         InputError
-            Some columns only, or a matrix that is not positive definite.
+            Only some of the columns exist, or a matrix is not positive definite.
         """
-        there = [name for name in COVARIANCE if prefix + name in self.columns]
-        if not there:
+        present = [name for name in COVARIANCE if prefix + name in self.columns]
+        if not present:
             return None
-        if len(there) < len(COVARIANCE):
+        if len(present) < len(COVARIANCE):
             missing = next(prefix + name for name in COVARIANCE if prefix + name not in self.columns)
             raise InputError(
                 "E-TABLE-COLUMN-MISSING",
@@ -162,12 +163,12 @@ class Table:
         return full
 
     def require_covariances(self, full: np.ndarray, rows: Rows) -> None:
-        """Refuse the first line whose covariance, of (m, n, n), is none that can be inverted.
+        """Refuse covariances (m, n, n) of the rows unless all are positive definite.
 
         Raises
         ------
         InputError
-            Names the line and what is wrong.
+            The message names the first bad line and its fault.
         """
         fault = first_fault(full, rows, definite=True)
         if fault is not None:
@@ -177,12 +178,12 @@ class Table:
             )
 
     def common_errors(self, covariance: np.ndarray | None) -> np.ndarray | None:
-        """(m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …; None where there are none.
+        """Return the common errors (m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …, or None.
 
         Raises
         ------
         InputError
-            Some columns only, or more than the covariance (m, 6, 6) that holds them.
+            Only some of the columns exist, or they exceed the covariance (m, 6, 6), which includes them.
         """
         count = len({name.split("_")[0] for name in self.columns if COMMON.fullmatch(name)})
         if not count:
@@ -209,7 +210,7 @@ class Table:
         return full
 
     def header(self) -> str:
-        """The columns' names, shortened."""
+        """Return the names of the columns, shortened, for messages."""
         text = ",".join(self.columns)
         return repr(text if len(text) <= 100 else text[:99] + "…")
 
@@ -221,16 +222,16 @@ class Table:
 
 
 def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz") -> Table:
-    """Read a CSV file with a header line; empty lines and lines that start with ``#`` are passed over. A table is taken
-    as it is.
+    """Read a CSV file with a header line; empty lines and lines that start with ``#`` are ignored.
 
-    ``quaternions`` : ``xyzw`` where their columns, in the order in which they stand, hold x, y, z, w whatever their
-    names say.
+    ``path`` : a :class:`Table` is returned unchanged; ``quaternions`` : ``xyzw`` if the quaternion columns hold x, y,
+    z, w in this order, whatever their names.
 
     Raises
     ------
     InputError
-        Unreadable, not UTF-8, no header or no rows, another separator, a name twice, or a row of another length.
+        The file is unreadable, not UTF-8, has no header, no rows or another separator, a column name occurs twice, or
+        a row has another length than the header.
     """
     if isinstance(path, Table):
         return path
@@ -275,10 +276,10 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
         if fast.shape == (len(rows), len(names)):
             return Table(where, {name: fast[:, k] for k, name in enumerate(names)}, numbers, quaternions, rows)
     except ValueError:
-        pass  # text among the numbers: row by row
+        pass  # there is text among the numbers: parse row by row
     try:
         cells = list(csv.reader(rows))
-    except csv.Error:  # a cell without end, longer than any may be
+    except csv.Error:  # an unclosed cell, longer than any may be
         cells = []
     if len(cells) != len(rows):
         open_one = next((i for i, line in used[1:] if line.count('"') % 2), numbers[0])
@@ -295,12 +296,12 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
 
 
 def common_columns(count: int) -> list[str]:
-    """Names of the columns of so many common errors."""
+    """Return the names of the columns of ``count`` common errors."""
     return [f"common{k}_{axis}" for k in range(1, count + 1) for axis in TWIST]
 
 
 def pose_cells(pose: Rigid, covariance: np.ndarray | None = None) -> list[str]:
-    """Cells of the columns :data:`POSE`, and of :data:`COVARIANCE` where it is given."""
+    """Return the cells of the columns :data:`POSE`, and of :data:`COVARIANCE` if a covariance is given."""
     values = [*pose.translation, *Poses.of([pose]).quaternions()[0]]
     if covariance is not None:
         values += list(covariance[np.triu_indices(6)])

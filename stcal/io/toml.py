@@ -1,4 +1,4 @@
-"""TOML files against a pydantic model, with every mistake named by file and place."""
+"""TOML files, validated by a pydantic model; messages name file and place of a mistake."""
 
 import json
 import tomllib
@@ -17,13 +17,13 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class Strict(BaseModel):
-    """Unknown keys are errors."""
+    """A model that refuses unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 LEAST = 1e-9
-"""Of positive lengths and σ, mm: far below an atom; the square of less may be no number."""
+"""Smallest positive length or σ, mm: far below the size of an atom; the square of a smaller value may underflow."""
 
 
 def _least(value: float) -> float:
@@ -32,13 +32,13 @@ def _least(value: float) -> float:
     return value
 
 
-# strict: a quoted number or a true is a slip of the pen; 1e6 mm: a slip of the unit.
+# strict: a quoted number or a true is a typing mistake; more than 1e6 mm is a wrong unit.
 Positive = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False, strict=True), AfterValidator(_least)]
 Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False, strict=True)]
 
 
 class PoseEntry(Strict):
-    """A place and a unit quaternion; none where nothing is said."""
+    """A position and a unit quaternion; the default is the identity."""
 
     x_mm: Finite = 0.0
     y_mm: Finite = 0.0
@@ -49,7 +49,7 @@ class PoseEntry(Strict):
     qz: Finite = 0.0
 
     def rigid(self, where: str) -> Rigid:
-        """The transform; ``where`` begins what an InputError says."""
+        """Return the transform; the message of an InputError begins with ``where``."""
         wxyz = np.array([self.qw, self.qx, self.qy, self.qz])
         length = float(np.linalg.norm(wxyz))
         if abs(length - 1) > UNIT_WITHIN:
@@ -60,12 +60,12 @@ class PoseEntry(Strict):
 
 
 def validated(content: Any, model: type[M], where: str) -> M:
-    """What a file holds, by its model.
+    """Return the content of a file as a ``model``.
 
     Raises
     ------
     InputError
-        Not as ``model`` wants it; the message begins with ``where`` and names place and reason.
+        The content does not fit ``model``; the message begins with ``where`` and names place and reason.
     """
     try:
         return model.model_validate(content)
@@ -74,12 +74,12 @@ def validated(content: Any, model: type[M], where: str) -> M:
 
 
 def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
-    """Read and validate; ``what`` names the kind of file, ``remedy`` what to do when it is not there.
+    """Read and validate a TOML file; messages name the kind of file, ``what``, and the ``remedy`` for a missing one.
 
     Raises
     ------
     InputError
-        Unreadable, not TOML, or not as ``model`` wants it; the message names file, place and reason.
+        The file is unreadable, not TOML, or does not fit ``model``; the message names file, place and reason.
     """
     try:
         text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")  # Windows editors put a byte-order mark first
@@ -92,6 +92,6 @@ def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
 
 
 def toml_string(value: str) -> str:
-    """A text as TOML has it, quoted."""
+    """Return a text as a quoted TOML string."""
     # JSON's escapes are TOML's, but JSON leaves DEL as it is.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

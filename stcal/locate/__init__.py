@@ -1,4 +1,4 @@
-"""A planar target of several tags: its calibration, where it is under any light, and whether that may be trusted."""
+"""A planar target of several tags: its calibration, its pose under any light, and whether the pose may be trusted."""
 
 import lazy_loader
 

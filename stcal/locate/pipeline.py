@@ -1,4 +1,4 @@
-"""From exposures to poses with verdicts: the stages in order."""
+"""Pipeline from exposures to poses with verdicts: the stages in order."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,25 +18,25 @@ from stcal.locate.pose.verdict import Verdict, VerdictOptions, judge
 
 Method = Literal["joint", "patent"]
 MOVED_SIGMAS = 5.0
-"""Of a shift between exposures: by chance once in 10⁵ (Rayleigh)."""
+"""Shift between exposures, in σ, beyond which a scene has moved. Chance exceeds it once in 10⁵ (Rayleigh)."""
 
 
 @dataclass(frozen=True, slots=True)
 class LocateOptions:
-    """How to locate a target.
+    """Options of how to locate a target.
 
     Parameters
     ----------
     method : {"joint", "patent"}
-        By all exposures together, or as the patent has it.
+        One pose from all exposures together, or the method of the patent.
     verdict : VerdictOptions
         Limits of the joint method.
     patent : PatentOptions
-        Limits of the patent's.
+        Limits of the patent's method.
     moved_px : float
-        A scene whose tags shift by more between exposures, and by more than :data:`MOVED_SIGMAS`, has moved.
+        A scene has moved if its tags shift by more than this between exposures, and by more than :data:`MOVED_SIGMAS`.
     workers : int or None
-        Threads that search for tags, as many as there are cores where None.
+        Number of threads that search for tags; as many as cores if None.
     """
 
     method: Method = "joint"
@@ -54,22 +54,22 @@ class LocateOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Located:
-    """One scene.
+    """Result of one scene.
 
     Parameters
     ----------
     tags : SceneTags
-        What its exposures show.
+        Tags that its exposures show.
     merged : Merged or None
-        Corners of all exposures together; None where these do not belong together.
+        Merged corners of all exposures; None if the exposures do not belong together.
     pose : ObjPose or None
-        None where none was found, or another method was asked for.
+        Pose by the joint method; None if it failed, or another method was asked for.
     verdict : Verdict
         Whether the pose may be used.
     notes : tuple of str
-        What was left out, and what else there is to know.
+        What was left out, and other notes.
     patent : PatentPose or None
-        What the patent's method says of it, where it was asked for.
+        Result of the patent's method, if it was asked for.
     """
 
     tags: SceneTags
@@ -81,31 +81,31 @@ class Located:
 
     @property
     def name(self) -> str:
-        """Of the scene."""
+        """Name of the scene."""
         return self.tags.name
 
 
 def run(
     scenes: Sequence[SceneFiles], layout: TargetLayout, camera: CameraModel, options: LocateOptions | None = None
 ) -> Iterator[Located]:
-    """The target's pose in each scene, with its verdict.
+    """Yields the target's pose in each scene, with its verdict.
 
     Parameters
     ----------
     scenes : sequence of SceneFiles
-        From :func:`~stcal.locate.find_scenes`.
+        Scenes from :func:`~stcal.locate.find_scenes`.
     layout : TargetLayout
         The target.
     camera : CameraModel
-        That took the exposures.
+        The camera that took the exposures.
     options : LocateOptions, optional
-        The defaults where None.
+        Options of the method; the defaults if None.
 
     Yields
     ------
     Located
-        One for each scene, in their order. Trouble with one scene rejects that scene, with the reason, and never ends
-        the run.
+        One result per scene, in their order. Trouble with one scene rejects that scene, with the reason, and never
+        ends the run.
     """
     options = options or LocateOptions()
     for files, tags in zip(scenes, read_scenes(scenes, layout, options.workers), strict=True):
@@ -118,7 +118,7 @@ def run(
 def locate_scene(
     scene: SceneTags, layout: TargetLayout, camera: CameraModel, options: LocateOptions | None = None
 ) -> Located:
-    """The verdict on one scene."""
+    """Locates the target in one scene and judges the pose."""
     options = options or LocateOptions()
     notes = [f"left out: {exposure.trouble}" for exposure in scene.unreadable()]
     used = scene.readable()
@@ -134,8 +134,10 @@ def locate_scene(
     prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
     try:
         if options.method == "patent":
-            found = locate_as_patent([e.tags for e in used], layout, camera.sized(*size), options.patent, scene.name)
-            return Located(scene, merged, None, found.verdict, tuple(notes), found)
+            patent_pose = locate_as_patent(
+                [e.tags for e in used], layout, camera.sized(*size), options.patent, scene.name
+            )
+            return Located(scene, merged, None, patent_pose.verdict, tuple(notes), patent_pose)
         pose = locate(merged.seen, layout, camera.sized(*size), prior, scene.name)
     except StcalError as error:
         return Located(scene, merged, None, _rejected([str(error).removeprefix(f"{scene.name}: ")]), tuple(notes))
@@ -169,20 +171,24 @@ def _scene_troubles(merged: Merged, options: LocateOptions) -> list[str]:
         return [f"tags seen twice: {names}; every id once in view needed; cover the copy"]
     if not len(merged.seen):
         return ["no tag of the layout; 1 needed"]
-    away = [shift for shift in merged.shifts if moved(shift, options)]
-    return [_moved_text(max(away, key=lambda shift: shift.shift_px), len(away) - 1)] if away else []
+    shifts_beyond_limit = [shift for shift in merged.shifts if moved(shift, options)]
+    return (
+        [_moved_text(max(shifts_beyond_limit, key=lambda shift: shift.shift_px), len(shifts_beyond_limit) - 1)]
+        if shifts_beyond_limit
+        else []
+    )
 
 
 def moved(shift: Shift, options: LocateOptions) -> bool:
-    """Whether two exposures show different scenes."""
+    """True if the scene moved between two exposures."""
     return shift.shift_px > max(options.moved_px, MOVED_SIGMAS * shift.sigma_px)
 
 
 def _moved_text(shift: Shift, others: int) -> str:
     first, second = shift.exposures
-    more = f" (and between {others} more pairs)" if others else ""
+    further_pairs = f" (and between {others} more pairs)" if others else ""
     return (
-        f"the scene moved between {first} and {second}: {shift.tags} tags by {shift.shift_px:.2f} px{more}; "
+        f"the scene moved between {first} and {second}: {shift.tags} tags by {shift.shift_px:.2f} px{further_pairs}; "
         "take the exposures with camera and target at rest"
     )
 
@@ -199,15 +205,17 @@ def _rejected(reasons: Sequence[str]) -> Verdict:
 
 
 def _why_no_tag(tags: SceneTags, merged: Merged, files: SceneFiles, layout: TargetLayout) -> str:
-    """Why no tag is seen: perhaps those in view are of another dictionary."""
-    known = layout.dictionaries()
+    """Returns why no tag of the layout is seen; the tags in view may be of another dictionary."""
+    dictionaries = layout.dictionaries()
     used = {exposure.name for exposure in tags.readable()}
     file = next(file for file in files.files if file.name in used)
-    others = other_dictionaries(decode(read_bytes(file.path, IMAGE_BYTES), file.name), known)
+    other_tags = other_dictionaries(decode(read_bytes(file.path, IMAGE_BYTES), file.name), dictionaries)
     if merged.unknown:
         names = ", ".join(str(tag) for _, tag in merged.unknown[:5])
         return f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"
-    reason = f"no tag of {', '.join(known)}; 1 of the layout needed"
-    if others:
-        reason += f", and {file.name} shows {others[0][1]} of {others[0][0]}; correct dictionary in the layout file"
+    reason = f"no tag of {', '.join(dictionaries)}; 1 of the layout needed"
+    if other_tags:
+        reason += (
+            f", and {file.name} shows {other_tags[0][1]} of {other_tags[0][0]}; correct dictionary in the layout file"
+        )
     return reason

@@ -35,11 +35,11 @@ from stcal.register.judge.shifts import Shifted, shifted_rows
 
 METHODS = ("robust", "least-squares", "liu2017")
 NEAREST_MM = 1e-9
-"""Of thresholds: the digits of a number end there, 1e12 mm is the farthest point."""
+"""Smallest threshold, mm: it is the precision of a double, with points as far as 1e12 mm."""
 SUSPICIOUS_SHARE = 0.5
 SUSPICIOUS_SIGMA = 0.05
-"""With fewer inliers, or a σ above this share of the points' RMS distance from their middle, a mirrored frame is
-tried. Both are met long before a mirrored frame is found; the trial costs time only."""
+"""Inlier share below which, and σ as a fraction of the points' RMS distance from their centroid above which, a mirrored
+frame is tried. Both are met long before a mirrored frame is found; the trial costs time only."""
 
 
 @one_thread()

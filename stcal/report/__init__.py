@@ -1,1 +1,1 @@
-"""Report pages that open off line, for every system."""
+"""Report pages that open offline, for every system."""

@@ -1,4 +1,4 @@
-"""Cameras shown and compared: text and pictures."""
+"""Text and figures that show cameras and compare them."""
 
 import numpy as np
 
@@ -11,19 +11,20 @@ from stcal.report.figure import INK, SMALL, calm, new_figure
 from stcal.report.text import NONE, text_table
 
 POOR_PX = 0.05
-"""Off by more, a fitted lens is what limits centres, known to some hundredths of a pixel."""
+"""Largest residual, px, of an adequately fitted lens; beyond it the fit limits the accuracy of centres, which is a few
+hundredths of a pixel."""
 LENGTHS = ("f", "fx", "fy", "cx", "cy")
 
 
 def shown(camera: CalibratedCamera) -> list[str]:
-    """Model, parameters with σ (OpenCV's pixel origin), field of view, and what the lens moves."""
+    """Return lines with model, parameters with σ (OpenCV's pixel origin), field of view, and largest distortion."""
     names, values = parameter_names(camera.colmap_model), camera.colmap_params()
     sigma = None if camera.covariance is None else np.sqrt(np.diag(camera.covariance))
     rows = [["<parameter", "value", "±"]]
     for i, (name, value) in enumerate(zip(names, values, strict=True)):
-        own = value - 0.5 if name in ("cx", "cy") else value
+        shown_value = value - 0.5 if name in ("cx", "cy") else value
         digits = 4 if name in LENGTHS else 7
-        rows.append([name, f"{own:.{digits}f}", NONE if sigma is None else f"{sigma[i]:.{digits}f}"])
+        rows.append([name, f"{shown_value:.{digits}f}", NONE if sigma is None else f"{sigma[i]:.{digits}f}"])
     lines = [f"{camera.colmap_model}, {camera.width}×{camera.height} px; first pixel's centre at (0, 0)"]
     lines += text_table(rows, (10, 14, 12))
     wide = [field_deg(camera, *ends) for ends in _ends(camera)]
@@ -40,7 +41,7 @@ def shown(camera: CalibratedCamera) -> list[str]:
 
 
 def exif_text(told: str) -> str:
-    """What a camera of a photograph's EXIF is worth."""
+    """Return a note on the accuracy of a camera from a photograph's EXIF."""
     return (
         f"from EXIF: {told}; f to {SIGMA_FOCAL:.0%}, distortion unknown: a start for `run --refine-camera`, not for "
         "measuring"
@@ -48,51 +49,53 @@ def exif_text(told: str) -> str:
 
 
 def fitted_text(called: str, found: FittedLens) -> list[str]:
-    """What a fitted lens is worth."""
-    said = [
+    """Return lines on the quality of a fitted lens."""
+    lines = [
         f"{called} has no place here: {found.camera.colmap_model} fitted to it is {found.rms_px:.2g} px RMS off over "
         f"the image, {found.most_px:.2g} px at most"
     ]
     if found.most_px > POOR_PX:
-        said.append(
+        lines.append(
             f"a fit more than {POOR_PX:g} px off is a start only: refine it (`--refine-camera`), or calibrate anew"
         )
     if found.share < 1:
-        said.append(f"in {1 - found.share:.0%} of the directions the image reaches beyond 89° from the axis: unused")
-    return said
+        lines.append(f"in {1 - found.share:.0%} of the directions the image reaches beyond 89° from the axis: unused")
+    return lines
 
 
 def _ends(camera: Camera) -> list[tuple[tuple[float, float], tuple[float, float]]]:
-    """Opposite pixels: left and right, top and bottom, corners."""
+    """Return pairs of opposite pixels: left and right, top and bottom, corners."""
     right, low = camera.width - 0.5, camera.height - 0.5
     x, y = camera.centre
     return [((-0.5, y), (right, y)), ((x, -0.5), (x, low)), ((-0.5, -0.5), (right, low))]
 
 
 def field_deg(camera: Camera, one: tuple[float, float], two: tuple[float, float]) -> float:
-    """Angle between the rays of two pixels; nan where there is none."""
+    """Return the angle between the rays of two pixels; nan if a pixel has no ray."""
     unit = [ray / np.linalg.norm(ray) for ray in rays(camera, np.array([one, two]))]
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(*unit)), unit[0] @ unit[1])))
 
 
 def moved_px(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """(r, c, 2) pixels over the image, and by how much the lens moves what is seen there: against the same focal
-    lengths without distortion, and of equidistant cameras with equal steps of angle."""
+    """Return pixels (r, c, 2) over the image, and their distortion (r, c, 2), px.
+
+    The distortion is relative to a camera with the same focal lengths and projection, but without distortion.
+    """
     pixels = image_grid(camera)
-    seen = rays(camera, pixels.reshape(-1, 2))
+    rays_camera = rays(camera, pixels.reshape(-1, 2))
     ideal = Camera(camera.width, camera.height, camera.focal, camera.centre, np.zeros(12), camera.fisheye)
     with np.errstate(invalid="ignore"):
-        return pixels, pixels - ideal.pixel_from_normalised(seen[:, :2]).reshape(pixels.shape)
+        return pixels, pixels - ideal.pixel_from_normalised(rays_camera[:, :2]).reshape(pixels.shape)
 
 
 def distortion_figure(camera: Camera):
-    """Where the lens moves points to, and by how much."""
+    """Return a figure of the distortion over the image: its direction and size."""
     pixels, moved = moved_px(camera)
     return _field(pixels, moved, "moved by the lens, px")
 
 
 def comparison_text(found: CameraDifference) -> list[str]:
-    """The figures of a comparison."""
+    """Return lines with the numbers of a comparison."""
     length = found.lengths()
     turn = np.degrees(found.second_from_first.log()[:3])
     rows, columns = length.shape
@@ -110,12 +113,12 @@ def comparison_text(found: CameraDifference) -> list[str]:
 
 
 def comparison_figure(found: CameraDifference):
-    """By how much, and to where, the second camera sees rays elsewhere."""
+    """Return a figure of the differences between two cameras: their direction and size."""
     return _field(found.pixels, found.apart, "second camera, px apart")
 
 
 def _field(pixels: np.ndarray, moved: np.ndarray, what: str):
-    """Lengths as colours, directions as arrows."""
+    """Return a figure of vectors (r, c, 2), px, at ``pixels``: lengths as colours, directions as arrows."""
     figure = new_figure(7.0, 0.9 + 5.6 * np.ptp(pixels[..., 1]) / np.ptp(pixels[..., 0]))
     axes = figure.add_subplot()
     length = np.linalg.norm(moved, axis=2)

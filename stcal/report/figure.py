@@ -1,6 +1,6 @@
-"""Figures: a calm look, as SVG data URIs for a page and as files, the same bytes for the same figure.
+"""Figures with a plain look, as SVG data URIs for a page and as files; equal figures give equal bytes.
 
-matplotlib is loaded when the first figure is drawn.
+matplotlib is imported when the first figure is drawn.
 """
 
 import base64
@@ -18,7 +18,7 @@ SMALL = 7.5
 
 
 def round_below(value: float) -> float:
-    """The largest 1, 2 or 5 times a power of ten that is not above ``value``; 1 where there is no value."""
+    """Return the largest 1, 2 or 5 times a power of ten up to ``value``; 1 if that is not a positive number."""
     if not np.isfinite(value) or value <= 0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))
@@ -26,14 +26,14 @@ def round_below(value: float) -> float:
 
 
 def locator(integer: bool = False):
-    """Round ticks, few."""
+    """Return a locator of few ticks at round values."""
     from matplotlib.ticker import MaxNLocator
 
     return MaxNLocator(5, steps=[1, 2, 5, 10], integer=integer)
 
 
 def new_figure(width: float, height: float):
-    """An empty figure, inches."""
+    """Return an empty figure; width and height in inches."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
@@ -43,7 +43,7 @@ def new_figure(width: float, height: float):
 
 
 def calm(axes) -> None:
-    """Axes without a frame."""
+    """Remove the frame of axes, and make ticks and remaining lines inconspicuous."""
     axes.tick_params(labelsize=SMALL, length=2, color="#9aa0a8")
     axes.set_facecolor("none")
     for side in ("top", "right"):
@@ -53,7 +53,7 @@ def calm(axes) -> None:
 
 
 def plane(axes, x: str, y: str, margin: float) -> None:
-    """Axes of a map: one scale for both, a faint grid, ``margin`` around in shares of the extent."""
+    """Prepare the axes of a map: equal scales, a faint grid, and a ``margin`` as a share of the extent."""
     axes.set_aspect("equal", "datalim")
     axes.margins(margin)
     axes.set_xlabel(x, fontsize=SMALL + 1, color=INK)
@@ -66,7 +66,7 @@ def plane(axes, x: str, y: str, margin: float) -> None:
 
 
 def uri(figure) -> str:
-    """The figure as an SVG data URI, the same bytes for the same figure."""
+    """Return the figure as an SVG data URI; equal figures give equal bytes."""
     import matplotlib
 
     stream = io.BytesIO()
@@ -77,7 +77,10 @@ def uri(figure) -> str:
 
 
 def save(figure, path: Path) -> None:
-    """As PNG or SVG, by the file's ending; its folder is made. Text stays text: small, and a change can be read."""
+    """Save a figure as PNG or SVG, by the file's suffix, and make its folder.
+
+    In SVG, text stays text: files are small, and changes of them are readable.
+    """
     import matplotlib
 
     path.parent.mkdir(parents=True, exist_ok=True)

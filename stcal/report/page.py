@@ -1,7 +1,7 @@
-"""Report pages: one file each that opens off line, from jinja2 templates that stand beside what they show.
+"""Report pages: single files that open offline, from jinja2 templates beside the code whose results they show.
 
-A template's name is its path below ``stcal/``. All have the macros of ``templates/macros.html.jinja``, and the filters
-``number``, ``cells`` and ``listed`` (``join``) of :mod:`stcal.report.text`.
+A template's name is its path below ``stcal/``. All templates have the macros of ``templates/macros.html.jinja``, and
+the filters ``number``, ``cells`` and ``listed`` (``join``) of :mod:`stcal.report.text`.
 """
 
 from collections.abc import Sequence
@@ -13,33 +13,33 @@ from markupsafe import Markup
 from stcal.report.text import cells, join, number
 
 Sections = Sequence[tuple[str, str, Markup]]
-"""(anchor, heading, markup)."""
+"""Sections of a page, each (anchor, heading, markup)."""
 MACROS = "report/templates/macros.html.jinja"
 
 
 @cache
 def environment() -> Environment:
-    """Everything that is not markup is escaped; a name that is not there is an error."""
-    own = Environment(
+    """Return the template environment, which escapes everything but markup, and refuses undefined names."""
+    env = Environment(
         loader=PackageLoader("stcal", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    own.filters |= {"number": number, "listed": join, "cells": lambda rows, spec: [cells(row, spec) for row in rows]}
-    macros = vars(own.get_template(MACROS).module)
-    own.globals |= {name: macro for name, macro in macros.items() if not name.startswith("_")}
-    return own
+    env.filters |= {"number": number, "listed": join, "cells": lambda rows, spec: [cells(row, spec) for row in rows]}
+    macros = vars(env.get_template(MACROS).module)
+    env.globals |= {name: macro for name, macro in macros.items() if not name.startswith("_")}
+    return env
 
 
 def render(template: str, **values) -> str:
-    """The page.
+    """Return the page of a template with these values.
 
     Raises
     ------
     LookupError
-        ``values`` have not what the template shows.
+        ``values`` lack a name that the template uses.
     """
     try:
         return environment().get_template(template).render(values)
@@ -48,10 +48,10 @@ def render(template: str, **values) -> str:
 
 
 def swatch(name: str, colour: str) -> Markup:
-    """A patch of colour and what it stands for, for a table's cell."""
+    """Return a patch of colour and its meaning ``name``, for a cell of a table."""
     return environment().globals["swatch"](name, colour)
 
 
 def verdict(text: str, colour: str) -> Markup:
-    """A word in its colour, for a table's cell."""
+    """Return a word in its colour, for a cell of a table."""
     return environment().globals["verdict"](text, colour)

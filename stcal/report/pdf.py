@@ -1,4 +1,4 @@
-"""A page of the package as PDF, for print and for files: by WeasyPrint, from the page alone and without network."""
+"""PDF of a report page, for print and for files: by WeasyPrint, from the page only and without network."""
 
 import io
 
@@ -12,16 +12,16 @@ NO_PANGO = (
 
 
 def pdf_of(page: str) -> bytes:
-    """The page as its style sheet prints it: A4, with numbers; the same bytes for the same page.
+    """Return the PDF of a page as its style sheet prints it, A4 with page numbers; equal pages give equal bytes.
 
     Parameters
     ----------
-    page : HTML with all that it shows inside; what it would load from elsewhere is left out
+    page : HTML with all of its content embedded; external resources are not loaded
 
     Raises
     ------
     InputError
-        WeasyPrint, or Pango of which it makes use, is not installed.
+        WeasyPrint, or Pango, which it uses, is not installed.
     """
     try:
         from weasyprint import HTML
@@ -36,11 +36,11 @@ def pdf_of(page: str) -> bytes:
 
 
 def require_pdf() -> None:
-    """Refuse, before the work, where no PDF can be made.
+    """Refuse, before the work, if no PDF can be made.
 
     Raises
     ------
     InputError
-        What is missing, and how to get it.
+        The message names the missing library, and how to install it.
     """
     pdf_of("<p></p>")

@@ -7,11 +7,11 @@ from stcal.geometry.rigid import Rigid
 from stcal.report.text import number
 
 HEADS = ("", "mm", "± σ", "rotation vector °", "± σ")
-"""Of :func:`transform_rows`."""
+"""Heads of the columns of :func:`transform_rows`."""
 
 
 def transform_rows(pose: Rigid, covariance: np.ndarray | None) -> list[list[str]]:
-    """Of x, y, z: translation and rotation vector, each with σ."""
+    """Return a row for each of x, y, z: translation in mm and rotation vector in degrees, each with σ."""
     turn = np.degrees(Rotation.from_matrix(np.array(pose.rotation)).as_rotvec())
     sigma = [None] * 6 if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
     sigma = [*(None if s is None else np.degrees(s) for s in sigma[:3]), *sigma[3:]]

@@ -8,20 +8,20 @@ from stcal.io.poses.text import fixed
 
 NONE = "–"
 WIDEST = 10_000
-"""Characters of a line: none is ever wrapped, whatever the terminal."""
+"""Largest number of characters of a line: no line is ever wrapped, whatever the terminal."""
 
 
 def number(value: float | None, digits: int) -> str:
-    """Fixed digits; a dash where there is no value, and no minus before zero."""
+    """Return a number with a fixed number of digits and no minus before zero; a dash if it is None or not finite."""
     if value is None or not math.isfinite(value):
         return NONE
     return fixed(value, digits)
 
 
 def cells(row: dict, spec: str) -> list:
-    """Values of a row by words of ``key``, or ``key:digits`` for numbers."""
-    found = [word.partition(":") for word in spec.split()]
-    return [number(row[key], int(digits)) if digits else row[key] for key, _, digits in found]
+    """Return the values of a row that ``spec`` names, in words ``key``, or ``key:digits`` for numbers."""
+    keys = [word.partition(":") for word in spec.split()]
+    return [number(row[key], int(digits)) if digits else row[key] for key, _, digits in keys]
 
 
 def join(values: Iterable) -> str:
@@ -29,10 +29,13 @@ def join(values: Iterable) -> str:
 
 
 def telling_names(names: Sequence[str], most: int = 14) -> list[str]:
-    """Short names that tell things apart: without what all begin and end with, words and numbers whole; of longer ones
-    both ends, or what stands between, with an ellipsis for the rest; numbers from 1 where that does not do.
+    """Return short names that remain distinct.
 
-    ``most`` : characters
+    The beginning and end that all names share are removed, but words and numbers stay whole. Names that are still too
+    long keep both ends, or a part between, with an ellipsis for the rest. If the results are not distinct, they are
+    numbers from 1.
+
+    ``most`` : largest number of characters
     """
     if len(set(names)) < 2:
         return [_shortened(name, most) for name in names]
@@ -44,32 +47,34 @@ def telling_names(names: Sequence[str], most: int = 14) -> list[str]:
         start -= 1
     while end and any(_within_word(name, len(name) - end) for name in names):
         end -= 1
-    own = [name[start : len(name) - end] for name in names]
-    if not all(own):
-        own = [name[start:] for name in names] if all(name[start:] for name in names) else list(names)
+    distinctive = [name[start : len(name) - end] for name in names]
+    if not all(distinctive):
+        distinctive = [name[start:] for name in names] if all(name[start:] for name in names) else list(names)
     for head in (most // 2, 2, most - 3):
-        short = [_shortened(name, most, head) for name in own]
+        short = [_shortened(name, most, head) for name in distinctive]
         if len(set(short)) == len(set(names)):
             return short
-    windows = [[_window(name, at, most) for name in own] for at in range(1, max(map(len, own)) - most + 2)]
+    windows = [
+        [_window(name, at, most) for name in distinctive] for at in range(1, max(map(len, distinctive)) - most + 2)
+    ]
     different = [short for short in windows if all(short) and len(set(short)) == len(set(names))]
     return different[len(different) // 2] if different else [str(i) for i in range(1, len(names) + 1)]
 
 
 def _window(name: str, at: int, most: int) -> str:
-    """What stands from there on, between ellipses where there is more."""
-    part = name[at : at + most - 2]
-    return name if len(name) <= most else f"…{part}{'…' * (at + len(part) < len(name))}" if part else ""
+    """Return the part of a name from index ``at`` on, with ellipses for omitted characters."""
+    middle = name[at : at + most - 2]
+    return name if len(name) <= most else f"…{middle}{'…' * (at + len(middle) < len(name))}" if middle else ""
 
 
 def _common(names: Sequence[str]) -> int:
-    """Characters with which all begin."""
+    """Return the number of leading characters that all names share."""
     first, last = min(names), max(names)
     return next((i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), min(len(first), len(last)))
 
 
 def _within_word(text: str, at: int) -> bool:
-    """Whether a cut before this character would go through a word or a number."""
+    """Return True if a cut before this character would split a word or a number."""
     pair = text[max(at - 1, 0) : at + 1]
     return 0 < at < len(text) and (pair.isdigit() or pair.isalpha())
 
@@ -82,24 +87,24 @@ def _shortened(name: str, most: int, head: int | None = None) -> str:
 
 
 def text_table(rows: Iterable[Sequence[str]], least: Sequence[int] = (), gap: int = 2) -> list[str]:
-    """Lines of a table without rules or colours; the same on any terminal, and no cell is wrapped.
+    """Return the lines of a table without rules or colours; it is the same on any terminal, and no cell is wrapped.
 
     Parameters
     ----------
-    rows : cells; the first row has the heads, and ``<`` in front of one aligns its column to the left
-    least : least width of each column, characters; none where empty
-    gap : characters between columns
+    rows : cells; the first row holds the heads, and a ``<`` before a head aligns its column to the left
+    least : smallest width of each column, characters; no limit if empty
+    gap : number of characters between columns
     """
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    heads, *others = rows
+    heads, *body = rows
     shown = Table(box=None, show_header=False, pad_edge=False, padding=(0, gap, 0, 0))
     for k, head in enumerate(heads):
-        left = "left" if head.startswith("<") else "right"
-        shown.add_column(justify=left, no_wrap=True, min_width=least[k] if least else None)
-    for row in [[head.removeprefix("<") for head in heads], *others]:
+        justification = "left" if head.startswith("<") else "right"
+        shown.add_column(justify=justification, no_wrap=True, min_width=least[k] if least else None)
+    for row in [[head.removeprefix("<") for head in heads], *body]:
         shown.add_row(*(Text(cell) for cell in row))
     stream = io.StringIO()
     Console(file=stream, width=WIDEST, color_system=None, legacy_windows=False).print(shown, crop=False)

@@ -1,6 +1,6 @@
 """Robots: kinematics, identification from measured data, compensation.
 
-Lengths in mm, angles in rad, joint values (m, n) as the controller has them::
+Lengths are in mm, angles in rad, joint values (m, n) as the controller has them::
 
     from stcal import robot
 

@@ -1,4 +1,4 @@
-"""Simulated arms as they leave the factory, and what an instrument sees of them."""
+"""Simulation of arms as they leave the factory, and of measurements of them by an instrument."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,19 +16,21 @@ from stcal.robot.kinematics.model import Robot
 
 
 def made(robot: Robot, rng: np.random.Generator, sigma_mm: float = 0.3, sigma_rad: float = 5e-4) -> Robot:
-    """The robot as made: every axis shifted and tilted, every zero position off by normal errors of these σ."""
+    """Returns the robot as made: every axis shifted and tilted, and every zero position off, by normal errors of these
+    σ."""
     chain = robot.chain()
     kinds = chain_parameters(chain)
     step = np.array([rng.normal(0, sigma_rad if c < 3 else sigma_mm) for _, c in kinds])
-    step[: sum(i == 0 for i, _ in kinds)] = 0  # the first axis is where the base is
-    found = robot_from_chain(moved_chain(chain, step), robot.tools, robot)
-    rows = [found.rows[0]]
-    rows += [replace(row, theta=row.theta + rng.normal(0, sigma_rad)) for row in found.rows[1:]]
-    return replace(found, rows=tuple(rows), tools=dict(robot.tools))
+    step[: sum(i == 0 for i, _ in kinds)] = 0  # the first axis defines the base
+    shifted = robot_from_chain(moved_chain(chain, step), robot.tools, robot)
+    rows = [shifted.rows[0]]
+    rows += [replace(row, theta=row.theta + rng.normal(0, sigma_rad)) for row in shifted.rows[1:]]
+    return replace(shifted, rows=tuple(rows), tools=dict(robot.tools))
 
 
 def joint_vectors(robot: Robot, count: int, rng: np.random.Generator, share: float = 0.6) -> np.ndarray:
-    """(count, n) over the middle ``share`` of each joint's range (± 1 rad or 100 mm of 0 where unlimited)."""
+    """Returns joint vectors (count, n) over the middle ``share`` of each joint's range (± 1 rad or 100 mm of 0 where
+    unlimited)."""
     low, high = robot.limits().T
     free = np.where(robot.prismatic, 100.0, 1.0)
     low, high = np.where(np.isfinite(low), low, -free), np.where(np.isfinite(high), high, free)
@@ -37,7 +39,7 @@ def joint_vectors(robot: Robot, count: int, rng: np.random.Generator, share: flo
 
 
 def placed(robot: Robot, world_from_base: Rigid, tools: dict[str, Rigid]) -> Robot:
-    """The robot where an instrument sees it, with these tools."""
+    """Returns the robot with ``world_from_base`` as an instrument sees it, and with these tools."""
     return replace(robot, world_from_base=world_from_base, tools=tools)
 
 
@@ -51,8 +53,11 @@ def measured(
     covariance: np.ndarray | None = None,
     conditions: Conditions = USUAL,
 ) -> Measurements:
-    """What an instrument sees of the robot at joint vectors (m, n): poses with normal noise of these σ per axis, or of
-    ``covariance`` (m, 6, 6) which then comes with them; of tool ``""``, or of each row's, and under its conditions."""
+    """Returns what an instrument measures of the robot at joint vectors (m, n).
+
+    The poses have normal noise of these σ per axis, or of ``covariance`` (m, 6, 6), which then comes with them. They
+    are of tool ``""``, or of each row's ``targets``, and under the rows' ``conditions``.
+    """
     targets = tuple(targets) or ("",) * len(q)
     tip = tips(State(robot.chain(), dict(robot.tools)), q, targets, conditions)
     noise = rng.normal(0, 1, (len(q), 6))

@@ -1,1 +1,1 @@
-"""Simulated targets, boards and photographs with known truth."""
+"""Simulation of targets, boards and photographs with known truth."""

@@ -1,6 +1,6 @@
-"""Everything in a simulated photograph but the circles to be measured: wall, lamps, table, box and plate.
+"""Background of a simulated photograph, without the circles to be measured: wall, lamps, table, box and plate.
 
-Drawn with cv2's anti-aliased polygons: what stands here need not be exact.
+It is drawn with cv2's anti-aliased polygons, because it need not be exact.
 """
 
 from dataclasses import dataclass
@@ -18,16 +18,16 @@ from stcal.synthetic.scene import Group, Scene
 WALL_BEHIND_MM = 350.0
 WALL_CELL_MM = 35.0
 WALL_REACH = 3.0
-"""Half the side of the wall, in widths of the view: seen slantwise it reaches far; cells out of view cost little."""
+"""Half the side of the wall, in widths of the view. An oblique view reaches far; cells out of view cost little."""
 LAMP_REACH_MM = 1000.0
 TABLE_BELOW_MM = 50.0
 SHIFT = 4
-"""Binary digits of cv2's fixed-point pixels."""
+"""Fractional bits of cv2's fixed-point pixels."""
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Grey levels (0 to 255) of the parts of a scene; ``lamps`` is the range of discs and ellipses on the wall."""
+    """Grey levels (0 to 255) of the parts of a scene; ``lamps`` is their range for discs and ellipses on the wall."""
 
     circle: float
     face: float
@@ -43,14 +43,14 @@ DARK = Look(circle=24, face=205, body=140, plate=214, wall=85, checker=(75, 108)
 
 
 def look_of(polarity: Polarity) -> Look:
-    """Grey levels for a target or a board with circles of that polarity."""
+    """Returns the grey levels for a target or a board with circles of this polarity."""
     return BRIGHT if polarity == "bright" else DARK
 
 
 def draw_background(scene: Scene, group: str, image: int, clutter: bool, scenery_seed: int) -> np.ndarray:
-    """The image without the circles, (height, width) uint8.
+    """Draws the image without the circles, (height, width) uint8.
 
-    The scenery belongs to the group: it is the same, seen from elsewhere, in all its images.
+    The scenery belongs to the group: all images of the group show the same scenery from different places.
     """
     g, look = scene.groups[group], look_of(scene.target.polarity)
     painter = _Painter(scene.camera, g.camera_from_target[image], look.wall)
@@ -67,18 +67,18 @@ def draw_background(scene: Scene, group: str, image: int, clutter: bool, scenery
 
 
 class _Painter:
-    """A canvas seen by a camera; draws polygons given in the target frame."""
+    """Canvas in the image of a camera, for polygons in the target frame."""
 
     def __init__(self, camera: Camera, camera_from_target: Rigid, level: float):
         self.camera, self.camera_from_target = camera, camera_from_target
         self.canvas = np.full((camera.height, camera.width), round(level), np.uint8)
 
     def pixels(self, polygons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (n, k, 2) of polygons (n, k, 3), and which of them are near the field of view, (n,)."""
+        """Returns the pixels (n, k, 2) of polygons (n, k, 3), and which polygons are near the field of view, (n,)."""
         xyz = self.camera_from_target @ polygons
         xy = xyz[..., :2] / np.maximum(xyz[..., 2:], 1.0)
         size = np.array([self.camera.width, self.camera.height])
-        # Beyond that the distortion may fold points back into the image.
+        # Beyond this reach the distortion may fold points back into the image.
         reach = 0.8 * size / self.camera.focal
         near = (xyz[..., 2].min(1) > 1) & (np.abs(xy) < reach).all((1, 2))
         xy = np.clip(xy, -reach, reach)
@@ -87,7 +87,7 @@ class _Painter:
         return pixel, near
 
     def polygons(self, polygons: np.ndarray, levels) -> None:
-        """Fill polygons (n, k, 3), later ones on top."""
+        """Fills polygons (n, k, 3), later ones on top."""
         pixel, near = self.pixels(polygons)
         fixed = np.rint(pixel * 2**SHIFT).astype(np.int32)
         for outline, level in zip(fixed[near], np.broadcast_to(levels, len(near))[near], strict=True):
@@ -95,14 +95,14 @@ class _Painter:
 
 
 def _edges(corners: np.ndarray, pieces: int = 12) -> np.ndarray:
-    """Points along the edges of a polygon (k, 3), so that the lens can bend them, (1, k·pieces, 3)."""
+    """Returns points along the edges of a polygon (k, 3), so that the lens can bend the edges, (1, k·pieces, 3)."""
     t = np.arange(pieces)[:, None] / pieces
     following = np.roll(corners, -1, axis=0)
     return (corners[:, None] * (1 - t) + following[:, None] * t).reshape(1, -1, 3)
 
 
 def _wall(scene: Scene, g: Group, rng) -> Rigid:
-    """target_from_wall of a wall behind target and board, z towards the camera."""
+    """Returns target_from_wall of a wall behind target and board, z towards the camera."""
     points = np.vstack([*(scene.face_outline(face.id) for face in scene.target.faces), scene.board_outline(g.name)])
     turn = Rigid.exp([*np.radians(rng.uniform(-10, 10, 3)), 0, 0, 0]).rotation
     rotation = g.axes.T @ turn
@@ -112,7 +112,7 @@ def _wall(scene: Scene, g: Group, rng) -> Rigid:
 
 
 def _view_mm(painter: _Painter) -> float:
-    """Width of what the camera sees at the wall, roughly."""
+    """Returns the approximate width of the view at the distance of the wall."""
     distance = np.linalg.norm(painter.camera_from_target.translation) + WALL_BEHIND_MM
     return float(distance * painter.camera.width / painter.camera.focal[0])
 
@@ -128,7 +128,7 @@ def _draw_checker(painter: _Painter, wall: Rigid, look: Look) -> None:
 
 
 def _draw_lamps(painter: _Painter, wall: Rigid, look: Look, rng) -> None:
-    """Discs of all sizes, as luminous as the circles or fainter, and ellipses at random."""
+    """Draws random discs of all sizes, as bright as the circles or fainter, and random ellipses."""
     n_discs, n_ellipses = 120, 60
     n = n_discs + n_ellipses
     centre = np.column_stack([rng.uniform(-LAMP_REACH_MM, LAMP_REACH_MM, (n, 2)), np.full(n, 1.0)])
@@ -145,7 +145,7 @@ def _draw_lamps(painter: _Painter, wall: Rigid, look: Look, rng) -> None:
 
 
 def _draw_reflections(painter: _Painter, scene: Scene, g: Group, look: Look) -> None:
-    """Faint mirror images of the circles in a glossy table under the target."""
+    """Draws faint mirror images of the circles in a glossy table under the target."""
     up = g.axes[1]
     circles = [
         (scene.face_circles(f.id), scene.target_from_face[f.id].rotation[:, 2], f.radius_mm) for f in scene.target.faces
@@ -153,27 +153,29 @@ def _draw_reflections(painter: _Painter, scene: Scene, g: Group, look: Look) -> 
     circles.append((g.board_circles_target, -g.target_from_board.rotation[:, 2], scene.board.radii_mm()))
     outlines = np.vstack([*(scene.face_outline(f.id) for f in scene.target.faces), scene.board_outline(g.name)])
     table = (outlines @ up).min() - TABLE_BELOW_MM
-    eye = painter.camera_from_target.inverse().translation
+    camera_centre = painter.camera_from_target.inverse().translation
     for xyz, normal, radius in circles:
         mirrored = xyz - 2 * np.outer(xyz @ up - table, up)
         mirrored_normal = normal - 2 * (normal @ up) * up
-        seen = (eye - mirrored) @ mirrored_normal > 0
-        # Only light that leaves the front of the circle, above the table, is reflected to an eye above it.
-        if seen.any() and eye @ up > table:
-            rims = rim_points(mirrored[seen], np.tile(mirrored_normal, (seen.sum(), 1)), radius[seen], 48)
+        reflected = (camera_centre - mirrored) @ mirrored_normal > 0
+        # Only light from the front of a circle above the table is reflected to a camera above the table.
+        if reflected.any() and camera_centre @ up > table:
+            rims = rim_points(
+                mirrored[reflected], np.tile(mirrored_normal, (reflected.sum(), 1)), radius[reflected], 48
+            )
             painter.polygons(rims, look.checker[1] + 0.12 * (look.circle - look.checker[1]))
 
 
 def _draw_body(painter: _Painter, scene: Scene, look: Look) -> None:
-    """The box: its silhouette hides what is behind; then the faces that are turned to the camera, far ones first."""
+    """Draws the box: its silhouette, which hides the background, then the faces towards the camera, far ones first."""
     outlines = {face.id: scene.face_outline(face.id) for face in scene.target.faces}
     pixel, _ = painter.pixels(np.concatenate([_edges(outline) for outline in outlines.values()]))
     points = pixel.reshape(-1, 2)
     hull = np.rint(points[ConvexHull(points).vertices] * 2**SHIFT).astype(np.int32)
     cv2.fillPoly(painter.canvas, [hull], float(look.body), cv2.LINE_AA, SHIFT)
-    eye = painter.camera_from_target.inverse().translation
-    for face_id in sorted(outlines, key=lambda face: -np.linalg.norm(outlines[face].mean(0) - eye)):
-        ray = eye - outlines[face_id].mean(0)
+    camera_centre = painter.camera_from_target.inverse().translation
+    for face_id in sorted(outlines, key=lambda face: -np.linalg.norm(outlines[face].mean(0) - camera_centre)):
+        ray = camera_centre - outlines[face_id].mean(0)
         cosine = scene.target_from_face[face_id].rotation[:, 2] @ ray / np.linalg.norm(ray)
         if cosine > 0:
             painter.polygons(_edges(outlines[face_id]), look.face * (0.8 + 0.2 * cosine))

@@ -1,4 +1,4 @@
-"""A scene as a folder: photographs, camera, designs and truth."""
+"""Data set of a simulated scene: a folder with photographs, camera, designs and truth."""
 
 import json
 from collections.abc import Callable
@@ -24,18 +24,18 @@ def write_dataset(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
-    """Write ``images/<group>/IMG_1000.jpg`` …, ``cameras.txt``, ``target.toml``, ``board.toml``, ``truth.json``.
+    """Writes ``images/<group>/IMG_1000.jpg`` …, ``cameras.txt``, ``target.toml``, ``board.toml``, ``truth.json``.
 
     Parameters
     ----------
     folder : path
-        Made if missing; must be empty.
+        Folder of the data set. It is created if missing, and must be empty.
     image_format : {"jpg", "png"}
     jpeg_quality : int
     workers : int, optional
-        Processes that render; default one per core.
+        Number of processes that render; one per core by default.
     progress : callable, optional
-        Called with the number of images done, and that of all.
+        Called with the number of images done, and the number of all images.
 
     Returns
     -------

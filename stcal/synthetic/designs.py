@@ -1,4 +1,4 @@
-"""Designs to simulate: where the faces of the reference target nominally are, and a second, quite different target."""
+"""Designs to simulate: nominal poses of the reference target's faces, and a second, quite different target."""
 
 from dataclasses import replace
 
@@ -8,11 +8,11 @@ from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_target
 from stcal.geometry.rigid import Rigid
 
 REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))
-"""The groups of Zhang & Wei (2017), sec. 2."""
+"""Groups of Zhang & Wei (2017), sec. 2."""
 
 
 def nominal_target_from_face() -> dict[str, Rigid]:
-    """Nominal face poses of the reference design, target frame = frame of face 1, mm."""
+    """Returns the nominal face poses of the reference design, target frame = frame of face 1, mm."""
     return reference_target().rough_poses()
 
 
@@ -53,10 +53,10 @@ _EDGE_MM = 140.0
 
 
 def second_design() -> tuple[TargetDesign, BoardDesign, dict[str, Rigid]]:
-    """A cube with dark circles on three white faces, its board with one larger corner dot, and nominal face poses.
+    """Returns a cube with dark circles on three white faces, a board with one larger corner dot, and nominal poses.
 
-    Nothing of the reference design recurs: face and circle ids, pattern, number of circles, radii, polarity, frame
-    circles, board. The poses are in the cube's own frame, origin at its centre.
+    It shares nothing with the reference design: face and circle ids, pattern, number of circles, radii, polarity, frame
+    circles and board all differ. The poses are in the cube's own frame, with the origin at its centre.
     """
     x, y, z = np.eye(3)
     drawings = {
@@ -77,7 +77,7 @@ def second_design() -> tuple[TargetDesign, BoardDesign, dict[str, Rigid]]:
 
 
 def face_of_drawing(face_id: str, circles, origin: str, x: str, y: str) -> tuple[FaceDesign, Rigid]:
-    """A face from (id, x, y, radius) rows in any drawing frame, and drawing_from_face.
+    """Returns a face from (id, x, y, radius) rows in any drawing frame, and drawing_from_face.
 
     The face frame has its origin at circle ``origin``, X through circle ``x``, Y on the side of circle ``y``.
     """
@@ -90,7 +90,7 @@ def face_of_drawing(face_id: str, circles, origin: str, x: str, y: str) -> tuple
 
 
 def three_point_frame(origin: np.ndarray, on_x: np.ndarray, on_y: np.ndarray) -> Rigid:
-    """a_from_face of the frame through three points of frame a: X through the second, Y on the third's side."""
+    """Returns a_from_face of the frame through three points of frame a: X through ``on_x``, ``on_y`` on Y's side."""
     x = (on_x - origin) / np.linalg.norm(on_x - origin)
     z = np.cross(x, on_y - origin)
     z /= np.linalg.norm(z)

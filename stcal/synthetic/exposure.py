@@ -1,4 +1,4 @@
-"""Real photographs exposed again: other exposure times, uneven light and glare, through a camera's response."""
+"""Simulation of new exposures of a real photograph: exposure time, uneven light, glare, and a camera's response."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,15 +9,15 @@ import numpy as np
 from stcal.errors import InputError
 
 DARKEST = 1e-3
-"""Of the light: below it the photograph itself holds nothing."""
+"""Least grey value, as a share of white. The photograph holds no information below."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A camera without its lens.
+    """Sensor of a camera.
 
-    ``gamma`` : the response is light to the power of 1/gamma; ``full_well`` : electrons at the end of the scale, whose
-    shot noise is the root of their number; ``read_noise`` : electrons; ``bits`` : 8 or 16.
+    ``gamma`` : the response is light to the power of 1/gamma; ``full_well`` : electrons at full scale, whose shot noise
+    is the root of their number; ``read_noise`` : read noise in electrons; ``bits`` : 8 or 16.
     """
 
     gamma: float = 1.0
@@ -35,11 +35,11 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """What falls on a scene beside what its photograph shows.
+    """Light on a scene in addition to the light in its photograph.
 
-    ``stops`` : over the width of the image it changes by so many powers of two, towards ``angle_rad``, and is unchanged
-    at ``pivot`` (x, y), in image widths; ``glare`` : light added in the middle of a spot, in units of the photograph's
-    white; ``glare_at``, ``glare_radius`` : its place (x, y) and Gaussian radius, in image widths.
+    ``stops`` : gradient in powers of two per width of the image, in direction ``angle_rad``; the light is unchanged at
+    ``pivot`` (x, y), in image widths; ``glare`` : light added in the middle of a spot, in units of the photograph's
+    white; ``glare_at``, ``glare_radius`` : place (x, y) and Gaussian radius of the spot, in image widths.
     """
 
     stops: float = 0.0
@@ -57,9 +57,9 @@ def expose(
     light: Light | None = None,
     seed: int = 0,
 ) -> list[np.ndarray]:
-    """The scene of an 8-bit photograph (height, width) at other exposure times; 1 is as bright as it was.
+    """Exposes the scene of an 8-bit photograph (height, width) at other times; time 1 keeps its brightness.
 
-    What was saturated in the photograph is white in all. The noise of the exposures is independent.
+    Saturated pixels of the photograph are taken to have the light of white. The noise of the exposures is independent.
     """
     if photograph.dtype != np.uint8 or photograph.ndim != 2:
         raise InputError(
@@ -69,7 +69,7 @@ def expose(
         raise InputError("E-EXPOSURES-VALUE", "exposure times: positive numbers needed")
     sensor, light = sensor or Sensor(), light or Light()
     rng = np.random.default_rng(seed)
-    # Within a step of grey the light may have been anything: spread evenly, or a darker exposure would show the steps.
+    # The light within one grey level is unknown. It is spread evenly, or a darker exposure would show the levels.
     grey = (photograph + rng.random(photograph.shape, np.float32)) / np.float32(256)
     scene = lit(np.maximum(grey, DARKEST) ** np.float32(sensor.gamma), light)
     top = 2**sensor.bits - 1
@@ -84,7 +84,7 @@ def expose(
 
 
 def lit(scene: np.ndarray, light: Light) -> np.ndarray:
-    """The light of a scene (height, width) with the gradient and the glare."""
+    """Returns the light of a scene (height, width) with gradient and glare."""
     height, width = scene.shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32) / width, np.arange(height, dtype=np.float32) / width)
     if light.stops:
@@ -92,13 +92,13 @@ def lit(scene: np.ndarray, light: Light) -> np.ndarray:
         along = (x - np.float32(light.pivot[0])) * towards[0] + (y - np.float32(light.pivot[1])) * towards[1]
         scene = scene * np.exp2(np.float32(light.stops) * along)
     if light.glare:
-        away = (x - np.float32(light.glare_at[0])) ** 2 + (y - np.float32(light.glare_at[1])) ** 2
-        scene = scene + np.float32(light.glare) * np.exp(-away / np.float32(2 * light.glare_radius**2))
+        squared_distance = (x - np.float32(light.glare_at[0])) ** 2 + (y - np.float32(light.glare_at[1])) ** 2
+        scene = scene + np.float32(light.glare) * np.exp(-squared_distance / np.float32(2 * light.glare_radius**2))
     return scene
 
 
 def moved(photograph: np.ndarray, shift_px: tuple[float, float]) -> np.ndarray:
-    """The photograph shifted in the image, as by a camera that turned a little."""
+    """Returns the photograph shifted in the image, as if the camera had turned a little."""
     matrix = np.array([[1, 0, shift_px[0]], [0, 1, shift_px[1]]], float)
     return cv2.warpAffine(
         photograph, matrix, photograph.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT

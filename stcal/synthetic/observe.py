@@ -1,4 +1,4 @@
-"""What one image shows: the circles in view, and measured centres without pixels."""
+"""Observations of one simulated image: the circles in view, and measured centres without rendering pixels."""
 
 from dataclasses import dataclass
 
@@ -11,20 +11,21 @@ from stcal.labels import DotLabel, Label
 from stcal.synthetic.scene import Scene
 
 MAX_FOUND_TILT_RAD = np.radians(70)
-"""Circles tilted more than this need not be found."""
+"""Largest tilt at which a circle must be found, in rad."""
 MAX_SHOWN_TILT_RAD = np.radians(89)
 RIM_POINTS = 72
 NEAR_BORDER = 3.0
-"""Radii of a circle's image seen frontally, from the image's border, beyond which no rim reaches it."""
+"""Distance of a circle's centre from the image border at which no rim reaches it, in radii of its frontal image."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageCircles:
-    """The circles that one image shows, true values; camera frame, mm.
+    """True values of the circles that one image shows; camera frame, mm.
 
     ``labels`` : n labels; ``xyz_camera``, ``normal_camera`` : (n, 3), normals towards the camera; ``radius_mm`` :
     (n,); ``tilt_rad`` : (n,) angle between normal and line of sight; ``centre_px`` : (n, 2) image of the circle's
-    centre; ``must_find`` : (n,) bool, of the group's faces or the board, tilt up to 70°, all of it in the image.
+    centre; ``must_find`` : (n,) bool, True for circles of the group's faces or the board with a tilt up to 70° that lie
+    completely in the image.
     """
 
     labels: tuple[Label, ...]
@@ -49,7 +50,7 @@ class ImageCircles:
 
 
 def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
-    """The circles that face the camera and whose centres lie in the image."""
+    """Returns the circles that face the camera and whose centres lie in the image."""
     g = scene.groups[group]
     camera_from_target = g.camera_from_target[image]
     labels, xyz, normal, radius, wanted = [], [], [], [], []
@@ -74,7 +75,7 @@ def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
     centre = scene.camera.project(xyz)
     shown = (tilt <= MAX_SHOWN_TILT_RAD) & ((centre > -0.5) & (centre < size - 0.5)).all(1)
     whole = _whole(scene.camera, xyz, normal, radius, centre)
-    must = np.array(wanted) & (tilt <= MAX_FOUND_TILT_RAD) & whole
+    findable = np.array(wanted) & (tilt <= MAX_FOUND_TILT_RAD) & whole
     return ImageCircles(
         tuple(label for label, keep in zip(labels, shown, strict=True) if keep),
         xyz[shown],
@@ -82,12 +83,12 @@ def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:
         radius[shown],
         tilt[shown],
         centre[shown],
-        must[shown],
+        findable[shown],
     )
 
 
 def _whole(camera: Camera, xyz, normal, radius, centre_px: np.ndarray) -> np.ndarray:
-    """Mask of the circles whose rims lie in the image; only those near its border are looked at."""
+    """Returns the mask of the circles whose rims lie in the image. Only rims near its border are computed."""
     size = np.array([camera.width, camera.height])
     reach = NEAR_BORDER * camera.focal.max() * radius / np.maximum(xyz[:, 2], radius)
     whole = ((centre_px > reach[:, None]) & (centre_px < size - 1 - reach[:, None])).all(1)
@@ -98,7 +99,7 @@ def _whole(camera: Camera, xyz, normal, radius, centre_px: np.ndarray) -> np.nda
 
 
 def rim_points(xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, count: int = RIM_POINTS) -> np.ndarray:
-    """Points on the rims of n circles, (n, count, 3), in the frame of the arguments (n, 3), (n, 3), (n,)."""
+    """Returns points on the rims of n circles, (n, count, 3), in the frame of the arguments (n, 3), (n, 3), (n,)."""
     helper = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])
     e1 = np.cross(normal, helper)
     e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
@@ -111,13 +112,17 @@ def rim_points(xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, count: i
 def simulate_centres(
     scene: Scene, group: str, image: int, noise_px: float, rng: np.random.Generator
 ) -> dict[Label, np.ndarray]:
-    """Measured ellipse centres by label, (2,) px, of one image: what a detector with that noise would give.
+    """Simulates measured ellipse centres of one image by label, (2,) px, as from a detector with this noise.
 
-    The centre of the ideal ellipse (not the image of the circle's centre), distorted by the lens, plus Gaussian
-    noise of ``noise_px`` per axis; circles of all faces and the board tilted up to 70°.
+    A measurement is the centre of the ideal ellipse (not the image of the circle's centre), distorted by the lens, plus
+    Gaussian noise of ``noise_px`` per axis. It covers circles of all faces with a tilt up to 70°, and all dots.
     """
-    seen = image_circles(scene, group, image)
-    ellipse_centre = scene.camera.project(circle_image_offset(seen.xyz_camera, seen.normal_camera, seen.radius_mm))
+    circles = image_circles(scene, group, image)
+    ellipse_centre = scene.camera.project(
+        circle_image_offset(circles.xyz_camera, circles.normal_camera, circles.radius_mm)
+    )
     measured = ellipse_centre + noise_px * rng.standard_normal(ellipse_centre.shape)
-    keep = (seen.tilt_rad <= MAX_FOUND_TILT_RAD) | np.array([isinstance(label, DotLabel) for label in seen.labels])
-    return {label: xy for label, xy, k in zip(seen.labels, measured, keep, strict=True) if k}
+    keep = (circles.tilt_rad <= MAX_FOUND_TILT_RAD) | np.array(
+        [isinstance(label, DotLabel) for label in circles.labels]
+    )
+    return {label: xy for label, xy, k in zip(circles.labels, measured, keep, strict=True) if k}

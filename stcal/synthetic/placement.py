@@ -1,4 +1,4 @@
-"""Where the board stands and where the photographs are taken from: rejection sampling until all is in view."""
+"""Placement of board and camera for simulated photographs: rejection sampling until everything is in view."""
 
 from dataclasses import dataclass
 
@@ -15,19 +15,19 @@ MAX_BOARD_TILT_RAD = np.radians(50)
 CANDIDATES = 600
 CANDIDATES_PER_VIEW = 8
 AT_ONCE = 600
-"""Views tested at a time: what that takes of memory does not grow with their number."""
+"""Number of views tested at a time, which bounds the memory."""
 PLACES = 60
 GOOD_SHARE = 0.5
-"""A board place is taken at once if this share of the views that show both faces also shows the board."""
+"""A place of the board is accepted at once if this share of the views of both faces also shows the board."""
 IMAGE_MARGIN = 0.03
-"""Free border of the image, in widths."""
+"""Free border of the image, in image widths."""
 BODY_GAP = 0.01
 """Free space between target and board in the image, in focal lengths."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupShape:
-    """What has to be seen in one group; target frame unless named otherwise, mm.
+    """Geometry that the images of one group must show; target frame unless named otherwise, mm.
 
     ``circles``, ``normals`` : (n, 3), circles of the two faces; ``axes`` : (3, 3), see :func:`viewing_axes`;
     ``body`` : (k, 3) corners of the target's faces; ``dots_board`` : (m, 3); ``outline_board`` : (4, 3) corners.
@@ -50,26 +50,26 @@ class _Views:
     centres: np.ndarray
 
     def to_camera(self, xyz_target: np.ndarray) -> np.ndarray:
-        """Points (k, 3) in every camera, (n, k, 3)."""
+        """Returns points (k, 3) in the frame of every camera, (n, k, 3)."""
         return np.einsum("nij,nkj->nki", self.rotations, xyz_target - self.centres[:, None])
 
     def tilt_rad(self, xyz_target: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Angles between normals and lines of sight, (n, k)."""
+        """Returns the angles between normals and lines of sight, (n, k)."""
         ray = self.centres[:, None] - xyz_target
         return np.arccos(np.clip((ray * normals).sum(-1) / np.linalg.norm(ray, axis=-1), -1, 1))
 
     def pose(self, i: int) -> Rigid:
-        """camera_from_target of view i."""
+        """Returns camera_from_target of view i."""
         return Rigid(self.rotations[i], -self.rotations[i] @ self.centres[i])
 
 
 def viewing_axes(normal_a: np.ndarray, normal_b: np.ndarray, where: str) -> np.ndarray:
-    """Rows right, up and towards the camera, (3, 3), of the view that shows two faces equally well.
+    """Returns the axes (3, 3) of the view that shows two faces equally well: rows right, up, towards the camera.
 
     Raises
     ------
     DegenerateError
-        If the faces are nearly parallel or opposite, so that no such view exists.
+        The faces are nearly parallel or opposite, so that no such view exists.
     """
     angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(normal_a, normal_b)), normal_a @ normal_b))
     if not 5 <= angle <= 130:
@@ -85,15 +85,15 @@ def viewing_axes(normal_a: np.ndarray, normal_b: np.ndarray, where: str) -> np.n
 def place_group(
     shape: GroupShape, camera: Camera, count: int, distance_mm: float, spread_rad: float, rng: np.random.Generator
 ) -> tuple[Rigid, list[Rigid]]:
-    """target_from_board and ``count`` camera_from_target.
+    """Returns target_from_board and ``count`` camera_from_target.
 
     In every view both faces are tilted by up to 67° and the board by up to 50°, all of target and board is inside
-    the image, and neither covers the other. Of the views that satisfy this the ones farthest apart are taken.
+    the image, and neither covers the other. Among the views that satisfy this, those farthest apart are chosen.
 
     Raises
     ------
     DegenerateError
-        If no place of the board leaves enough such views.
+        No place of the board leaves enough such views.
     """
     best, shown = None, 0
     for _ in range(PLACES):
@@ -150,8 +150,8 @@ def _candidate_views(shape, target_from_board, camera, n: int, distance_mm, spre
         xy = xyz[..., :2] / xyz[..., 2:]
         low, high = xy.min(1), xy.max(1)
         offset = place * np.maximum(free - (high - low) / 2, 0) if step == 2 else 0
-        ahead = np.column_stack([(low + high) / 2 - offset, np.ones(n)])
-        forward = np.einsum("nji,nj->ni", views.rotations, ahead)
+        towards_middle = np.column_stack([(low + high) / 2 - offset, np.ones(n)])
+        forward = np.einsum("nji,nj->ni", views.rotations, towards_middle)
         forward /= np.linalg.norm(forward, axis=1, keepdims=True)
         views = _Views(_look_along(forward, shape.axes[1], roll), views.centres)
     return views
@@ -167,33 +167,33 @@ def _look_along(forward: np.ndarray, up: np.ndarray, roll: np.ndarray) -> np.nda
 
 def _board_seen(shape, target_from_board, views: _Views, camera: Camera) -> np.ndarray:
     outline = target_from_board @ shape.outline_board
-    # The tangent of the tilt is the distance from the foot of the camera, and that is largest at a corner of the dots.
+    # The tangent of the tilt grows with the distance from the camera's foot, which is largest at a corner of the dots.
     dots = target_from_board @ shape.dots_board[ConvexHull(shape.dots_board[:, :2]).vertices]
     facing = -target_from_board.rotation[:, 2]
-    seen = (views.tilt_rad(dots, np.broadcast_to(facing, dots.shape)) <= MAX_BOARD_TILT_RAD).all(1)
+    valid = (views.tilt_rad(dots, np.broadcast_to(facing, dots.shape)) <= MAX_BOARD_TILT_RAD).all(1)
     body, plate = views.to_camera(shape.body), views.to_camera(outline)
-    seen &= (body[..., 2].min(1) > 0) & (plate[..., 2].min(1) > 0)
+    valid &= (body[..., 2].min(1) > 0) & (plate[..., 2].min(1) > 0)
     body, plate = body[..., :2] / body[..., 2:], plate[..., :2] / plate[..., 2:]
-    # Far outside the image the distortion may fold back into it.
-    seen &= (np.abs(np.concatenate([body, plate], 1)) < np.array([camera.width, camera.height]) / camera.focal).all(
+    # Points far outside the image may be folded back into it by the distortion.
+    valid &= (np.abs(np.concatenate([body, plate], 1)) < np.array([camera.width, camera.height]) / camera.focal).all(
         (1, 2)
     )
     pixel = camera.pixel_from_normalised(np.concatenate([body, plate], 1))
     margin = IMAGE_MARGIN * camera.width
     inside = (pixel > margin) & (pixel < np.array([camera.width, camera.height]) - 1 - margin)
-    return seen & inside.all((1, 2)) & _apart(body, plate)
+    return valid & inside.all((1, 2)) & _apart(body, plate)
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Whether a line with room on both sides separates point sets (n, k, 2) and (n, m, 2); exact to 2°."""
+    """Returns whether a line with a gap separates the point sets (n, k, 2) and (n, m, 2); directions in steps of 2°."""
     angle = np.radians(np.arange(0, 360, 2))
     direction = np.array([np.cos(angle), np.sin(angle)])
-    parts = [slice(at, at + AT_ONCE) for at in range(0, len(a), AT_ONCE)]
-    return np.concatenate([((b[k] @ direction).min(1) - (a[k] @ direction).max(1) > BODY_GAP).any(1) for k in parts])
+    batches = [slice(at, at + AT_ONCE) for at in range(0, len(a), AT_ONCE)]
+    return np.concatenate([((b[k] @ direction).min(1) - (a[k] @ direction).max(1) > BODY_GAP).any(1) for k in batches])
 
 
 def _farthest(directions: np.ndarray, count: int) -> np.ndarray:
-    """Greedy farthest-point choice among directions (n, 3): indices (count,)."""
+    """Chooses directions (n, 3) greedily by farthest-point sampling, and returns their indices (count,)."""
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     cosine = unit @ unit.T
     chosen = [int(np.argmin(unit @ unit.mean(0)))]

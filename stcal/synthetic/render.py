@@ -1,4 +1,4 @@
-"""Photographs of a scene: circles by exact area coverage, lens blur, vignetting, noise and quantisation."""
+"""Synthesis of photographs of a scene: circles by exact area coverage, lens blur, vignetting, noise, quantisation."""
 
 from dataclasses import dataclass
 
@@ -13,9 +13,9 @@ from stcal.synthetic.observe import ImageCircles, image_circles, rim_points
 from stcal.synthetic.scene import Scene
 
 SUBSAMPLES = 8
-"""Cells per pixel side at a rim. A cell that the rim crosses counts by its linear share."""
+"""Number of cells per pixel side at a rim. A cell that the rim crosses counts by its linear share."""
 FINE = 4
-"""Squares per pixel side on which a circle is blurred."""
+"""Number of squares per pixel side on which a circle is blurred."""
 RIM_REACH_PX = 1.5
 STEEP_RAD = np.radians(75)
 FULL_SCALE = 255.0
@@ -23,7 +23,7 @@ FULL_SCALE = 255.0
 
 @dataclass(frozen=True, slots=True)
 class RenderOptions:
-    """How the photographs look.
+    """Appearance of the photographs.
 
     Parameters
     ----------
@@ -34,17 +34,17 @@ class RenderOptions:
     vignetting : float
         Loss of light in the corners, fraction.
     gradient : float
-        Brightness varies linearly by ± this fraction from one side of the image to the other, in a random direction.
+        Linear variation of brightness by ± this fraction from one side of the image to the other, in random direction.
     spread : float
         Standard deviation of the brightness of single circles, fraction.
     exposure : float
         Factor on all brightness. Circles saturate above 1.4 on a bright design; the default stays clear of it.
     clutter : bool
-        A checkered wall, discs and ellipses on it, reflections; without it a plain wall.
+        Whether there are a checkered wall with discs and ellipses, and reflections; else a plain wall.
     bit_depth : int
         8 or 16.
     seed : int
-        Of noise and scenery, beside the scene's own.
+        Seed of noise and scenery, in addition to the seed of the scene.
     """
 
     noise: float = 0.01
@@ -68,7 +68,7 @@ class RenderOptions:
 
 
 def render(scene: Scene, group: str, image: int, options: RenderOptions | None = None) -> np.ndarray:
-    """Photograph number ``image`` of ``group``: (height, width), uint8 or uint16.
+    """Renders photograph number ``image`` of ``group``: (height, width), uint8 or uint16.
 
     The same arguments give the same image.
     """
@@ -84,7 +84,7 @@ def render(scene: Scene, group: str, image: int, options: RenderOptions | None =
 
 
 def encode(picture: np.ndarray, suffix: str, jpeg_quality: int = 95) -> bytes:
-    """Content of an image file; ``suffix`` is ``.jpg`` or ``.png``."""
+    """Returns the content of an image file; ``suffix`` is ``.jpg`` or ``.png``."""
     quality = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if suffix == ".jpg" else []
     return cv2.imencode(suffix, picture, quality)[1].tobytes()
 
@@ -92,10 +92,10 @@ def encode(picture: np.ndarray, suffix: str, jpeg_quality: int = 95) -> bytes:
 def _add_circles(
     picture: np.ndarray, camera: Camera, circles: ImageCircles, levels: np.ndarray, blur_px: float
 ) -> np.ndarray:
-    """The picture, blurred, with the circles.
+    """Blurs the picture and adds the circles.
 
     The lens blurs before the sensor samples: blurring coverage per pixel instead would shift centres by up to
-    0.004 px. So each circle is blurred on a finer grid, and added; around it the background is even.
+    0.004 px. Therefore each circle is blurred on a finer grid, and added; the background around it is even.
     """
     rims = camera.project(rim_points(circles.xyz_camera, circles.normal_camera, circles.radius_mm))
     margin = 2 + int(np.ceil(4 * blur_px))
@@ -119,16 +119,16 @@ def _add_circles(
 def _fine_coverage(
     camera: Camera, box, centre: np.ndarray, normal: np.ndarray, radius: float, steep: bool
 ) -> np.ndarray:
-    """Share of each ¼ px square of a box that one disc covers, (4·(y1 - y0), 4·(x1 - x0)) float32.
+    """Returns the share of each ¼ px square of a box that one disc covers, (4·(y1 - y0), 4·(x1 - x0)) float32.
 
-    Rays through pixels meet the disc's plane; off the rim the distance from the disc's centre decides, near the rim
-    the pixel is divided into cells.
+    Rays through pixels are intersected with the disc's plane. Away from the rim the distance from the disc's centre
+    decides; near the rim the pixel is divided into cells.
     """
     x0, y0, x1, y1 = box
     ideal = camera.normalised_from_pixel(np.stack(np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)), axis=-1))
     outside = _relative_distance(ideal, centre, normal, radius)
     rim = np.abs(outside) < RIM_REACH_PX * np.hypot(*np.gradient(outside))
-    if steep:  # so narrow that the linear estimate of the distance fails
+    if steep:  # the ellipse is so narrow that the linear estimate of the distance fails
         rim[:] = True
     # Within a pixel the lens is linear to 1e-5 px.
     _, distorted_from_ideal = camera.distort_jacobian(ideal[rim])
@@ -148,8 +148,8 @@ def _fine_coverage(
 
 
 def _relative_distance(xy: np.ndarray, centre: np.ndarray, normal: np.ndarray, radius: float) -> np.ndarray:
-    """(Distance from the disc's centre)/radius − 1 of the points where rays (..., 2) meet the disc's plane, (...)."""
-    # Written out: a product of matrices would start BLAS threads, which get in the way of parallel rendering.
+    """Returns distance from the disc's centre / radius − 1 where rays (..., 2) meet the disc's plane, (...)."""
+    # Written out, because a matrix product would start BLAS threads, which slow down parallel rendering.
     x, y = xy[..., 0], xy[..., 1]
     depth = (normal @ centre) / (x * normal[0] + y * normal[1] + normal[2])
     dx, dy, dz = depth * x - centre[0], depth * y - centre[1], depth - centre[2]
@@ -157,7 +157,7 @@ def _relative_distance(xy: np.ndarray, centre: np.ndarray, normal: np.ndarray, r
 
 
 def _expose(picture: np.ndarray, options: RenderOptions, rng: np.random.Generator) -> np.ndarray:
-    """Grey levels of the light on the sensor, which is overwritten."""
+    """Returns the grey levels of the light ``picture`` on the sensor, which is overwritten."""
     height, width = picture.shape
     x = ((np.arange(width) - (width - 1) / 2) / (width / 2)).astype(np.float32)
     y = ((np.arange(height) - (height - 1) / 2) / (width / 2)).astype(np.float32)

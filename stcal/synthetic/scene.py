@@ -1,4 +1,4 @@
-"""A scene with known truth: the target and the board as really made, where they stand, and the cameras."""
+"""Scene with known truth: target and board as really made, their poses, and the cameras."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -21,13 +21,13 @@ __all__ = ["Group", "Scene", "SceneOptions", "make_scene", "nominal_target_from_
 FACE_MARGIN_MM = 15.0
 BOARD_MARGIN_MM = 15.0
 FOCAL_PER_WIDTH = 24 / 22.3
-"""A 24 mm lens on a sensor 22.3 mm wide."""
+"""Focal length in image widths of a 24 mm lens on a sensor 22.3 mm wide."""
 CONVEX_TOLERANCE_MM = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class SceneOptions:
-    """What to simulate.
+    """Options of a simulated scene.
 
     Parameters
     ----------
@@ -35,22 +35,22 @@ class SceneOptions:
     width, height : int
         Image size, px.
     focal_px : float, optional
-        Default: a 24 mm lens on a 22.3 mm wide sensor.
+        Focal length; by default that of a 24 mm lens on a 22.3 mm wide sensor.
     distortion : tuple of up to 8 floats
         k1, k2, p1, p2, k3, k4, k5, k6.
     centre_sigma : float
         Standard deviation of the principal point about the middle of the image, in image widths.
     distance_mm : float
-        Camera to target and board; varies by ±10 %.
+        Distance from the camera to target and board; varies by ±10 %.
     spread_deg : float
-        The views spread this far to every side, as far as both faces stay visible.
+        Angle by which the views spread to every side, as far as both faces stay visible.
     images_per_group : int
     groups : tuple of pairs of face ids, optional
-        Default: those of the paper for the reference design, else all pairs that can be seen together.
+        By default the groups of the paper for the reference design, else all pairs that can be seen together.
     circle_sigma_mm : float
-        In-plane placement error of the target's circles, per axis. The board's is in its design.
+        σ of the in-plane placement of the target's circles, per axis. That of the board's dots is in its design.
     face_shift_mm, face_turn_deg : float
-        RMS length and angle by which the true face poses differ from the nominal ones.
+        RMS length and angle of the deviations of true face poses from nominal ones.
     """
 
     seed: int = 0
@@ -81,10 +81,11 @@ class SceneOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
-    """Photographs between which only the camera moves.
+    """Group of photographs between which only the camera moves.
 
-    ``faces`` : the group is for, two in a made scene; ``axes`` : (3, 3) rows right, up, towards the camera of the
-    middle view, target frame; ``board_circles_target`` : (n, 3) mm, row-major; ``camera_from_target`` : one per image.
+    ``faces`` : faces that the group shows, two in a scene of :func:`make_scene`; ``axes`` : (3, 3) rows right, up,
+    towards the camera of the middle view, target frame; ``board_circles_target`` : (n, 3) mm, row-major;
+    ``camera_from_target`` : one pose per image.
     """
 
     name: str
@@ -101,10 +102,10 @@ class Group:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """The truth of a simulated measurement.
+    """Truth of a simulated measurement.
 
-    ``target_from_face`` : three-point frames through the circles as really placed, by face id; the first face of
-    the design is the reference, its frame is the target frame. ``circles_target`` : (3,) mm by label.
+    ``target_from_face`` : three-point frames through the circles as really placed, by face id. The first face of the
+    design is the reference: its frame is the target frame. ``circles_target`` : (3,) mm by label.
     """
 
     target: TargetDesign
@@ -121,15 +122,15 @@ class Scene:
         return self.target.faces[0].id
 
     def face_circles(self, face_id: str) -> np.ndarray:
-        """Circle centres of a face, (n, 3), target frame, in the design's order."""
+        """Returns the circle centres of a face, (n, 3), target frame, in the design's order."""
         return np.array([self.circles_target[label] for label in self.target.face(face_id).labels()])
 
     def face_outline(self, face_id: str) -> np.ndarray:
-        """Corners of the visible side of a face, (k, 3), target frame."""
+        """Returns the corners of the visible side of a face, (k, 3), target frame."""
         return self.target_from_face[face_id] @ _face_corners(self.target.face(face_id))
 
     def board_outline(self, group: str) -> np.ndarray:
-        """Corners of the board's plate, (4, 3), target frame."""
+        """Returns the corners of the board's plate, (4, 3), target frame."""
         return self.groups[group].target_from_board @ _board_rectangle(self.board)
 
 
@@ -139,17 +140,17 @@ def make_scene(
     board: BoardDesign | None = None,
     nominal: dict[str, Rigid] | None = None,
 ) -> Scene:
-    """Make a scene; the same arguments give the same scene.
+    """Makes a scene; the same arguments give the same scene.
 
     Parameters
     ----------
     options : SceneOptions, optional
     target : TargetDesign, optional
-        Default: the reference design.
+        Design of the target; the reference design by default.
     board : BoardDesign, optional
-        Default: the reference board.
+        Design of the board; the reference board by default.
     nominal : dict of Rigid, optional
-        Nominal pose of every face in one common frame, by face id; default: the rough poses of ``target``.
+        Nominal pose of every face in one common frame, by face id; the rough poses of ``target`` by default.
 
     Raises
     ------
@@ -178,25 +179,27 @@ def make_scene(
 
 
 def seen_by(options: SceneOptions, file: CameraModel) -> SceneOptions:
-    """Options by which views are placed for the camera of a file, which states its image size: its size and focal
-    length, and its distortion where the lens is no equidistant one."""
+    """Returns options that place views for the camera of a file, which must state its image size.
+
+    Size and focal length come from the file, and the distortion too unless the lens is equidistant.
+    """
     focal_px = float(np.sqrt(file.focal.prod()))
     distortion = () if FISHEYE in file.colmap_model else tuple(file.distortion[:8])
     return replace(options, width=file.width, height=file.height, focal_px=focal_px, distortion=distortion)
 
 
 def group_name(pair: tuple[str, str]) -> str:
-    """Folder name of a group: ``12``, or ``top-left`` where ids are longer than one character."""
+    """Returns the folder name of a group: ``12``, or ``top-left`` if ids are longer than one character."""
     return ("" if all(len(face) == 1 for face in pair) else "-").join(pair)
 
 
 def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[CircleLabel, np.ndarray]]:
-    """True poses and circles, in the frame of the reference face."""
+    """Returns true poses and circles, in the frame of the reference face."""
     placed, frames = {}, {}
     for face in target.faces:
         turn, shift = rng.standard_normal((2, 3)) / np.sqrt(3)
         moved = Rigid.exp([*(np.radians(options.face_turn_deg) * turn), *(options.face_shift_mm * shift)])
-        # Turned about the face's own origin: the shift is what moves it.
+        # The face turns about its own origin, so that only the shift moves the origin.
         pose = Rigid(
             moved.rotation @ nominal[face.id].rotation, nominal[face.id].translation + options.face_shift_mm * shift
         )
@@ -227,18 +230,20 @@ def _made_camera(options: SceneOptions, rng) -> CalibratedCamera:
 def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) -> list[tuple[str, str]]:
     pairs = combinations([face.id for face in target.faces], 2)
     normal = {face: pose.rotation[:, 2] for face, pose in target_from_face.items()}
-    seen = [(a, b) for a, b in pairs if np.cos(np.radians(120)) <= normal[a] @ normal[b] <= np.cos(np.radians(20))]
+    visible_pairs = [
+        (a, b) for a, b in pairs if np.cos(np.radians(120)) <= normal[a] @ normal[b] <= np.cos(np.radians(20))
+    ]
     if set(target_from_face) == {face for pair in REFERENCE_GROUPS for face in pair} and set(REFERENCE_GROUPS) <= {
-        *seen
+        *visible_pairs
     }:
         return list(REFERENCE_GROUPS)
-    if not seen:
+    if not visible_pairs:
         raise DegenerateError(
             "E-SCENE-FACES",
             f"scene: no two faces of target {target.name} are 20° to 120° apart, so that one photograph shows both; "
             "check the rough poses, or add a face",
         )
-    return seen
+    return visible_pairs
 
 
 def _made_group(pair, target, board, camera, target_from_face, circles, options, rng) -> Group:
@@ -259,20 +264,20 @@ def _made_group(pair, target, board, camera, target_from_face, circles, options,
     target_from_board, views = place_group(
         shape, camera, options.images_per_group, options.distance_mm, np.radians(options.spread_deg), rng
     )
-    made = target_from_board @ (dots + board.sigma_mm * rng.standard_normal(dots.shape))
-    return Group(name, tuple(pair), axes, target_from_board, made, tuple(views))
+    dots_target = target_from_board @ (dots + board.sigma_mm * rng.standard_normal(dots.shape))
+    return Group(name, tuple(pair), axes, target_from_board, dots_target, tuple(views))
 
 
 def _rectangle(xy: np.ndarray, radius: np.ndarray, margin: float) -> np.ndarray:
-    """Corners, (4, 3), of the smallest rectangle (to 3°) about circles, in their plane z = 0."""
-    found = []
+    """Returns the corners (4, 3) of the smallest rectangle (to 3°) about circles, in their plane z = 0."""
+    rectangles = []
     for angle in np.radians(np.arange(0, 90, 3)):
         turned_from_plane = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         turned = xy @ turned_from_plane.T
         (x0, y0), (x1, y1) = (turned - radius[:, None]).min(0) - margin, (turned + radius[:, None]).max(0) + margin
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-        found.append(((x1 - x0) * (y1 - y0), corners @ turned_from_plane))
-    return frozen(np.column_stack([min(found, key=lambda each: each[0])[1], np.zeros(4)]), (4, 3), "corners")
+        rectangles.append(((x1 - x0) * (y1 - y0), corners @ turned_from_plane))
+    return frozen(np.column_stack([min(rectangles, key=lambda each: each[0])[1], np.zeros(4)]), (4, 3), "corners")
 
 
 @lru_cache(maxsize=32)

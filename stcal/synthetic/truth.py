@@ -1,4 +1,4 @@
-"""``truth.json``: what a scene really is, as a file."""
+"""File ``truth.json`` with the truth of a scene."""
 
 from typing import Literal
 
@@ -34,7 +34,7 @@ class TrueGroup(Part):
 
 
 class TruthFile(ResultFile):
-    """mm, target frame, pixels from the centre of the top-left pixel; ``faces.json`` of another run will do."""
+    """Truth of a scene: mm, target frame, pixels from the centre of the top-left one. A ``faces.json`` is valid too."""
 
     format: Literal["stcal truth 1", "stcal faces 1"] = Field(
         default="stcal truth 1", description="the file's form and its version; may be left out"
@@ -47,7 +47,7 @@ class TruthFile(ResultFile):
 
     @classmethod
     def of(cls, scene: Scene, image_format: str = "jpg") -> "TruthFile":
-        """The truth of a scene, its images named as :func:`image_name` does."""
+        """Returns the truth of a scene, with images named by :func:`image_name`."""
         return cls(
             unit="mm",
             reference_face=scene.reference_face,
@@ -69,12 +69,12 @@ class TruthFile(ResultFile):
 
 
 def image_name(group: str, image: int, image_format: str = "jpg") -> str:
-    """Name of an image inside ``images``: ``12/IMG_1000.jpg``."""
+    """Returns the name of an image inside ``images``: ``12/IMG_1000.jpg``."""
     return f"{group}/IMG_{FIRST_IMAGE + image}.{image_format}"
 
 
 def _circles(scene: Scene, group: str, image: int) -> dict[str, TrueCircle]:
-    seen = image_circles(scene, group, image)
+    shown = image_circles(scene, group, image)
     number: dict[Label, str] = {label: f"{BOARD}:{i}" for i, label in enumerate(scene.board.labels())}
     return {
         number.get(label, label): TrueCircle(
@@ -82,5 +82,7 @@ def _circles(scene: Scene, group: str, image: int) -> dict[str, TrueCircle]:
             tilt_deg=round(float(np.degrees(tilt)), 2),
             must_find=bool(must),
         )
-        for label, centre, tilt, must in zip(seen.labels, seen.centre_px, seen.tilt_rad, seen.must_find, strict=True)
+        for label, centre, tilt, must in zip(
+            shown.labels, shown.centre_px, shown.tilt_rad, shown.must_find, strict=True
+        )
     }

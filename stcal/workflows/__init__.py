@@ -1,1 +1,1 @@
-"""Work that needs several systems at once; nothing below composes systems."""
+"""Workflows that need several systems at once. Only workflows compose systems."""

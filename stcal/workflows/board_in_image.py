@@ -1,4 +1,4 @@
-"""A board in one image, whatever its kind: its view, or the reason why there is none."""
+"""Detection of a board of any kind in one image: its view, or the reason why there is none."""
 
 from dataclasses import replace
 
@@ -30,13 +30,14 @@ from stcal.sfm.detect.circles.ellipses import EllipseOptions, find_ellipses
 from stcal.sfm.detect.image import detect_image
 
 CENTRING_ROUNDS = 3
-"""The pose that the ellipses' centres give is off by less than a thousandth of what they are moved by: two would do."""
+"""Rounds of the correction for the ellipses' centres. The error of the pose from these centres is less than a
+thousandth of the correction; two rounds would be enough."""
 CORNER_SIGMA_PX = 0.1
-"""Of corners whose detector states none, beside boards whose detector does."""
+"""σ of corners whose detector states none, where they are used with boards whose detector does."""
 NEAREST = 6
-"""Outlines about a circle among which its neighbour is."""
+"""Number of outlines about a circle, one of which is its neighbour."""
 MIN_SHARE = 0.35
-"""Of a board's circles."""
+"""Smallest share of a board's circles that must be seen."""
 Board = BoardDesign | FlatBoard | BoardSet
 KINDS = {
     BoardDesign: "dots",
@@ -49,12 +50,12 @@ KINDS = {
 
 
 def kind_of(board: Board) -> str:
-    """What messages call it."""
+    """Returns the name of the board's kind in messages."""
     return f"{len(board.boards)} boards" if isinstance(board, BoardSet) else KINDS[type(board)]
 
 
 def symmetries(board: Board) -> list[Rigid]:
-    """Turns after which the board looks the same, as board_from_board; never the identity."""
+    """Returns the rotations after which the board looks the same, as board_from_board, without the identity."""
     if not isinstance(board, BoardDesign):
         return board.symmetries()
     if board.corner is not None:
@@ -63,17 +64,18 @@ def symmetries(board: Board) -> list[Rigid]:
 
 
 def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> tuple[BoardView | None, str]:
-    """The view of the board in a grey image, or why there is none; of a set of boards all that are seen."""
+    """Returns the view of the board in a grey image, or the reason why there is none. For a set of boards it is the
+    view of all that are seen."""
     if not isinstance(board, BoardSet):
         return _find_or_why(image, name, camera, board)
     views, reasons = [], []
     places = zip(board.names, board.common_from_board, board.first_ids(), strict=True)
-    for part, (own, place, first) in zip(board.boards, places, strict=True):
-        view, why = _find_or_why(image, name, camera, part)
+    for single, (board_name, place, first) in zip(board.boards, places, strict=True):
+        view, why = _find_or_why(image, name, camera, single)
         if view is None:
-            reasons.append(f"{own}: {why}")
+            reasons.append(f"{board_name}: {why}")
         else:
-            views.append(_placed(view, own, place, first))
+            views.append(_placed(view, board_name, place, first))
     if not views:
         return None, "; ".join(reasons)
     return _together(name, views, tuple(reasons)), ""
@@ -89,7 +91,7 @@ def _find_or_why(
 
 
 def _placed(view: BoardView, own: str, common_from_board: Rigid, first: int) -> BoardView:
-    """A view of one board of a set in the frame of the set."""
+    """Returns a view of one board of a set in the frame of the set."""
     return BoardView(
         view.image,
         view.ids + first,
@@ -97,12 +99,12 @@ def _placed(view: BoardView, own: str, common_from_board: Rigid, first: int) -> 
         view.xy_px,
         view.covariance_px2,
         np.tile(common_from_board.rotation[:, 2], (len(view), 1)),
-        tuple(f"{own}: {said}" for said in view.unused),
+        tuple(f"{own}: {reason}" for reason in view.unused),
     )
 
 
 def _together(name: str, views: list[BoardView], reasons: tuple[str, ...]) -> BoardView:
-    """Views of several boards as one."""
+    """Returns the views of several boards as one view."""
     covariances = [_covariance_px2(view) for view in views]
     return BoardView(
         name,
@@ -111,12 +113,13 @@ def _together(name: str, views: list[BoardView], reasons: tuple[str, ...]) -> Bo
         np.concatenate([view.xy_px for view in views]),
         np.concatenate(covariances),
         np.concatenate([view.normal for view in views if view.normal is not None]),
-        (*(said for view in views for said in view.unused), *reasons),
+        (*(reason for view in views for reason in view.unused), *reasons),
     )
 
 
 def _covariance_px2(view: BoardView) -> np.ndarray:
-    """Of a board whose detector has no idea of it, as among boards that have one."""
+    """Returns the covariances of a view. A board whose detector states none gets the default, since the other boards
+    have theirs."""
     if view.covariance_px2 is not None:
         return view.covariance_px2
     return np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
@@ -125,7 +128,7 @@ def _covariance_px2(view: BoardView) -> np.ndarray:
 def _find_flat(
     image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard
 ) -> tuple[BoardView | None, str]:
-    """The view of a single board, or why there is none."""
+    """Returns the view of a single board, or the reason why there is none."""
     if isinstance(board, BoardDesign):
         return _find_dots(image, name, camera, board)
     if isinstance(board, AsymmetricCirclesDesign):
@@ -143,14 +146,16 @@ def _find_flat(
 
 
 def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
-    """Why there are no corners, as far as the tags tell."""
+    """Returns the reason why there are no corners, as far as the tags show it."""
     ids = [tag for _, tag in find_tags(image, (board.dictionary,)).tags]
-    few, own = "fewer than 4 corners of the ChArUco board", board.tag_ids()
+    few, board_ids = "fewer than 4 corners of the ChArUco board", board.tag_ids()
     if not ids:
         return f"{few}: no tag of {board.dictionary}"
-    if others := [tag for tag in ids if tag not in own]:
-        of = f"{len(own)} on a board of {board.rows}×{board.columns}"
-        return f"{few}: tag {max(others)} of {board.dictionary}, of {of}" + (f" from {own[0]}" if own[0] else "")
+    if others := [tag for tag in ids if tag not in board_ids]:
+        extent = f"{len(board_ids)} on a board of {board.rows}×{board.columns}"
+        return f"{few}: tag {max(others)} of {board.dictionary}, of {extent}" + (
+            f" from {board_ids[0]}" if board_ids[0] else ""
+        )
     return (
         f"{few}, but {len(ids)} of its tags: are rows and columns exchanged, or is it one that OpenCV drew before 4.6 "
         "(legacy = true)?"
@@ -177,13 +182,16 @@ def _find_asymmetric(
 
 
 def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesign) -> float | None:
-    """Radius by the distance of neighbours, the median over all circles in the image, mm; None where there are none."""
-    found = Candidates.of(find_ellipses(grey_8bit(image), board.polarity, EllipseOptions()), camera)
-    if len(found) < len(board.xy_mm()) * MIN_SHARE:
+    """Returns the radius from the distance of neighbours, the median over all circles in the image, mm; None where
+    there are none."""
+    candidates = Candidates.of(find_ellipses(grey_8bit(image), board.polarity, EllipseOptions()), camera)
+    if len(candidates) < len(board.xy_mm()) * MIN_SHARE:
         return None
-    near = found.tree.query(found.xy, k=NEAREST + 1)[1][:, 1:]
-    # Where circles are seen aslant, the one that looks nearest may not be: lengths are in units of the circle's image.
-    apart = np.linalg.solve(found.shape[:, None], (found.xy[near] - found.xy[:, None])[..., None])[..., 0]
+    near = candidates.tree.query(candidates.xy, k=NEAREST + 1)[1][:, 1:]
+    # In oblique views, the circle that looks nearest may not be nearest: lengths are in units of the circle's image.
+    apart = np.linalg.solve(candidates.shape[:, None], (candidates.xy[near] - candidates.xy[:, None])[..., None])[
+        ..., 0
+    ]
     steps = np.median(np.linalg.norm(apart, axis=2).min(1))
     return float(np.sqrt(2) * board.spacing_mm / steps)
 
@@ -196,47 +204,50 @@ def _find_circles(
     grid: BoardDesign,
     place: np.ndarray,
 ) -> tuple[BoardView | None, str]:
-    """``grid`` : the lattice that the circles of the board are found as; ``place`` : (rows, columns) of it, their rows
-    in the board's ``xy_mm``."""
-    what = "board of dots" if grid is board else "asymmetric grid of circles"
-    found = detect_image(image, camera, TargetDesign("none", grid.polarity, ()), grid, EllipseOptions())
-    if found.repeated:
+    """Returns the view of a board of circles, or the reason why there is none.
+
+    ``grid`` : the lattice in which the circles of the board are found; ``place`` : (rows, columns) of the lattice, rows
+    of its circles in the board's ``xy_mm``.
+    """
+    pattern = "board of dots" if grid is board else "asymmetric grid of circles"
+    detected = detect_image(image, camera, TargetDesign("none", grid.polarity, ()), grid, EllipseOptions())
+    if detected.repeated:
         return None, "the board is in view more than once"
-    if found.board is None or not len(found.board.rows):
-        return None, f"no {what} recognised"
-    ids = place[tuple(np.moveaxis(found.board.numberings, 2, 0))]
+    if detected.board is None or not len(detected.board.rows):
+        return None, f"no {pattern} recognised"
+    ids = place[tuple(np.moveaxis(detected.board.numberings, 2, 0))]
     if not _turned_only(ids, board):
         return None, "a strip of the board is hidden, so that its dots cannot be numbered; show more of it"
-    centres, xy = found.centres.select(found.board.rows), board.xy_mm()[ids[0]]
+    centres, xy = detected.centres.select(detected.board.rows), board.xy_mm()[ids[0]]
     xyz = np.column_stack([xy, np.zeros(len(xy))])
     centre_px = images_of_centres(centres.centre_px, xyz, board.radii_mm()[ids[0]], camera)
     return BoardView(name, ids[0], xyz, centre_px, centres.covariance_px2), ""
 
 
 def _turned_only(ids: np.ndarray, board: BoardDesign | AsymmetricCirclesDesign) -> bool:
-    """Whether all numberings (k, n) differ by nothing but a turn that leaves the board as it is."""
+    """True if all numberings (k, n) differ only by a rotation that leaves the board as it is."""
     xy = board.xy_mm()
     pitch = board.pitch_mm if isinstance(board, BoardDesign) else board.spacing_mm
     places = [(turn @ np.column_stack([xy, np.zeros(len(xy))]))[:, :2] for turn in (Rigid(), *symmetries(board))]
-    return all(any(np.allclose(xy[own], place[ids[0]], atol=pitch / 4) for place in places) for own in ids)
+    return all(any(np.allclose(xy[numbering], place[ids[0]], atol=pitch / 4) for place in places) for numbering in ids)
 
 
 def images_of_centres(
     centre_px: np.ndarray, xyz_board: np.ndarray, radius_mm: np.ndarray, camera: Camera
 ) -> np.ndarray:
-    """Images (n, 2) of the centres of a flat board's circles, px, from the centres (n, 2) of their ellipses.
+    """Returns the images (n, 2) of the centres of a flat board's circles, px, from their ellipses' centres (n, 2).
 
     Raises
     ------
     DegenerateError
         Fewer than four circles, or all on a line.
     """
-    seen = centre_px
+    corrected_px = centre_px
     for _ in range(CENTRING_ROUNDS):
-        normalised = camera.normalised_from_pixel(seen)
+        normalised = camera.normalised_from_pixel(corrected_px)
         pose = camera_from_plane(fit_homography(xyz_board[:, :2], normalised))
         pose = refine_planar_pose(pose, xyz_board[:, :2], normalised)
         centre = pose @ xyz_board
         ellipse = circle_image_offset(centre, pose.rotation[:, 2], radius_mm)
-        seen = centre_px - (camera.project(ellipse) - camera.project(centre))
-    return seen
+        corrected_px = centre_px - (camera.project(ellipse) - camera.project(centre))
+    return corrected_px

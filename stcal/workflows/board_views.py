@@ -1,7 +1,7 @@
 """Corners of a board in a folder of images: every kind of board, each image decoded once, in parallel.
 
-Here dots (``stcal.sfm``) and the boards of other makers (``stcal.boards``) come together, for all commands that start
-from images of a board.
+Dots (``stcal.sfm``) and the boards of other makers (``stcal.boards``) are brought together here, for all commands that
+start from images of a board.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,8 @@ from stcal.workflows.board_in_image import Board, find_board, symmetries
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardDetection:
-    """One readable image: ``view`` of the board, None where ``why`` tells the reason; ``tags`` that were asked for."""
+    """One readable image: ``view`` of the board, or None with the reason ``why``; ``tags`` of the requested
+    dictionaries."""
 
     name: str
     size: tuple[int, int]
@@ -31,8 +32,8 @@ class BoardDetection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardDetections:
-    """``camera`` : with its size; ``images`` : readable ones, in the order of the files; ``skipped`` : all that show no
-    board that could be used, and why; ``symmetries`` : turns by which the numbering of a view may be off."""
+    """``camera`` : with its size; ``images`` : readable images, in the order of the files; ``skipped`` : images without
+    a usable view of the board, and why; ``symmetries`` : rotations by which the numbering of a view may be off."""
 
     camera: Camera
     images: tuple[BoardDetection, ...]
@@ -40,17 +41,18 @@ class BoardDetections:
     symmetries: tuple[Rigid, ...]
 
     def views(self) -> dict[str, BoardView]:
-        """By image, those that show the board."""
+        """Returns the views by image, for the images that show the board."""
         return {detection.name: detection.view for detection in self.images if detection.view is not None}
 
     def unused(self) -> list[str]:
-        """What images show of the board, or of the boards, and views do not use: a line for each reason."""
+        """Returns a line for each reason why views do not use a part of the board, or of the boards, that images
+        show."""
         images: dict[str, list[str]] = {}
         for name, view in self.views().items():
-            for said in view.unused:
-                images.setdefault(said, []).append(name)
-        of = len(self.views())
-        return [f"{said} (in {len(names)} of {of} images, {names[0]} …)" for said, names in images.items()]
+            for reason in view.unused:
+                images.setdefault(reason, []).append(name)
+        total = len(self.views())
+        return [f"{reason} (in {len(names)} of {total} images, {names[0]} …)" for reason, names in images.items()]
 
 
 def detect_boards(
@@ -61,11 +63,13 @@ def detect_boards(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BoardDetections:
-    """Find the board in all images, and the tags of ``dictionaries`` beside it; trouble with one image skips it.
+    """Find the board in all images, and the tags of ``dictionaries`` beside it.
+
+    An image that cannot be used is skipped.
 
     Parameters
     ----------
-    progress : called with the number of images done, and that of all
+    progress : called with the number of images done, and the number of all images
 
     Raises
     ------
@@ -80,17 +84,17 @@ def detect_boards(
         by_job[i] = detection
         if progress:
             progress(len(by_job), len(jobs))
-    found = [by_job[i] for i in range(len(jobs))]
-    detections = [each for each in found if isinstance(each, BoardDetection)]
+    outcomes = [by_job[i] for i in range(len(jobs))]
+    detections = [outcome for outcome in outcomes if isinstance(outcome, BoardDetection)]
     if not detections:
-        first = next(each for each in found if isinstance(each, Skipped))
+        first = next(outcome for outcome in outcomes if isinstance(outcome, Skipped))
         raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {first.name}: {first.reason}")
     size = detections[0].size
     model.require_inside(*detections[0].size, detections[0].name)
-    found = [_of_size(each, size, detections[0].name) for each in found]
-    detections = tuple(each for each in found if isinstance(each, BoardDetection))
+    outcomes = [_of_size(outcome, size, detections[0].name) for outcome in outcomes]
+    detections = tuple(outcome for outcome in outcomes if isinstance(outcome, BoardDetection))
     without = (Skipped(s.name, s.why, "board") for s in detections if s.view is None)
-    skipped = (*(each for each in found if isinstance(each, Skipped)), *without)
+    skipped = (*(outcome for outcome in outcomes if isinstance(outcome, Skipped)), *without)
     return BoardDetections(model.sized(*size), detections, skipped, tuple(symmetries(board)))
 
 
@@ -115,5 +119,7 @@ def _detect_board(
 def _of_size(each: BoardDetection | Skipped, size: tuple[int, int], first: str) -> BoardDetection | Skipped:
     if isinstance(each, Skipped) or each.size == size:
         return each
-    own, wanted = ("{}×{} px".format(*s) for s in (each.size, size))
-    return Skipped(each.name, f"{own}, but {first} has {wanted}; use images of one camera", "image_size", own, wanted)
+    own_size, wanted = ("{}×{} px".format(*s) for s in (each.size, size))
+    return Skipped(
+        each.name, f"{own_size}, but {first} has {wanted}; use images of one camera", "image_size", own_size, wanted
+    )

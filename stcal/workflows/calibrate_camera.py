@@ -1,7 +1,7 @@
-"""Calibrate a camera from photographs of a chessboard or a ChArUco board: the same adjustment as from dots.
+"""Calibration of a camera from photographs of a chessboard or a ChArUco board: the same adjustment as from dots.
 
-The published way of documents 003 and 004 (Zhang 2000) takes corners as exact on the board and of one σ; here their
-places are unknowns with a σ, as those of dots are.
+The published method of documents 003 and 004 (Zhang 2000) takes corners as exact on the board and of one σ. Here their
+places are unknowns with a σ, like those of dots.
 """
 
 from functools import partial
@@ -33,9 +33,9 @@ from stcal.workflows.board_in_image import kind_of
 from stcal.workflows.board_views import detect_boards
 
 CORNER_SIGMA_PX = 0.1
-"""Of corners whose detector states none; only that they are alike matters, the factor is estimated."""
+"""σ of corners whose detector states none. Only their equality matters, since the factor is estimated."""
 POINT_RADIUS_MM = 1e-6
-"""A corner is a circle without extent: it has no eccentricity."""
+"""Radius of a corner as a circle: it has no extent and therefore no eccentricity."""
 
 
 @one_thread()
@@ -46,7 +46,7 @@ def calibrate_camera_by_corners(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> CameraCalibration:
-    """Intrinsics from a folder of photographs that show a chessboard or a ChArUco board.
+    """Returns intrinsics from a folder of photographs that show a chessboard or a ChArUco board.
 
     Parameters
     ----------
@@ -64,12 +64,12 @@ def calibrate_camera_by_corners(
     Returns
     -------
     CameraCalibration
-        As of dots; a corner (row, column) stands for the dot of that place.
+        The same result as from dots; a corner (row, column) stands for the dot of that place.
 
     Raises
     ------
     StcalError
-        One of its kinds, with a one-line message that says what to do.
+        One of its subclasses, with a one-line message that says what to do.
     """
     grid = corner_grid(board)
     if colmap_model == AUTO:
@@ -78,14 +78,14 @@ def calibrate_camera_by_corners(
         )
     require_model(colmap_model)
     progress = progress or (lambda *_: None)
-    files, other = find_images(images)
+    files, skipped_files = find_images(images)
     camera = start_camera(*first_size(files), colmap_model)
     rounds = 2 if isinstance(board, CharucoDesign) else 1  # a ChArUco board's corners are found by the camera
     for done in range(1, rounds + 1):
         model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
-        found = detect_boards(files, model, board, (), workers, partial(progress, f"detect {done}"))
-        views = _observations(files, found.views(), grid, camera)
-        skipped = (*other, *found.skipped)
+        detections = detect_boards(files, model, board, (), workers, partial(progress, f"detect {done}"))
+        views = _observations(files, detections.views(), grid, camera)
+        skipped = (*skipped_files, *detections.skipped)
         require_views(views, len(files), skipped)
         start = camera if done > 1 else closed_form(views, grid, camera)
         result = adjust_intrinsics(views, grid, start, colmap_model)
@@ -95,12 +95,12 @@ def calibrate_camera_by_corners(
 
 
 def corner_grid(board: FlatBoard) -> BoardDesign:
-    """The inner corners of a board as a board of dots without extent.
+    """Returns the inner corners of a board as a board of dots without extent.
 
     Raises
     ------
     InputError
-        Another kind, whose points are no grid of squares.
+        A board of another kind, whose points are not a grid of squares.
     """
     if isinstance(board, ChessboardDesign):
         rows, columns = board.rows, board.columns
@@ -116,13 +116,13 @@ def corner_grid(board: FlatBoard) -> BoardDesign:
 
 def _observations(files: list[ImageFile], views: dict[str, BoardView], grid: BoardDesign, camera):
     group = {file.name: file.group for file in files}
-    found = []
+    observations = []
     for name, view in views.items():
         labels = tuple(DotLabel(*divmod(i, grid.columns)) for i in view.ids.tolist())
         covariance = view.covariance_px2
         if covariance is None:
             covariance = np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
-        found.append(
+        observations.append(
             ImageObservations(
                 name=name,
                 group=group[name],
@@ -133,4 +133,4 @@ def _observations(files: list[ImageFile], views: dict[str, BoardView], grid: Boa
                 covariance_px2=covariance,
             )
         )
-    return found
+    return observations

@@ -1,4 +1,4 @@
-"""Calibrate the cameras of a rig from a folder with one of photographs for each."""
+"""Calibration of the cameras of a rig from a folder that has one folder of photographs for each camera."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,41 +21,41 @@ from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner
 
 RIG_FILE, CHAIN_FILE = "rig.json", "camchain.yaml"
 TAKEN = ("rig", "camchain")
-"""Names whose files would stand in the place of these."""
+"""Camera names whose files would overwrite these files."""
 
 
 @dataclass(frozen=True, slots=True)
 class Models:
-    """Lens models: ``own`` by camera, ``common`` for the others."""
+    """Lens models: ``own`` by camera, ``common`` for the other cameras."""
 
     own: Mapping[str, str]
     common: str
 
     @classmethod
     def of(cls, given: Sequence[str], default: str) -> "Models":
-        """From words NAME=MODEL, and one MODEL.
+        """Returns the models from words NAME=MODEL, and one word MODEL.
 
         Raises
         ------
         InputError
-            Two for one camera.
+            Two models for one camera, or two words MODEL.
         """
-        own: dict[str, str] = {}
+        model_of: dict[str, str] = {}
         common = [word for word in given if "=" not in word]
         for word in given:
             name, separator, model = word.rpartition("=")
-            if separator and name in own:
+            if separator and name in model_of:
                 raise InputError(
-                    "E-OPTION-REPEATED", f"--model {word}: {name} has {own[name]} already; one for each camera"
+                    "E-OPTION-REPEATED", f"--model {word}: {name} has {model_of[name]} already; one for each camera"
                 )
             if separator:
-                own[name] = model
+                model_of[name] = model
         if len(common) > 1:
             raise InputError(
                 "E-OPTION-CONFLICT",
                 f"--model {common[1]}: {common[0]} is given too; one for all, or NAME=MODEL for each",
             )
-        return cls(own, common[0] if common else default)
+        return cls(model_of, common[0] if common else default)
 
 
 def calibrate_rig_from_photographs(
@@ -66,21 +66,21 @@ def calibrate_rig_from_photographs(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> RigCalibration:
-    """Each camera by itself, then all together.
+    """Calibrate each camera by itself, then all together.
 
     Parameters
     ----------
     folder
-        With a folder of photographs for each camera; images of one instant have the same name in all.
+        Folder with a folder of photographs for each camera; images of one instant have the same name in all.
     target, board, workers, progress
-        As of :func:`calibrate_camera`; boards of corners too.
+        As in :func:`calibrate_camera`; boards of corners are possible too.
     models
-        COLMAP's, or ``auto``.
+        COLMAP's models, or ``auto``.
 
     Raises
     ------
     StcalError
-        One of its kinds; the message names the camera.
+        One of its subclasses; the message names the camera.
     """
     names = camera_names(folder)
     unknown = [name for name in models.own if name not in names]
@@ -99,29 +99,31 @@ def calibrate_rig_from_photographs(
 
         try:
             if isinstance(board, BoardDesign):
-                found = calibrate_camera(folder / name, target, board, model, workers=workers, progress=step)
+                calibration = calibrate_camera(folder / name, target, board, model, workers=workers, progress=step)
             else:
-                found = calibrate_camera_by_corners(folder / name, board, model, workers, step)
+                calibration = calibrate_camera_by_corners(folder / name, board, model, workers, step)
         except StcalError as error:
             raise type(error)(error.code, f"rig: {name}: {error}") from error
-        cameras[name] = found
+        cameras[name] = calibration
     return calibrate_rig(cameras, grid, isinstance(board, CharucoDesign))
 
 
 def camera_names(folder: Path) -> list[str]:
-    """Folders in it.
+    """Returns the names of the folders in a folder.
 
     Raises
     ------
     InputError
-        Fewer than two, or names that no file can have.
+        Not a folder, fewer than two folders in it, or names that no file can have.
     """
     if not folder.is_dir():
         raise InputError(
             "E-IMAGES-FOLDER",
             f"rig folder {folder}: {'not a folder' if folder.exists() else 'does not exist'}; give one",
         )
-    names = sorted(each.name for each in folder.iterdir() if each.is_dir() and not each.name.startswith("."))
+    names = sorted(
+        subfolder.name for subfolder in folder.iterdir() if subfolder.is_dir() and not subfolder.name.startswith(".")
+    )
     if len(names) < 2:
         raise InputError(
             "E-RIG-CAMERAS",
@@ -138,19 +140,22 @@ def camera_names(folder: Path) -> list[str]:
 
 
 def files_of(rig: RigCalibration) -> tuple[dict[str, str], list[str]]:
-    """Contents by name: a camera file and its JSON for each camera, ``rig.json``, and ``camchain.yaml`` where Kalibr
-    has models for the lenses; and what is missing, and why."""
+    """Returns the contents of the files by name, and what is missing, with the reason.
+
+    The files are a camera file and its JSON for each camera, ``rig.json``, and ``camchain.yaml`` where Kalibr has
+    models for the lenses.
+    """
     files, cameras = {}, []
-    for name, own in zip(rig.names, rig.cameras, strict=True):
-        intrinsics = own.intrinsics
+    for name, calibration in zip(rig.names, rig.cameras, strict=True):
+        intrinsics = calibration.intrinsics
         camera = CalibratedCamera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance)
-        files |= {f"{name}.txt": cameras_txt(camera), f"{name}.json": json_text(CalibrationFile.of(own))}
+        files |= {f"{name}.txt": cameras_txt(camera), f"{name}.json": json_text(CalibrationFile.of(calibration))}
         cameras.append((name, camera))
     summary: ResultFile = RigCalibrationFile.of(rig)
     files[RIG_FILE] = json_text(summary)
     missing = []
     try:
-        chain = [(*each, pose) for each, pose in zip(cameras, rig.camera_from_first, strict=True)]
+        chain = [(*named_camera, pose) for named_camera, pose in zip(cameras, rig.camera_from_first, strict=True)]
         files[CHAIN_FILE] = kalibr_chain(chain)
     except InputError as error:
         missing.append(f"no {CHAIN_FILE}: {error}")

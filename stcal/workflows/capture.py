@@ -1,4 +1,4 @@
-"""A calibration that takes its photographs itself: after each, what was found in it, how sharp, and σ so far."""
+"""A calibration that takes its photographs itself: after each, the circles in it, its sharpness, and σ so far."""
 
 import math
 import re
@@ -23,9 +23,9 @@ NUMBERED = re.compile(r"IMG_(\d{4,})\.png")
 class Taken:
     """A photograph.
 
-    ``name`` : as the run has it; ``exposure`` : that was really set, in the driver's unit; ``update`` : the calibration
-    so far; ``circles`` : named ones in it, ``saturated`` : those of them whose middle is; ``saturated_share`` : of all
-    pixels.
+    ``name`` : as in the run; ``exposure`` : the one that was actually set, in the driver's unit; ``update`` : the
+    calibration so far; ``circles`` : number of named circles in it; ``saturated`` : number of these whose middle is
+    saturated; ``saturated_share`` : share of saturated pixels.
     """
 
     name: str
@@ -36,28 +36,28 @@ class Taken:
     saturated_share: float
 
     def light(self) -> str:
-        """Exposure and saturation, in words."""
-        said = f"exposure {self.exposure:g}, {100 * self.saturated_share:.1f} % of the pixels saturated"
+        """Returns exposure and saturation in words."""
+        message = f"exposure {self.exposure:g}, {100 * self.saturated_share:.1f} % of the pixels saturated"
         if self.circles:
-            said += f", {self.saturated} of {self.circles} circles"
+            message += f", {self.saturated} of {self.circles} circles"
         if self.circles and self.saturated > self.circles / 2:
-            said += ": expose less, saturated circles grow and their centres move"
-        return said
+            message += ": expose less, saturated circles grow and their centres move"
+        return message
 
 
 class Trigger:
-    """When a photograph is taken: at each Enter, or each so many seconds.
+    """Trigger of photographs: at each Enter, or at fixed intervals.
 
     Parameters
     ----------
     count : int, optional
-        Ends after so many.
+        Number of photographs after which it ends.
     every_s : float, optional
-        At each line of ``keys`` where None.
+        Interval; at each line of ``keys`` where None.
     keys : text stream
-        Its end ends it.
+        The trigger ends with this stream.
     say : callable
-        Called with what the user is asked for.
+        Called with the text that prompts the user.
     """
 
     def __init__(self, count: int | None, every_s: float | None, keys: TextIO, say: Callable[[str], object]):
@@ -66,7 +66,7 @@ class Trigger:
         self._last: float | None = None
 
     def ready(self, number: int) -> bool:
-        """Waits for photograph ``number``; False where there will be none."""
+        """Waits for photograph ``number``. Returns False where there will be none."""
         if self._left < 1:
             return False
         self._left -= 1
@@ -88,7 +88,7 @@ def photograph(
     ready: Callable[[int], bool],
     progress: Progress | None = None,
 ) -> Iterator[Taken]:
-    """Take photographs of a group, ``IMAGES/<group>/IMG_0001.png`` …, and run after each over all that are there.
+    """Take photographs of a group, ``IMAGES/<group>/IMG_0001.png`` …, and after each run over all photographs so far.
 
     Parameters
     ----------
@@ -97,13 +97,13 @@ def photograph(
     growing : Growing
         The calibration.
     group : str
-        Between its photographs only the camera moves; its folder may hold earlier ones, which stay.
+        Name of the group, in which only the camera moves. Its folder may hold earlier photographs, which stay.
     exposure : float, optional
-        In the driver's unit; as it is where None.
+        In the driver's unit; unchanged where None.
     settle_s : float
-        Given to the camera before each photograph, s.
+        Time that the camera is given before each photograph, s.
     ready : callable
-        Waits for the photograph of this number in the group; ends where False.
+        Waits for the photograph of this number in the group; returns False at the end.
     progress : callable, optional
         Called with (stage, done, total).
 
@@ -114,7 +114,7 @@ def photograph(
     Raises
     ------
     InputError
-        The name is no folder's, the camera gives no image, or something that is given is not what it is given for.
+        The name cannot be a folder's, the camera gives no image, or an input is not of the kind that is expected.
     """
     folder = growing.images / checked_name(group, "group")
     number = _next(folder)
@@ -125,7 +125,7 @@ def photograph(
         save(growing.images / name, png(image))
         images = sum(1 for path in growing.images.glob("*/*") if path.is_file())
         update = growing.update(images, {name}, (), progress)
-        inside = [_middle(image, each.observations.centre_px) for each in update.new]
+        inside = [_middle(image, labelled.observations.centre_px) for labelled in update.new]
         grey = np.concatenate(inside) if inside else np.zeros(0)
         saturated = int((grey >= SATURATED).sum())
         yield Taken(name, really, update, len(grey), saturated, float((image >= SATURATED).mean()))
@@ -133,12 +133,12 @@ def photograph(
 
 
 def _next(folder: Path) -> int:
-    there = folder.iterdir() if folder.is_dir() else ()
-    numbers = [int(found[1]) for path in there if (found := NUMBERED.fullmatch(path.name))]
+    paths = folder.iterdir() if folder.is_dir() else ()
+    numbers = [int(match[1]) for path in paths if (match := NUMBERED.fullmatch(path.name))]
     return max(numbers, default=FIRST - 1) + 1
 
 
 def _middle(image: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
-    """(n,) grey values at circles' centres (n, 2), px."""
+    """Returns the grey values (n,) at circles' centres (n, 2), px."""
     column, row = np.clip(np.rint(centre_px).astype(int), 0, np.array(image.shape)[::-1] - 1).T
     return image[row, column]

@@ -1,7 +1,7 @@
 """Detection and ``measure`` on the machines of a Dask cluster.
 
-Considered too: Ray and MPI (a cluster of their own to keep, and no worker may come, go or die on the way), job arrays
-of a batch system (each its own program; the cache by content takes what they leave in a shared folder).
+Alternatives considered: Ray and MPI need a cluster of their own, and no worker may join, leave or die during the work.
+Jobs of a batch system are separate programs; the cache by content takes the files that they leave in a shared folder.
 """
 
 import asyncio
@@ -18,9 +18,9 @@ from stcal.errors import InputError
 from stcal.io.spread import spread
 
 ANSWER_S = 10
-"""How long a scheduler, and the first worker, may take to answer."""
+"""Longest time that a scheduler, and the first worker, may take to answer, in s."""
 AT_ONCE = 4
-"""Images handed over for each thread of the workers: the next are there when one is done."""
+"""Number of images handed over for each thread of the workers, so that the next ones are there when one is done."""
 ADDRESS = re.compile(r"((tcp|tls)://)?([\w.-]+|\[[\da-fA-F:]+\]):\d{1,5}")
 SAME = ("stcal", "numpy", "scipy", "opencv-python-headless")
 """Packages on which a result depends, bit by bit."""
@@ -28,14 +28,14 @@ SAME = ("stcal", "numpy", "scipy", "opencv-python-headless")
 
 @contextlib.contextmanager
 def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
-    """Hand what is done image by image meanwhile to a Dask cluster.
+    """Hand the work on single images to a Dask cluster for the duration of the context.
 
     Parameters
     ----------
     address : str
-        Of the scheduler, ``tcp://host:8786``.
+        Address of the scheduler, ``tcp://host:8786``.
     send_images : bool
-        Images go by their content; by their paths, on storage that all workers share, where False.
+        Whether images are sent by content. Otherwise they are sent by path, on storage that all workers share.
 
     Raises
     ------
@@ -48,12 +48,12 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
 
 @contextlib.contextmanager
 def executor_of(address: str | None = None) -> Iterator[Executor]:
-    """The workers of a Dask cluster, or, without an address, processes of this machine, one per core.
+    """Yield the workers of a Dask cluster, or, without an address, processes of this machine, one per core.
 
     Raises
     ------
     InputError
-        As :func:`dask_cluster`.
+        For the reasons given in :func:`dask_cluster`.
     """
     with ProcessPoolExecutor() if address is None else _connected(address) as executor:
         yield executor
@@ -80,7 +80,8 @@ def _connected(address: str) -> Iterator["_Workers"]:
 
 @contextlib.contextmanager
 def _silent(package: str) -> Iterator[None]:
-    """Dask logs each lost worker and each closed connection; what goes wrong is told by what it costs."""
+    """Silence the logs of a package. Dask logs each lost worker and each closed connection; a fault shows by
+    its effect."""
     every = logging.root.manager.loggerDict.items()
     logs = [log for name, log in every if isinstance(log, logging.Logger) and name.split(".")[0] == package]
     levels = [log.level for log in logs]
@@ -94,7 +95,8 @@ def _silent(package: str) -> Iterator[None]:
 
 
 def _require_address(address: str) -> None:
-    """Dask's client waits for ever for some addresses that are none, and for answers of what is no scheduler."""
+    """Refuse addresses without a scheduler: for some of them, and for answers of other programs, Dask's client waits
+    for ever."""
     from distributed.core import rpc
     from distributed.security import Security
 
@@ -108,7 +110,7 @@ def _require_address(address: str) -> None:
         )
     try:
         asyncio.run(asyncio.wait_for(ask(), ANSWER_S))
-    except Exception as error:  # what is no scheduler may answer anything
+    except Exception as error:  # a program that is not a scheduler may answer anything
         raise InputError(
             "E-CLUSTER-SCHEDULER",
             f"--scheduler {address}: no scheduler answers within {ANSWER_S} s; start one with `dask scheduler`, and "
@@ -117,20 +119,21 @@ def _require_address(address: str) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Of the packages on which a result depends, here; empty for one that is not installed by its name."""
-    found = {"stcal": stcal.__version__}
+    """Returns the versions here of the packages on which a result depends; empty for a package that is not installed by
+    its name."""
+    version_of = {"stcal": stcal.__version__}
     for name in SAME[1:]:
         try:
-            found[name] = metadata.version(name)
+            version_of[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = ""
-    return found
+            version_of[name] = ""
+    return version_of
 
 
 def _require_same(found: dict[str, dict[str, str]], address: str) -> None:
-    own = versions()
+    local = versions()
     for worker, theirs in found.items():
-        for name, version in own.items():
+        for name, version in local.items():
             if theirs[name] != version:
                 raise InputError(
                     "E-CLUSTER-VERSIONS",
@@ -140,14 +143,14 @@ def _require_same(found: dict[str, dict[str, str]], address: str) -> None:
 
 
 class _Workers(Executor):
-    """The workers of a cluster; what one that is lost had begun, Dask gives to another, three times at most."""
+    """The workers of a cluster. Dask gives the jobs of a lost worker to another one, three times at most."""
 
     def __init__(self, client, threads: int):
         self._client, self.threads = client, threads
 
     def submit(self, function: Callable, /, *arguments, **_) -> Future:
         answer: Future = Future()
-        answer.set_running_or_notify_cancel()  # the client gives up what nobody waits for any more
+        answer.set_running_or_notify_cancel()  # the client drops futures that nobody waits for
         future = self._client.submit(_alone, function, *arguments, pure=False)
 
         def done(inner) -> None:
@@ -170,7 +173,7 @@ _limit: Any = None
 
 
 def _alone(function: Callable, *arguments):
-    """On a worker: with one thread for BLAS, from the first job on, as processes of this machine have."""
+    """Execute a job on a worker, with one thread for BLAS from the first job on, as in processes of this machine."""
     global _limit
     if _limit is None:
         from threadpoolctl import threadpool_limits

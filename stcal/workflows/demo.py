@@ -1,4 +1,4 @@
-"""A data set with known truth, rendered, calibrated, and the faces against the truth: ``stcal-sfm demo``."""
+"""A data set with known truth: rendered, calibrated, and compared with the truth, for ``stcal-sfm demo``."""
 
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ WHAT = "simulated photographs of the reference target: 4 groups of 5 images, 172
 
 
 def demo(folder: Path, workers: int | None, progress: Progress) -> tuple[RunResult, CompareFile]:
-    """The run in ``folder/run`` of the data set in ``folder/data``, and its errors against the truth."""
+    """Returns the run in ``folder/run`` of the data set in ``folder/data``, and its errors against the truth."""
     data = folder / "data"
     write_dataset(data, make_scene(OPTIONS), workers=workers, progress=partial(progress, "render"))
     files = data / "target.toml", data / "board.toml", RunOptions(workers=workers)

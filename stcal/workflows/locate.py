@@ -1,4 +1,5 @@
-"""Photographs to calibrate a target of tags from: any board beside the tags, for ``stcal locate calibrate``."""
+"""Photographs from which a target of tags is calibrated, with any board beside the tags, for ``stcal locate
+calibrate``."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,9 +19,11 @@ def calibration_images(
     workers: int | None = None,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> CalibrationImages:
-    """Board and tags in all images of a folder; ``progress`` is called with (stage, done, total)."""
+    """Returns board and tags in all images of a folder; ``progress`` is called with (stage, done, total)."""
     files, skipped = find_images(folder)
-    found = detect_boards(files, model, board, dictionaries, workers, partial(progress, "images"))
-    names, views, tags = zip(*((each.name, each.view, each.tags) for each in found.images), strict=True)
-    left_out = tuple(f"{each.name}: {each.reason}" for each in (*skipped, *found.skipped) if each.name not in names)
-    return CalibrationImages(names, views, tags, found.camera, found.symmetries, left_out)
+    detections = detect_boards(files, model, board, dictionaries, workers, partial(progress, "images"))
+    names, views, tags = zip(*((image.name, image.view, image.tags) for image in detections.images), strict=True)
+    left_out = tuple(
+        f"{image.name}: {image.reason}" for image in (*skipped, *detections.skipped) if image.name not in names
+    )
+    return CalibrationImages(names, views, tags, detections.camera, detections.symmetries, left_out)

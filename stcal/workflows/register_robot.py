@@ -1,4 +1,5 @@
-"""Base and kinematics solved together, beside the transform: ``stcal register --robot`` composes two systems."""
+"""Base and kinematics solved together, as an alternative to the transform: ``stcal register --robot`` composes two
+systems."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,17 +32,19 @@ from stcal.robot.kinematics.model import Robot
 
 FIRST_NAMES = 6
 ROUNDS, CLEAN_SETS = 3, 0.01
-"""Rows are taken in that lie within the bound that a clean set exceeds anywhere in one case of a hundred."""
+"""Number of rounds in which rows are added, and the probability that a clean set exceeds, anywhere, the bound of rows
+to add."""
 SAME_MM = 0.01
-"""Positions of a and of the robot file agree, or a is of another base or tool."""
+"""Largest deviation, in mm, at which positions of a and of the robot file agree; beyond it, a is of another base or
+tool."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Held-out errors of the same rows, mm, by the transform and by base and kinematics together.
+    """Errors on the same held-out rows, mm, by the transform and by base and kinematics together.
 
-    ``rows`` : (m,) tried; ``transform_mm``, ``kinematics_mm`` : (m,); ``wild`` : (m,) outliers of both; ``off_mm`` :
-    RMS distance of a from the robot file's forward kinematics after a rigid fit.
+    ``rows`` : (m,) rows held out; ``transform_mm``, ``kinematics_mm`` : (m,); ``wild`` : (m,) outliers of both;
+    ``off_mm`` : RMS distance of a from the robot file's forward kinematics after a rigid fit.
     """
 
     robot: Robot
@@ -56,16 +59,16 @@ class Comparison:
     off_mm: float
 
     def errors(self) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """(which rows, errors by the transform, errors by base and kinematics)."""
-        found = [("all rows", self.transform_mm, self.kinematics_mm)]
+        """Returns (which rows, errors by the transform, errors by base and kinematics)."""
+        groups = [("all rows", self.transform_mm, self.kinematics_mm)]
         if self.wild.any() and not self.wild.all():
             name = f"without {self.wild.sum()} outliers"
-            found.append((name, self.transform_mm[~self.wild], self.kinematics_mm[~self.wild]))
-        return found
+            groups.append((name, self.transform_mm[~self.wild], self.kinematics_mm[~self.wild]))
+        return groups
 
     @property
     def better(self) -> bool:
-        """Whether base and kinematics together predict better."""
+        """True if base and kinematics together predict better."""
         _, transform, kinematics = self.errors()[-1]
         return bool(len(transform) and kinematics.mean() < transform.mean())
 
@@ -74,14 +77,14 @@ class Comparison:
 def compared(
     pairs: Pairs, file: Path | Table, robot_file: Path, found: Findings, options: dict, folds: int
 ) -> Comparison:
-    """Identify base and kinematics from the joint values of ``file``, and hold rows out of both ways.
+    """Identify base and kinematics from the joint values of ``file``, and compute held-out errors of both methods.
 
-    ``options`` : of :func:`stcal.register.pipeline`, as ``found`` was made with.
+    ``options`` : of :func:`stcal.register.pipeline`, by which ``found`` was computed.
 
     Raises
     ------
     InputError
-        No joint values, or a robot that does not fit.
+        There are no joint values, or the robot does not fit them.
     DegenerateError
         Too few points for the robot's parameters.
     """
@@ -94,12 +97,12 @@ def compared(
     identified, used = grown(robot, data, good, settings)
 
     def by_transform(train: np.ndarray, test: np.ndarray) -> np.ndarray:
-        own = {
+        of_train = {
             name: None if values is None else values[train]
             for name, values in (("weights", pairs.weights), ("covariances", pairs.covariances))
         }
-        more = {"folds": 0, "allow_ambiguous": True}
-        b_from_a = register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **own, **more).b_from_a
+        settings_of_fold = {"folds": 0, "allow_ambiguous": True}
+        b_from_a = register(pairs.xyz_a[train], pairs.xyz_b[train], **options, **of_train, **settings_of_fold).b_from_a
         return np.linalg.norm(pairs.xyz_b[test] - b_from_a @ pairs.xyz_a[test], axis=1)
 
     def by_kinematics(train: np.ndarray, test: np.ndarray) -> np.ndarray:
@@ -108,10 +111,12 @@ def compared(
 
     parts = dealt(len(data), folds, np.random.default_rng([options["seed"], 4]))
     done, rows, (by_one, by_both) = held_out_errors([by_transform, by_kinematics], parts)
-    wild = ~(found.registration.inliers | used)[rows]
+    outliers_of_both = ~(found.registration.inliers | used)[rows]
     nominal = positions(robot, data)
-    off = float(np.sqrt(((pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal) ** 2).sum(1).mean()))
-    return Comparison(robot, identified, found.registration.model, pairs.lines, done, rows, by_one, by_both, wild, off)
+    off_mm = float(np.sqrt(((pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal) ** 2).sum(1).mean()))
+    return Comparison(
+        robot, identified, found.registration.model, pairs.lines, done, rows, by_one, by_both, outliers_of_both, off_mm
+    )
 
 
 def _measurements(pairs: Pairs, file: Path | Table, robot: Robot) -> Measurements:
@@ -125,28 +130,31 @@ def _measurements(pairs: Pairs, file: Path | Table, robot: Robot) -> Measurement
 
 
 def grown(robot: Robot, data: Measurements, good: np.ndarray, settings: IdentifyOptions):
-    """Identified from the rows that are good, and from those that it then explains: bent points are no outliers."""
-    found = identify(robot, data[good], settings)
+    """Returns the identification from the good rows and from the rows that it then explains, and which rows were used.
+
+    Rows that the transform cannot explain because the arm bends its points are not outliers of the kinematics.
+    """
+    identified = identify(robot, data[good], settings)
     for _ in range(ROUNDS):
-        error = np.linalg.norm(data.positions - positions(found.robot, data), axis=1)
-        explained = good | (error < found.weighting.sigma_mm * length_limit(3, CLEAN_SETS / len(data)))
+        error = np.linalg.norm(data.positions - positions(identified.robot, data), axis=1)
+        explained = good | (error < identified.weighting.sigma_mm * length_limit(3, CLEAN_SETS / len(data)))
         if (explained == good).all():
             break
         good = explained
-        found = identify(robot, data[good], settings)
+        identified = identify(robot, data[good], settings)
     used = good.copy()
-    used[np.flatnonzero(good)[[row for row, _ in found.outliers()]]] = False
-    return found, used
+    used[np.flatnonzero(good)[[row for row, _ in identified.outliers()]]] = False
+    return identified, used
 
 
 def positions(robot: Robot, data: Measurements) -> np.ndarray:
-    """(m, 3) of the targets, in the instrument's frame."""
+    """Returns the positions (m, 3) of the targets, in the instrument's frame."""
     tools = {name: robot.tool(name if name in robot.tools else "") for name in data.targets}
     return tips(State(robot.chain(), tools), data.q, data.targets, data.conditions).translation
 
 
 def comparison_text(beside: Comparison) -> str:
-    """For the terminal."""
+    """Returns the comparison as text for the terminal."""
     heads = ["<held out, mm", "points", "mean", "RMS", "max"]
     lines = [_title(beside), *text_table([heads, *_rows(beside)], (52, 6, 8, 8, 8))]
     lines += ["b_from_base of the identified robot, mm", *matrix_lines(_b_from_base(beside))]
@@ -154,7 +162,7 @@ def comparison_text(beside: Comparison) -> str:
 
 
 def robot_part(beside: Comparison) -> RobotPart:
-    """For the file of the registration."""
+    """Returns the comparison as part of the registration's file."""
     result, lines = beside.identified, beside.lines
     return RobotPart(
         name=beside.robot.name,
@@ -181,7 +189,7 @@ def robot_part(beside: Comparison) -> RobotPart:
 
 
 def comparison_section(beside: Comparison) -> tuple[str, str, Markup]:
-    """For the page."""
+    """Returns the comparison as a section of the page."""
     content = render(
         "workflows/register_robot.html.jinja",
         title=_title(beside),
@@ -200,12 +208,12 @@ def _title(beside: Comparison) -> str:
 
 
 def _rows(beside: Comparison) -> list[list[str]]:
-    found = []
+    rows = []
     for name, transform, kinematics in beside.errors():
         for way, errors in ((f"{beside.model} transform", transform), ("base and kinematics together", kinematics)):
             if len(errors):
-                found.append([f"{name}: {way}", str(len(errors)), *(number(v, 4) for _, v in _figures(errors))])
-    return found
+                rows.append([f"{name}: {way}", str(len(errors)), *(number(v, 4) for _, v in _figures(errors))])
+    return rows
 
 
 def _notes(beside: Comparison) -> list[str]:

@@ -1,4 +1,4 @@
-"""What a report of a fault needs to know of the machine: versions of the program and of what it is built on."""
+"""Versions of the program, of this machine and of the libraries, for the report of a fault."""
 
 import platform
 import shutil
@@ -9,24 +9,24 @@ from stcal.errors import InputError
 from stcal.sfm.interop.native import find_colmap
 
 LIBRARIES = {"pycolmap": "pycolmap", "OpenCV": "cv2", "NumPy": "numpy", "SciPy": "scipy"}
-"""Module by name."""
+"""Module of each library, by name."""
 
 
 def environment() -> dict[str, str]:
-    """Versions by name, as loaded; of what is not there, or does not load, it is said.
+    """Returns the versions by name, as loaded. A library that is missing or does not load is reported as such.
 
     Returns
     -------
     versions : stcal, Python, system, the libraries, and the native COLMAP on the PATH
     """
-    found = {"stcal": stcal.__version__, "Python": platform.python_version(), "system": platform.platform()}
-    return found | {name: _library(module) for name, module in LIBRARIES.items()} | {"native colmap": _native()}
+    version_of = {"stcal": stcal.__version__, "Python": platform.python_version(), "system": platform.platform()}
+    return version_of | {name: _library(module) for name, module in LIBRARIES.items()} | {"native colmap": _native()}
 
 
 def _library(module: str) -> str:
     try:
         return str(import_module(module).__version__)
-    except Exception as error:  # of a broken installation, which is what is looked for
+    except Exception as error:  # raised by a broken installation, which this report is to reveal
         return f"does not load: {error}"
 
 

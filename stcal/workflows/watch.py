@@ -1,4 +1,4 @@
-"""A calibration that grows while photographs are taken: after each, what was found, σ so far, and what helps most."""
+"""A calibration that grows while photographs are taken: after each, its circles, σ so far, and the best next view."""
 
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -24,23 +24,23 @@ from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.saved import load_run
 
 RELOAD_S = 5
-"""The report's page shows itself anew so often."""
+"""Interval in s at which the report's page reloads itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WatchOptions:
-    """How to watch.
+    """Options of watching a folder.
 
     Parameters
     ----------
     interval_s : float
-        The folder is looked at so often, s; a photograph counts when it has not changed between two looks.
+        Interval at which the folder is looked at, s; a photograph counts when it has not changed between two looks.
     idle_s : float, optional
-        Ends when no photograph has come for so long, s; never where None.
+        Time without a new photograph after which watching ends, s; never where None.
     views : int
-        Views to advise after each run; none where 0.
+        Number of views to advise after each run; none where 0.
     run : RunOptions
-        Of the runs.
+        Options of the runs.
     """
 
     interval_s: float = 1.0
@@ -58,13 +58,12 @@ class WatchOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Update:
-    """After photographs came, or went.
+    """State after photographs were added or removed.
 
-    ``images`` : photographs that are there; ``new`` : what was found in those that came; ``left_out`` : those of them
-    that cannot be used; ``gone`` : names of those that are no longer there; ``result`` : of the run over all of them,
-    None where it is not possible yet, for the ``reason``; ``advice`` : what to photograph next, None where that was not
-    asked for, or cannot be told, for the ``reason``; ``blur_px`` : by name of those that came, the median σ of the blur
-    of edges.
+    ``images`` : number of photographs; ``new`` : labelled images among the added ones; ``left_out`` : added ones that
+    cannot be used; ``gone`` : names of removed ones; ``result`` : of the run over all photographs, None where a run is
+    not possible yet, for the ``reason``; ``advice`` : views to photograph next, None where advice was not requested, or
+    is not possible, for the ``reason``; ``blur_px`` : median σ of the blur of edges, by name of the added photographs.
     """
 
     images: int
@@ -79,7 +78,7 @@ class Update:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Growing:
-    """A calibration over photographs that come: folders, and what is known beforehand.
+    """A calibration over a growing set of photographs: folders, designs and options.
 
     ``camera`` : its file or model; ``out`` : the run's folder.
     """
@@ -102,22 +101,23 @@ class Growing:
         board: str | Path | BoardDesign | None,
         options: WatchOptions,
     ) -> "Growing":
-        """From what a user gives; files are read, so that what is wrong in them is said at once."""
+        """Returns the calibration for a user's input. Files are read here, so that faults in them are reported at
+        once."""
         designs = target_of(target), board_of(board)
         settled = (options.run or RunOptions()).settled(designs[0])
-        read = camera if isinstance(camera, CameraModel) else read_camera(camera)
-        given = read if isinstance(camera, CameraModel) else camera
+        model = camera if isinstance(camera, CameraModel) else read_camera(camera)
+        given = model if isinstance(camera, CameraModel) else camera
         return cls(Path(images), given, Path(out), *designs, options.views, settled)
 
     def update(
         self, images: int, came: Collection[str], gone: Sequence[str], progress: Progress | None = None
     ) -> Update:
-        """A run over all photographs that are there; detections of earlier ones are kept."""
+        """Returns the state after a run over all photographs. Detections of earlier photographs are kept."""
         result, reason, advice = None, "", None
         try:
             result = run(self.images, self.camera, self.out, self.target, self.board, self.options, progress, RELOAD_S)
         except StcalError as error:
-            if not (self.out / CACHE).is_dir():  # the folder itself is refused
+            if not (self.out / CACHE).is_dir():  # the run refused the folder itself
                 raise
             reason = str(error)
         if result is not None and self.views:
@@ -129,7 +129,8 @@ class Growing:
         return Update(images, new, left_out, tuple(gone), result, reason, advice, blur_px)
 
     def _found(self, came: Collection[str], result: RunResult | None):
-        """What those that came show, by the run, or by what it has kept."""
+        """Returns labelled images, skipped images and blur of the added photographs, from the run, or from its
+        cache."""
         if result is not None:
             detection, labelled, skipped = result.detection, result.labelled, result.detection.skipped
         else:
@@ -137,17 +138,17 @@ class Growing:
             model = self.camera if isinstance(self.camera, CameraModel) else read_camera(self.camera)
             cache, ellipses, workers = self.out / CACHE, self.options.ellipses, self.options.workers
             try:
-                files, other = find_images(self.images)
+                files, skipped_files = find_images(self.images)
                 detection = detect_files(files, model, self.target, self.board, ellipses, cache, workers)
                 labelled = label_images(detection, self.target, self.board, ellipses, cache, workers)
-                skipped = (*other, *detection.skipped)
-            except StcalError:  # not one is usable: the reason that the run has given
+                skipped = (*skipped_files, *detection.skipped)
+            except StcalError:  # no photograph is usable, for the reason that the run has given
                 return (), (), {}
-        blur = {each.file.name: each.detection.centres.blur_px for each in detection.images}
+        blur = {image.file.name: image.detection.centres.blur_px for image in detection.images}
         return (
-            tuple(each for each in labelled if each.observations.name in came),
-            tuple(each for each in skipped if each.name in came),
-            {name: float(np.median(own)) for name, own in blur.items() if name in came and len(own)},
+            tuple(image for image in labelled if image.observations.name in came),
+            tuple(image for image in skipped if image.name in came),
+            {name: float(np.median(blurs)) for name, blurs in blur.items() if name in came and len(blurs)},
         )
 
 
@@ -161,7 +162,7 @@ def watch(
     progress: Progress | None = None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[Update]:
-    """Run again whenever photographs have come into a folder; detections of the others are kept.
+    """Repeat the run whenever photographs were added to a folder or removed from it; detections of the others are kept.
 
     Parameters
     ----------
@@ -182,12 +183,12 @@ def watch(
     Yields
     ------
     Update
-        After each run, or try.
+        State after each run, or attempt.
 
     Raises
     ------
     InputError
-        There is no such folder, a file is not what it is given for, or the output folder is not a run's.
+        There is no such folder, a file is not of the kind that is expected, or the output folder is not a run's.
     """
     options = options or WatchOptions()
     growing = Growing.of(images, camera, out, target, board, options)
@@ -214,8 +215,8 @@ def watch(
 
 
 def _stamps(images: Path) -> dict[str, tuple]:
-    """Size and time of each image file; none where there is none yet."""
-    found = {}
+    """Returns size and time of each image file; empty where there is none yet."""
+    stamps = {}
     try:
         files, _ = find_images(images)
     except InputError:
@@ -224,6 +225,6 @@ def _stamps(images: Path) -> dict[str, tuple]:
         try:
             stat = file.path.stat()
         except OSError:
-            continue  # gone meanwhile
-        found[file.name] = stat.st_size, stat.st_mtime_ns
-    return found
+            continue  # removed meanwhile
+        stamps[file.name] = stat.st_size, stat.st_mtime_ns
+    return stamps

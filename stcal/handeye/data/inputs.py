@@ -1,4 +1,4 @@
-"""From what files hold to what is calibrated from: one direction, mm, and rows of both sides that belong together."""
+"""Pose pairs from the content of files: one direction, mm, and rows of both sides that belong together."""
 
 import re
 from collections.abc import Callable, Hashable, Sequence
@@ -19,20 +19,20 @@ from stcal.io.quaternions import Order
 from stcal.io.table import FARTHEST, LENGTHS, Table, read_table
 
 METRES_UP_TO, MILLIMETRES_FROM = 5.0, 50.0
-"""Lengths of which all are below are metres, and of which one is above are millimetres: flanges and boards are farther
-from base and camera than 5 mm, and nearer than 50 m."""
+"""Lengths are metres if all are below the first limit, and millimetres if one is above the second. Flanges and boards
+are farther from base and camera than 5 mm, and nearer than 50 m."""
 MIXED = 100.0
-"""Poses of which the farthest is so many times as far as the nearest are of two units."""
+"""Ratio of the farthest to the nearest pose above which poses are in two units."""
 SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posed:
-    """Poses of one side in the direction that is wanted, mm.
+    """Poses of one side in the direction that is needed, mm.
 
-    ``names`` : image or timestamp of each, or none; ``places`` : where each stands; ``understood`` : what the file was
-    taken for; ``scaled`` : whether lengths have no unit; ``guessed`` : the unit that was told by size, empty where it
-    is known.
+    ``names`` : image or timestamp of each pose, or none; ``places`` : place of each pose in its file; ``understood`` :
+    how the file was read; ``scaled`` : whether lengths have no unit; ``guessed`` : the unit that was guessed from the
+    size of lengths, empty where it is known.
     """
 
     poses: Poses
@@ -48,15 +48,15 @@ class Posed:
         return len(self.poses)
 
     def called(self, row: int) -> str:
-        """Name of a row, or its place."""
+        """Returns the name of a row, or its place."""
         return self.names[row] if self.names else self.places[row]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """Pose pairs; ``understood`` : a line for each input; ``setup`` : where a file says so; ``scaled`` : whether the
-    camera's lengths have no unit; ``left_out`` : (name, why); ``timed`` : where the robot's poses were taken
-    by time."""
+    """Pose pairs; ``understood`` : a line for each input; ``setup`` : where a file states it; ``scaled`` : whether the
+    camera's lengths have no unit; ``left_out`` : (name, why); ``timed`` : where the robot's poses were taken by
+    time."""
 
     pairs: HandEyePoses
     understood: tuple[str, ...]
@@ -67,12 +67,12 @@ class Told:
 
 
 def read_pairs(path: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Told | None:
-    """Pose pairs of one file; None where it is one of the package's own tables.
+    """Returns the pose pairs of one file; None where it is one of the package's own tables.
 
     Raises
     ------
     InputError
-        What is wrong with the file, or poses of one side only.
+        The message says what is wrong with the file, or that it holds poses of one side only.
     """
     content = read_content(path, said, key, quaternions)
     if content is None:
@@ -104,27 +104,34 @@ def read_two(
     tolerance_s: float = TOLERANCE_S,
     timed: bool = False,
 ) -> Told | None:
-    """The robot's poses and the camera's of two files, joined by image or time, or by their order where neither file
-    says any; None where both are the package's own tables. Of times that are not equal, and of all where ``timed``, the
-    robot's poses are those at the camera's times, within ``tolerance_s``.
+    """Returns the robot's poses and the camera's, from two files, as pairs.
+
+    The result is None where both files are the package's own tables. The rows are joined by image or time, or by their
+    order where neither file has names. Where times are not equal, and for all rows where ``timed``, the robot's poses
+    are those at the camera's times, within ``tolerance_s``.
 
     Raises
     ------
     InputError
-        What is wrong with a file, or that nothing fits together.
+        The message says what is wrong with a file, or that no rows belong together.
     """
     by_role = [said.of(role) for role in FRAMES]
-    contents = [read_content(path, each, key, quaternions) for path, each in zip((first, second), by_role, strict=True)]
+    contents = [
+        read_content(path, side_options, key, quaternions)
+        for path, side_options in zip((first, second), by_role, strict=True)
+    ]
     if contents[0] is None and contents[1] is None:
         return None
     sides = []
     for role, path, content in zip(FRAMES, (first, second), contents, strict=True):
-        found = content or own_table(path, said, key, quaternions)
-        sides.append(settled(_side(found, role, path), role, found, path, said))
+        content_of_side = content or own_table(path, said, key, quaternions)
+        sides.append(settled(_side(content_of_side, role, path), role, content_of_side, path, said))
     robot, camera = sides
     setup = next((content.setup for content in contents if content is not None and content.setup), None)
-    if (told := _by_time(robot, camera, setup, f"{first.name} with {second.name}", tolerance_s, timed)) is not None:
-        return told
+    if (
+        told_by_time := _by_time(robot, camera, setup, f"{first.name} with {second.name}", tolerance_s, timed)
+    ) is not None:
+        return told_by_time
     rows, how = matched(robot, camera, key)
     notes = () if not how else (f"rows joined {how}",)
     a, b = [i for i, _ in rows], [j for _, j in rows]
@@ -137,46 +144,46 @@ def read_two(
 
 
 def read_robot(path: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
-    """The robot's poses of a file or folder; None where it is one of the package's own tables.
+    """Returns the robot's poses of a file or folder; None where it is one of the package's own tables.
 
     Raises
     ------
     InputError
-        What is wrong with it.
+        The message says what is wrong with the file or folder.
     """
     content = read_content(path, said.of("robot"), key, quaternions)
     return None if content is None else settled(_side(content, "robot", path), "robot", content, path, said)
 
 
 def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
-    """Lines on a table of pose pairs of the package's own."""
+    """Returns lines that describe a table of pose pairs of the package's own."""
     table = read_table(source, "pose file", quaternions)
     lines = []
     for role, names in FRAMES.items():
         frame = next((name for name in names if any(column.startswith(f"{name}_") for column in table.columns)), "")
         unit = table.unit(f"{frame}_x", LENGTHS)
-        own = ", with covariances" if f"{frame}_cov_rx_rx" in table else ""
+        with_covariances = ", with covariances" if f"{frame}_cov_rx_rx" in table else ""
         turned = "quaternions by name" if quaternions == "wxyz" else "quaternions x, y, z, w by their order"
-        held = f"{len(table)} poses; {frame} by its columns; {turned}; {unit}{own}"
+        held = f"{len(table)} poses; {frame} by its columns; {turned}; {unit}{with_covariances}"
         lines.append(f"{role}: {table.where.removeprefix('pose file ')}: table; {held}")
     return lines
 
 
 def own_table(path: Path, said: Said, key: str, quaternions: Order) -> Content:
-    """A table of the package's own, of one side."""
+    """Returns the poses of one of the package's own tables, of one side."""
     table = read_table(path, "table", quaternions)
-    found = read_columns(table, read_bytes(path, TABLE_BYTES).decode("utf-8-sig"), key, said)
-    if found is None:
+    content = read_columns(table, read_bytes(path, TABLE_BYTES).decode("utf-8-sig"), key, said)
+    if content is None:
         raise InputError("E-POSES-NOT-FOUND", f"{table.where}: no poses in its columns; the header is {table.header()}")
-    return found
+    return content
 
 
 def _by_time(
     robot: Posed, camera: Posed, setup: str | None, where: str, tolerance_s: float, always: bool
 ) -> Told | None:
-    """The robot's poses at the camera's times; None where either has none, or, unless ``always``, where all of the
-    camera's are times of the robot."""
-    times = [stamps_of(each.names) if each.names else None for each in (robot, camera)]
+    """Returns the robot's poses at the camera's times. Returns None where either side has no times, or, unless
+    ``always``, where all times of the camera are times of the robot."""
+    times = [stamps_of(side.names) if side.names else None for side in (robot, camera)]
     if times[0] is None or times[1] is None:
         if always:
             without = (robot, camera)[times[0] is not None]
@@ -194,10 +201,10 @@ def _by_time(
             "E-POSES-UNMATCHED",
             f"{camera.where}: no pose has one of the robot: first {camera.names[0]}, {taken.why[0]}",
         )
-    kept = np.flatnonzero(taken.kept)
-    of_camera = None if camera.covariance is None else camera.covariance[kept]
-    names = tuple(camera.names[i] for i in kept)
-    pairs = HandEyePoses(taken.base_from_flange, camera.poses[kept], None, of_camera, names, where)
+    rows = np.flatnonzero(taken.kept)
+    of_camera = None if camera.covariance is None else camera.covariance[rows]
+    names = tuple(camera.names[i] for i in rows)
+    pairs = HandEyePoses(taken.base_from_flange, camera.poses[rows], None, of_camera, names, where)
     left_out = tuple((camera.names[i], why) for i, why in enumerate(taken.why) if why)
     dropped = (
         ("covariances of the robot's poses are not used: they are of other times",)
@@ -205,30 +212,30 @@ def _by_time(
         else ()
     )
     lines = (*_both(robot, camera), taken.said, *dropped)
-    return Told(pairs, lines, setup, camera.scaled, left_out, Timed(stream, seconds[kept]))
+    return Told(pairs, lines, setup, camera.scaled, left_out, Timed(stream, seconds[rows]))
 
 
 def _side(content: Content, role: Role, path: Path) -> Side:
-    """The side of a role, or the only one where nothing says whose it is."""
-    found = content.of(role)
-    if found is None and len(content.sides) == 1 and content.sides[0].frames is None:
-        found = content.sides[0]
-    if found is None:
+    """Returns the side of a role, or the only side where nothing states its role."""
+    side = content.of(role)
+    if side is None and len(content.sides) == 1 and content.sides[0].frames is None:
+        side = content.sides[0]
+    if side is None:
         frames = content.sides[0].frames
         held = frames.name if frames else "poses"
         raise InputError(
             "E-POSES-MIXED", f"{path}: {content.form} of {held}, {FRAMES[role][0]} needed here; give another file"
         )
-    return found
+    return side
 
 
 def settled(side: Side, role: Role, content: Content, path: Path, said: Said) -> Posed:
-    """Poses in the direction wanted, mm, with a line on how they were read.
+    """Returns poses in the direction that is needed, mm, with a line on how they were read.
 
     Raises
     ------
     InputError
-        A unit that cannot be told, or an option that the file contradicts.
+        The unit cannot be recognised, or an option contradicts the file.
     """
     said = said.of(role)
     far = np.flatnonzero(np.abs(side.translation).max(axis=1) > FARTHEST)
@@ -247,15 +254,15 @@ def settled(side: Side, role: Role, content: Content, path: Path, said: Said) ->
         poses = poses.inverse()
     parts = [f"{path.name}: {content.form}", f"{len(side)} poses", f"{frames.name} {frames.by}", side.turned, unit]
     if content.passed_over:
-        more = " …" if len(content.passed_over) > SHOWN else ""
-        parts.append(f"passed over: {', '.join(content.passed_over[:SHOWN])}{more}")
+        ellipsis = " …" if len(content.passed_over) > SHOWN else ""
+        parts.append(f"passed over: {', '.join(content.passed_over[:SHOWN])}{ellipsis}")
     scaled = side.scaled and said.length_unit is None
     return Posed(poses, side.names, side.places, covariance, str(path), "; ".join(parts), scaled, guessed)
 
 
 def _direction(side: Side, role: Role, path: Path, said: Said) -> Frames:
-    """As the file or the user says; else base_from_flange and camera_from_board, of trajectories what moves in its
-    world."""
+    """Returns the direction that the file or the user states. The default is base_from_flange and camera_from_board,
+    and for trajectories the pose of the moving body in its world."""
     option = said.frames_of(role)
     if option is not None:
         if side.frames is not None and side.frames.stated and side.frames.name != option:
@@ -273,16 +280,17 @@ def _direction(side: Side, role: Role, path: Path, said: Said) -> Frames:
 
 
 def _unit(side: Side, name: str, path: Path, said: Said) -> tuple[float, str, str]:
-    """mm of a unit of length; how it is known; and the unit where it is told by size."""
-    given = side.unit
-    if given is not None and given.stated:
-        return LENGTHS[given.name], f"{given.name} {given.by}", ""
+    """Returns the factor from a unit of length to mm, how the unit is known, and the unit where it was guessed from the
+    size of lengths."""
+    stated = side.unit
+    if stated is not None and stated.stated:
+        return LENGTHS[stated.name], f"{stated.name} {stated.by}", ""
     if said.length_unit is not None:
         return LENGTHS[said.length_unit], f"{said.length_unit} as you say", ""
     if side.scaled:
         return 1.0, "lengths without a unit, whose scale is solved for", ""
-    if given is not None:
-        return LENGTHS[given.name], f"{given.name} {given.by}", ""
+    if stated is not None:
+        return LENGTHS[stated.name], f"{stated.name} {stated.by}", ""
     distances = np.linalg.norm(side.translation, axis=1)
     farthest, nearest = float(distances.max()), float(distances.min())
     if 0 < nearest < farthest / MIXED:
@@ -315,13 +323,14 @@ def _both(robot: Posed, camera: Posed) -> tuple[str, ...]:
 
 
 def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]], str]:
-    """Rows of both sides that belong together, in the order of the robot's; and how they were matched, empty where the
-    names are the same.
+    """Returns the rows of both sides that belong together, in the order of the robot's rows, and how they were matched.
+
+    The description of the match is empty where the names are the same.
 
     Raises
     ------
     InputError
-        None do.
+        No rows belong together.
     """
     if not robot.names and not camera.names:
         if len(robot) != len(camera):
@@ -338,20 +347,21 @@ def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]
             f"{without.where}: no names or times of its poses, {other.where} has: {other.names[0]} …; name both, like "
             f"with a column {key}",
         )
-    found = partners(robot.names, camera.names)
-    if found is None:
+    rows = partners(robot.names, camera.names)
+    if rows is None:
         raise InputError(
             "E-POSES-UNMATCHED",
             f"{robot.where}, {camera.where}: no name or time in common: {robot.names[0]} … in the one, "
             f"{camera.names[0]} … in the other; correct them",
         )
-    return found
+    return rows
 
 
 def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[int, int]], str] | None:
-    """Places of names in both lists that mean the same, and how that was told; None where none do.
+    """Returns the places of names in both lists that mean the same, and how they were matched.
 
-    As they are; as times; without folder and ending; by the number at their ends, where no number occurs twice.
+    The result is None where no names match. Names are compared as they are, then as times, then without folder and
+    ending, then by the number at their ends, where no number occurs twice.
     """
     ways: tuple[tuple[Callable[[str], Hashable | None], str], ...] = (
         (str, ""),
@@ -359,24 +369,25 @@ def partners(first: Sequence[str], second: Sequence[str]) -> tuple[list[tuple[in
         (stem_of, "by names without folder and ending"),
         (trailing_number, "by the number at the end of each name, like"),
     )
-    for way, how in ways:
+    for way, description in ways:
         keys = [[way(name) for name in names] for names in (first, second)]
         places = []
-        for each in keys:
-            known = [key for key in each if key is not None]
+        for keys_of_list in keys:
+            known = [key for key in keys_of_list if key is not None]
             if len(set(known)) < len(known) or not known:
                 break
-            places.append({key: i for i, key in enumerate(each) if key is not None})
+            places.append({key: i for i, key in enumerate(keys_of_list) if key is not None})
         if len(places) < 2:
             continue
         rows = [(i, places[1][key]) for key, i in places[0].items() if key in places[1]]
         if rows:
             i, j = rows[0]
-            return rows, f"{how} {first[i]} and {second[j]}" if how.endswith("like") else how
+            return rows, f"{description} {first[i]} and {second[j]}" if description.endswith("like") else description
     return None
 
 
 def trailing_number(name: str) -> int | None:
-    """Of ``img07.png``: 7; None where the name ends otherwise, or is a time."""
-    found = re.fullmatch(r"(?:.*[^\d.])?(\d{1,9})", stem_of(name))
-    return int(found[1]) if found else None
+    """Returns the number at the end of a name: 7 for ``img07.png``. Returns None where the name ends otherwise, or is a
+    time."""
+    match = re.fullmatch(r"(?:.*[^\d.])?(\d{1,9})", stem_of(name))
+    return int(match[1]) if match else None

@@ -1,4 +1,4 @@
-"""Motions between poses: A of the mount, B of the camera, AX = XB."""
+"""Motions between poses: A of the mount and B of the camera in AX = XB."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye.data.loop import Loop
 
 LARGEST_RAD = np.radians(170)
-"""Beyond it the logarithm is ill-conditioned: at a half turn the smallest error turns the axis round."""
+"""Angle beyond which the logarithm is ill-conditioned: at a half turn the smallest error reverses the axis."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +30,7 @@ class Motions:
 
     @classmethod
     def between(cls, loop: Loop, first: np.ndarray, second: np.ndarray) -> "Motions":
-        """Between poses ``first`` and ``second`` (k,) of a loop."""
+        """Returns the motions between poses ``first`` and ``second`` (k,) of a loop."""
         hand, eye = loop.stand_from_mount, loop.camera_from_board
         mount = hand[second].inverse() @ hand[first]
         camera = eye[second] @ eye[first].inverse()
@@ -39,33 +39,33 @@ class Motions:
 
     @classmethod
     def consecutive(cls, loop: Loop) -> "Motions":
-        """From each pose to the next."""
+        """Returns the motions from each pose to the next."""
         at = np.arange(len(loop) - 1)
         return cls.between(loop, at, at + 1)
 
     @classmethod
     def all(cls, loop: Loop) -> "Motions":
-        """Of every pair of poses."""
+        """Returns the motions between every pair of poses."""
         return cls.between(loop, *np.triu_indices(len(loop), 1))
 
     def __len__(self) -> int:
         return len(self.first)
 
     def __getitem__(self, index) -> "Motions":
-        """Motions by a mask, slice or list."""
+        """Returns the motions selected by a mask, slice or list."""
         return Motions(*(getattr(self, name)[index] for name in self.__slots__))
 
     def has_log(self) -> np.ndarray:
-        """(k,) whether the logarithms of both rotations are well-conditioned."""
+        """Returns (k,) True where the logarithms of both rotations are well-conditioned."""
         return (np.linalg.norm(self.alpha, axis=1) < LARGEST_RAD) & (np.linalg.norm(self.beta, axis=1) < LARGEST_RAD)
 
     def with_log(self, method: str) -> "Motions":
-        """Those of :meth:`has_log`.
+        """Returns the motions that satisfy :meth:`has_log`.
 
         Raises
         ------
         DegenerateError
-            Fewer than two.
+            Fewer than two motions do.
         """
         good = self.has_log()
         if good.sum() < 2:
@@ -78,7 +78,8 @@ class Motions:
 
 
 def poses_with_log(loop: Loop) -> np.ndarray:
-    """Poses (m,) between any two of which the logarithm is well-conditioned: those most in the way are left out."""
+    """Returns which poses (m,) to use so that the logarithm between any two of them is well-conditioned. Poses with
+    most ill-conditioned motions are left out first."""
     motions, used = Motions.all(loop), np.ones(len(loop), bool)
     bad = ~motions.has_log()
     while bad.any():

@@ -1,4 +1,4 @@
-"""Pose pairs: where the robot said its flange was, and where the camera saw the board."""
+"""Pose pairs: the robot's poses of its flange, and the camera's poses of the board."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from stcal.io.table import Table, read_table
 
 WHAT = "pose file"
 SIDES = (("base_from_flange", "flange_from_base"), ("camera_from_board", "board_from_camera"))
-"""What each row must hold, and the inverse that is accepted in its place."""
+"""Transforms that each row must hold, with the inverse that is accepted in place of each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,13 +23,13 @@ class HandEyePoses:
     Parameters
     ----------
     base_from_flange, camera_from_board : Poses
-        m each, mm.
+        m poses each, mm.
     base_from_flange_covariance, camera_from_board_covariance : (m, 6, 6) arrays, optional
         Rotation (rad) and translation (mm), left perturbation in the first frame, where they are known.
     names : tuple of str
-        What each pair is called in messages: ``line 7``, an image's name; ``pose 1`` … where none are given.
+        Name of each pair in messages: ``line 7``, an image's name; ``pose 1`` … where no names are given.
     where : str
-        What they were read from.
+        Source of the poses.
 
     Raises
     ------
@@ -62,7 +62,7 @@ class HandEyePoses:
 
     @classmethod
     def from_matrices(cls, base_from_flange, camera_from_board, names=(), where: str = "poses") -> "HandEyePoses":
-        """From homogeneous matrices (m, 4, 4), mm.
+        """Returns pose pairs from homogeneous matrices (m, 4, 4), mm.
 
         Raises
         ------
@@ -70,14 +70,14 @@ class HandEyePoses:
             A matrix that is not finite, left-handed, scaled or transposed; the message names it.
         """
         sides = []
-        for what, matrices in (("base_from_flange", base_from_flange), ("camera_from_board", camera_from_board)):
+        for side, matrices in (("base_from_flange", base_from_flange), ("camera_from_board", camera_from_board)):
             rigid = []
             for i, matrix in enumerate(matrices):
                 name = names[i] if i < len(names) else f"pose {i + 1}"
                 try:
                     rigid.append(Rigid.from_matrix(matrix))
                 except InputError as error:
-                    raise InputError(error.code, f"{where}: {name}: {what}: {error}") from error
+                    raise InputError(error.code, f"{where}: {name}: {side}: {error}") from error
             sides.append(Poses.of(rigid))
         return cls(*sides, names=tuple(names), where=where)
 
@@ -85,7 +85,7 @@ class HandEyePoses:
         return len(self.base_from_flange)
 
     def __getitem__(self, index) -> "HandEyePoses":
-        """Pairs by a mask, slice or list."""
+        """Returns the pairs selected by a mask, slice or list."""
         rows = np.arange(len(self))[index]
         of_flange, of_board = self.base_from_flange_covariance, self.camera_from_board_covariance
         return HandEyePoses(
@@ -98,12 +98,12 @@ class HandEyePoses:
         )
 
     def _check_copies(self):
-        """Measured values are never equal to the last digit: equal ones were copied."""
+        """Refuse poses that are equal to the last digit: measured values never are, so equal values were copied."""
         flange, board = self.base_from_flange, self.camera_from_board
         first: dict[bytes, int] = {}
         for i in range(len(self)):
-            seen = board.rotation[i].tobytes() + board.translation[i].tobytes()
-            j = first.setdefault(seen, i)
+            content = board.rotation[i].tobytes() + board.translation[i].tobytes()
+            j = first.setdefault(content, i)
             if j == i:
                 continue
             pair = f"{self.where}: {self.names[j]} and {self.names[i]}"
@@ -129,7 +129,7 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
     path : str or Path
         The file.
     quaternions : {"wxyz", "xyzw"}
-        As their columns are named, or x, y, z, w in the order in which these stand.
+        ``wxyz`` reads them by their columns' names; ``xyzw`` takes x, y, z, w in the order of the columns.
 
     Returns
     -------
@@ -139,7 +139,8 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
     Raises
     ------
     InputError
-        Missing columns; a value that is not finite or a quaternion that is not of unit length, named by line; copies.
+        Missing columns; a value that is not finite or a quaternion that is not of unit length, named by line; copied
+        poses.
     """
     table = read_table(path, WHAT, quaternions)
     sides = [read_side(table, *names) for names in SIDES]
@@ -149,30 +150,30 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
 
 
 def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None]:
-    """Poses ``wanted`` and their covariances, whichever of the two the table has."""
-    given = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
-    if len(given) != 1:
-        found = "no such columns" if not given else "both"
+    """Returns poses ``wanted`` and their covariances, from the columns of ``wanted`` or of its inverse."""
+    names = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
+    if len(names) != 1:
+        fault = "no such columns" if not names else "both"
         raise InputError(
             "E-TABLE-COLUMN-MISSING",
-            f"{table.where}: {found}, {wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}",
+            f"{table.where}: {fault}, {wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}",
         )
-    poses, covariance = table.poses(given[0] + "_"), table.pose_covariances(given[0] + "_")
-    if given[0] == wanted:
+    poses, covariance = table.poses(names[0] + "_"), table.pose_covariances(names[0] + "_")
+    if names[0] == wanted:
         return poses, covariance
     return poses.inverse(), None if covariance is None else inverse_covariance(poses, covariance)
 
 
 def inverse_jacobian(poses: Poses) -> np.ndarray:
-    """Derivative (m, 6, 6) of the left perturbation of the inverses by that of the poses."""
-    back = np.swapaxes(poses.rotation, 1, 2)
-    by = np.zeros((len(poses), 6, 6))
-    by[:, :3, :3] = by[:, 3:, 3:] = -back
-    by[:, 3:, :3] = -back @ skew(poses.translation)
-    return by
+    """Returns the derivative (m, 6, 6) of the left perturbation of the inverses by that of the poses."""
+    transposed = np.swapaxes(poses.rotation, 1, 2)
+    derivative = np.zeros((len(poses), 6, 6))
+    derivative[:, :3, :3] = derivative[:, 3:, 3:] = -transposed
+    derivative[:, 3:, :3] = -transposed @ skew(poses.translation)
+    return derivative
 
 
 def inverse_covariance(poses: Poses, covariance: np.ndarray) -> np.ndarray:
-    """Covariances (m, 6, 6) of the inverses of poses with these (m, 6, 6)."""
-    by = inverse_jacobian(poses)
-    return by @ covariance @ np.swapaxes(by, 1, 2)
+    """Returns the covariances (m, 6, 6) of the inverses of poses with these covariances (m, 6, 6)."""
+    jacobian = inverse_jacobian(poses)
+    return jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)

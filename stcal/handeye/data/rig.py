@@ -1,4 +1,4 @@
-"""What several cameras of one robot saw of one board."""
+"""Observations of one board by several cameras of one robot."""
 
 from dataclasses import dataclass, replace
 
@@ -14,20 +14,20 @@ from stcal.io.cameras.model import CameraPrior
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigCamera:
-    """What one camera of a rig saw.
+    """Observations of one camera of a rig.
 
     Parameters
     ----------
     name : str
-        What the camera is called.
+        Name of the camera.
     views : Views
-        v of them, with the camera's intrinsics.
+        v views, with the camera's intrinsics.
     rows : (v,) int array
-        At which of the robot's poses each was taken; no pose twice.
+        Pose of the robot at which each view was taken; no pose twice.
     images : tuple of str
         Name of each view.
     prior : CameraPrior, optional
-        What is known of the intrinsics; they are exact where None.
+        Prior of the intrinsics, which are exact where it is None.
     """
 
     name: str
@@ -51,10 +51,10 @@ class RigCamera:
         return len(self.views)
 
     def __getitem__(self, index) -> "RigCamera":
-        """Views by a mask or list."""
-        kept = np.arange(len(self))[index]
-        images = tuple(self.images[i] for i in kept)
-        return replace(self, views=self.views[kept], rows=self.rows[kept], images=images)
+        """Returns the views selected by a mask or list."""
+        rows = np.arange(len(self))[index]
+        images = tuple(self.images[i] for i in rows)
+        return replace(self, views=self.views[rows], rows=self.rows[rows], images=images)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,18 +64,18 @@ class RigPoses:
     Parameters
     ----------
     base_from_flange : Poses
-        m of them, mm, as the robot states them; errors of each are shared by all images that were taken there.
+        m poses, mm, as the robot states them. All images from one pose share the error of that pose.
     cameras : tuple of RigCamera
-        c of them, each with a name of its own.
+        c cameras, each with a name of its own.
     names : tuple of str
-        What each pose of the robot is called; ``pose 1`` … where none are given.
+        Name of each pose of the robot; ``pose 1`` … where no names are given.
     where : str
-        What they were read from.
+        Source of the poses.
 
     Raises
     ------
     InputError
-        No camera, two of one name, or a row that is not there.
+        No camera, two cameras of one name, or a row that no pose has.
     """
 
     base_from_flange: Poses
@@ -106,12 +106,13 @@ class RigPoses:
         return len(self.base_from_flange)
 
     def only(self, rows: np.ndarray) -> "RigPoses":
-        """With the images of these poses of the robot alone, (k,) int; all keep their numbers."""
+        """Returns the rig with only the images from these poses of the robot, (k,) int. All poses keep their
+        numbers."""
         cameras = tuple(camera[np.isin(camera.rows, rows)] for camera in self.cameras)
         return replace(self, cameras=cameras)
 
     def pairs(self, i: int) -> HandEyePoses:
-        """Pose pairs of one camera, the board's poses from each view by itself."""
+        """Returns the pose pairs of one camera, with the board's pose from each view by itself."""
         camera = self.cameras[i]
         where = f"{self.where}: camera {camera.name}"
         return pairs_of_views(self.base_from_flange[camera.rows], camera.views, camera.images, where)

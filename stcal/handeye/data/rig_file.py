@@ -1,4 +1,4 @@
-"""RIG.toml: which files belong to which camera of a rig."""
+"""Reader of RIG.toml, which says which files belong to which camera of a rig."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,8 +32,8 @@ class _RigFile(Strict):
 
 @dataclass(frozen=True, slots=True)
 class RigCameraFiles:
-    """``name`` of a camera; ``images`` : folder; ``camera`` : intrinsics; ``poses`` : the robot's, of its images;
-    ``times`` : of its images, where their names are none."""
+    """``name`` of a camera; ``images`` : folder; ``camera`` : intrinsics; ``poses`` : the robot's poses at its images;
+    ``times`` : times of its images, where their names are not times."""
 
     name: str
     images: Path
@@ -44,7 +44,7 @@ class RigCameraFiles:
 
 @dataclass(frozen=True, slots=True)
 class RigFiles:
-    """``file`` itself; ``setup``; ``board``; ``cameras`` in their order."""
+    """``file`` : the rig file; ``setup``; ``board``; ``cameras`` in their order."""
 
     file: Path
     setup: Setup
@@ -52,34 +52,35 @@ class RigFiles:
     cameras: tuple[RigCameraFiles, ...]
 
     def read(self) -> list[tuple[str, Path]]:
-        """Every file and folder that is read, with what it is."""
-        found = [(WHAT, self.file), ("board", self.board)]
-        for each in self.cameras:
-            keys = ("images", "camera", "poses", *(("times",) if each.times else ()))
-            found += [(f"{each.name}: {key}", getattr(each, key)) for key in keys]
-        return list(dict(reversed([(path, (what, path)) for what, path in found])).values())
+        """Returns every file and folder that is read, with what each is."""
+        files = [(WHAT, self.file), ("board", self.board)]
+        for camera in self.cameras:
+            keys = ("images", "camera", "poses", *(("times",) if camera.times else ()))
+            files += [(f"{camera.name}: {key}", getattr(camera, key)) for key in keys]
+        return list(dict(reversed([(path, (what, path)) for what, path in files])).values())
 
 
 def read_rig_file(path: Path) -> RigFiles:
-    """Read; all paths in it are relative to the file's folder.
+    """Read a rig file. All paths in it are relative to its folder.
 
     Raises
     ------
     InputError
-        Not TOML, not as it should be, two cameras of one name, or one without poses of the robot.
+        Not TOML, not of the required form, two cameras of one name, or a camera without poses of the robot.
     """
     content = load_toml(path, _RigFile, WHAT, "give a file with setup, board, poses and a [[camera]] for each camera")
     folder, cameras = path.parent, []
-    for number, each in enumerate(content.camera, 1):
-        poses = each.poses or content.poses
+    for number, entry in enumerate(content.camera, 1):
+        poses = entry.poses or content.poses
         if poses is None:
             raise InputError(
-                "E-RIG-POSES", f"{WHAT} {path}: camera {each.name}: no poses of the robot; add `poses`, here or for all"
+                "E-RIG-POSES",
+                f"{WHAT} {path}: camera {entry.name}: no poses of the robot; add `poses`, here or for all",
             )
-        if each.name in [other.name for other in cameras]:
+        if entry.name in [previous.name for previous in cameras]:
             raise InputError(
-                "E-RIG-CAMERAS", f"{WHAT} {path}: camera {number} is called {each.name!r} as another is; one name each"
+                "E-RIG-CAMERAS", f"{WHAT} {path}: camera {number} is called {entry.name!r} as another is; one name each"
             )
-        files = (folder / name for name in (each.images, each.camera, poses))
-        cameras.append(RigCameraFiles(each.name, *files, times=folder / each.times if each.times else None))
+        files = (folder / name for name in (entry.images, entry.camera, poses))
+        cameras.append(RigCameraFiles(entry.name, *files, times=folder / entry.times if entry.times else None))
     return RigFiles(path, content.setup, folder / content.board, tuple(cameras))

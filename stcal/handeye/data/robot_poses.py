@@ -1,4 +1,4 @@
-"""The robot's poses at which images were taken."""
+"""Reader of the robot's poses at which images were taken."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,16 +19,16 @@ from stcal.io.table import LENGTHS, read_table
 
 YAML = (".yaml", ".yml")
 TIME = "time_s"
-"""Column of a stream of poses in place of ``image``."""
+"""Column of a stream of poses, in place of ``image``."""
 INDUSTRIAL = "poses of ROS-Industrial; base_from_flange by default; quaternions by name; m as in ROS"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotPoses:
-    """``images`` : name of each; ``base_from_flange`` : m, mm; ``covariance`` : (m, 6, 6) or None; ``places`` : where
-    each stands in ``where``, for messages; ``understood`` : what the file was taken for; ``own`` : whether it is a
-    table of the package; ``timed`` : whether ``images`` are times by the name of their column. Without ``images`` the
-    poses are of the images in their order."""
+    """``images`` : image of each pose; ``base_from_flange`` : m, mm; ``covariance`` : (m, 6, 6) or None; ``places`` :
+    place of each pose in ``where``, for messages; ``understood`` : how the file was read; ``own`` : whether it is a
+    table of the package; ``timed`` : whether ``images`` are times by the name of their column. Without ``images``, the
+    poses belong to the images in their order."""
 
     images: tuple[str, ...]
     base_from_flange: Poses
@@ -41,17 +41,19 @@ class RobotPoses:
 
     @property
     def file(self) -> str:
-        """Name of the file or folder, without those above it."""
+        """Name of the file or folder, without its parent folders."""
         return Path(self.where.removeprefix("robot poses ")).name
 
     def pairing(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...], str]:
-        """As :meth:`rows`; where no name fits, by times or the numbers at the ends of names; without names in order.
-        The last is how, empty where it is by names.
+        """Returns the row by image, the images of rows without a partner, and how they were matched.
+
+        The first two are those of :meth:`rows`. Where no name fits, images are matched by times or by the numbers at
+        the ends of names; poses without names, by order. The last result is empty where images are matched by name.
 
         Raises
         ------
         InputError
-            A name that may be of two images; poses without names that are not as many as the images.
+            A name fits two images, or poses without names are not as many as the images.
         """
         if not self.images:
             if len(names) != len(self.base_from_flange):
@@ -64,54 +66,59 @@ class RobotPoses:
             order = list(range(len(names)))
             if None not in numbers and len(set(numbers)) == len(numbers):
                 order.sort(key=lambda i: numbers[i] or 0)
-            how = f"by order, for the poses have no names: {self.places[0]} is of {names[order[0]]}"
-            return {names[i]: row for row, i in enumerate(order)}, (), how
+            description = f"by order, for the poses have no names: {self.places[0]} is of {names[order[0]]}"
+            return {names[i]: row for row, i in enumerate(order)}, (), description
         rows, missing = self.rows(names)
-        if rows or (found := partners(self.images, names)) is None:
+        if rows or (matches := partners(self.images, names)) is None:
             return rows, missing, ""
-        pairs, how = found
+        pairs, description = matches
         used = {i for i, _ in pairs}
-        return {names[j]: i for i, j in pairs}, tuple(n for i, n in enumerate(self.images) if i not in used), how
+        return (
+            {names[j]: i for i, j in pairs},
+            tuple(n for i, n in enumerate(self.images) if i not in used),
+            description,
+        )
 
     def rows(self, names: list[str]) -> tuple[dict[str, int], tuple[str, ...]]:
-        """Row by image, of those of ``names`` that have one, and the images of rows that have none.
+        """Returns the row of each of ``names`` that has one, and the images of rows that are not in ``names``.
 
-        A row may give the name without its folder, or without its ending too, as long as no other image has the same.
+        A row may give the name without its folder, or without its ending too, as long as no other image has the same
+        name.
         """
         short: dict[str, list[str]] = {}
         for name in names:
-            alone = name.rsplit("/", 1)[-1]
-            for key in {alone, alone.rsplit(".", 1)[0]}:
+            file_name = name.rsplit("/", 1)[-1]
+            for key in {file_name, file_name.rsplit(".", 1)[0]}:
                 short.setdefault(key, []).append(name)
-        found, missing = {}, []
+        row_of_image, missing = {}, []
         for row, image in enumerate(self.images):
-            of = [image] if image in names else short.get(image, [])
-            if len(of) > 1:
+            fitting = [image] if image in names else short.get(image, [])
+            if len(fitting) > 1:
                 raise InputError(
                     "E-IMAGE-NAME-AMBIGUOUS",
-                    f"{self.where}: {self.places[row]}: {image} may be {of[0]} or {of[1]}; give its path",
+                    f"{self.where}: {self.places[row]}: {image} may be {fitting[0]} or {fitting[1]}; give its path",
                 )
-            if of and of[0] in found:
-                both = f"{self.places[found[of[0]]]} and {self.places[row]}"
+            if fitting and fitting[0] in row_of_image:
+                both = f"{self.places[row_of_image[fitting[0]]]} and {self.places[row]}"
                 raise InputError(
-                    "E-POSE-REPEATED", f"{self.where}: {both}: both are of image {of[0]!r}; one row needed"
+                    "E-POSE-REPEATED", f"{self.where}: {both}: both are of image {fitting[0]!r}; one row needed"
                 )
-            if of:
-                found[of[0]] = row
+            if fitting:
+                row_of_image[fitting[0]] = row
             else:
                 missing.append(image)
-        return found, tuple(missing)
+        return row_of_image, tuple(missing)
 
 
 def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", said: Said | None = None) -> RobotPoses:
-    """Read any of :mod:`stcal.handeye.data.formats`.
+    """Read the robot's poses in any format of :mod:`stcal.handeye.data.formats`.
 
-    Or a CSV file with a column ``image``, or ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
+    A CSV file may have a column ``image``, or ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
 
-    Or ROS-Industrial's calibration data: a folder of YAML files, one for each image, of the same name, with ``x, y, z``
-    in metres and ``qx, qy, qz, qw``; or a YAML list of such files, each a ``pose`` with its ``image``.
-    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand; ``said`` : what a
-    file of another program does not say itself.
+    ROS-Industrial's calibration data are read too: a folder of YAML files, one for each image, of the same name, with
+    ``x, y, z`` in metres and ``qx, qy, qz, qw``; or a YAML list of such files, each a ``pose`` with its ``image``.
+    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand; ``said`` : the user's
+    statements about what a file of another program does not state itself.
 
     Raises
     ------
@@ -120,8 +127,8 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", said: Said |
         image that has two rows; another order of quaternions than their names say, in YAML.
     """
     path, said = Path(path), said or Said()
-    if (found := _of_others(path, said, quaternions)) is not None:
-        return found
+    if (poses_of_others := _of_others(path, said, quaternions)) is not None:
+        return poses_of_others
     if said.options():
         raise InputError(
             "E-OPTION-NEEDS", f"robot poses {path}: its columns or keys say all; leave {', '.join(said.options())} out"
@@ -155,23 +162,24 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", said: Said |
 
 
 def _of_others(path: Path, said: Said, quaternions: Order) -> RobotPoses | None:
-    """Of formats of other programs; None of tables, and of data of ROS-Industrial, whose readers follow."""
+    """Returns poses from formats of other programs. Returns None for tables, and for data of ROS-Industrial, whose
+    readers follow."""
     if path.is_dir() and _industrial(path):
         return None
     try:
-        found = read_robot(path, said, "image", quaternions)
+        poses = read_robot(path, said, "image", quaternions)
     except NotToldError:
         if path.suffix.lower() in YAML:  # a list of images and files
             return None
         raise
-    if found is None:
+    if poses is None:
         return None
     where = f"robot poses {path}"
-    return RobotPoses(found.names, found.poses, found.covariance, found.places, where, found.understood, own=False)
+    return RobotPoses(poses.names, poses.poses, poses.covariance, poses.places, where, poses.understood, own=False)
 
 
 def _industrial(folder: Path) -> bool:
-    """Whether a file of the folder has a pose as ROS-Industrial writes it, and all are YAML."""
+    """True if a file of the folder has a pose as ROS-Industrial writes it, and all files are YAML."""
     files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES]
     if any(file.suffix.lower() not in YAML for file in files):
         return False
@@ -186,7 +194,7 @@ def _industrial(folder: Path) -> bool:
 
 
 def _listed(path: Path) -> list[tuple[str, Path]]:
-    """Images and pose files of a list of both, alone or under ``data``."""
+    """Returns the images and pose files in a list of both, alone or under ``data``."""
     content = _yaml(path, f"robot poses {path}")
     rows = content.get("data") if isinstance(content, dict) else content
     form = f"robot poses {path}: no list of pairs `image:` and `pose:`; give these, or the folder of the poses"
@@ -199,7 +207,7 @@ def _listed(path: Path) -> list[tuple[str, Path]]:
 
 
 def _from_yaml(files: list[tuple[str, Path]], where: str) -> RobotPoses:
-    """One pose from each file, by the name of its image."""
+    """Returns one pose from each file, by the name of its image."""
     names, values = [file.name for _, file in files], []
     require_each_once([image for image, _ in files], names, where, "image ")
     for _, file in files:

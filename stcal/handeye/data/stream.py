@@ -1,4 +1,4 @@
-"""The robot's poses as a stream with times, and the pose at the time of an image."""
+"""Streams of the robot's poses with times, and the pose at the time of an image."""
 
 import re
 from collections.abc import Sequence
@@ -14,28 +14,29 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses
 
 LONGEST_S = 0.25
-"""Between two samples a pose is interpolated where they are not farther apart …"""
+"""Largest distance in time of two samples between which a pose is interpolated."""
 TOLERANCE_S = 0.02
-"""… else the nearest sample stands for it within this, if no other tolerance is stated."""
+"""Default tolerance within which the nearest sample replaces a pose that cannot be interpolated."""
 SAME_S = 1e-9
-"""Times that are equal."""
+"""Difference below which times are equal."""
 NANOSECONDS_FROM = Decimal(10) ** 14
 LEAST_STAMP = Decimal(10) ** 8
-"""Whole numbers below are numbers of images, not seconds since 1970."""
+"""Whole numbers below this are numbers of images, not seconds since 1970."""
 STEP = 1e-3
-"""Of a derivative, in spacings of the samples."""
+"""Step of a numerical derivative, in spacings of the samples."""
 WINDOW = 4
-"""Samples of a cubic."""
+"""Number of samples of a cubic."""
 LOO_NOISE = float(np.sqrt(1 + 34 / 36))
-"""By which a sample's noise and that of its four neighbours make it miss their cubic, in σ of one."""
+"""Scatter of a sample about the cubic through its four neighbours, in σ of one sample; it holds the noise of all
+five."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
     """n poses of the flange in order of their times.
 
-    ``seconds`` : (n,) after ``origin``, the first sample's, of the robot's clock; ``base_from_flange`` : n, mm;
-    ``where`` : the file's name.
+    ``seconds`` : (n,) times after ``origin``, the time of the first sample by the robot's clock; ``base_from_flange`` :
+    n, mm; ``where`` : the file's name.
     """
 
     seconds: np.ndarray
@@ -51,12 +52,12 @@ class Stream:
 
     @classmethod
     def of(cls, times: Sequence[Decimal], poses: Poses, where: str) -> "Stream":
-        """In any order.
+        """Returns the stream of samples that may be in any order.
 
         Raises
         ------
         InputError
-            Fewer than two samples, or two of one time.
+            Fewer than two samples, or two samples of one time.
         """
         if len(times) < 2:
             raise InputError(
@@ -72,12 +73,15 @@ class Stream:
         return cls(seconds, poses[order], origin, where)
 
     def after_origin(self, times: Sequence[Decimal]) -> np.ndarray:
-        """(k,) s."""
+        """Returns times (k,) after the origin, in s."""
         return np.array([float(time - self.origin) for time in times])
 
     def at(self, seconds: np.ndarray) -> Poses:
-        """Poses (k,) at times after the origin: of a cubic through the four samples about each (Lagrange), of rotations
-        in the rotation vectors from the sample before. Outside it goes on, and should not be asked."""
+        """Returns poses (k,) at times after the origin, each from a cubic through the four samples about it (Lagrange).
+
+        Rotations are interpolated as rotation vectors from the sample before. Outside the samples the cubic is
+        extrapolated and should not be used.
+        """
         n, width = len(self), min(WINDOW, len(self))
         before = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, n - 2)
         nodes = np.clip(before - 1, 0, n - width)[:, None] + np.arange(width)
@@ -85,50 +89,53 @@ class Stream:
         return self._weighted(before, nodes, weight)
 
     def velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """(k, 6) at times after the origin: of the left perturbation, rad/s and mm/s."""
+        """Returns velocities (k, 6) at times after the origin, of the left perturbation, rad/s and mm/s."""
         step = STEP * self.spacing_s()
         return self.at(seconds + step).difference(self.at(seconds - step)) / (2 * step)
 
     def spacing_s(self) -> float:
-        """Median between samples."""
+        """Returns the median time between samples."""
         return float(np.median(np.diff(self.seconds)))
 
     def rest(self) -> tuple[float, float]:
-        """By how much a sample misses the cubic through its four neighbours (RMS; rad, mm), as σ of one sample where
-        that is noise: interpolation errs less. NaN of fewer than five."""
+        """Returns σ of one sample (rad, mm).
+
+        It is computed from the RMS deviation of samples from the cubic through their four neighbours. It holds where
+        the deviation is noise; the error of interpolation is smaller. Fewer than five samples give NaN.
+        """
         n = len(self)
         if n < WINDOW + 1:
             return float("nan"), float("nan")
-        own = np.arange(2, n - 2)
-        nodes = own[:, None] + np.array([-2, -1, 1, 2])
+        samples = np.arange(2, n - 2)
+        nodes = samples[:, None] + np.array([-2, -1, 1, 2])
         close = self.seconds[nodes[:, -1]] - self.seconds[nodes[:, 0]] <= WINDOW * LONGEST_S
-        own, nodes = own[close], nodes[close]
-        if not len(own):
+        samples, nodes = samples[close], nodes[close]
+        if not len(samples):
             return float("nan"), float("nan")
-        met = self._weighted(own - 1, nodes, _lagrange(self.seconds[nodes], self.seconds[own]))
-        off = self.base_from_flange[own].difference(met).reshape(-1, 2, 3)
-        turn, shift = np.sqrt((off**2).sum(2).mean(0)) / LOO_NOISE
+        interpolated = self._weighted(samples - 1, nodes, _lagrange(self.seconds[nodes], self.seconds[samples]))
+        deviation = self.base_from_flange[samples].difference(interpolated).reshape(-1, 2, 3)
+        turn, shift = np.sqrt((deviation**2).sum(2).mean(0)) / LOO_NOISE
         return float(turn), float(shift)
 
     def travel(self, seconds: np.ndarray, window_s: float) -> tuple[float, float]:
-        """RMS turn (rad) and way (mm) of the flange within a window about each time."""
+        """Returns the RMS rotation (rad) and travel (mm) of the flange within a window about each time."""
         low, high = (np.clip(seconds + s * window_s / 2, 0, self.seconds[-1]) for s in (-1, 1))
-        off = self.at(high).difference(self.at(low)).reshape(-1, 2, 3)
-        turn, way = np.sqrt((off**2).sum(2).mean(0))
+        motion = self.at(high).difference(self.at(low)).reshape(-1, 2, 3)
+        turn, way = np.sqrt((motion**2).sum(2).mean(0))
         return float(turn), float(way)
 
     def _weighted(self, reference: np.ndarray, nodes: np.ndarray, weight: np.ndarray) -> Poses:
-        base = np.asarray(self.base_from_flange.rotation)
-        about = base[reference]
-        turned = base[nodes] @ np.swapaxes(about, 1, 2)[:, None]
+        rotation = np.asarray(self.base_from_flange.rotation)
+        reference_rotation = rotation[reference]
+        turned = rotation[nodes] @ np.swapaxes(reference_rotation, 1, 2)[:, None]
         logs = Rotation.from_matrix(turned.reshape(-1, 3, 3)).as_rotvec().reshape(*nodes.shape, 3)
         turn = Rotation.from_rotvec(np.einsum("kn,kna->ka", weight, logs)).as_matrix()
         place = np.einsum("kn,kna->ka", weight, np.asarray(self.base_from_flange.translation)[nodes])
-        return Poses(turn @ about, place)
+        return Poses(turn @ reference_rotation, place)
 
 
 def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Weights (k, w) of values at nodes (k, w) for the polynomial through them, at (k,)."""
+    """Returns weights (k, w) of values at nodes (k, w) for the polynomial through them, evaluated at (k,)."""
     width = nodes.shape[1]
     weight = np.ones(nodes.shape)
     for i in range(width):
@@ -140,7 +147,8 @@ def _lagrange(nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timed:
-    """``stream`` of the robot's poses; ``seconds`` : (m,) times of the pairs after its origin by the camera's clock."""
+    """``stream`` of the robot's poses; ``seconds`` : (m,) times of the pairs after the stream's origin, by the camera's
+    clock."""
 
     stream: Stream
     seconds: np.ndarray
@@ -148,8 +156,11 @@ class Timed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Taken:
-    """Poses at k times: ``kept`` : (k,) whether there is one; ``base_from_flange`` : of those kept; ``why`` : (k,) why
-    there is none, empty where there is; ``said`` : what was done, in a line."""
+    """Poses at k times.
+
+    ``kept`` : (k,) whether there is a pose; ``base_from_flange`` : poses at the kept times; ``why`` : (k,) reason why
+    there is no pose, empty where there is one; ``said`` : a line on how the poses were found.
+    """
 
     kept: np.ndarray
     base_from_flange: Poses
@@ -158,59 +169,60 @@ class Taken:
 
 
 def taken_at(stream: Stream, seconds: np.ndarray, tolerance_s: float = TOLERANCE_S) -> Taken:
-    """Poses at times (k,) after the stream's origin, interpolated where its samples are close, else of the nearest
-    within the tolerance."""
-    own = stream.seconds
-    after = np.clip(np.searchsorted(own, seconds), 1, len(own) - 1)
+    """Returns poses at times (k,) after the stream's origin. They are interpolated where the samples are close, else
+    taken from the nearest sample within the tolerance."""
+    samples = stream.seconds
+    after = np.clip(np.searchsorted(samples, seconds), 1, len(samples) - 1)
     before = after - 1
-    nearest = np.where(seconds - own[before] <= own[after] - seconds, before, after)
-    away = np.abs(own[nearest] - seconds)
-    inside = (seconds >= own[0]) & (seconds <= own[-1]) & (own[after] - own[before] <= LONGEST_S)
-    near, same = away <= tolerance_s, away < SAME_S
+    nearest = np.where(seconds - samples[before] <= samples[after] - seconds, before, after)
+    gap_s = np.abs(samples[nearest] - seconds)
+    inside = (seconds >= samples[0]) & (seconds <= samples[-1]) & (samples[after] - samples[before] <= LONGEST_S)
+    near, same = gap_s <= tolerance_s, gap_s < SAME_S
     kept = inside | near | same
-    at = np.where(inside & ~same, seconds, own[nearest])
+    at = np.where(inside & ~same, seconds, samples[nearest])
     why = []
     for k, time in enumerate(seconds):
         if kept[k]:
             why.append("")
-        elif own[0] <= time <= own[-1]:
-            gap = own[after[k]] - own[before[k]]
+        elif samples[0] <= time <= samples[-1]:
+            gap = samples[after[k]] - samples[before[k]]
             why.append(
                 f"in a gap of {gap:.3g} s of {stream.where}, {LONGEST_S:g} s allowed; the nearest sample is "
-                f"{away[k]:.3g} s away, {tolerance_s:g} s allowed (--time-tolerance)"
+                f"{gap_s[k]:.3g} s away, {tolerance_s:g} s allowed (--time-tolerance)"
             )
         else:
-            side = "before" if time < own[0] else "after"
+            side = "before" if time < samples[0] else "after"
             why.append(
-                f"{away[k]:.4g} s {side} the samples of {stream.where}, {tolerance_s:g} s allowed (--time-tolerance)"
+                f"{gap_s[k]:.4g} s {side} the samples of {stream.where}, {tolerance_s:g} s allowed (--time-tolerance)"
             )
     counts = int(same.sum()), int((inside & ~same).sum()), int((kept & ~inside & ~same).sum())
     parts = [f"{counts[0]} at a sample"] if counts[0] else []
     if counts[1]:
         turn, shift = stream.rest()
-        rest = "" if np.isnan(turn) else f", each within {shift:.2g} mm and {np.degrees(turn):.2g}° of the others"
-        parts.append(f"{counts[1]} interpolated (cubic; samples {stream.spacing_s():.3g} s apart{rest})")
+        noise = "" if np.isnan(turn) else f", each within {shift:.2g} mm and {np.degrees(turn):.2g}° of the others"
+        parts.append(f"{counts[1]} interpolated (cubic; samples {stream.spacing_s():.3g} s apart{noise})")
     if counts[2]:
-        farthest = away[kept & ~inside & ~same].max()
+        farthest = gap_s[kept & ~inside & ~same].max()
         parts.append(f"{counts[2]} by the nearest sample, up to {farthest:.3g} s away ({tolerance_s:g} s allowed)")
     if len(seconds) > kept.sum():
         parts.append(f"{len(seconds) - int(kept.sum())} left out")
-    said = f"poses by time: {len(seconds)} times in {len(own)} samples of {stream.where}: {', '.join(parts)}"
-    return Taken(kept, stream.at(at[kept]) if kept.any() else Poses.of([]), tuple(why), said)
+    message = f"poses by time: {len(seconds)} times in {len(samples)} samples of {stream.where}: {', '.join(parts)}"
+    return Taken(kept, stream.at(at[kept]) if kept.any() else Poses.of([]), tuple(why), message)
 
 
 def stamps_of(names: Sequence[str]) -> list[Decimal] | None:
-    """Times that names are, s; None where one is none, or all are whole numbers as of a count of images."""
-    found = [time_of(name) for name in names]
-    times = [time for time in found if time is not None]
-    if not times or len(times) < len(found):
+    """Returns the times that names mean, in s. Returns None where a name is not a time, or where all are whole numbers
+    that may count images."""
+    parsed = [time_of(name) for name in names]
+    times = [time for time in parsed if time is not None]
+    if not times or len(times) < len(parsed):
         return None
     fraction = any(re.search(r"\d\.\d", name) for name in names)
     return times if fraction or max(abs(time) for time in times) >= LEAST_STAMP else None
 
 
 def time_of(name: str) -> Decimal | None:
-    """Seconds; numbers of nanoseconds as seconds too."""
+    """Returns the time that a name means, in s, also from a number of nanoseconds; None where it is not a time."""
     try:
         value = Decimal(stem_of(name) if not re.fullmatch(r"[-+\d.eE]+", name) else name)
     except InvalidOperation:
@@ -221,5 +233,5 @@ def time_of(name: str) -> Decimal | None:
 
 
 def stem_of(name: str) -> str:
-    last = PurePosixPath(name.replace("\\", "/")).name
-    return last.rsplit(".", 1)[0] if re.search(r"\.[A-Za-z]\w{1,4}$", last) else last
+    file_name = PurePosixPath(name.replace("\\", "/")).name
+    return file_name.rsplit(".", 1)[0] if re.search(r"\.[A-Za-z]\w{1,4}$", file_name) else file_name

@@ -1,4 +1,4 @@
-"""What the camera saw of the board: corners in images, and the board's pose in each by itself."""
+"""Views of the board: corners in images, and the board's pose in each image by itself."""
 
 from dataclasses import dataclass, replace
 
@@ -14,8 +14,8 @@ from stcal.handeye.data.pairs import HandEyePoses
 
 LEAST_CORNERS = 4
 SAME_COSINE, APART = 1 - 1e-9, 0.02
-"""Corners are of one plane where their normals are the same and no gap in height is more than this share of the view's
-extent; the pose only starts from there."""
+"""Limits for corners of one plane: their normals agree to this cosine, and no gap in height exceeds this share of the
+view's extent. Only the start of the pose depends on them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,13 +25,13 @@ class View:
     Parameters
     ----------
     xyz_board : (k, 3) array
-        Their places on the board, mm; k ≥ 4, not all on a line.
+        Places on the board, mm; k ≥ 4, not all on a line.
     xy_px : (k, 2) array
-        Where they were seen, px, lens distortion in them.
+        Places in the image, px, with lens distortion.
     covariance : (k, 2, 2) array, optional
-        Of ``xy_px``, px², known up to a common factor. Without it all weigh alike.
+        Covariances of ``xy_px``, px², known up to a common factor. Without it, all corners have equal weight.
     normal : (k, 3) array, optional
-        Unit normals of the planes that the corners lie in, of several boards in one frame. Without it, Z of all.
+        Unit normals of the planes that the corners lie in, for several boards in one frame. Without it, Z for all.
     """
 
     xyz_board: np.ndarray
@@ -52,20 +52,20 @@ class View:
         return len(self.xyz_board)
 
     def normals(self) -> np.ndarray:
-        """(k, 3) of the planes that the corners lie in."""
+        """Returns the normals (k, 3) of the planes that the corners lie in."""
         return np.tile([0.0, 0.0, 1.0], (len(self), 1)) if self.normal is None else self.normal
 
     def moved(self, xyz_board: np.ndarray) -> "View":
-        """The same corners, elsewhere on the board."""
+        """Returns the same corners at other places on the board."""
         return replace(self, xyz_board=xyz_board)
 
     def turned(self, turn: Rigid) -> "View":
-        """The same corners after a turn of the board."""
+        """Returns the same corners after a rotation of the board."""
         normal = None if self.normal is None else self.normal @ turn.rotation.T
         return replace(self, xyz_board=turn @ self.xyz_board, normal=normal)
 
     def whitening(self) -> np.ndarray:
-        """(k, 2, 2): makes the covariance of errors 1."""
+        """Returns matrices (k, 2, 2) that transform the covariance of the errors to the identity."""
         if self.covariance is None:
             return np.tile(np.eye(2), (len(self), 1, 1))
         return np.linalg.inv(np.linalg.cholesky(self.covariance))
@@ -78,9 +78,9 @@ class Views:
     Parameters
     ----------
     camera : Camera
-        That took them.
+        Camera that took the views.
     views : tuple of View
-        m of them, in order of the poses.
+        m views, in the order of the poses.
     """
 
     camera: Camera
@@ -90,11 +90,11 @@ class Views:
         return len(self.views)
 
     def __getitem__(self, index) -> "Views":
-        """Views by a mask, slice or list."""
+        """Returns the views selected by a mask, slice or list."""
         return Views(self.camera, tuple(self.views[i] for i in np.arange(len(self))[index]))
 
     def corners(self) -> int:
-        """Number in all views."""
+        """Returns the number of corners in all views."""
         return sum(len(view) for view in self.views)
 
 
@@ -109,7 +109,7 @@ class Resection:
 
 
 def resect(views: Views, names: tuple[str, ...]) -> Resection:
-    """Pose of the board in each view by itself, of least reprojection error.
+    """Returns the pose of the board in each view by itself, of least reprojection error.
 
     Raises
     ------
@@ -118,10 +118,10 @@ def resect(views: Views, names: tuple[str, ...]) -> Resection:
     """
     poses, normals, cost = [], [], 0.0
     for view, name in zip(views.views, names, strict=True):
-        found = _pose_of(view, views.camera, name)
-        poses.append(found.state)
-        normals.append(found.linear.normal)
-        cost += found.linear.cost
+        minimum = _pose_of(view, views.camera, name)
+        poses.append(minimum.state)
+        normals.append(minimum.linear.normal)
+        cost += minimum.linear.cost
     redundancy = 2 * views.corners() - 6 * len(views)
     variance = cost / redundancy if redundancy else 1.0
     covariance = variance * np.linalg.inv(np.array(normals))
@@ -131,18 +131,18 @@ def resect(views: Views, names: tuple[str, ...]) -> Resection:
 def pairs_of_views(
     base_from_flange: Poses, views: Views, names: tuple[str, ...] = (), where: str = "views"
 ) -> HandEyePoses:
-    """Pose pairs of which the board's poses, with their covariances, come from the corners of each view.
+    """Returns pose pairs whose poses of the board, with their covariances, come from the corners of each view.
 
     Parameters
     ----------
     base_from_flange : Poses
-        m of them, mm, as the robot states them.
+        m poses, mm, as the robot states them.
     views : Views
-        m of them, in the same order.
+        m views, in the same order.
     names : tuple of str
-        What each pair is called in messages; ``pose 1`` … where none are given.
+        Name of each pair in messages; ``pose 1`` … where no names are given.
     where : str
-        What the views were read from, for messages.
+        Source of the views, for messages.
 
     Returns
     -------
@@ -161,12 +161,12 @@ def pairs_of_views(
             f"{where}: {len(base_from_flange)} poses of the flange and {len(views)} views; pairs needed",
         )
     names = names or tuple(f"pose {i}" for i in range(1, len(views) + 1))
-    found = resect(views, names)
-    return HandEyePoses(base_from_flange, found.camera_from_board, None, found.covariance, names, where)
+    resection = resect(views, names)
+    return HandEyePoses(base_from_flange, resection.camera_from_board, None, resection.covariance, names, where)
 
 
 def project_jacobian(camera: Camera, xyz_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (n, 2) of points (n, 3) in the camera's frame, and their derivative (n, 2, 3)."""
+    """Returns pixels (n, 2) of points (n, 3) in the camera's frame, and their derivative (n, 2, 3)."""
     depth = xyz_camera[:, 2:]
     xy = xyz_camera[:, :2] / depth
     distorted, by_ideal = camera.distort_jacobian(xy)
@@ -177,7 +177,8 @@ def project_jacobian(camera: Camera, xyz_camera: np.ndarray) -> tuple[np.ndarray
 
 
 def whitened(view: View, camera: Camera, camera_from_board: Rigid) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (2k,) of a view's corners in units of their σ, and their derivative (2k, 6) by the board's pose."""
+    """Returns residuals (2k,) of a view's corners in units of their σ, and their derivative (2k, 6) by the board's
+    pose."""
     weight = view.whitening()
     rotated = view.xyz_board @ camera_from_board.rotation.T
     px, by_point = project_jacobian(camera, rotated + camera_from_board.translation)
@@ -192,30 +193,30 @@ def _pose_of(view: View, camera: Camera, name: str) -> Minimum[Rigid, NormalEqua
         )
     starts = _starts(view, camera.normalised_from_pixel(view.xy_px))
     if not starts:
-        of = (
+        fault = (
             "the corners seen lie"
             if view.normal is None
             else "the corners seen of each board are fewer than four or lie"
         )
-        raise DegenerateError("E-VIEW-CORNERS", f"{name}: {of} on a line; take the image out")
+        raise DegenerateError("E-VIEW-CORNERS", f"{name}: {fault} on a line; take the image out")
 
     def linearise(pose: Rigid) -> NormalEquations:
         if ((view.xyz_board @ pose.rotation[2] + pose.translation[2]) <= 0).any():
             return NormalEquations.impossible(6)
         return NormalEquations.of(*whitened(view, camera, pose))
 
-    found = [minimise(start, linearise, perturbed) for start in starts]
-    best = min(found, key=lambda each: (not each.converged, each.linear.cost))
+    minima = [minimise(start, linearise, perturbed) for start in starts]
+    best = min(minima, key=lambda minimum: (not minimum.converged, minimum.linear.cost))
     return best.required(name, "take the image out")
 
 
 def _starts(view: View, seen: np.ndarray) -> list[Rigid]:
-    """camera_from_board by the homography of each plane with four corners or more."""
+    """Returns camera_from_board by the homography of each plane with four corners or more."""
     starts = []
-    for own, board_from_plane in _planes(view):
-        xyz = board_from_plane.inverse() @ view.xyz_board[own]
+    for rows, board_from_plane in _planes(view):
+        xyz = board_from_plane.inverse() @ view.xyz_board[rows]
         try:
-            homography = fit_homography(xyz[:, :2], seen[own])
+            homography = fit_homography(xyz[:, :2], seen[rows])
         except DegenerateError:
             continue
         starts.append(camera_from_plane(homography) @ board_from_plane.inverse())
@@ -223,30 +224,30 @@ def _starts(view: View, seen: np.ndarray) -> list[Rigid]:
 
 
 def _planes(view: View) -> list[tuple[np.ndarray, Rigid]]:
-    """Rows of the corners of each plane that has enough, and its frame, Z the normal, as board_from_plane.
+    """Returns the rows of the corners of each plane that has enough of them, and board_from_plane, with Z the normal.
 
-    Adjusted corners leave their plane by a little: one plane ends where the next corner is far above.
+    Adjusted corners leave their plane by a little. A plane therefore ends only where the next corner is far above it.
     """
-    normals, found = view.normals(), []
+    normals, planes = view.normals(), []
     extent = np.linalg.norm(np.ptp(view.xyz_board, axis=0))
-    left = np.ones(len(view), bool)
-    while left.any():
-        normal = normals[left][0]
-        alike = np.flatnonzero(left & (normals @ normal > SAME_COSINE))
-        left[alike] = False
+    open_rows = np.ones(len(view), bool)
+    while open_rows.any():
+        normal = normals[open_rows][0]
+        alike = np.flatnonzero(open_rows & (normals @ normal > SAME_COSINE))
+        open_rows[alike] = False
         height = view.xyz_board[alike] @ normal
         order = np.argsort(height, kind="stable")
         steps = np.flatnonzero(np.diff(height[order]) > APART * extent) + 1
-        for part in np.split(order, steps):
-            if len(part) >= LEAST_CORNERS:
-                own = np.sort(alike[part])
+        for group in np.split(order, steps):
+            if len(group) >= LEAST_CORNERS:
+                rows = np.sort(alike[group])
                 turn = _turn_to(normal)
-                found.append((own, Rigid(turn, turn @ [0, 0, height[part].mean()])))
-    return found
+                planes.append((rows, Rigid(turn, turn @ [0, 0, height[group].mean()])))
+    return planes
 
 
 def _turn_to(normal: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) that takes Z to a unit vector; none where it is Z."""
+    """Returns a rotation (3, 3) that takes Z to a unit vector; the identity where the vector is Z."""
     if normal[2] > SAME_COSINE:
         return np.eye(3)
     across = np.cross(normal, np.eye(3)[int(np.abs(normal).argmin())])

@@ -1,1 +1,1 @@
-"""What the poses can tell, which conventions they follow, and what should be known about a solution."""
+"""Judgement of poses and solutions: observability, conventions, and notes on a solution."""

@@ -1,4 +1,4 @@
-"""What a note weighs: one of these words in place of a plain string, wherever notes are only read as text."""
+"""Classes of notes by weight. They stand in place of a plain string where notes are otherwise only read as text."""
 
 
 class Grave(str):
@@ -8,6 +8,6 @@ class Grave(str):
 
 
 class Aside(str):
-    """A note that takes nothing from the result, or whose matter the verdict judges by itself."""
+    """A note that takes nothing from the result, or whose subject the verdict judges by itself."""
 
     __slots__ = ()

@@ -1,4 +1,4 @@
-"""What a set of poses can tell about X: the axes about which the flange turned, and the motion that is missing."""
+"""Observability of X from a set of poses: the axes about which the flange turned, and the motion that is missing."""
 
 from dataclasses import dataclass
 
@@ -12,38 +12,39 @@ from stcal.io.table import LENGTHS, UNIT_WORDS
 
 UNITS = {words: LENGTHS[unit] for unit, words in UNIT_WORDS.items()}
 SAME_UNIT = 0.05
-"""Logarithm by which a size may be off the ratio of two units."""
+"""Largest difference of logarithms between a size and the ratio of two units that it is taken for."""
 LARGEST_SCALE = 5.0
-"""Nobody misses a board's size by more, but by a unit."""
+"""Largest plausible factor between a board's real and stated size; a larger one is an error of the unit."""
 SCALE_SEEN = 36.0
-"""Times the number of poses: the information on a scale that counts. Errors of the camera's translations alone look
-like three to a pose, and by that share, a twelfth, a scale would be too small at this limit."""
+"""Information on a scale, per pose, above which the scale counts as observed. Errors of the camera's translations alone
+look like an information of three per pose; at this limit the scale is too small by that share, a twelfth."""
 COMMON_RAD, COMMON_MM = 1e-3, 0.5
-"""Errors of a common camera's poses at half a metre, with which is judged whether poses are of any use."""
+"""σ of the poses of a common camera at half a metre, by which the usefulness of a set of poses is judged."""
 USELESS_RAD, USELESS_MM = np.radians(5), 50.0
-"""A hand-eye transform that is not known better than so (σ) from such poses is not worth having."""
+"""σ of a hand-eye transform from such poses, beyond which the transform is not worth having."""
 WANTED_DEG = 30
-"""Rotations of this size between poses make σ of the translation about that of a pose."""
+"""Size of rotations between poses that makes σ of X's translation about that of a pose."""
 LEAST_TURN = np.radians(5)
-"""Of a robot of four axes, RMS."""
+"""Smallest RMS rotation of a robot of four axes."""
 LEAST_POSES = 3
 MOST_PAIRS = 100_000
-"""Of poses, by which the principal axes are judged; of more poses than 450 some pairs, drawn at random."""
+"""Number of pairs of poses from which the principal axes are computed. More than 450 poses have more pairs; these are
+then drawn at random."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observability:
-    """How well a loop of m poses determines X.
+    """Measures of how well a loop of m poses determines X.
 
     Parameters
     ----------
     turns_rad : (3,) array
-        RMS rotations between poses about ``axes``, falling: singular values of the stacked log R_A over √(number of
-        motions). The second one is 0 where all axes are parallel: X then slides along the axis.
+        RMS rotations between poses about ``axes``, in descending order: singular values of the stacked log R_A over
+        √(number of motions). The second one is 0 where all axes are parallel: X then slides along the axis.
     axes : (3, 3) array
         Rows: the principal axes of all rotations, in the flange's frame.
     mount_axis : (3,) array
-        The first of them in the mount's frame.
+        The first principal axis in the mount's frame.
     sigma_rad, sigma_mm : float
         σ of the worst direction of X from poses of a common camera (:data:`COMMON_RAD`, :data:`COMMON_MM`); infinite
         where it is not determined.
@@ -61,7 +62,7 @@ class Observability:
 
     @classmethod
     def of(cls, loop: Loop) -> "Observability":
-        """Of the poses of a loop, at least two; X itself is not needed."""
+        """Returns the observability of a loop of at least two poses. X itself is not needed."""
         flange = loop.stand_from_mount.rotation
         base_from_flange = np.swapaxes(flange, 1, 2) if loop.inverted else flange
         turns, axes = _principal(np.swapaxes(base_from_flange, 1, 2))  # flange_j_from_flange_i
@@ -71,16 +72,16 @@ class Observability:
 
     @property
     def useless(self) -> bool:
-        """Whether no answer is worth having."""
+        """True if no estimate of X from these poses is worth having."""
         return self.sigma_rad > USELESS_RAD or self.sigma_mm > USELESS_MM
 
     @property
     def one_axis(self) -> bool:
-        """Whether what is missing are rotations about a second axis."""
+        """True if rotations about a second axis are missing."""
         return bool(self.turns_rad[1] < 0.1 * self.turns_rad[0])
 
     def missing(self) -> str:
-        """The motion that would help, in words."""
+        """Returns the motion that would help, in words."""
         turns, first = np.degrees(self.turns_rad), in_words(self.axes[0])
         if self.one_axis and self.turns_rad[0] > LEAST_TURN:
             return (
@@ -94,12 +95,12 @@ class Observability:
 
 
 def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability:
-    """Refuse what cannot be solved.
+    """Refuse a loop that cannot be solved, and return its observability.
 
     Raises
     ------
     DegenerateError
-        Fewer than three poses, rotations about one axis only (unless ``four_dof``), or none.
+        Fewer than three poses, rotations about one axis only (unless ``four_dof``), or no rotations.
     """
     if len(loop) < LEAST_POSES:
         raise DegenerateError(
@@ -107,39 +108,41 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
             f"{where}: {len(loop)} poses, {LEAST_POSES} needed and 10 wanted; rotate the flange about two axes of its "
             f"own, by {WANTED_DEG}° or more, and take more",
         )
-    found = Observability.of(loop)
+    observability = Observability.of(loop)
     if four_dof:
-        turns = _list(np.degrees(found.turns_rad))
-        if found.turns_rad[0] < LEAST_TURN:
+        turns = _list(np.degrees(observability.turns_rad))
+        if observability.turns_rad[0] < LEAST_TURN:
             raise DegenerateError(
                 "E-HANDEYE-AXES",
                 f"{where}: the flange turns by {turns}° (RMS) about its principal axes; "
-                f"rotate it about {in_words(found.axes[0])} by {WANTED_DEG}° or more",
+                f"rotate it about {in_words(observability.axes[0])} by {WANTED_DEG}° or more",
             )
-        if not found.one_axis:
+        if not observability.one_axis:
             raise DegenerateError(
                 "E-HANDEYE-AXES",
                 f"{where}: the flange turns by {turns}° (RMS) about its principal axes, "
                 "that of a robot of four axes about one only; leave four_dof out",
             )
-    elif found.useless:
+    elif observability.useless:
         slides = f"; a robot of four axes cannot: with four_dof all but {FRAMES[setup].camera} along that axis is found"
-        raise DegenerateError("E-HANDEYE-AXES", f"{where}: {found.missing()}{slides if found.one_axis else ''}")
-    return found
+        raise DegenerateError(
+            "E-HANDEYE-AXES", f"{where}: {observability.missing()}{slides if observability.one_axis else ''}"
+        )
+    return observability
 
 
 def scale_is_seen(scale: float, sigma: float, poses: int) -> bool:
-    """Whether a scale, solved for with this σ, is more than what noise makes of it."""
+    """True if a scale, solved for with this σ, is more than what noise makes of it."""
     return scale > 0 and (scale / sigma) ** 2 > SCALE_SEEN * poses
 
 
 def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
-    """Refuse one that is not seen.
+    """Refuse a scale that the motions do not determine, or that is implausible.
 
     Raises
     ------
     DegenerateError
-        How far the flange moves, and that it should move farther.
+        The message says how far the flange moves, and that it should move farther.
     """
     if scale_is_seen(scale, sigma, len(loop)):
         if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:
@@ -160,7 +163,7 @@ def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
 
 
 def unit_of(scale: float) -> str:
-    """What a scale looks like that is the ratio of two units."""
+    """Returns the words for a scale that looks like the ratio of two units; empty for any other scale."""
     for unit, factor in UNITS.items():
         if abs(np.log(scale / factor)) < SAME_UNIT:
             return f", as if its lengths were in {unit}"
@@ -170,7 +173,8 @@ def unit_of(scale: float) -> str:
 
 
 def _principal(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """RMS angles (3,) about principal axes (3, 3), in rows, of R_j R_iᵀ between all pairs of rotations (m, 3, 3)."""
+    """Returns the RMS angles (3,) about the principal axes (3, 3), in rows, of R_j R_iᵀ between all pairs of rotations
+    (m, 3, 3)."""
     i, j = np.triu_indices(len(rotations), 1)
     if len(i) > MOST_PAIRS:
         some = np.random.default_rng(0).choice(len(i), MOST_PAIRS, replace=False)
@@ -183,22 +187,22 @@ def _principal(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _worst(loop: Loop) -> tuple[float, float]:
-    """Largest σ of X's rotation (rad) and translation (mm) from poses of a common camera.
+    """Returns the largest σ of X's rotation (rad) and translation (mm) from poses of a common camera.
 
-    Two steps: the rotation from rotations alone, then the translation with the rotation known. Both depend on how the
-    robot turned, not on X.
+    X is found in two steps: the rotation from rotations alone, then the translation with the rotation known. Both σ
+    depend on how the robot turned, not on X.
     """
     turn = loop.stand_from_mount.rotation
     m, mean = len(turn), turn.mean(0)
     # Σ over poses of the information on w_X in R_G w_X − w_Z, with w_Z eliminated; the same for translations.
-    spare = np.maximum(np.linalg.eigvalsh(m * (np.eye(3) - mean.T @ mean))[0], 0)
-    if spare < 1e-12 * m:
+    information = np.maximum(np.linalg.eigvalsh(m * (np.eye(3) - mean.T @ mean))[0], 0)
+    if information < 1e-12 * m:
         return np.inf, np.inf
-    return float(COMMON_RAD / np.sqrt(spare)), float(COMMON_MM / np.sqrt(spare))
+    return float(COMMON_RAD / np.sqrt(information)), float(COMMON_MM / np.sqrt(information))
 
 
 def in_words(axis: np.ndarray) -> str:
-    """A direction, to two digits."""
+    """Returns a direction in words, to two digits."""
     return f"({_list(axis + 0.0)})"
 
 

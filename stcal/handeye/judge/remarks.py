@@ -1,4 +1,4 @@
-"""What should be known about a solution: poses that do not fit, wrong σ, a board or units that are not as stated."""
+"""Notes on a solution: poses that do not fit, wrong σ, a board or units that are not as stated."""
 
 import numpy as np
 from scipy.stats import chi2
@@ -13,41 +13,43 @@ from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
 from stcal.handeye.methods.start import robust
 
 SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
-"""A board's size is doubted beyond so many σ, and a share that matters: 0.5 mm at half a metre."""
+"""Number of σ, and relative deviation, beyond which a board's size is doubted; the latter is 0.5 mm at half a metre."""
 HINTED = 2.0
-"""So many σ of one step's scale have it solved for: a wrong size makes these σ itself, and of few poses all of them."""
+"""Number of σ by which one step must change the scale before it is solved for. The limit is low, since a wrong size
+inflates these σ, and with few poses all of them."""
 MANY = 0.25
-"""Share of the poses that may be bad before something else is suspected."""
+"""Share of bad poses above which something else is suspected."""
 LEAST_IN_GROUPS, APART = 10, 0.9
-"""Poses, and share of their scatter along its main direction that two groups explain: 0.64 of normal errors (2/π), and
-0.8 of a dozen of them at the most."""
+"""Least number of poses, and the share of their scatter along its main direction that two groups must explain. Two
+halves of normal errors explain 0.64 (2/π), and at most 0.8 of a dozen of them."""
 NEAR_MM = 20.0
-"""No camera sees a board from so near."""
+"""Distance, in mm, below which no camera sees a board."""
 
 
 def of_outliers(names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray) -> tuple[str, ...]:
-    """Poses left out (m,), with their residuals (m, 6)."""
-    found = []
+    """Returns notes on the poses that were left out, (m,), with their residuals (m, 6)."""
+    notes = []
     for i in np.flatnonzero(outliers):
         turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
-        found.append(Aside(f"{names[i]} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out"))
+        notes.append(Aside(f"{names[i]} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out"))
     if outliers.mean() > MANY:
-        found.append(
+        notes.append(
             Grave(
                 f"{outliers.sum()} of {len(outliers)} poses contradict the others: with so many look first for a wrong "
                 "setup, for poses of the robot beside those of other images, and for a camera file that does not fit"
             )
         )
-    return tuple(found)
+    return tuple(notes)
 
 
 def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
-    """Whether poses with these residuals (m, 6) fall into two groups, as of a board that was moved in between."""
+    """Returns a note if poses with these residuals (m, 6) fall into two groups, as they do when a board is moved in
+    between."""
     if len(names) < LEAST_IN_GROUPS:
         return ()
     for columns, unit, word in ((slice(0, 3), np.degrees(1.0), "°"), (slice(3, 6), 1.0, " mm")):
-        own = residuals[:, columns] - residuals[:, columns].mean(0)
-        along = own @ np.linalg.svd(own, full_matrices=False)[2][0]
+        centred = residuals[:, columns] - residuals[:, columns].mean(0)
+        along = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
         order, m = np.argsort(along), len(along)
         first = np.arange(max(3, m // 5), m - max(3, m // 5) + 1)
         below = np.cumsum(along[order])[first - 1]
@@ -65,14 +67,14 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
 
 
 def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, ...]:
-    """Where the board is of another size than stated: ``hint`` is what one step makes of its scale, with σ."""
+    """Returns a note if the board is of another size than stated. ``hint`` is the scale after one step, with its σ."""
     if not _is_other(*hint, HINTED):
         return ()
-    try:  # the step is a large one
-        found = adjust_poses(loop, LoopState(*robust(loop, with_scale=True)), noise, with_scale=True)
+    try:  # the hint comes from one large step, so the scale is solved for
+        solution = adjust_poses(loop, LoopState(*robust(loop, with_scale=True)), noise, with_scale=True)
     except StcalError:
         return ()
-    scale, sigma = found.state.scale, float(np.sqrt(generalised_inverse(found.normal)[12, 12]))
+    scale, sigma = solution.state.scale, float(np.sqrt(generalised_inverse(solution.normal)[12, 12]))
     if not (_is_other(scale, sigma, SIZE_SIGMAS) and scale_is_seen(scale, sigma, len(loop))):
         return ()
     return (
@@ -88,24 +90,25 @@ def _is_other(scale: float, sigma: float, sigmas: float) -> bool:
 
 
 def of_distance(loop: Loop) -> tuple[str, ...]:
-    """Where all lengths are of another unit, which no equation shows."""
+    """Returns a note if all lengths are in another unit, which no equation shows."""
     away = float(np.median(np.linalg.norm(loop.camera_from_board.translation, axis=1)))
     if away >= NEAR_MM:
         return ()
-    said = f"the board is {away:.2g} mm from the camera (median): if lengths are in metres, name the columns _m"
-    return (Grave(said),)
+    message = f"the board is {away:.2g} mm from the camera (median): if lengths are in metres, name the columns _m"
+    return (Grave(message),)
 
 
 def of_rounds(settled: bool) -> tuple[str, ...]:
-    """Where the σ that are estimated from the residuals, or the poses taken to be good, still change at the end."""
+    """Returns a note if the σ that are estimated from the residuals, or the set of poses taken to be good, still change
+    at the end."""
     if settled:
         return ()
     return ("the estimated σ, or the set of outliers, did not settle: state those σ that are known, or add poses",)
 
 
 def of_variance(factor: float, redundancy: int) -> tuple[str, ...]:
-    """Where the residuals are not what stated σ make expect: ``factor`` is the mean square in units of σ, over
-    this ``redundancy``."""
+    """Returns a note if the residuals are not as large as the stated σ make expect. ``factor`` is the mean square of
+    the residuals in units of σ, over this ``redundancy``."""
     low, high = chi2.ppf([0.0005, 0.9995], redundancy) / redundancy
     if low <= factor <= high:
         return ()

@@ -1,4 +1,5 @@
-"""Boards that look the same after a turn: views that were numbered from another end, found from the robot's motion."""
+"""Boards that look the same after a rotation: views that were numbered from another end, found from the robot's
+motion."""
 
 from dataclasses import dataclass, replace
 
@@ -17,15 +18,15 @@ ROUNDS = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Repair:
-    """``pairs`` : m, the board's poses as if all had been numbered alike; ``views`` : the same, where given;
-    ``turned`` : (m,) which of the symmetries each was turned by, counted from 1; 0 where it stayed."""
+    """``pairs`` : m, the board's poses as if all views had been numbered alike; ``views`` : the same, where given;
+    ``turned`` : (m,) number, from 1, of the symmetry that each view was turned by; 0 where the view stayed."""
 
     pairs: HandEyePoses
     views: Views | None
     turned: np.ndarray
 
     def notes(self) -> tuple[str, ...]:
-        """Which views were turned."""
+        """Returns a note that names the turned views."""
         names = [name for name, turn in zip(self.pairs.names, self.turned, strict=True) if turn]
         if not names:
             return ()
@@ -35,13 +36,13 @@ class Repair:
 def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], views: Views | None = None) -> Repair:
     """Give all views the same numbering of a symmetric board.
 
-    Between two poses robot and camera turn by the same angle, and advance by the same length along the axis, whatever X
-    is: that tells which numberings belong together. The most common numbering is kept.
+    Between two poses, robot and camera turn by the same angle and advance by the same length along the axis, whatever X
+    is. This tells which numberings belong together. The most common numbering is kept.
 
     Parameters
     ----------
     symmetries : tuple of Rigid
-        All board_from_board that leave the look of the board as it is, but for the identity.
+        All board_from_board but the identity that leave the look of the board as it is.
 
     Raises
     ------
@@ -49,8 +50,8 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
         Fewer than three poses.
     """
     loop, every = Loop.of(pairs, setup), (Rigid(), *symmetries)
-    seen = loop.camera_from_board
-    variants = [seen @ turn for turn in every]
+    as_numbered = loop.camera_from_board
+    variants = [as_numbered @ turn for turn in every]
     best, least = np.zeros(len(loop), int), np.inf
     for labels in np.unique(_guesses(loop, variants), axis=0):
         labels, cost = _settled(loop, variants, labels)
@@ -60,7 +61,7 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
     poses = Poses.of(variants[k][i] for i, k in enumerate(best))
     covariance = pairs.camera_from_board_covariance
     if covariance is not None:
-        covariance = _carried(covariance, seen, poses)
+        covariance = _carried(covariance, as_numbered, poses)
     repaired = replace(pairs, camera_from_board=poses, camera_from_board_covariance=covariance)
     if views is not None:
         turned = (turned_view(view, every[k]) for view, k in zip(views.views, best, strict=True))
@@ -69,24 +70,26 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
 
 
 def _guesses(loop: Loop, variants: list[Poses]) -> np.ndarray:
-    """Labels (m, m): seen from each pose as the reference, the numbering that agrees best with the robot's motion."""
+    """Returns labels (m, m). Each row holds, with one pose as the reference, the numbering of every pose that agrees
+    best with the robot's motion."""
     hand, m = loop.stand_from_mount, len(loop)
     labels = np.zeros((m, m), int)
     for reference in range(m):
         by_robot = _invariants(hand.inverse() @ hand[reference])
-        away = []
+        misfits = []
         for variant in variants:
             by_camera = _invariants(variant @ variants[0][reference].inverse())
-            # Angles weigh by the distance of the board: then both are millimetres.
+            # Angles are multiplied by the distance of the board, so that both terms are in mm.
             reach = np.linalg.norm(variant.translation, axis=1)
-            away.append(np.hypot((by_robot - by_camera)[:, 0] * reach, (by_robot - by_camera)[:, 1]))
-        labels[reference] = np.argmin(away, axis=0)
+            misfits.append(np.hypot((by_robot - by_camera)[:, 0] * reach, (by_robot - by_camera)[:, 1]))
+        labels[reference] = np.argmin(misfits, axis=0)
         labels[reference, reference] = 0
     return labels
 
 
 def _invariants(motions: Poses) -> np.ndarray:
-    """Angle (rad) and advance along the axis (mm) of motions, (m, 2): the same for A and B where AX = XB."""
+    """Returns the angle (rad) and the advance along the axis (mm) of motions, (m, 2). They are the same for A and B
+    where AX = XB."""
     log = Rotation.from_matrix(np.array(motions.rotation)).as_rotvec()
     angle = np.linalg.norm(log, axis=1)
     axis = log / np.maximum(angle, 1e-12)[:, None]
@@ -95,7 +98,7 @@ def _invariants(motions: Poses) -> np.ndarray:
 
 
 def _settled(loop: Loop, variants: list[Poses], labels: np.ndarray) -> tuple[np.ndarray, float]:
-    """Labels that fit the solution they lead to, and the sum of their residuals, mm."""
+    """Returns labels that fit the solution they lead to, and the sum of their residuals, mm."""
     for _ in range(ROUNDS):
         chosen = replace(loop, camera_from_board=Poses.of(variants[k][i] for i, k in enumerate(labels)))
         x, z, _ = start.robust(chosen)
@@ -112,25 +115,26 @@ def _settled(loop: Loop, variants: list[Poses], labels: np.ndarray) -> tuple[np.
 
 
 def _most_as_they_are(labels: np.ndarray, every: tuple[Rigid, ...]) -> np.ndarray:
-    """The same numbering up to one turn of all, by which most views stay as they are."""
+    """Returns the same numbering after one turn of all views, chosen so that most views stay as they are."""
     common = int(np.bincount(labels).argmax())
-    back = every[common].inverse()
-    # label k of a view means C S_k; all turned by S_common⁻¹ from the right: S_k S_common⁻¹, again one of the group.
-    return np.array([_nearest(every[k] @ back, every) for k in labels])
+    common_inverse = every[common].inverse()
+    # Label k of a view means C S_k. All are turned by S_common⁻¹ from the right; S_k S_common⁻¹ is again in the group.
+    return np.array([_nearest(every[k] @ common_inverse, every) for k in labels])
 
 
 def _nearest(turn: Rigid, every: tuple[Rigid, ...]) -> int:
-    away = [Rigid(each.rotation.T @ turn.rotation).angle_rad() for each in every]
-    return int(np.argmin(away))
+    angles = [Rigid(symmetry.rotation.T @ turn.rotation).angle_rad() for symmetry in every]
+    return int(np.argmin(angles))
 
 
 def _carried(covariance: np.ndarray, seen: Poses, poses: Poses) -> np.ndarray:
-    """Covariances of camera_from_board when its origin moves on the board: the rotation's error moves it too."""
-    by = np.tile(np.eye(6), (len(poses), 1, 1))
-    by[:, 3:, :3] = -skew(poses.translation - seen.translation)
-    return by @ covariance @ np.swapaxes(by, 1, 2)
+    """Returns the covariances of camera_from_board when its origin moves on the board: the error of the rotation moves
+    the origin too."""
+    jacobian = np.tile(np.eye(6), (len(poses), 1, 1))
+    jacobian[:, 3:, :3] = -skew(poses.translation - seen.translation)
+    return jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
 
 
 def turned_view(view: View, turn: Rigid) -> View:
-    """The same corners under the numbers that they have after the turn."""
+    """Returns the same corners under the numbers that they have after the turn."""
     return view.turned(turn.inverse())

@@ -1,7 +1,7 @@
-"""What an error of the camera file does to hand and eye that were found with the camera as filed.
+"""The effect of an error of the camera file on X and Z that were found with the camera as filed.
 
 Parameters that are not solved for, but are not exact either, are *considered* (Schmidt 1966; Bierman, "Factorization
-Methods for Discrete Sequential Estimation", 1977, ch. VIII): what is known of them is carried through the solution.
+Methods for Discrete Sequential Estimation", 1977, ch. VIII): their prior covariance is carried through the solution.
 """
 
 from dataclasses import dataclass
@@ -20,37 +20,37 @@ from stcal.io.cameras.model import CameraPrior, intrinsic_basis
 
 ROUNDS = 50
 SETTLED = 1e-3
-"""Relative change of the factors of σ that moves nothing any more."""
+"""Relative change of the factors of σ below which the iteration has converged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraError:
-    """``slope`` : (12, q) of the normal equations of X and Z, by the intrinsics; ``moment`` : (q, q) second moment of
-    the intrinsics' error about zero, from what is known of them and from the corners; ``noise`` : (12, 12) covariance
-    of the gradient by all other errors, None where it is the normal matrix. Of a rig of c cameras, 6c + 6 for 12."""
+    """``slope`` : (12, q) derivative of the gradient of X and Z by the intrinsics; ``moment`` : (q, q) second moment of
+    the intrinsics' error about zero, from the prior and from the corners; ``noise`` : (12, 12) covariance of the
+    gradient by all other errors, None where it equals the normal matrix. For a rig of c cameras, 6c + 6 replaces 12."""
 
     slope: np.ndarray
     moment: np.ndarray
     noise: np.ndarray | None = None
 
     def covariance(self, inverse: np.ndarray) -> np.ndarray:
-        """(12, 12) of X and Z, of which ``inverse`` (12, 12) is the inverse normal matrix."""
+        """Returns the covariance (12, 12) of X and Z, given their inverse normal matrix ``inverse`` (12, 12)."""
         moved = inverse @ self.slope
-        own = inverse if self.noise is None else inverse @ self.noise @ inverse
-        return own + moved @ self.moment @ moved.T
+        without_camera = inverse if self.noise is None else inverse @ self.noise @ inverse
+        return without_camera + moved @ self.moment @ moved.T
 
 
 def of_corners(corners: Corners, state: Bundle, prior: CameraPrior, free: tuple[str, ...]) -> CameraError:
-    """Of a reprojection adjustment with the intrinsics as filed."""
+    """Returns the camera error of a reprojection adjustment that kept the intrinsics as filed."""
     known = np.linalg.inv(prior.covariance)
     return considered(corners.with_intrinsics(intrinsic_basis(prior.colmap_model), known), state, free)
 
 
 def considered(wider: Problem, state: Any, free: tuple[str, ...]) -> CameraError:
-    """Of intrinsics that were not solved for, but are among the unknowns of ``wider``.
+    """Returns the effect of intrinsics that were not solved for, but are among the unknowns of ``wider``.
 
-    Corners that are off by the camera's error make all ``free`` σ too large: they are estimated anew with the
-    intrinsics among the unknowns, linear about the state.
+    Corners that are off by the camera's error make all ``free`` σ too large. These σ are therefore estimated again with
+    the intrinsics among the unknowns, linear about the state.
     """
     factors, poses = wider.factors(), wider.places()["z"].stop
     sigma = wider.sigma | estimated(wider, state, (*free, *factors))
@@ -59,16 +59,18 @@ def considered(wider: Problem, state: Any, free: tuple[str, ...]) -> CameraError
     others = np.setdiff1d(np.arange(wider.count()), camera)
     covariance = generalised_inverse(linear.normal)
     error = -covariance[camera] @ linear.gradient
-    # What all others follow, in units of the σ that the solution was weighted by.
+    # Normal matrix and gradient noise of all other observations, in units of the σ that weighted the solution.
     normal, noise = np.zeros((2, wider.count(), wider.count()))
     for group in wider.groups(state):
-        for name, (_, part) in group.by_name().items():
+        for name, (_, equations) in group.by_name().items():
             if name not in factors:
-                normal += part.normal
-                noise += part.normal * (sigma[name] / wider.sigma[name]) ** 2 if name in free else part.normal
-    rest = others[poses:]
+                normal += equations.normal
+                noise += equations.normal * (sigma[name] / wider.sigma[name]) ** 2 if name in free else equations.normal
+    eliminated = others[poses:]
     reduced = np.eye(poses, len(others))
-    reduced[:, poses:] = -normal[np.ix_(others[:poses], rest)] @ generalised_inverse(normal[np.ix_(rest, rest)])
+    reduced[:, poses:] = -normal[np.ix_(others[:poses], eliminated)] @ generalised_inverse(
+        normal[np.ix_(eliminated, eliminated)]
+    )
     return CameraError(
         slope=reduced @ normal[np.ix_(others, camera)],
         moment=covariance[np.ix_(camera, camera)] + np.outer(error, error),
@@ -77,21 +79,23 @@ def considered(wider: Problem, state: Any, free: tuple[str, ...]) -> CameraError
 
 
 def of_poses(loop: Loop, solution: PoseSolution, views: Views, prior: CameraPrior) -> CameraError:
-    """Of an adjustment of the board's poses, each from its view by the camera as filed."""
+    """Returns the camera error of an adjustment of the board's poses, each of which was found from its view with the
+    camera as filed."""
     used = np.flatnonzero(~solution.outliers)
     basis = intrinsic_basis(prior.colmap_model)
-    by_camera, own = poses_by_camera(views, loop.camera_from_board, basis, prior)
+    by_camera, second_moment = poses_by_camera(views, loop.camera_from_board, basis, prior)
     state: LoopState = solution.state
     jacobian = loop.jacobian(state.mount_from_camera, state.scale)[:, :, :12]
     moves = loop.by_camera(state.mount_from_camera, state.scale) @ by_camera
     weighted = np.linalg.solve(solution.covariance[used], moves[used])
-    return CameraError(np.einsum("mai,maj->ij", jacobian[used], weighted), own)
+    return CameraError(np.einsum("mai,maj->ij", jacobian[used], weighted), second_moment)
 
 
 def poses_by_camera(
     views: Views, camera_from_board: Poses, basis: np.ndarray, prior: CameraPrior
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Derivative (m, 6, q) of the board's pose in each view by the intrinsics, and their :func:`moment` (q, q)."""
+    """Returns the derivative (m, 6, q) of the board's pose in each view by the intrinsics, and the :func:`moment` (q,
+    q) of the intrinsics."""
     q = basis.shape[1]
     information, gradient, cost, slopes = np.zeros((q, q)), np.zeros(q), 0.0, []
     for view, pose in zip(views.views, camera_from_board, strict=True):
@@ -100,9 +104,9 @@ def poses_by_camera(
         by_own = view.whitening() @ views.camera.parameter_jacobian(point[:, :2] / point[:, 2:]) @ basis
         by_own = by_own.reshape(-1, q)
         slopes.append(-np.linalg.lstsq(by_pose, by_own)[0])
-        left = by_own + by_pose @ slopes[-1]
-        information += left.T @ left
-        gradient += left.T @ white
+        reduced = by_own + by_pose @ slopes[-1]
+        information += reduced.T @ reduced
+        gradient += reduced.T @ white
         cost += float(white @ white)
     gain = float(gradient @ generalised_inverse(information) @ gradient)
     redundancy = 2 * views.corners() - 6 * len(views) - q
@@ -111,10 +115,10 @@ def poses_by_camera(
 
 
 def moment(information: np.ndarray, gradient: np.ndarray, basis: np.ndarray, prior: CameraPrior) -> np.ndarray:
-    """Second moment (q, q) of the intrinsics' error: squared estimate and its covariance.
+    """Returns the second moment (q, q) of the intrinsics' error: squared estimate plus covariance.
 
-    Where the corners contradict the prior, its σ are widened by kind, by expectation and maximisation of the likelihood
-    (Dempster, Laird & Rubin 1977), as an adjustment of the intrinsics would.
+    Where the corners contradict the prior, the prior σ are widened by kind, as an adjustment of the intrinsics would
+    do. The factors maximise the likelihood by expectation and maximisation (Dempster, Laird & Rubin 1977).
     """
     known = np.linalg.inv(prior.covariance)
     parts = [rows for _, rows in camera_parts(basis, known)]
@@ -125,10 +129,10 @@ def moment(information: np.ndarray, gradient: np.ndarray, basis: np.ndarray, pri
             scaled[np.ix_(rows, rows)] /= value
         covariance = np.linalg.inv(information + scaled)
         error = -covariance @ gradient
-        found = covariance + np.outer(error, error)
-        new = [max(float(np.trace(known[np.ix_(r, r)] @ found[np.ix_(r, r)])) / len(r), 1.0) for r in parts]
+        second = covariance + np.outer(error, error)
+        new = [max(float(np.trace(known[np.ix_(r, r)] @ second[np.ix_(r, r)])) / len(r), 1.0) for r in parts]
         settled = np.abs(np.log(new / squared)).max() < SETTLED
         squared = np.array(new)
         if settled:
             break
-    return found
+    return second

@@ -1,7 +1,7 @@
 """The closed-form methods that OpenCV has, by their authors' names.
 
-Lengths go in and come out in a unit in which rotation and translation weigh alike, so that the unit of the input makes
-no difference: Andreff, Daniilidis and Li mix both in one equation.
+Andreff, Daniilidis and Li mix rotation and translation in one equation. Lengths are therefore passed to OpenCV in a
+unit in which both weigh alike, so that the unit of the input makes no difference.
 """
 
 import cv2
@@ -25,14 +25,14 @@ AX_ZB = {"shah": cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH, "li": cv2.CALIB_ROBOT_WORL
 
 
 def closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple[Rigid, Rigid]:
-    """X and Z by one of :data:`AX_XB` or :data:`AX_ZB`; ``unit_mm`` is the length that weighs like one radian.
+    """Returns X and Z by one of :data:`AX_XB` or :data:`AX_ZB`; ``unit_mm`` is the length that weighs like one radian.
 
-    AX = XB has no Z: it is then the mean of the chains.
+    AX = XB does not contain Z: Z is then the mean of the chains.
 
     Raises
     ------
     ConvergenceError
-        OpenCV fails or returns what is no transform.
+        OpenCV fails, or its result is not a rigid transform.
     """
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     try:

@@ -1,10 +1,10 @@
-"""Zhao's convex method: the largest error of all motions as small as it can be, R_X being any matrix.
+"""Zhao's convex method: it minimises the largest error of all motions, with R_X any matrix.
 
 Zhao, *Hand-eye calibration using convex optimization*, ICRA 2011, in the form of orthogonal matrices: minimise over
 x = (vec R_X, b_X) the largest ‖C_i x − d_i‖, the twelve equations of motion i; then take the rotation nearest to R_X.
-This second-order cone program has 13 unknowns and one smooth constraint for each motion; sequential quadratic
-programming solves it in a few dozen steps, and the multipliers there prove that nothing is left to gain. A conic solver
-is not needed.
+This second-order cone program has 13 unknowns and one smooth constraint for each motion. Sequential quadratic
+programming solves it in a few dozen steps, and the multipliers at the solution prove that it is the minimum. A conic
+solver is not needed.
 """
 
 import numpy as np
@@ -15,16 +15,16 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.motions import Motions
 
 GAP = 1e-4
-"""By so much, relative, the largest error may exceed the proven bound: a hundredth of any σ."""
+"""Largest relative excess of the largest error over the proven bound: a hundredth of any σ."""
 
 
 def convex(motions: Motions, unit_mm: float = 1000.0) -> Rigid:
-    """X by L∞ minimisation; ``unit_mm`` is the length that weighs like one radian.
+    """Returns X by L∞ minimisation; ``unit_mm`` is the length that weighs like one radian.
 
     Raises
     ------
     ConvergenceError
-        The bound is not reached, or the matrix found is no rotation's.
+        The bound is not reached, or the matrix is not a rotation.
     """
     c, d = equations(motions, unit_mm)
     x, *_ = np.linalg.lstsq(c.reshape(-1, 12), d.ravel(), rcond=None)
@@ -38,7 +38,8 @@ def convex(motions: Motions, unit_mm: float = 1000.0) -> Rigid:
 
 
 def equations(motions: Motions, unit_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """C (k, 12, 12) and d (k, 12): R_A R_X − R_X R_B and (R_A − I) b_X − R_X b_B + b_A, of x with R_X by columns."""
+    """Returns C (k, 12, 12) and d (k, 12) of the residuals R_A R_X − R_X R_B and (R_A − I) b_X − R_X b_B + b_A; x holds
+    R_X by columns."""
     a, b, k = motions.mount, motions.camera, len(motions)
     eye = np.eye(3)
     c, d = np.zeros((k, 12, 12)), np.zeros((k, 12))
@@ -52,15 +53,15 @@ def equations(motions: Motions, unit_mm: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """x that minimises the largest ‖C_i x − d_i‖, from a start.
+    """Returns the x that minimises the largest ‖C_i x − d_i‖, from a start.
 
     Raises
     ------
     ConvergenceError
-        Not proven to be within :data:`GAP` of the minimum.
+        The result is not proven to be within :data:`GAP` of the minimum.
     """
     scale = np.linalg.norm(np.einsum("kij,j->ki", c, x) - d, axis=1).max()
-    if scale < 1e-12:  # exact
+    if scale < 1e-12:  # the start has no residuals
         return x
     hessian, pull = np.swapaxes(c, 1, 2) @ c / scale**2, np.einsum("kij,ki->kj", c, d) / scale**2
     level = (d**2).sum(1) / scale**2
@@ -75,7 +76,7 @@ def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
         return np.column_stack([-2 * (hessian @ y[:-1] - pull), np.ones(len(c))])
 
     ahead = np.eye(13)[-1]
-    found = minimize(
+    solution = minimize(
         lambda y: y[-1],
         np.append(x, 1.0),
         jac=lambda _: ahead,
@@ -83,15 +84,15 @@ def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
         constraints={"type": "ineq", "fun": below, "jac": below_slope},
         options={"maxiter": 500, "ftol": 1e-14},
     )
-    x = found.x[:-1]
+    x = solution.x[:-1]
     errors = squared(x).sum(1)
-    # Any mean of the squared errors has its minimum below that of the largest: the multipliers give the best mean.
+    # The minimum of a weighted mean of the squared errors is below that of the largest: multipliers give the best mean.
     active = errors > (1 - 1e-2) * errors.max()
     slopes = 2 * (hessian @ x - pull)[active]
-    share, _ = nnls(np.vstack([slopes.T, np.ones(active.sum())]), np.append(np.zeros(12), 1.0))
-    share /= share.sum()
-    mean, right = np.tensordot(share, hessian[active], 1), share @ pull[active]
-    bound = share @ level[active] - right @ np.linalg.lstsq(mean, right, rcond=None)[0]
+    shares, _ = nnls(np.vstack([slopes.T, np.ones(active.sum())]), np.append(np.zeros(12), 1.0))
+    shares /= shares.sum()
+    mean, right = np.tensordot(shares, hessian[active], 1), shares @ pull[active]
+    bound = shares @ level[active] - right @ np.linalg.lstsq(mean, right, rcond=None)[0]
     if errors.max() > (1 + 2 * GAP) * bound:
         raise ConvergenceError(
             "E-HANDEYE-METHOD-FAILS",

@@ -1,4 +1,5 @@
-"""Hand-eye calibration by differential evolution on SE(3), as Jin et al. wrote it, and the same polished."""
+"""Hand-eye calibration by differential evolution on SE(3), as Jin et al. wrote it, and the same with a final
+descent."""
 
 from dataclasses import dataclass
 
@@ -11,21 +12,21 @@ from stcal.geometry.rigid import Rigid, skew
 from stcal.handeye.data.motions import Motions
 
 MOST = 100_000
-"""Of candidates, and of generations."""
+"""Largest number of candidates, and of generations."""
 EXACT = 1e-24
-"""What a step at the minimum may promise, rad²: the objective is in no σ."""
+"""Gain of a step at which the minimum is reached, rad²: the objective is not in units of any σ."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Of three coordinates of the first population.
+    """Bounds of three coordinates of the first population.
 
     Parameters
     ----------
     half_width : float
         mm, or rad of the rotation vector.
     centre : (3,) tuple, optional
-        In the middle; where None, that of the closed-form solution (Park & Martin 1994).
+        Centre of the bounds; where None, that of the closed-form solution (Park & Martin 1994).
 
     Raises
     ------
@@ -58,10 +59,10 @@ class EvolutionOptions:
     weight : float
         λ, with lengths in the unit that weighs like one radian (1 m where no σ are stated).
     bounds_rad : Bounds
-        Where the rotation vectors of the first population lie. The paper takes bounds from knowledge of the set-up;
-        what they were is not legible in the source.
+        Bounds of the rotation vectors of the first population. The paper takes them from knowledge of the set-up; its
+        values are not legible in the source.
     bounds_mm : Bounds, optional
-        Where its translations lie; about zero, as far as the farthest board or flange, where None.
+        Bounds of its translations; where None, about zero, as wide as the distance of the farthest board or flange.
     seed : int
     """
 
@@ -90,11 +91,11 @@ class EvolutionOptions:
             )
 
     def needs_closed_form(self) -> bool:
-        """Whether bounds lie about the closed-form solution."""
+        """True if some bounds lie about the closed-form solution."""
         return any(bounds is not None and bounds.centre is None for bounds in (self.bounds_rad, self.bounds_mm))
 
     def in_words(self, unit_mm: float) -> str:
-        """What the paper leaves to choose, or its copy does not show."""
+        """Returns in words the settings that the paper leaves to choose, or that its copy does not show."""
         turn = _in_words(self.bounds_rad, 180 / np.pi, "°")
         shift = _in_words(self.bounds_mm, 1.0, " mm") if self.bounds_mm else "as far as the farthest pose about zero"
         return (
@@ -106,26 +107,30 @@ class EvolutionOptions:
 def _in_words(bounds: Bounds, factor: float, unit: str) -> str:
     about = "the closed-form solution"
     if bounds.centre is not None:
-        about = ", ".join(f"{factor * each:g}" for each in bounds.centre) + unit if any(bounds.centre) else "zero"
+        about = (
+            ", ".join(f"{factor * coordinate:g}" for coordinate in bounds.centre) + unit
+            if any(bounds.centre)
+            else "zero"
+        )
     return f"±{factor * bounds.half_width:.4g}{unit} about {about}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Objective:
-    """f = Σ‖α − R_X β‖² + λ Σ‖(R_A − I) b_X + b_A − R_X b_B‖², lengths in ``unit_mm``; x = (log R_X, b_X)."""
+    """Objective f = Σ‖α − R_X β‖² + λ Σ‖(R_A − I) b_X + b_A − R_X b_B‖², lengths in ``unit_mm``; x = (log R_X, b_X)."""
 
     motions: Motions
     unit_mm: float
     weight: float
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """(p,) of candidates (p, 6)."""
+        """Returns the objective (p,) of candidates (p, 6)."""
         turn = Rotation.from_rotvec(x[:, :3]).as_matrix()
         rotation, translation = self._parts(turn, x[:, 3:])
         return (rotation**2).sum((1, 2)) + self.weight * (translation**2).sum((1, 2))
 
     def linear(self, x: Rigid) -> NormalEquations:
-        """About X, translation in mm."""
+        """Returns the normal equations about X, translation in mm."""
         rotation, translation = self._parts(x.rotation[None], x.translation[None] / self.unit_mm)
         root = np.sqrt(self.weight)
         white = np.concatenate([rotation[0], root * translation[0]]).ravel()
@@ -136,7 +141,7 @@ class Objective:
         return NormalEquations.of(white, jacobian.reshape(-1, 6))
 
     def _parts(self, turn: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Errors (p, k, 3) of rotation and translation."""
+        """Returns the errors (p, k, 3) of rotation and translation."""
         a, b = self.motions.mount, self.motions.camera
         rotation = self.motions.alpha - np.einsum("pij,kj->pki", turn, self.motions.beta)
         moved = np.einsum("kij,pj->pki", a.rotation - np.eye(3), shift) + a.translation / self.unit_mm
@@ -144,7 +149,9 @@ class Objective:
 
 
 def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, closed_form: Rigid | None = None) -> Rigid:
-    """The best of the last generation. Mutants are not held within the bounds, which are those of the first one.
+    """Returns the best candidate of the last generation.
+
+    The bounds limit the first population only; mutants may leave them.
 
     Parameters
     ----------
@@ -153,16 +160,16 @@ def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, clo
     reach_mm : float
         Half width of the translation's bounds where the options have none.
     closed_form : Rigid, optional
-        In the middle of bounds without a centre.
+        Centre of bounds that have no centre.
     """
     rng, size = np.random.default_rng(options.seed), options.population
     about = np.zeros(6) if closed_form is None else closed_form.log()
     parts = options.bounds_rad, options.bounds_mm or Bounds(reach_mm)
     centre = np.concatenate(
-        [about[3 * i : 3 * i + 3] if each.centre is None else each.centre for i, each in enumerate(parts)]
+        [about[3 * i : 3 * i + 3] if bounds.centre is None else bounds.centre for i, bounds in enumerate(parts)]
     )
     scale = np.repeat([1.0, 1 / objective.unit_mm], 3)
-    centre, half = centre * scale, np.repeat([each.half_width for each in parts], 3) * scale
+    centre, half = centre * scale, np.repeat([bounds.half_width for bounds in parts], 3) * scale
     x = rng.uniform(centre - half, centre + half, (size, 6))
     value = objective.values(x)
     for _ in range(options.generations):
@@ -177,19 +184,19 @@ def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, clo
 
 
 def three_others(rng: np.random.Generator, size: int) -> np.ndarray:
-    """(3, size): for each of ``size`` candidates three others, all different."""
+    """Returns three other candidates for each of ``size`` candidates, all different, (3, size)."""
     order = rng.random((size, size))
-    np.fill_diagonal(order, 2)  # oneself comes last
+    np.fill_diagonal(order, 2)  # the candidate itself comes last
     return np.argsort(order, axis=1)[:, :3].T
 
 
 def polish(objective: Objective, x: Rigid) -> Rigid:
-    """The minimum of the objective next to X.
+    """Returns the minimum of the objective next to X.
 
     Raises
     ------
     ConvergenceError
-        None is reached.
+        No minimum is reached.
     """
-    found = minimise(x, objective.linear, perturbed, least_gain=EXACT)
-    return found.required("differential evolution", "check the poses that fit worst").state
+    minimum = minimise(x, objective.linear, perturbed, least_gain=EXACT)
+    return minimum.required("differential evolution", "check the poses that fit worst").state

@@ -1,4 +1,4 @@
-"""How much robot and camera err: stated, or estimated from the residuals as variance components."""
+"""Errors of robot and camera: σ as stated, or estimated from the residuals as variance components."""
 
 from dataclasses import dataclass
 
@@ -11,37 +11,37 @@ from stcal.geometry.variances import component_variances
 from stcal.handeye.data.loop import Loop
 
 LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
-"""Estimates stay above, by kind: exact data have none …"""
+"""Lower limits of estimated σ, by kind: exact data would give 0."""
 CAUTION = 2.0
-"""Redundancies that are not counted: a variance of ν of them is the sum of squares over ν − 2, so that errors in units
-of its root have mean square 1 (the mean of F is ν / (ν − 2)). It also keeps a component of few poses off 0, as the
-penalty of Chung, Rabe-Hesketh, Dorie, Gelman & Liu (2013) does."""
+"""Redundancies that are not counted. The variance from redundancy ν is the sum of squares over ν − 2, so that errors in
+units of its root have mean square 1 (the mean of F is ν / (ν − 2)). This also keeps a component of few poses off 0, as
+the penalty of Chung, Rabe-Hesketh, Dorie, Gelman & Liu (2013) does."""
 MOST_RAD, MOST_MM = np.radians(10), 100.0
-"""σ of poses beyond which they tell nothing."""
+"""Largest σ of poses; beyond it poses tell nothing."""
 FARTHEST = 7.0
-"""An estimate is looked for within a factor of a thousand of the first guess, in its logarithm."""
+"""Largest logarithm of the ratio between an estimated σ and its first guess: a factor of a thousand."""
 UNKNOWNS = 12
-"""Of X and Z."""
+"""Number of unknowns of X and Z."""
 LEAST_SHARE = 1e-3
-"""… and above this share of what the first guess of the variance was: less does not weigh, but few poses that fit by
-chance would have all others follow them."""
+"""Lower limit of an estimated variance as a share of its first guess. Less makes no difference to the weights, but a
+few poses that fit by chance would pull all others to themselves."""
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """σ of one coordinate; None where it is not known and to be estimated from the residuals, 0 for what is exact.
+    """σ of one coordinate. None where it is to be estimated from the residuals, 0 for what is exact.
 
     Parameters
     ----------
     robot_rad, robot_mm : float, optional
-        Of base_from_flange, in the axes of the base, about the flange.
+        σ of base_from_flange, in the axes of the base, about the flange.
     camera_rad, camera_mm : float, optional
-        Of camera_from_board, about the board's origin. If nothing is known of either side, ``robot_mm`` is taken to be
-        0: shifts of the two look alike, and the estimate of ``camera_mm`` holds both.
+        σ of camera_from_board, about the board's origin. If nothing is known of either side, ``robot_mm`` is taken to
+        be 0: shifts of the two look alike, and the estimate of ``camera_mm`` holds both.
     corner_px : float, optional
-        Of a corner in the image, or the factor of the stated covariances of corners. Never 0.
+        σ of a corner in the image, or the factor of the stated covariances of corners. Never 0.
     board_mm : float, optional
-        Of a corner's place on the board.
+        σ of a corner's place on the board.
     """
 
     robot_rad: float | None = None
@@ -76,9 +76,9 @@ class Noise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopComponents:
-    """Covariances of a loop's residuals, (m, 6, 6): ``known``, and each of ``free``, (f, m, 6, 6), times a variance.
+    """Covariances (m, 6, 6) of a loop's residuals: ``known``, plus each of ``free``, (f, m, 6, 6), times its variance.
 
-    ``names`` : (f,) which σ of :class:`Noise` the free ones are.
+    ``names`` : (f,) the σ of :class:`Noise` that each free component stands for.
     """
 
     known: np.ndarray
@@ -86,15 +86,15 @@ class LoopComponents:
     names: tuple[str, ...]
 
     def total(self, variances: np.ndarray) -> np.ndarray:
-        """(m, 6, 6)."""
+        """Returns the covariances (m, 6, 6) for these variances (f,)."""
         return self.known + np.tensordot(variances, self.free, 1)
 
     def of(self, used: np.ndarray) -> "LoopComponents":
-        """Of some poses."""
+        """Returns the components of the poses ``used``."""
         return LoopComponents(self.known[used], self.free[:, used], self.names)
 
     def first(self, residuals: np.ndarray) -> np.ndarray:
-        """Variances (f,) to start with, from the medians of residuals (m, 6): bad poses do not count."""
+        """Returns first variances (f,) from the medians of residuals (m, 6), on which bad poses have little effect."""
         lengths = np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2)
         squared = [robust_sigma(length, 3) ** 2 for length in lengths.T]
         turns = max(sum(name.endswith("_rad") for name in self.names), 1)
@@ -102,28 +102,29 @@ class LoopComponents:
         return np.maximum([by_kind[_kind(name)] for name in self.names], self.least())
 
     def least(self) -> np.ndarray:
-        """(f,)."""
+        """Returns the lower limits (f,) of the variances."""
         return np.square([LEAST[_kind(name)] for name in self.names])
 
 
 def _kind(name: str) -> str:
-    """``rad``, ``mm`` or ``factor``."""
+    """Returns ``rad``, ``mm`` or ``factor``."""
     return name.rpartition("_")[2]
 
 
 def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float = 1.0) -> LoopComponents:
-    """At an estimate of X, on which arms of levers depend.
+    """Returns the components at an estimate of X, on which the lever arms depend.
 
-    Covariances that come with the camera's poses tell the noise of the images; what intrinsics err has the same weak
-    directions. So they hold up to a factor that is estimated, where σ of the robot are too.
+    Covariances that come with the camera's poses hold the noise of the images. Errors of the intrinsics have the same
+    weak directions. These covariances therefore hold up to a factor, which is estimated where σ of the robot are
+    estimated too.
     """
-    by = {"robot": loop.by_robot(mount_from_camera, scale), "camera": loop.by_camera(mount_from_camera, scale)}
+    jacobians = {"robot": loop.by_robot(mount_from_camera, scale), "camera": loop.by_camera(mount_from_camera, scale)}
     stated = {
         "robot": _stated(len(loop), loop.robot_covariance, noise.robot_rad, noise.robot_mm),
         "camera": _stated(len(loop), loop.camera_covariance, noise.camera_rad, noise.camera_mm),
     }
     known, free = np.zeros((len(loop), 6, 6)), {}
-    for side, jacobian in by.items():
+    for side, jacobian in jacobians.items():
         if stated[side] is not None:
             carried = jacobian @ stated[side] @ np.swapaxes(jacobian, 1, 2)
             if side == "camera" and loop.camera_covariance is not None and stated["robot"] is None:
@@ -135,7 +136,7 @@ def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float 
             free[name] = jacobian[:, :, columns] @ np.swapaxes(jacobian[:, :, columns], 1, 2)
     if len(free) == 4:  # shifts of robot and camera move the board alike
         del free["robot_mm"]
-    if 6 * len(loop) - UNKNOWNS <= CAUTION * len(free):  # three poses: one less is told
+    if 6 * len(loop) - UNKNOWNS <= CAUTION * len(free):  # three poses determine one component less
         if "camera_factor" in free:
             known = known + free.pop("camera_factor")
         else:
@@ -144,7 +145,7 @@ def components(loop: Loop, noise: Noise, mount_from_camera: Rigid, scale: float 
 
 
 def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float | None) -> np.ndarray | None:
-    """The covariances of the poses where they have any, else of one σ for all."""
+    """Returns the covariances of the poses where they have any, else those of one σ for all poses."""
     if covariance is not None:
         return covariance
     if rad is None or mm is None:
@@ -155,16 +156,17 @@ def _stated(m: int, covariance: np.ndarray | None, rad: float | None, mm: float 
 def variance_components(
     parts: LoopComponents, residuals: np.ndarray, jacobian: np.ndarray, first: np.ndarray
 ) -> np.ndarray:
-    """Restricted maximum-likelihood variances (f,) of the free components, from residuals (m, 6) near a solution.
+    """Returns restricted maximum-likelihood variances (f,) of the free components.
 
-    What the parameters take up of the residuals does not count (Patterson & Thompson 1971); :data:`CAUTION` besides.
+    They are computed from residuals (m, 6) near a solution. Redundancy that the parameters take up does not count
+    (Patterson & Thompson 1971), nor does :data:`CAUTION`.
 
     Parameters
     ----------
     jacobian : (m, 6, k) array
         Derivative of the residuals by the parameters solved for; dependent columns do no harm.
     first : (f,) array
-        The first guess, of :meth:`LoopComponents.first`.
+        The first guess, from :meth:`LoopComponents.first`.
     """
     least = np.maximum(parts.least(), LEAST_SHARE * first)
     most = np.maximum(first, least) * np.exp(2 * FARTHEST)

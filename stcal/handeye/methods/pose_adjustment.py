@@ -1,4 +1,4 @@
-"""Pose-error least squares: both unknowns from all poses, weighted by what robot and camera err; bad poses named."""
+"""Pose-error least squares: X and Z from all poses, weighted by the errors of robot and camera, with outliers named."""
 
 from dataclasses import dataclass
 
@@ -12,38 +12,38 @@ from stcal.handeye.data.loop import Loop
 from stcal.handeye.methods.noise import Noise, components, variance_components
 
 FALSE_ALARM = 0.01
-"""Chance that a set of good poses has one called an outlier."""
+"""False-alarm probability that a set of good poses has an outlier."""
 MOSTLY_GOOD = 2 / 3
 """Share of the poses that is taken to be good."""
 LEAST_POSES = 4
-"""So many must be left to contradict an outlier: three poses fit three free ones."""
+"""Number of poses that must be left to contradict an outlier: any three poses can be fitted."""
 ROUNDS = 30
 SEEN = 1e-6
-"""A share of a pose's own variance below which the pose alone determined the solution, and cannot contradict it."""
+"""Share of a pose's own variance below which this pose alone determined the solution and cannot contradict it."""
 SETTLED = 1e-4
-"""Relative change of the estimated σ from round to round that moves nothing any more."""
+"""Relative change of the estimated σ between rounds below which the iteration has converged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopState:
-    """Unknowns: X, Z and the board's scale."""
+    """The unknowns: X, Z and the board's scale."""
 
     mount_from_camera: Rigid
     stand_from_board: Rigid
     scale: float = 1.0
 
     def moved(self, step: np.ndarray) -> "LoopState":
-        """By left perturbations (12,) or (13,) of X, Z and the scale."""
+        """Returns the state after left perturbations of X and Z and a change of the scale, (12,) or (13,)."""
         x, z = (perturbed(a, s) for a, s in ((self.mount_from_camera, step[:6]), (self.stand_from_board, step[6:12])))
         return LoopState(x, z, self.scale + (step[12] if len(step) > 12 else 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseSolution:
-    """``normal`` : (k, k) of X, Z (and the scale); ``residuals`` : (m, 6); ``covariance`` : (m, 6, 6) theirs;
-    ``outliers`` : (m,); ``sigma`` : what was estimated, by name; ``variance_factor`` : mean squared residual in
-    units of σ, over the ``redundancy``; ``scale_hint`` : what the scale would become if it were solved for, and its σ;
-    ``settled`` : whether σ and outliers did within :data:`ROUNDS`."""
+    """``normal`` : (k, k) of X, Z (and the scale); ``residuals`` : (m, 6); ``covariance`` : (m, 6, 6) of the residuals;
+    ``outliers`` : (m,); ``sigma`` : the estimated σ, by name; ``variance_factor`` : mean squared residual in units of
+    σ, over the ``redundancy``; ``scale_hint`` : the scale if it were solved for, and its σ; ``settled`` : whether σ and
+    outliers settled within :data:`ROUNDS`."""
 
     state: LoopState
     normal: np.ndarray
@@ -60,10 +60,10 @@ class PoseSolution:
 def adjust_poses(
     loop: Loop, start: LoopState, noise: Noise, with_scale: bool = False, robust: bool = True
 ) -> PoseSolution:
-    """Least squares of the loop's residuals, each in units of its σ, from a start.
+    """Returns the least-squares solution of the loop's residuals, each in units of its σ, from a start.
 
     This is the maximum-likelihood solution for Gaussian errors of robot and camera (Strobl & Hirzinger 2006 without
-    their metric's free parameter): errors of both are carried to the board's origin, to first order.
+    their metric's free parameter). Errors of both are carried to the board's origin, to first order.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def adjust_poses(
             old = variances
             variances = variance_components(parts.of(used), residuals[used], jacobian[used], first)
             settled = bool(np.abs(np.log(variances / old)).max() < SETTLED)
-        if robust and round_ < ROUNDS // 2:  # later they stay: a set that swings would never settle
+        if robust and round_ < ROUNDS // 2:  # later the set stays: a set that alternates would never settle
             used = _agreeing(residuals, jacobian, parts.total(variances), used, estimated=bool(parts.names))
         settled &= bool((used == before).all())
         if settled:
@@ -111,7 +111,8 @@ def adjust_poses(
 
 
 def _scale_hint(loop: Loop, state: LoopState, residuals: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
-    """What the scale would become, and its σ: one step from the solution with the scale among the unknowns."""
+    """Returns the scale if it were solved for, and its σ: one step from the solution with the scale among the
+    unknowns."""
     jacobian = _jacobian(loop, state, 13)
     weighted = np.linalg.solve(covariance, jacobian)
     inverse = generalised_inverse(np.einsum("mai,maj->ij", jacobian, weighted))
@@ -128,26 +129,27 @@ def _jacobian(loop: Loop, state: LoopState, count: int) -> np.ndarray:
 
 
 def _solved(loop: Loop, start: LoopState, covariance: np.ndarray, count: int) -> tuple[LoopState, np.ndarray]:
-    """State of least squares and its normal matrix."""
+    """Returns the least-squares state and its normal matrix."""
     weight = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def linearise(state: LoopState) -> NormalEquations:
         white = np.einsum("mab,mb->ma", weight, _residuals(loop, state)).ravel()
         return NormalEquations.of(white, (weight @ _jacobian(loop, state, count)).reshape(-1, count))
 
-    found = minimise(start, linearise, LoopState.moved)
-    # Derivatives leave out how residuals bend: of rough poses, steps end where even a damped one gains nothing.
-    found = found.required("hand-eye", "check the poses that fit worst", accepted=UNKEPT)
-    return found.state, found.linear.normal
+    minimum = minimise(start, linearise, LoopState.moved)
+    # Derivatives neglect curvature. With rough poses, steps end where even a damped step gains nothing.
+    minimum = minimum.required("hand-eye", "check the poses that fit worst", accepted=UNKEPT)
+    return minimum.state, minimum.linear.normal
 
 
 def _squared(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Squared residuals in units of σ, (m,)."""
+    """Returns squared residuals in units of σ, (m,)."""
     return np.einsum("ma,ma->m", residuals, np.linalg.solve(covariance, residuals[:, :, None])[:, :, 0])
 
 
 def _near(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Poses to start with, by σ of their medians: at least the better two thirds, or chance would choose among them."""
+    """Returns which poses to start with, by σ from their medians. At least the better two thirds are kept, so that they
+    are not chosen by chance."""
     squared = np.sort(_squared(residuals, covariance))
     enough = max(int(np.ceil(MOSTLY_GOOD * len(squared))), LEAST_POSES)
     return _squared(residuals, covariance) <= max(chi2.ppf(1 - FALSE_ALARM, 6), squared[min(enough, len(squared)) - 1])
@@ -156,7 +158,7 @@ def _near(residuals: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def _agreeing(
     residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, used: np.ndarray, estimated: bool
 ) -> np.ndarray:
-    """Which poses, (m,), agree with the solution of all others."""
+    """Returns which poses, (m,), agree with the solution of all others."""
     m, count = len(used), jacobian.shape[2]
     redundancy = 6 * int(used.sum()) - count - 6
     if redundancy < 6:
@@ -168,10 +170,10 @@ def _agreeing(
 
 
 def against_others(residuals: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Squared residuals (m,), each in units of its own σ: χ² of 6 degrees of freedom for good poses.
+    """Returns squared residuals (m,), each in units of its own σ: χ² of 6 degrees of freedom for good poses.
 
-    A pose that took part has drawn the solution towards itself, so that its residual scatters less than the pose; one
-    that did not has the solution's error besides.
+    The residual of a pose that took part scatters less than the pose, since the pose pulled the solution towards
+    itself. The residual of a pose that did not take part has the error of the solution as well.
     """
     weight = np.linalg.inv(np.linalg.cholesky(covariance))
     white, by = np.einsum("mab,mb->ma", weight, residuals), weight @ jacobian

@@ -24,40 +24,40 @@ from stcal.handeye.methods.rounds import LEAST, Problem, adjust
 from stcal.io.cameras.model import PARAMETER_NAMES, CameraPrior, intrinsic_basis
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
-"""A pose that misses by more (rotation; translation in shares of the distance) is wrong from the start: no error of the
-camera file, which is solved for here, makes so much."""
+"""Residuals (rotation; translation as share of the distance) above which a pose is wrong from the start. No error of
+the camera file, which is solved for here, makes so much."""
 NO_PRIOR = 1e-12
-"""Information that keeps nothing back, px⁻²."""
+"""Information that holds an unknown back by nothing, px⁻²."""
 CAMERA_MODEL = "OPENCV"
-"""Model of the camera in which is looked for errors of the camera file."""
+"""Camera model in which errors of the camera file are looked for."""
 UNKNOWN_LENS = intrinsic_basis(CAMERA_MODEL), NO_PRIOR * np.eye(intrinsic_basis(CAMERA_MODEL).shape[1])
-"""Basis of its intrinsics, and what is known of them."""
+"""Basis of the intrinsics of this model, and their prior information."""
 CAMERA_GAIN = 5.0
-"""Eight intrinsics that are right gain 8 ± 4 in cost, 1 ± 0.5 each; eight that gain 5 each are wrong."""
+"""Gain in cost per intrinsic above which intrinsics are wrong. Eight right ones gain 8 ± 4 together, 1 ± 0.5 each."""
 SAME_DIGITS = 6
-"""Decimals of a millimetre in which places on the board that are one corner agree."""
+"""Decimals of a millimetre to which two places on the board agree that are one corner."""
 SEEN = 1e-3
-"""A share of the robot's variance below which the corners say nothing of its error."""
+"""Share of the robot's variance below which the corners tell nothing about the robot's error."""
 FIRST = {"corner_px": 0.3, "robot_rad": 1e-3, "robot_mm": 0.5, "board_mm": 0.1, "arm_rad": 1e-3, "arm_mm": 0.5}
-"""Where the estimate of σ starts."""
+"""First guesses of the σ that are estimated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reprojection:
-    """What a reprojection adjustment finds besides X and Z.
+    """Results of a reprojection adjustment besides X and Z.
 
     Parameters
     ----------
     camera : Camera
-        As adjusted, or as given where the intrinsics were not solved for.
+        Adjusted camera, or the given one where the intrinsics were not solved for.
     camera_covariance : (q, q) array, optional
-        Of the intrinsics solved for, in the order of their COLMAP model.
+        Covariance of the intrinsics solved for, in the order of their COLMAP model.
     base_from_flange : Poses
-        m; where the flange really was. As reported for outliers, and where the robot is exact.
+        m true poses of the flange; as reported for outliers, and where the robot is exact.
     designed, corners : (K, 3) arrays
         The board's corners as designed, and as adjusted in the true scale, mm.
     view, corner : (n,) int arrays
-        Of each measured corner: which pose, and which of ``corners``. Outliers have none.
+        Pose and row in ``corners`` of each measured corner. Outliers have no corners.
     residuals_px : (n, 2) array
         Projected minus measured.
     arm, arm_covariance : (k,), (k, k) arrays, optional
@@ -83,12 +83,13 @@ class Reprojection:
         object.__setattr__(self, "residuals_px", frozen(self.residuals_px, (len(self.view), 2), "residuals"))
 
     def rms_px(self, pose: int) -> float:
-        """RMS length of the residuals in one view; NaN where it has none."""
-        own = self.residuals_px[self.view == pose]
-        return float(np.sqrt((own**2).sum(1).mean())) if len(own) else float("nan")
+        """Returns the RMS length of the residuals in one view; NaN where it has none."""
+        residuals = self.residuals_px[self.view == pose]
+        return float(np.sqrt((residuals**2).sum(1).mean())) if len(residuals) else float("nan")
 
     def board(self, xyz_board: np.ndarray) -> np.ndarray:
-        """Where corners of the design (k, 3) really are, mm; those that were not seen keep their place, scaled."""
+        """Returns the true places (k, 3) of corners of the design (k, 3), mm. Corners that were not seen keep their
+        place, scaled."""
         distance, nearest = KDTree(self.designed).query(xyz_board)
         scale = np.linalg.norm(self.corners) / np.linalg.norm(self.designed)
         return np.where((distance < 10.0**-SAME_DIGITS)[:, None], self.corners[nearest], scale * np.asarray(xyz_board))
@@ -96,11 +97,11 @@ class Reprojection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedViews:
-    """``loop`` : that was adjusted; ``state`` : of the poses used; ``outliers`` : (m,); ``normal`` : (12, 12) of X and
-    Z, all else eliminated; ``covariance`` : its inverse; ``sigma_scale``; ``sigma`` : by group; ``estimated`` : which;
-    ``scale_hint`` : what the scale would become if it were solved for, and its σ;
-    ``camera_gain`` : by how much the cost would fall, per parameter, if intrinsics were; ``camera_error`` : of those as
-    filed, where something is known of them; ``found``; ``settled`` : whether the estimated σ did."""
+    """``loop`` : the adjusted loop; ``state`` : of the poses used; ``outliers`` : (m,); ``normal`` : (12, 12) of X and
+    Z, all other unknowns eliminated; ``covariance`` : its inverse; ``sigma_scale``; ``sigma`` : by group; ``estimated``
+    : groups whose σ were estimated; ``scale_hint`` : the scale if it were solved for, and its σ; ``camera_gain`` : fall
+    of the cost per parameter if intrinsics were solved for; ``camera_error`` : error of the intrinsics as filed, where
+    their prior is known; ``found``; ``settled`` : whether the estimated σ settled."""
 
     loop: Loop
     state: Bundle
@@ -128,13 +129,14 @@ def adjust_views(
     camera: CameraPrior | None = None,
     arm: ArmModel | None = None,
 ) -> AdjustedViews:
-    """Least squares of all corners from ``first`` X, Z, scale; ``loop`` holds the same poses, the board's by them.
+    """Returns the least-squares adjustment of all corners from ``first`` X, Z, scale.
 
-    Unknowns: X, Z, and by their σ where the robot really was and where the board's corners really are; intrinsics about
-    ``intrinsics`` (whose σ are widened where the corners contradict them) and the board's scale on demand. Errors of
-    intrinsics that are not solved for are considered by what is known of them, ``camera``. Of an ``arm``, which then
-    makes the poses in place of ``base_from_flange``, the parameters are unknowns too. Corners and poses have Huber's
-    weights; then poses that contradict the others are left out.
+    ``loop`` holds the same poses; its poses of the board come from ``views``. Unknowns are X, Z, and, according to
+    their σ, the true poses of the robot and the true places of the board's corners. Intrinsics about ``intrinsics``
+    (whose σ are widened where the corners contradict them) and the board's scale are unknowns on demand. Errors of
+    intrinsics that are not solved for are considered by their prior, ``camera``. The parameters of an ``arm``, which
+    replaces ``base_from_flange``, are unknowns too. Corners and poses have Huber's weights; poses that contradict the
+    others are then left out.
 
     Raises
     ------
@@ -149,13 +151,13 @@ def adjust_views(
     for _ in range(ROUNDS):
         linear, flange = LinearArm.about(arm, parameters), arm.poses(parameters)
         moved = replace(loop, stand_from_mount=flange.inverse() if loop.inverted else flange)
-        found = _adjusted(moved, flange, views, first, noise, intrinsics, with_scale, camera, linear, sigma)
-        sigma = FIRST | found.sigma
-        parameters = parameters + found.state.arm
-        first = (found.state.mount_from_camera, found.state.stand_from_board, found.state.scale)
-        if linear.moves_mm(found.state.arm) < SETTLED_MM:
-            return found
-    return replace(found, settled=False)
+        adjusted = _adjusted(moved, flange, views, first, noise, intrinsics, with_scale, camera, linear, sigma)
+        sigma = FIRST | adjusted.sigma
+        parameters = parameters + adjusted.state.arm
+        first = (adjusted.state.mount_from_camera, adjusted.state.stand_from_board, adjusted.state.scale)
+        if linear.moves_mm(adjusted.state.arm) < SETTLED_MM:
+            return adjusted
+    return replace(adjusted, settled=False)
 
 
 def _adjusted(
@@ -170,7 +172,8 @@ def _adjusted(
     arm: LinearArm | None = None,
     sigma: Mapping[str, float] = FIRST,
 ) -> AdjustedViews:
-    """With the arm linear, if there is one; ``sigma`` : where those that are estimated start."""
+    """Returns the adjustment with the arm, if there is one, linearised. ``sigma`` : first guesses of the σ that are
+    estimated."""
     x, z, scale = first
     miss = loop.residuals(x, z, scale)
     far = np.linalg.norm(miss[:, 3:], axis=1) > GROSS_SHARE * np.linalg.norm(loop.camera_from_board.translation, axis=1)
@@ -183,9 +186,9 @@ def _adjusted(
                 "check that poses and images belong together, and the conventions of both",
             )
         rows = np.flatnonzero(used)
-        own = None if arm is None else arm[rows]
+        arm_used = None if arm is None else arm[rows]
         given = (loop[rows], base_from_flange[rows], views[rows], noise, intrinsics, with_scale)
-        corners, free = problem(*given, arm=own, first=sigma)
+        corners, free = problem(*given, arm=arm_used, first=sigma)
         begin = Bundle(x, z, corners.base_from_flange, corners.xyz_board, views.camera, scale, corners.no_step())
         solution = adjust(corners, begin, free)
         corners, state, normal = solution.corners, solution.state, solution.normal
@@ -197,14 +200,14 @@ def _adjusted(
     at = corners.places()
     sigma_scale = float(np.sqrt(inverse[at["scale"], at["scale"]].item())) if with_scale else None
     sigma = {name: float(value) for name, value in corners.sigma.items() if value}
-    found = found_of(corners, state, inverse, base_from_flange, rows, intrinsics is not None)
-    rest = generalised_inverse(normal[12:, 12:])
-    own = normal[:12, :12] - normal[:12, 12:] @ rest @ normal[12:, :12]
+    results = found_of(corners, state, inverse, base_from_flange, rows, intrinsics is not None)
+    rest_inverse = generalised_inverse(normal[12:, 12:])
+    arm_used = normal[:12, :12] - normal[:12, 12:] @ rest_inverse @ normal[12:, :12]
     return AdjustedViews(
         loop=loop,
         state=state,
         outliers=~used,
-        normal=own,
+        normal=arm_used,
         covariance=inverse[:12, :12],
         sigma_scale=sigma_scale,
         sigma=sigma,
@@ -212,13 +215,13 @@ def _adjusted(
         scale_hint=scale_hint(corners, state),
         camera_gain=_camera_gain(corners, state),
         camera_error=of_corners(corners, state, camera, free) if camera is not None and intrinsics is None else None,
-        found=found,
+        found=results,
         settled=solution.settled,
     )
 
 
 def resected(pairs_names: tuple[str, ...], views: Views, board: Reprojection) -> Poses:
-    """camera_from_board of all views by the adjusted camera and board."""
+    """Returns camera_from_board of all views by the adjusted camera and board."""
     seen = tuple(view.moved(board.board(view.xyz_board)) for view in views.views)
     return resect(Views(board.camera, seen), pairs_names).camera_from_board
 
@@ -235,10 +238,10 @@ def problem(
     rows: np.ndarray | None = None,
     designed: np.ndarray | None = None,
 ) -> tuple[Corners, tuple[str, ...]]:
-    """The problem, and which groups' σ are to be estimated, from ``first``.
+    """Returns the problem, and the groups whose σ are to be estimated, from ``first``.
 
-    ``rows`` : (v,) which of base_from_flange each view is of, one each in their order where None; ``designed`` :
-    (K, 3) the board's corners, of :func:`board_of`, those of the views where None.
+    ``rows`` : (v,) row in base_from_flange of each view; one view for each row, in order, where None; ``designed`` :
+    (K, 3) the board's corners, from :func:`board_of`; those of the views where None.
     """
     designed = board_of([views]) if designed is None else designed
     every = np.concatenate([designed, *(view.xyz_board for view in views.views)])
@@ -250,7 +253,7 @@ def problem(
         if value is None:
             free.append(name)
         sigma[name] = first[name] if value is None else value
-    if sigma["robot_rad"] or sigma["robot_mm"] or arm is not None:  # exact in one of the two only: nearly
+    if sigma["robot_rad"] or sigma["robot_mm"] or arm is not None:  # exact in one of them only: tiny σ there
         sigma |= {name: max(sigma[name], LEAST[name]) for name in ("robot_rad", "robot_mm")}
     robot = None
     if loop.robot_covariance is not None:
@@ -282,23 +285,24 @@ def problem(
 
 
 def board_of(every: Sequence[Views]) -> np.ndarray:
-    """All corners (K, 3) that any view shows, mm, each once."""
-    seen = [view.xyz_board for views in every for view in views.views]
-    return np.unique(np.round(np.concatenate(seen), SAME_DIGITS), axis=0)
+    """Returns all corners (K, 3) that any view shows, mm, each once."""
+    corners = [view.xyz_board for views in every for view in views.views]
+    return np.unique(np.round(np.concatenate(corners), SAME_DIGITS), axis=0)
 
 
 def contradicting(corners: Problem, state: Any, inverse: np.ndarray) -> np.ndarray:
-    """Poses (m,) of which the robot's error is not by chance: its estimate against the variance that it should have."""
+    """Returns which poses (m,) have an error of the robot that is not by chance: its estimate is tested against the
+    variance that it should have."""
     m = len(corners.base_from_flange)
     at = corners.places()["robot"]
     if at.stop == at.start:
         return np.zeros(m, bool)
-    off = state.base_from_flange.difference(corners.base_from_flange)
+    error = state.base_from_flange.difference(corners.base_from_flange)
     weight = corners.robot_weight()
-    white = np.einsum("mab,mb->ma", weight, off)
-    own = inverse[at, at].reshape(m, 6, m, 6)[np.arange(m), :, np.arange(m)]
-    # Of Gaussian knowledge δ ~ N(0, Σ) with posterior covariance C, the estimate of δ scatters by Σ − C.
-    value, vector = np.linalg.eigh(np.eye(6) - weight @ own @ np.swapaxes(weight, 1, 2))
+    white = np.einsum("mab,mb->ma", weight, error)
+    covariance = inverse[at, at].reshape(m, 6, m, 6)[np.arange(m), :, np.arange(m)]
+    # For Gaussian knowledge δ ~ N(0, Σ) with posterior covariance C, the estimate of δ scatters by Σ − C.
+    value, vector = np.linalg.eigh(np.eye(6) - weight @ covariance @ np.swapaxes(weight, 1, 2))
     turned = np.einsum("mab,ma->mb", vector, white)
     squared = np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1)
     redundancy = max(6 * (m - 1) - corners.places()["board"].start, 6)
@@ -306,7 +310,8 @@ def contradicting(corners: Problem, state: Any, inverse: np.ndarray) -> np.ndarr
 
 
 def scale_hint(corners: Problem, state: Any) -> tuple[float, float]:
-    """One step from the solution with the scale among the unknowns."""
+    """Returns the scale if it were solved for, and its σ: one step from the solution with the scale among the
+    unknowns."""
     wider = corners.with_board_scale()
     linear, at = wider.linear(state), wider.places()["scale"].start
     inverse = generalised_inverse(linear.normal)
@@ -320,8 +325,8 @@ def _camera_gain(corners: Corners, state: Bundle) -> float:
 
 
 def camera_gain(wider: Problem, state: Any) -> float:
-    """By how much the cost would fall, per parameter of one camera, with intrinsics among the unknowns as of
-    :data:`UNKNOWN_LENS`: predicted by one step from the solution; about 1 where the camera is right."""
+    """Returns the fall of the cost, per parameter of one camera, with intrinsics among the unknowns as in
+    :data:`UNKNOWN_LENS`. It is predicted by one step from the solution, and about 1 where the camera is right."""
     linear = wider.linear(state)
     return float(linear.gradient @ generalised_inverse(linear.normal) @ linear.gradient) / UNKNOWN_LENS[0].shape[1]
 
@@ -329,7 +334,8 @@ def camera_gain(wider: Problem, state: Any) -> float:
 def found_of(
     corners: Corners, state: Bundle, inverse: np.ndarray, reported: Poses, rows: np.ndarray, with_camera: bool
 ) -> Reprojection:
-    """``rows`` : (m,) which of ``reported`` each pose of the problem is, -1 for one that this camera did not see."""
+    """Returns the results of one camera. ``rows`` : (m,) row in ``reported`` of each pose of the problem, -1 for a pose
+    that this camera did not see."""
     at = corners.places()
     white, _ = corners.seen(state)
     residuals = corners.sigma["corner_px"] * np.linalg.solve(corners.weight, white[:, :, None])[:, :, 0]

@@ -1,4 +1,4 @@
-"""Reprojection adjustment of several cameras: X of each, one Z, one board and one robot, from all corners at once."""
+"""Reprojection adjustment of several cameras: X of each, one Z, one board and one robot, from all corners together."""
 
 from dataclasses import dataclass
 
@@ -31,18 +31,20 @@ from stcal.handeye.methods.rounds import adjust
 from stcal.io.cameras.model import intrinsic_basis
 
 LEAST_VIEWS = 1
-"""Of a camera: one image of a board tells where its camera is, if other cameras tell where the board is."""
+"""Least number of views of a camera. One image of a board gives the camera's place if other cameras give the
+board's."""
 MISSED = 3.0
-"""A view whose own pose of the board differs from that of the others is doubted from so many times the usual on."""
+"""Factor over the usual discrepancy between a view's own pose of the board and that of the others, from which the view
+is doubted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedRig:
-    """``state`` : of the poses used; ``used`` : which views of each camera were; ``outliers`` : (m,) poses of the robot
-    that contradict the others; ``covariance`` : (6c + 6, 6c + 6) of all X and Z; ``sigma_scale``; ``sigma`` : by group;
-    ``estimated`` : which of them; ``scale_hint`` : what the scale would become if it were solved for, and its σ;
-    ``camera_gain`` : (c,) by how much the cost would fall, per parameter, if a camera's intrinsics were solved for;
-    ``found`` : of each camera; ``settled`` : whether the estimated σ did."""
+    """``state`` : of the poses used; ``used`` : which views of each camera were used; ``outliers`` : (m,) poses of the
+    robot that contradict the others; ``covariance`` : (6c + 6, 6c + 6) of all X and Z; ``sigma_scale``; ``sigma`` : by
+    group; ``estimated`` : groups whose σ were estimated; ``scale_hint`` : the scale if it were solved for, and its σ;
+    ``camera_gain`` : (c,) fall of the cost per parameter if a camera's intrinsics were solved for; ``found`` : results
+    of each camera; ``settled`` : whether the estimated σ settled."""
 
     state: RigBundle
     used: tuple[np.ndarray, ...]
@@ -65,18 +67,18 @@ def adjust_rig(
     refine: bool = False,
     with_scale: bool = False,
 ) -> AdjustedRig:
-    """Least squares of all corners of all cameras from ``first`` X of each, Z, scale.
+    """Returns the least-squares adjustment of all corners of all cameras from ``first`` X of each, Z, scale.
 
-    As :func:`~stcal.handeye.methods.reprojection.adjust_views`; the error of each pose of the robot is one unknown, to
-    which all images that were taken there contribute, and σ of the robot is estimated over all. Poses of the robot that
-    contradict the others are left out, and so is an image that contradicts the others of the same pose.
+    It is like :func:`~stcal.handeye.methods.reprojection.adjust_views`. The error of each pose of the robot is one
+    unknown, to which all images from that pose contribute, and σ of the robot is estimated over all images. Poses of
+    the robot that contradict the others are left out, and so is an image that contradicts the others of the same pose.
 
     Raises
     ------
     ConvergenceError
         No minimum is reached.
     DegenerateError
-        Fewer than three poses of the robot agree, or no view of a camera does.
+        Fewer than three poses of the robot agree, or no view of a camera agrees.
     """
     loops = [Loop.of(given.pairs(i), setup) for i in range(len(given.cameras))]
     used = tuple(_near(loop, x, *first[1:]) for loop, x in zip(loops, first[0], strict=True))
@@ -103,12 +105,12 @@ def adjust_rig(
     error = None if refine else _considered(given, corners, state, free)
     at = corners.places()
     poses = inverse[: at["z"].stop, : at["z"].stop]
-    found = []
+    results = []
     for i, camera in enumerate(given.cameras):
         columns, view = corners.columns(i), np.full(len(given), -1)
         view[camera.rows[used[i]]] = np.flatnonzero(used[i])
         own, reported = inverse[np.ix_(columns, columns)], given.base_from_flange[camera.rows]
-        found.append(found_of(corners.each[i], state.of(i), own, reported, view[rows], refine))
+        results.append(found_of(corners.each[i], state.of(i), own, reported, view[rows], refine))
     return AdjustedRig(
         state=state,
         used=used,
@@ -119,28 +121,28 @@ def adjust_rig(
         estimated=free,
         scale_hint=scale_hint(corners, state),
         camera_gain=np.ones(len(given.cameras)) if refine else _camera_gains(corners, state),
-        found=tuple(found),
+        found=tuple(results),
         settled=solution.settled,
     )
 
 
 def _near(loop: Loop, x: Rigid, z: Rigid, scale: float) -> np.ndarray:
-    """Views (v,) that are not wrong from the start."""
+    """Returns which views (v,) are not wrong from the start."""
     miss = loop.residuals(x, z, scale)
     far = np.linalg.norm(miss[:, 3:], axis=1) > GROSS_SHARE * np.linalg.norm(loop.camera_from_board.translation, axis=1)
     return ~(far | (np.linalg.norm(miss[:, :3], axis=1) > GROSS_RAD))
 
 
 def _rows(given: RigPoses, used: tuple[np.ndarray, ...], outliers: np.ndarray) -> np.ndarray:
-    """Poses of the robot that some view is used of."""
-    for camera, own in zip(given.cameras, used, strict=True):
-        if own.sum() < LEAST_VIEWS:
+    """Returns the poses of the robot that are used in some view."""
+    for camera, good in zip(given.cameras, used, strict=True):
+        if good.sum() < LEAST_VIEWS:
             raise DegenerateError(
                 "E-HANDEYE-DISAGREE",
-                f"camera {camera.name}: none of {len(own)} views agrees with the other cameras; check its images, "
+                f"camera {camera.name}: none of {len(good)} views agrees with the other cameras; check its images, "
                 "intrinsics, board and poses",
             )
-    rows = np.unique(np.concatenate([camera.rows[own] for camera, own in zip(given.cameras, used, strict=True)]))
+    rows = np.unique(np.concatenate([camera.rows[good] for camera, good in zip(given.cameras, used, strict=True)]))
     if len(rows) < 3:
         raise DegenerateError(
             "E-HANDEYE-DISAGREE",
@@ -159,22 +161,22 @@ def _problem(
     refine: bool,
     with_scale: bool,
 ) -> tuple[RigCorners, tuple[str, ...]]:
-    """The problem with the poses ``rows`` of the robot, and which groups' σ are to be estimated."""
-    kept = [camera[own] for camera, own in zip(given.cameras, used, strict=True)]
-    board, flange = board_of([camera.views for camera in kept]), given.base_from_flange[rows]
-    each, free = [], []
-    for camera, loop in zip(kept, loops, strict=True):
+    """Returns the problem with the poses ``rows`` of the robot, and the groups whose σ are to be estimated."""
+    cameras = [camera[corners] for camera, corners in zip(given.cameras, used, strict=True)]
+    board, flange = board_of([camera.views for camera in cameras]), given.base_from_flange[rows]
+    problems, free = [], []
+    for camera, loop in zip(cameras, loops, strict=True):
         at = np.searchsorted(rows, camera.rows)
         prior = camera.prior if refine else None
-        own, names = problem(loop, flange, camera.views, noise, prior, with_scale, rows=at, designed=board)
-        each.append(own)
-        found = RigCorners((camera.name,), (own,))
-        free += [name for name in (*found.sigma, *found.factors()) if name.split(":")[0] in names]
-    return RigCorners(tuple(camera.name for camera in kept), tuple(each)), tuple(dict.fromkeys(free))
+        corners, names = problem(loop, flange, camera.views, noise, prior, with_scale, rows=at, designed=board)
+        problems.append(corners)
+        named = RigCorners((camera.name,), (corners,))
+        free += [name for name in (*named.sigma, *named.factors()) if name.split(":")[0] in names]
+    return RigCorners(tuple(camera.name for camera in cameras), tuple(problems)), tuple(dict.fromkeys(free))
 
 
 def _considered(given: RigPoses, corners: RigCorners, state: RigBundle, free: tuple[str, ...]) -> CameraError | None:
-    """Of the intrinsics as filed, where something is known of them."""
+    """Returns the effect of the intrinsics as filed; None where no prior of any camera is known."""
     known = {}
     for i, camera in enumerate(given.cameras):
         if camera.prior is not None:
@@ -183,39 +185,45 @@ def _considered(given: RigPoses, corners: RigCorners, state: RigBundle, free: tu
 
 
 def _camera_gains(corners: RigCorners, state: RigBundle) -> np.ndarray:
-    """(c,) :func:`~stcal.handeye.methods.reprojection.camera_gain` of each camera: of the worst one by itself, of the
-    next with the intrinsics of that one free, for a wrong camera draws board and robot of all to its side."""
+    """Returns (c,) :func:`~stcal.handeye.methods.reprojection.camera_gain` of each camera.
+
+    The worst camera is tested by itself, the next with the intrinsics of the worst free, since a wrong camera draws the
+    board and the robot of all to its side.
+    """
     wrong: list[int] = []
-    found, before = np.ones(len(corners.each)), 0.0
-    while len(wrong) < len(found):
+    gains, before = np.ones(len(corners.each)), 0.0
+    while len(wrong) < len(gains):
         gain = {}
-        for i in set(range(len(found))) - set(wrong):
+        for i in set(range(len(gains))) - set(wrong):
             wider = corners.with_intrinsics(dict.fromkeys((*wrong, i), UNKNOWN_LENS))
             gain[i] = camera_gain(wider, state) - before
-            found[i] = gain[i]
+            gains[i] = gain[i]
         worst = max(gain, key=gain.__getitem__)
         if gain[worst] <= CAMERA_GAIN:
             break
         wrong.append(worst)
         before += gain[worst]
-    return found
+    return gains
 
 
 def _worst_view(
     given: RigPoses, used: tuple[np.ndarray, ...], rows: np.ndarray, corners: RigCorners, state: RigBundle
 ) -> tuple[int, int] | None:
-    """The view (camera, its number) that contradicts the others most, by what its corners would gain from a pose of
+    """Returns the view (camera, its number) that contradicts the others most, by the gain of its corners from a pose of
     their own; None where all agree."""
     worst, most = None, 1.0
     for i, camera in enumerate(given.cameras):
-        own, numbers = corners.each[i], np.flatnonzero(used[i])
-        white, by = own.seen(state.of(i))
+        corners_of_camera, numbers = corners.each[i], np.flatnonzero(used[i])
+        white, derivatives = corners_of_camera.seen(state.of(i))
         gains = []
         for row in np.searchsorted(rows, camera.rows[numbers]):
-            here = own.view == row
-            slope, off = by["x"][here].reshape(-1, 6), white[here].ravel()  # moving X is moving the board in the view
-            gains.append(float(off @ slope @ generalised_inverse(slope.T @ slope) @ slope.T @ off))
-        # What all views of a camera miss alike, its lens or a rough board does: a view is measured by the others.
+            in_view = corners_of_camera.view == row
+            slope, miss = (
+                derivatives["x"][in_view].reshape(-1, 6),
+                white[in_view].ravel(),
+            )  # moving X is moving the board in the view
+            gains.append(float(miss @ slope @ generalised_inverse(slope.T @ slope) @ slope.T @ miss))
+        # An error that all views of a camera share comes from its lens or the board: a view is judged by the others.
         usual = max(1.0, float(np.median(gains)) / 6)
         limit = 6 * MISSED * usual * f.ppf(1 - FALSE_ALARM / len(gains), 6, len(white))
         k = int(np.argmax(gains))

@@ -1,4 +1,4 @@
-"""What is known, in groups of one σ each, and the adjustment that estimates these σ in rounds."""
+"""Observations in groups of one σ each, and the adjustment that estimates these σ in rounds."""
 
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
@@ -20,25 +20,25 @@ LEAST = {
     "arm_rad": 1e-8,
     "arm_mm": 1e-5,
 }
-"""Estimated σ stay above: exact data have none. Factors of what is stated of a camera stay above 1."""
+"""Lower limits of estimated σ: exact data would give 0. The lower limit of the factors of stated camera σ is 1."""
 ROUNDS = 20
 ROUGHLY = 1e-6
-"""Relative fall of the cost at which a round of σ has solved well enough."""
+"""Relative fall of the cost below which the minimisation within a round of σ ends."""
 SETTLED = 1e-3
-"""Relative change of σ from round to round that moves nothing any more."""
+"""Relative change of σ between rounds below which the iteration has converged."""
 HELD = 1e-10
-"""Share of each unknown's information that is added: what nothing determines must not be singular."""
+"""Share of each unknown's information that is added, so that undetermined unknowns do not make the matrix singular."""
 WORST = "check the poses that fit worst"
 FARTHEST = 7.0
-"""A round changes a σ by e⁷, a thousand times, at most."""
+"""Largest logarithm of the change of a σ in one round: e⁷ is a factor of a thousand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Knowledge:
-    """Knowledge of one kind.
+    """Observations of one kind.
 
-    ``names`` : of the σ that its columns have, each an equal share; ``white`` : (g, d) residuals in units of σ;
-    ``jacobian`` : (g d, k) their derivative; ``limit`` : Huber's, of the length of a row.
+    ``names`` : names of the σ of its columns, each of an equal share of the columns; ``white`` : (g, d) residuals in
+    units of σ; ``jacobian`` : (g d, k) their derivative; ``limit`` : Huber's limit of the length of a row.
     """
 
     names: tuple[str, ...]
@@ -47,77 +47,78 @@ class Knowledge:
     limit: float
 
     def weight(self) -> np.ndarray:
-        """(g,) Huber's weights."""
+        """Returns Huber's weights (g,)."""
         return huber_weights(np.linalg.norm(self.white, axis=1), self.limit)
 
     def linear(self) -> NormalEquations:
-        """Its part of the cost and of the normal equations."""
+        """Returns the group's contribution to the cost and to the normal equations."""
         cost = float(huber_cost(np.linalg.norm(self.white, axis=1), self.limit).sum())
         pulled = self.jacobian.multiply(np.repeat(self.weight(), self.white.shape[1])[:, None]).tocsr().T
         return NormalEquations(cost, (pulled @ self.jacobian).toarray(), pulled @ self.white.ravel())
 
     def by_name(self) -> dict[str, tuple[int, NormalEquations]]:
-        """By each of ``names``, or by none: number of residuals, and its quadratic part of the cost."""
+        """Returns, for each of ``names`` or for the empty name, the number of residuals and their quadratic part of the
+        cost."""
         g, d = self.white.shape
         width = d // max(len(self.names), 1)
         weight = np.repeat(self.weight(), d)
-        found = {}
+        parts = {}
         for i, name in enumerate(self.names or ("",)):
             rows = np.flatnonzero(np.arange(g * d) % d // width == i)
             jacobian, white = self.jacobian[rows], self.white.ravel()[rows]
             pulled = jacobian.multiply(weight[rows, None]).tocsr().T
             linear = NormalEquations(float(weight[rows] @ white**2), (pulled @ jacobian).toarray(), pulled @ white)
-            found[name] = len(rows), linear
-        return found
+            parts[name] = len(rows), linear
+        return parts
 
 
 class Problem(Protocol):
-    """What is adjusted: the corners of one camera, or of several about the same board."""
+    """An adjustment problem: the corners of one camera, or of several cameras about the same board."""
 
     @property
     def sigma(self) -> dict[str, float]:
-        """Of each group."""
+        """σ of each group."""
         ...
 
     @property
     def base_from_flange(self) -> Poses:
-        """As reported."""
+        """The poses of the flange, as reported."""
         ...
 
     def with_sigma(self, sigma: dict[str, float]) -> Any:
-        """With other σ."""
+        """Returns the same problem with other σ."""
         ...
 
     def with_board_scale(self) -> Any:
-        """With the board's scale among the unknowns."""
+        """Returns the same problem with the board's scale among the unknowns."""
         ...
 
     def places(self) -> dict[str, slice]:
-        """Where the unknowns stand in a step."""
+        """Returns the places of the unknowns in a step."""
         ...
 
     def factors(self) -> dict[str, float]:
-        """1 for each kind of the intrinsics solved for."""
+        """Returns a factor of 1 for each kind of the intrinsics solved for."""
         ...
 
     def robot_weight(self) -> np.ndarray:
-        """(m, 6, 6) whitening of errors of base_from_flange."""
+        """Returns the whitening (m, 6, 6) of errors of base_from_flange."""
         ...
 
     def count(self) -> int:
-        """Number of unknowns."""
+        """Returns the number of unknowns."""
         ...
 
     def moved(self, state: Any, step: np.ndarray) -> Any:
-        """A state after a step of all unknowns."""
+        """Returns a state after a step of all unknowns."""
         ...
 
     def groups(self, state: Any) -> list[Knowledge]:
-        """Everything that is known."""
+        """Returns all observations: the corners seen, and the prior knowledge."""
         ...
 
     def linear(self, state: Any) -> NormalEquations:
-        """Cost and normal equations."""
+        """Returns cost and normal equations."""
         ...
 
 
@@ -127,8 +128,8 @@ S = TypeVar("S")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleSolution(Generic[P, S]):
-    """``corners`` : with the σ that were estimated; ``state``; ``normal`` : matrix about it; ``settled`` : whether the
-    σ did within :data:`ROUNDS`."""
+    """``corners`` : problem with the estimated σ; ``state``; ``normal`` : normal matrix about the state; ``settled`` :
+    whether the σ settled within :data:`ROUNDS`."""
 
     corners: P
     state: S
@@ -137,7 +138,7 @@ class BundleSolution(Generic[P, S]):
 
 
 def adjust(corners: P, start: S, free: tuple[str, ...]) -> BundleSolution[P, S]:
-    """Solve, and estimate the σ of the ``free`` groups in rounds.
+    """Solve the problem, and estimate the σ of the ``free`` groups in rounds.
 
     Raises
     ------
@@ -153,12 +154,12 @@ def adjust(corners: P, start: S, free: tuple[str, ...]) -> BundleSolution[P, S]:
         settled = bool(change < SETTLED)
         if settled:
             break
-    found = minimise(state, corners.linear, corners.moved).required("hand-eye", WORST)
-    return BundleSolution(corners, found.state, found.linear.normal, settled)
+    minimum = minimise(state, corners.linear, corners.moved).required("hand-eye", WORST)
+    return BundleSolution(corners, minimum.state, minimum.linear.normal, settled)
 
 
 def estimated(corners: Problem, state: Any, free: tuple[str, ...]) -> dict[str, float]:
-    """Restricted maximum-likelihood σ of the ``free`` groups, all else linear about a state (as
+    """Returns restricted maximum-likelihood σ of the ``free`` groups, with all else linear about a state (like
     :func:`~stcal.handeye.methods.noise.variance_components`)."""
     unknowns = corners.count()
     nothing = NormalEquations(0.0, np.zeros((unknowns, unknowns)), np.zeros(unknowns))
@@ -170,7 +171,7 @@ def estimated(corners: Problem, state: Any, free: tuple[str, ...]) -> dict[str, 
             parts[key] = old_count + count, old + linear
     fixed = parts.pop("", (0, nothing))[1]
     names = tuple(parts)
-    found = Parts(
+    likelihood = Parts(
         each=NormalEquations.stacked([linear for _, linear in parts.values()]),
         count=np.array([count for count, _ in parts.values()]),
         fixed=fixed,
@@ -179,10 +180,10 @@ def estimated(corners: Problem, state: Any, free: tuple[str, ...]) -> dict[str, 
     )
     least = np.log([LEAST.get(kind(name), 1.0) / corners.sigma[name] for name in names])
     farthest = np.full(len(names), FARTHEST)
-    best = found.best(np.maximum(least, -farthest), farthest, [np.zeros(len(names))])
+    best = likelihood.best(np.maximum(least, -farthest), farthest, [np.zeros(len(names))])
     return {name: float(corners.sigma[name] * np.exp(x)) for name, x in zip(names, best, strict=True)}
 
 
 def kind(name: str) -> str:
-    """``corner_px`` of a group that is one camera's of several, ``corner_px:left``."""
+    """Returns the kind of a group: ``corner_px`` for ``corner_px:left``, the group of one camera of several."""
     return name.partition(":")[0]

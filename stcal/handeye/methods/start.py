@@ -1,4 +1,5 @@
-"""Linear solutions of the loop, many subsets of poses at once; and one that a third of bad poses does not disturb."""
+"""Linear solutions of the loop for many subsets of poses at once, and a solution that tolerates a third of bad
+poses."""
 
 from dataclasses import replace
 
@@ -11,22 +12,23 @@ from stcal.handeye.data.loop import Loop
 from stcal.handeye.data.motions import Motions
 
 SUBSETS = 200
-"""Of three or four poses: with a third of all poses bad, hundreds of clean ones are among them on average …"""
+"""Number of subsets of three or four poses. With a third of all poses bad, enough subsets are clean on average."""
 LEAST_LENGTH = 0.1
-"""Of the camera's paths over those of the flange, as they fit: 1 but for the board's size, 0 where neither moves."""
+"""Least ratio of the fitted length of the camera's paths to that of the flange. It is 1 but for the board's size, and 0
+where neither moves."""
 LEAST_SCALE = 1e-6
-"""Of the board: its lengths in metres make it 0.001."""
+"""Smallest scale of the board; lengths in metres give 0.001."""
 SEED = 0
-"""… and the same ones every time."""
+"""Seed of the subsets, so that they are the same every time."""
 
 
 def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
-    """The best X, Z and scale of many small subsets: with the least product of the median rotation and translation.
+    """Returns X, Z and scale of the best of many small subsets, by least product of median rotation and translation.
 
-    The product has no unit that would have to be weighed; translations are in units of the board, of which one that is
-    shrunk to nothing would fit a flange that turns about a point. Solved once more from all poses within three times
-    the medians. Rotations by Shah (2013), then translations, and the board's scale where wanted, by linear least
-    squares: no logarithms, so that half turns are motions like any other.
+    The product needs no weight between the two units. Translations are in units of the board, since a board shrunk to
+    nothing would fit a flange that turns about a point. The solution is repeated with all poses within three times the
+    medians. Rotations are found by Shah (2013), then translations, and the board's scale where wanted, by linear least
+    squares. No logarithms are used, so that half turns are motions like any other.
 
     Raises
     ------
@@ -44,7 +46,7 @@ def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
         size = 3 if m < 6 else 4
         order = rng.permuted(np.tile(np.arange(m), (SUBSETS, 1)), axis=1)
         candidates.append(_linear(loop, order[:, :size], with_scale))
-    parts = [np.concatenate(part) for part in zip(*candidates, strict=True)]
+    parts = [np.concatenate(arrays) for arrays in zip(*candidates, strict=True)]
     turn, shift = _misses(loop, *parts)
     shift = _in_board_units(shift, parts[4])
     best = np.argmin(np.log(np.median(turn, 1) + 1e-15) + np.log(np.median(shift, 1) + 1e-12))
@@ -55,21 +57,21 @@ def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
         new_shift = _in_board_units(new_shift, again[4])
         if np.median(new_turn) * np.median(new_shift) < np.median(turn[best]) * np.median(shift[best]):
             parts, best = again, 0
-    x, t_x, z, t_z, scale = (part[best] for part in parts)
+    x, t_x, z, t_z, scale = (arrays[best] for arrays in parts)
     return Rigid(x, t_x), Rigid(z, t_z), float(scale)
 
 
 def _in_board_units(shift: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Distances (s, m) over scales (s,); infinite for a board of no size."""
+    """Returns distances (s, m) over scales (s,); infinite for a board of no size."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(np.abs(scale) < LEAST_SCALE, np.inf, shift.T / np.abs(scale)).T
 
 
 def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
-    """X, Z and scale of poses that turn about one axis (3,) of the mount only; X does not move along it.
+    """Returns X, Z and scale of poses that turn about one axis (3,) of the mount only; X has no part along the axis.
 
-    The rotations tell where the axis lies in the camera; the angle about it comes from the translations, linear in its
-    cosine and sine; their length is the scale.
+    The rotations give the direction of the axis in the camera. The angle about it comes from the translations, linear
+    in its cosine and sine; their length is the scale.
     """
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     motions = Motions.all(loop)
@@ -100,16 +102,17 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
 
 
 def slid(x: Rigid, z: Rigid, mount_axis: np.ndarray, loop: Loop) -> tuple[Rigid, Rigid]:
-    """X without its part along the axis about which all poses turn, and Z that still closes the loop."""
+    """Returns X without its part along the axis about which all poses turn, and the Z that still closes the loop."""
     along = (x.translation @ mount_axis) * mount_axis
     stand = (loop.stand_from_mount.rotation @ along).mean(0)
     return Rigid(x.rotation, x.translation - along), Rigid(z.rotation, z.translation - stand)
 
 
 def _linear(loop: Loop, subsets: np.ndarray, with_scale: bool) -> tuple[np.ndarray, ...]:
-    """X, Z and scale of subsets (s, k) of the poses: rotations (s, 3, 3), translations (s, 3), of each; scales (s,)."""
+    """Returns X, Z and scale of subsets (s, k) of the poses: rotations (s, 3, 3) and translations (s, 3) of each, and
+    scales (s,)."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
-    # R_G R_X R_C = R_Z: Σ R_C ⊗ R_G maps vec R_X to k vec R_Z, both of the same length: its first singular vectors.
+    # R_G R_X R_C = R_Z: Σ R_C ⊗ R_G maps vec R_X to k vec R_Z, both of one length. They are the first singular vectors.
     k = np.einsum("mab,mcd->madbc", hand.rotation, eye.rotation).reshape(len(loop), 9, 9)
     u, _, vt = np.linalg.svd(k[subsets].sum(1))
     z, x = u[:, :, 0].reshape(-1, 3, 3), vt[:, 0].reshape(-1, 3, 3)
@@ -120,8 +123,8 @@ def _linear(loop: Loop, subsets: np.ndarray, with_scale: bool) -> tuple[np.ndarr
 
 
 def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bool) -> tuple[np.ndarray, ...]:
-    """t_X and t_Z, (s, 3), and scales (s,) for rotations of X (s, 3, 3): R_G t_X + s R_G R_X t_C − t_Z = −t_G; the
-    shortest where they are not unique."""
+    """Returns t_X and t_Z, (s, 3), and scales (s,) for rotations of X (s, 3, 3), from R_G t_X + s R_G R_X t_C − t_Z =
+    −t_G. Where they are not unique, the shortest is returned."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     rows = np.concatenate([hand.rotation, np.tile(-np.eye(3), (len(loop), 1, 1))], axis=2)[subsets]
     moved = np.einsum("skab,sbc,skc->ska", hand.rotation[subsets], x, eye.translation[subsets])
@@ -141,7 +144,7 @@ def _scaled(loop: Loop, scale: float) -> Loop:
 
 
 def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
-    """Angles (s, m) and distances (s, m) by which the chains miss Z."""
+    """Returns the angles (s, m) and distances (s, m) by which the chains miss Z."""
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     chain = np.einsum("mab,sbc,mcd->smad", hand.rotation, x, eye.rotation)
     cosine = (np.einsum("smab,sab->sm", chain, z) - 1) / 2
@@ -151,12 +154,12 @@ def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nearest_rotation(m: np.ndarray) -> np.ndarray:
-    """Rotations nearest to matrices (s, 3, 3)."""
+    """Returns the rotations nearest to matrices (s, 3, 3)."""
     u, _, vt = np.linalg.svd(m)
     u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
     return u @ vt
 
 
 def mean_pose(chain: Poses) -> Rigid:
-    """Mean of poses: the chordal mean of their rotations."""
+    """Returns the mean of poses, with the chordal mean of their rotations."""
     return Rigid(Rotation.from_matrix(np.array(chain.rotation)).mean().as_matrix(), chain.translation.mean(0))

@@ -1,1 +1,1 @@
-"""A hand-eye calibration for people and for other programs."""
+"""Reports and files of hand-eye calibrations, for people and for other programs."""

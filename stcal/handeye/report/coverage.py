@@ -1,4 +1,4 @@
-"""What the poses covered: the image by the board, rotations by the flange, and how corners by the robot miss."""
+"""Coverage by the poses: the image by the board, and rotations by the flange; and errors of corners by the robot."""
 
 from dataclasses import dataclass
 
@@ -13,17 +13,20 @@ from stcal.handeye.data.views import Views
 from stcal.handeye.result import HandEye
 
 CELLS = 60
-"""Along the longer side of the image, in which is counted where the board was."""
+"""Number of cells along the longer side of the image, in which views of the board are counted."""
 MOST_TURNS = 1000
-"""Pairs of poses of which the turn is drawn, some of all at random."""
+"""Largest number of pairs of poses whose turn is drawn; of more pairs, a random sample."""
 LEAST_TURN = np.radians(2)
-"""Below it the axis of a turn is noise."""
+"""Smallest turn whose axis is drawn, in rad; the axes of smaller turns are noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageCoverage:
-    """``counts`` : (rows, columns), in how many photographs the board lay over each cell of the image; ``share`` of the
-    cells over which it ever lay."""
+    """Coverage of the image by the board.
+
+    ``counts`` : (rows, columns) number of photographs in which the board covers a cell; ``share`` : share of the cells
+    that the board covers at least once.
+    """
 
     counts: np.ndarray
     share: float
@@ -33,7 +36,7 @@ class ImageCoverage:
 
 
 def image_coverage(views: Views) -> ImageCoverage:
-    """Over the hulls of the corners of each view."""
+    """Returns the coverage of the image by the convex hulls of each view's corners."""
     width, height = views.camera.width, views.camera.height
     cell = max(width, height) / CELLS
     columns, rows = max(1, round(width / cell)), max(1, round(height / cell))
@@ -44,47 +47,52 @@ def image_coverage(views: Views) -> ImageCoverage:
     counts = np.zeros(len(middle), int)
     for view in views.views:
         try:
-            side = ConvexHull(view.xy_px).equations
-        except QhullError:  # all on a line
+            sides = ConvexHull(view.xy_px).equations
+        except QhullError:  # all corners on a line
             continue
-        counts += (middle @ side[:, :2].T + side[:, 2] <= 0).all(1)
+        counts += (middle @ sides[:, :2].T + sides[:, 2] <= 0).all(1)
     return ImageCoverage(counts.reshape(rows, columns), float((counts > 0).mean()))
 
 
 def turns_between(pairs: HandEyePoses) -> np.ndarray:
-    """(n, 3) rotation vectors of the flange between poses, its axes, rad; Z ≥ 0, as a turn and its inverse are one."""
+    """Returns rotation vectors (n, 3) of the flange between poses, in its axes, rad.
+
+    A turn and its inverse count as one, with Z ≥ 0.
+    """
     rotation = pairs.base_from_flange.rotation
     i, j = np.triu_indices(len(rotation), 1)
     if len(i) > MOST_TURNS:
-        some = np.random.default_rng(0).choice(len(i), MOST_TURNS, replace=False)
-        i, j = i[some], j[some]
+        sample = np.random.default_rng(0).choice(len(i), MOST_TURNS, replace=False)
+        i, j = i[sample], j[sample]
     turn = Rotation.from_matrix(np.swapaxes(rotation[j], 1, 2) @ rotation[i]).as_rotvec()
     return np.where(turn[:, 2:] < 0, -turn, turn)
 
 
 def equal_area(directions: np.ndarray) -> np.ndarray:
-    """(n, 2): unit vectors with Z ≥ 0 in Lambert's azimuthal projection, the half sphere a disc of radius 1."""
+    """Projects unit vectors with Z ≥ 0 by Lambert's azimuthal projection, (n, 2), onto a disc of radius 1."""
     return directions[:, :2] / np.sqrt(1 + np.abs(directions[:, 2:]))
 
 
 def by_robot(result: HandEye, pairs: HandEyePoses, views: Views) -> list[np.ndarray]:
-    """(k, 2) px for each view: where its corners would be, by the robot's pose as reported and the transforms; NaN
-    where that is behind the camera."""
+    """Predicts the corners of each view from the robot's reported pose and the transforms, (k, 2) px.
+
+    Corners behind the camera are NaN.
+    """
     loop, board = Loop.of(pairs, result.setup), result.reprojection
     camera = views.camera if board is None else board.camera
-    found = []
+    predicted = []
     poses = result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
     for view, pose in zip(views.views, poses, strict=True):
         xyz = pose @ (result.scale * view.xyz_board if board is None else board.board(view.xyz_board))
-        before = xyz[:, 2] > 0
+        in_front = xyz[:, 2] > 0
         px = np.full((len(xyz), 2), np.nan)
-        px[before] = camera.project(xyz[before])
-        found.append(px)
-    return found
+        px[in_front] = camera.project(xyz[in_front])
+        predicted.append(px)
+    return predicted
 
 
 def rms_px(predicted: np.ndarray, seen: np.ndarray) -> float:
-    """RMS distance of those that could be predicted; infinite where none could."""
+    """Returns the RMS distance over all corners that could be predicted, or infinity if none could."""
     squared = ((predicted - seen) ** 2).sum(1)
     known = np.isfinite(squared)
     return float(np.sqrt(squared[known].mean())) if known.any() else float("inf")

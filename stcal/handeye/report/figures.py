@@ -13,13 +13,13 @@ from stcal.report.text import number, telling_names
 
 GOOD, BAD = COLOURS[0], COLOURS[1]
 MOST_NAMED = 40
-"""Poses of which each has its name below the chart; of more poses, every second, third …"""
+"""Largest number of pose names below the chart. Of more poses, every second, third, … is named."""
 MOST_VECTORS = 1500
-"""Residuals that are drawn over the image."""
+"""Largest number of residuals that are drawn over the image."""
 WIDE, HIGH, LEFT, GAP = 960.0, 112.0, 62.0, 30.0
-"""Of the chart of poses, px: width, height of one panel, room for its numbers, and between panels."""
+"""Layout of the chart of poses, in px: width, height of one panel, room for its numbers, gap between panels."""
 LONGEST = 0.06
-"""Of the image's width: the residual that 95 % are below, as drawn."""
+"""Length at which the 95 % quantile of the residuals is drawn, as a share of the image's width."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +34,10 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class PoseBars:
-    """The chart of poses: ``panels`` one below the other, ``names`` (x, text, full name) below them, slanted where
-    ``slope``, shorter than they are where ``cut``."""
+    """The chart of poses: ``panels`` one below the other, and ``names`` (x, text, full name) below them.
+
+    ``slope`` : whether the names are slanted; ``cut`` : whether they are shortened.
+    """
 
     width: float
     height: float
@@ -48,29 +50,29 @@ class PoseBars:
 
 
 def pose_bars(result: HandEye) -> PoseBars:
-    """Of each pose: rotation, board's origin, and RMS of its corners where these were adjusted."""
+    """Returns the chart of each pose's residuals: rotation, board's origin, and corner RMS if corners were adjusted."""
     turn, shift = (np.linalg.norm(part, axis=1) for part in np.split(result.residuals, 2, axis=1))
     rows = [("rotation, °", np.degrees(turn), 4, "°"), ("board's origin, mm", shift, 3, " mm")]
     if result.reprojection is not None:
         rms = np.array([result.reprojection.rms_px(i) for i in range(len(result.names))])
         rows.append(("corners, RMS px", rms, 3, " px"))
     step = (WIDE - LEFT) / len(result.names)
-    at = [LEFT + (i + 0.5) * step for i in range(len(result.names))]
+    centres = [LEFT + (i + 0.5) * step for i in range(len(result.names))]
     panels = []
     for k, (label, values, digits, unit) in enumerate(rows):
         top = 20 + k * (HIGH + GAP)
         largest = float(np.nanmax(values, initial=0)) or 1.0
         ticks = [t for t in locator().tick_values(0, largest) if 0 <= t <= 1.001 * largest]
         bars = []
-        for x, value, name, bad in zip(at, values, result.names, result.outliers, strict=True):
+        for x, value, name, bad in zip(centres, values, result.names, result.outliers, strict=True):
             title = f"{name}: {number(value, digits)}{unit}{', left out' if bad else ''}"
             height = HIGH * float(np.nan_to_num(value)) / largest
             bars.append((x, top + HIGH - height, height, BAD if bad else GOOD, title))
         panels.append(Panel(label, top, [(top + HIGH * (1 - t / largest), f"{t:g}") for t in ticks], bars))
-    every = int(np.ceil(len(at) / MOST_NAMED))
+    every = int(np.ceil(len(centres) / MOST_NAMED))
     short = telling_names(result.names)
     slope = max(map(len, short)) * 7.5 > every * step
-    names = list(zip(at, short, result.names, strict=True))[::every]
+    names = list(zip(centres, short, result.names, strict=True))[::every]
     room = 22 if not slope else 18 + 5.0 * max(len(text) for _, text, _ in names)
     height = panels[-1].top + HIGH + room
     return PoseBars(
@@ -79,11 +81,11 @@ def pose_bars(result: HandEye) -> PoseBars:
 
 
 def corner_figure(found: Reprojection):
-    """Residuals of all corners."""
+    """Draws the residuals of the corners, and the circle that holds 95 % of them."""
     figure = new_figure(4.4, 4.0)
     axes = figure.add_axes((0.15, 0.12, 0.8, 0.86))
-    off = found.residuals_px[_some(len(found.residuals_px))]
-    axes.plot(*off.T, ".", color=GOOD, ms=2.2, alpha=0.6)
+    residuals = found.residuals_px[_some(len(found.residuals_px))]
+    axes.plot(*residuals.T, ".", color=GOOD, ms=2.2, alpha=0.6)
     radius = float(np.quantile(np.linalg.norm(found.residuals_px, axis=1), 0.95))
     turn = np.linspace(0, 2 * np.pi, 100)
     axes.plot(radius * np.cos(turn), radius * np.sin(turn), color=INK, lw=0.8)
@@ -94,11 +96,11 @@ def corner_figure(found: Reprojection):
 
 
 def image_figure(size: tuple[int, int], covered: ImageCoverage, seen: np.ndarray, off: np.ndarray):
-    """Where the board was in the image, and residuals ``off`` (n, 2) of the corners ``seen`` (n, 2), enlarged.
+    """Draws where the board was in the image, and enlarged residuals ``off`` (n, 2) of the corners ``seen`` (n, 2).
 
     Returns
     -------
-    figure, and by what the residuals are enlarged
+    The figure, and the factor by which the residuals are enlarged.
     """
     from matplotlib.collections import LineCollection
 
@@ -116,8 +118,8 @@ def image_figure(size: tuple[int, int], covered: ImageCoverage, seen: np.ndarray
         aspect="equal",
     )
     factor = enlargement(off, width)
-    some = _some(len(seen))
-    seen, off = seen[some], off[some]
+    sample = _some(len(seen))
+    seen, off = seen[sample], off[sample]
     axes.add_collection(LineCollection(np.stack([seen, seen + factor * off], axis=1).tolist(), colors=BAD, lw=0.8))
     axes.plot(*seen.T, ".", color=INK, ms=1.6)
     axes.set_xlim(-0.5, width - 0.5)
@@ -131,14 +133,14 @@ def image_figure(size: tuple[int, int], covered: ImageCoverage, seen: np.ndarray
 
 
 def enlargement(off: np.ndarray, width: float) -> float:
-    """A round factor by which residuals (n, 2) are seen on an image of this width, and do not cover it; 1 or more."""
+    """Returns a round factor, 1 or more, that makes residuals (n, 2) visible on an image of this width."""
     length = np.linalg.norm(off[np.isfinite(off).all(1)], axis=1)
     usual = float(np.quantile(length, 0.95)) if len(length) else 0.0
     return max(1.0, round_below(LONGEST * width / usual)) if usual else 1.0
 
 
 def turns_figure(turns: np.ndarray, seen: Observability | None):
-    """Axes of the turns (n, 3) between poses on the half sphere, and how large these turns are."""
+    """Draws the axes of the turns (n, 3) between poses on the half sphere, and a histogram of their angles."""
     figure = new_figure(9.4, 4.1)
     axes = figure.add_axes((0.01, 0.03, 0.44, 0.94))
     angle = np.linalg.norm(turns, axis=1)
@@ -153,8 +155,10 @@ def turns_figure(turns: np.ndarray, seen: Observability | None):
         axes.text(x, y, text, fontsize=SMALL + 0.5, ha="center", va="center", color=INK)
     axes.plot(0, 0, "+", color="#9aa0a8", ms=6)
     axes.text(0.03, 0.03, "Z", fontsize=SMALL + 0.5, color=INK)
-    at = equal_area(turns[large] / angle[large, None])
-    dots = axes.scatter(*at.T, c=np.degrees(angle[large]), s=11, cmap="viridis_r", vmin=0, lw=0, alpha=0.85, zorder=2)
+    points = equal_area(turns[large] / angle[large, None])
+    dots = axes.scatter(
+        *points.T, c=np.degrees(angle[large]), s=11, cmap="viridis_r", vmin=0, lw=0, alpha=0.85, zorder=2
+    )
     if seen is not None:
         for k, axis in enumerate(np.where(seen.axes[:, 2:] < 0, -seen.axes, seen.axes), 1):
             x, y = equal_area(axis[None])[0]
@@ -176,7 +180,7 @@ def turns_figure(turns: np.ndarray, seen: Observability | None):
 
 
 def _some(count: int) -> np.ndarray:
-    """All, or as many as are drawn, at random."""
+    """Returns the rows that are drawn: all of them, or a random sample of :data:`MOST_VECTORS`."""
     return np.sort(np.random.default_rng(0).permutation(count)[:MOST_VECTORS])
 
 

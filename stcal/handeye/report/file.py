@@ -1,4 +1,4 @@
-"""All that a hand-eye calibration found, and its file."""
+"""The result file of a hand-eye calibration, with all of its results."""
 
 from typing import Literal
 
@@ -137,7 +137,7 @@ class TimeOffsetPart(Part):
 
 
 class HandEyeFile(ResultFile):
-    """Of ``handeye``: mm, rad, px; null where there is no value."""
+    """Result file of ``handeye``: mm, rad, px; null where there is no value."""
 
     format: Literal["stcal handeye 1"] = Field(description="the file's form and its version")
     version: str = Field(description="of stcal")
@@ -234,17 +234,17 @@ class HandEyeFile(ResultFile):
 
     @classmethod
     def of(cls, outcome: Outcome, whole: bool = False) -> "HandEyeFile":
-        """What ``--out`` holds; ``whole`` : what ``--json`` does, every split and every method too."""
+        """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split and every method too."""
         result, names, board = outcome.result, outcome.result.names, FRAMES[outcome.result.setup].board
         poses = {name: pose.matrix() for name, pose in result.transforms.items()}
         compared = [_method(each, names) for each in outcome.compared]
-        more: dict = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
-        more |= {} if outcome.choice is None else {"choice": _choice(outcome.choice)}
-        more |= {} if outcome.arm is None else {"arm": _arm(outcome.arm)}
+        optional: dict = {} if outcome.motions is None else {"motions_held_out": _motions(outcome.motions)}
+        optional |= {} if outcome.choice is None else {"choice": _choice(outcome.choice)}
+        optional |= {} if outcome.arm is None else {"arm": _arm(outcome.arm)}
         if (offset := outcome.time_offset) is not None:
-            more["time_offset"] = {name: getattr(offset, name) for name in TimeOffsetPart.model_fields}
-        more |= {"understood": outcome.understood} if outcome.understood else {}
-        more |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
+            optional["time_offset"] = {name: getattr(offset, name) for name in TimeOffsetPart.model_fields}
+        optional |= {"understood": outcome.understood} if outcome.understood else {}
+        optional |= {"splits": _splits(outcome.held_out, names), "methods": compared} if whole else {}
         return cls.model_validate(
             {
                 "format": "stcal handeye 1",
@@ -268,7 +268,7 @@ class HandEyeFile(ResultFile):
                 "held_out": _held_out(outcome.held_out, result.outliers),
                 "observability": _observability(result.observability),
                 "notes": outcome.all_notes(),
-                **more,
+                **optional,
             }
         )
 
@@ -286,13 +286,13 @@ def board_part(outcome: Outcome) -> BoardSize:
 
 
 def camera_part(outcome: Outcome) -> AdjustedCamera | None:
-    found = outcome.result.reprojection
-    if found is None or found.camera_covariance is None:
+    adjustment = outcome.result.reprojection
+    if adjustment is None or adjustment.camera_covariance is None:
         return None
-    names, sigma = parameter_names(outcome.colmap_model), np.sqrt(np.diag(found.camera_covariance))
+    names, sigma = parameter_names(outcome.colmap_model), np.sqrt(np.diag(adjustment.camera_covariance))
     return AdjustedCamera(
         model=outcome.colmap_model,
-        parameters=dict(zip(PARAMETER_NAMES, found.camera.parameters(), strict=True)),
+        parameters=dict(zip(PARAMETER_NAMES, adjustment.camera.parameters(), strict=True)),
         sigma=dict(zip(names, sigma, strict=True)),
     )
 
@@ -330,12 +330,12 @@ def _motions(found: HeldOutMotions) -> HeldOutMotionRows:
 def _choice(found: Choice) -> ChoicePart:
     tried = [
         TriedRow(
-            way=each.candidate.name,
-            splits=len(each.error_mm),
-            error_mm=each.mean_mm() if each.error_mm.size else None,
-            reason=why_out(each) or None,
+            way=candidate.candidate.name,
+            splits=len(candidate.error_mm),
+            error_mm=candidate.mean_mm() if candidate.error_mm.size else None,
+            reason=why_out(candidate) or None,
         )
-        for each in found.tried
+        for candidate in found.tried
     ]
     return ChoicePart(chosen=found.chosen.name, sentence=found.sentence, tried=tried)
 
@@ -350,14 +350,14 @@ def _arm(found: ArmFound) -> ArmPart:
 
 
 def why_out(each: Tried) -> str:
-    """Why a way of solving was not followed to the end; empty where it was."""
+    """Returns why a way of solving was not tried to the end, or an empty string if it was."""
     if each.reason or not each.out:
         return each.reason
     return f"surely worse after {each.out} splits, of which the best has {each.best_mm:.3g} mm"
 
 
 def _splits(found: HeldOutPoses | None, names: tuple[str, ...]) -> list[SplitErrors]:
-    """Of each split the poses held out, and the errors on each."""
+    """Returns the held-out poses of each split, and the errors on each."""
     if found is None:
         return []
     return [

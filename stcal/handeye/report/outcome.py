@@ -1,4 +1,4 @@
-"""A hand-eye calibration as it is reported."""
+"""Outcome of a hand-eye calibration: the result with everything that the report shows."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,18 +16,18 @@ from stcal.handeye.validate import Compared, HeldOutPoses
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmFound:
-    """Parameters of the arm that were solved for too.
+    """The arm's parameters, if they were solved for.
 
     Parameters
     ----------
     robot : str
-        Its name.
+        Name of the robot.
     names : tuple of str
-        (k,) of the parameters: small motions of the axes, J2 ry in rad, J2 x in mm.
+        Names of the k parameters: small motions of the axes, such as J2 ry in rad, J2 x in mm.
     parameters, sigma : (k,) arrays
-        By how much the axes are off the robot's file, and its σ.
+        Deviation of the axes from the robot's file, and its σ.
     plain : HeldOutPoses, optional
-        Errors on the same poses held out, of the solution without them.
+        Errors on the same held-out poses, of the solution without these parameters.
     """
 
     robot: str
@@ -39,45 +39,45 @@ class ArmFound:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """A calibration as it is reported.
+    """A calibration with everything that its report shows.
 
     Parameters
     ----------
     where : str
-        What it was made from.
+        Names of the files that were solved.
     result : HandEye
     held_out : HeldOutPoses, optional
-        Errors of its method on poses held out.
+        Errors of the result's method on held-out poses.
     compared : tuple of Compared
-        Every method, where that was asked for.
+        Results of every method, if a comparison was asked for.
     pitch_mm : float, optional
-        Of dots or squares, as the board's file states it.
+        Pitch of dots or squares, as the board's file states it.
     colmap_model : str
-        Of the camera whose intrinsics were solved for.
+        Model of the camera whose intrinsics were solved for.
     own_sigmas : bool
-        Whether corners came with covariances, of which the result's ``corner_px`` is the factor.
+        Whether corners came with covariances. The result's ``corner_px`` is then their factor.
     left_out : tuple of (str, str)
         Images and rows that did not take part, and why.
     notes : tuple of str
-        Besides those of the result.
+        Notes in addition to those of the result.
     motions : HeldOutMotions, optional
         Errors of the last motions, held out.
     choice : Choice, optional
-        What else was tried, where no method was named.
+        The candidates that were tried, if no method was named.
     pairs : HandEyePoses, optional
-        What was solved, numberings of a symmetric board put right.
+        The pairs that were solved, after repair of the numbering of a symmetric board.
     views : Views, optional
-        The corners, likewise, where there were images.
+        The corners after the same repair, if there were images.
     folder : Path, optional
-        Where the images lie, of which the pairs have the names.
+        Folder of the images; the pairs hold their names.
     understood : tuple of str
-        What files of other programs were taken for.
+        How files of other programs were interpreted.
     unit_mm : float, optional
-        Of a model without a unit: mm by which the camera's lengths were multiplied before.
+        Unit that was assumed for a model without a unit, in mm: the camera's lengths were multiplied by it.
     arm : ArmFound, optional
-        Where the arm's parameters were solved for too.
+        The arm's parameters, if they were solved for.
     time_offset : TimeOffset, optional
-        Of the robot's clock from the camera's, where it was solved for; σ of the result hold its own.
+        Offset of the robot's clock from the camera's, if it was solved for. σ of the result contain its σ.
     """
 
     where: str
@@ -100,21 +100,21 @@ class Outcome:
     time_offset: TimeOffset | None = None
 
     def sentence(self) -> str:
-        """What was solved for, and what that gains; empty where the user said what to solve for."""
+        """Returns what was solved for and what that gains; empty if the user chose what to solve for."""
         if self.arm is None:
             return self.choice.sentence if self.choice else ""
         if self.arm.plain is None or self.held_out is None:
             return f"solved for the parameters of {self.arm.robot} too"
-        now, before = self.held_out.means(), self.arm.plain.means()
+        with_arm, without_arm = self.held_out.means(), self.arm.plain.means()
         return (
             f"with the parameters of {self.arm.robot} solved for, poses held out are missed by "
-            f"{now['board_mm']:.3g} mm at the board, {before['board_mm']:.3g} mm without"
+            f"{with_arm['board_mm']:.3g} mm at the board, {without_arm['board_mm']:.3g} mm without"
         )
 
     def all_notes(self) -> tuple[str, ...]:
-        """Of the result, then the others."""
+        """Returns the notes of the result, then those of the choice, then the others."""
         return (*self.result.notes, *(self.choice.notes if self.choice else ()), *self.notes)
 
     def outliers(self) -> tuple[str, ...]:
-        """Names of the poses that contradict the others."""
+        """Returns the names of the poses that contradict the others."""
         return tuple(name for name, bad in zip(self.result.names, self.result.outliers, strict=True) if bad)

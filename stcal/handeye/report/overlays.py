@@ -1,4 +1,4 @@
-"""Images with the corners that were measured and those that robot and transforms predict, enlarged."""
+"""Images with measured corners, and enlarged residuals of the corners that robot and transforms predict."""
 
 import base64
 from dataclasses import dataclass
@@ -13,13 +13,16 @@ from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode, grey_8bit, thumbnail
 
 WIDTH_PX = 800
-"""Of an image in the page: some 100 kB each, three of them."""
+"""Width of an image in the page, in px. The page holds three images of some 100 kB each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """``corners`` : (x, y, x and y of the end of its enlarged residual, title); ``factor`` by which it is enlarged;
-    ``dot`` : radius, px of the image."""
+    """One image with its corners.
+
+    ``corners`` : (x, y, x and y of the end of the enlarged residual, title); ``factor`` : enlargement of the residuals;
+    ``dot`` : radius of the dots in px of the image.
+    """
 
     title: str
     says: str
@@ -32,8 +35,10 @@ class Overlay:
 
 
 def overlays(outcome: Outcome) -> tuple[list[Overlay], list[str]]:
-    """Of the worst, a usual and the best image, and a line for each that is not there any more; none where the poses
-    did not come from images."""
+    """Returns the overlays of the worst, the median and the best image, and a message for each unreadable image.
+
+    Both lists are empty if the poses did not come from images.
+    """
     result, pairs, views = outcome.result, outcome.pairs, outcome.views
     if pairs is None or views is None or outcome.folder is None:
         return [], []
@@ -43,7 +48,7 @@ def overlays(outcome: Outcome) -> tuple[list[Overlay], list[str]]:
     chosen: dict[int, str] = {}
     for i, word in ((order[0], "worst"), (order[len(order) // 2], "usual"), (order[-1], "best")):
         chosen.setdefault(int(i), word)
-    found, missing = [], []
+    shown, missing = [], []
     for i, word in chosen.items():
         name = pairs.names[i]
         try:
@@ -52,19 +57,19 @@ def overlays(outcome: Outcome) -> tuple[list[Overlay], list[str]]:
             reason = error.strerror or error if isinstance(error, OSError) else error
             missing.append(f"{name} cannot be shown: {reason}")
             continue
-        said = f"{rms[i]:.3g} px RMS by the robot's pose{', left out' if result.outliers[i] else ''}"
-        found.append(_overlay(f"{word}: {name}", said, grey, views.views[i].xy_px, predicted[i]))
-    return found, missing
+        text = f"{rms[i]:.3g} px RMS by the robot's pose{', left out' if result.outliers[i] else ''}"
+        shown.append(_overlay(f"{word}: {name}", text, grey, views.views[i].xy_px, predicted[i]))
+    return shown, missing
 
 
 def _overlay(title: str, says: str, grey: np.ndarray, seen: np.ndarray, predicted: np.ndarray) -> Overlay:
     height, width = grey.shape
-    off = predicted - seen
-    factor = enlargement(off, width)
+    residuals = predicted - seen
+    factor = enlargement(residuals, width)
     corners = []
-    for (x, y), (right, down) in zip(seen.tolist(), off.tolist(), strict=True):
+    for (x, y), (right, down) in zip(seen.tolist(), residuals.tolist(), strict=True):
         if np.isfinite(right):
-            said = f"x {right:+.2f} px, y {down:+.2f} px, {np.hypot(right, down):.2f} px"
-            corners.append((x, y, x + factor * right, y + factor * down, said))
+            text = f"x {right:+.2f} px, y {down:+.2f} px, {np.hypot(right, down):.2f} px"
+            corners.append((x, y, x + factor * right, y + factor * down, text))
     jpeg = base64.b64encode(thumbnail(grey, WIDTH_PX)[0].tobytes()).decode()
     return Overlay(title, says, width, height, f"data:image/jpeg;base64,{jpeg}", factor, 0.005 * width, corners)

@@ -1,4 +1,4 @@
-"""A hand-eye calibration for the terminal, and as a page."""
+"""Report of a hand-eye calibration, for the terminal and as a page."""
 
 import numpy as np
 
@@ -27,7 +27,7 @@ ERRORS = {
     "board_mm": ("3-D at the board mm", 1.0, 3),
     "pose_mm": ("3-D by pose mm", 1.0, 3),
 }
-"""Heads, units and digits of the errors of poses held out."""
+"""Heads, unit factors and digits of the errors on held-out poses."""
 SIGMA_NAMES = {
     "corner_px": ("corner in the image", "px", 1.0),
     "robot_rad": ("robot, rotation", "°", np.degrees(1.0)),
@@ -41,11 +41,11 @@ SIGMA_NAMES = {
     **{key: (f"camera file, {name}", "times its σ", 1.0) for key, name in FACTORS.items()},
 }
 VERDICTS = {"good": "#1b7837", "use with care": "#b26a00", "do not use": "#b3261e"}
-"""Colours of the words."""
+"""Colours of the verdicts."""
 
 
 def outcome_text(outcome: Outcome) -> str:
-    """Tables for the terminal."""
+    """Returns the report for the terminal."""
     result, frames = outcome.result, FRAMES[outcome.result.setup]
     lines = [_headline(outcome), f"verdict: {judged(outcome).sentence()}"]
     for name, pose, covariance in _transforms(result):
@@ -77,25 +77,27 @@ def outcome_text(outcome: Outcome) -> str:
 
 
 def _motions_text(outcome: Outcome) -> str:
-    found = outcome.motions
-    return f"motions predicted by those before (Jin et al., eqs. 24–26): fitted to {found.fitted}" if found else ""
+    motions = outcome.motions
+    return f"motions predicted by those before (Jin et al., eqs. 24–26): fitted to {motions.fitted}" if motions else ""
 
 
 def _motion_cells(outcome: Outcome) -> list[list[str]]:
-    """Heads, a row for each motion that was held out, and their means."""
-    found = outcome.motions
-    if found is None:
+    """Returns heads, one row per held-out motion, and the means."""
+    motions = outcome.motions
+    if motions is None:
         return []
     rows = [
         [f"{first} → {second}", number(shift, 3), number(np.degrees(turn), 4)]
-        for (first, second), shift, turn in zip(found.names, found.translation_mm, found.rotation_rad, strict=True)
+        for (first, second), shift, turn in zip(
+            motions.names, motions.translation_mm, motions.rotation_rad, strict=True
+        )
     ]
-    means = ["mean", number(found.translation_mm.mean(), 3), number(np.degrees(found.rotation_rad.mean()), 4)]
+    means = ["mean", number(motions.translation_mm.mean(), 3), number(np.degrees(motions.rotation_rad.mean()), 4)]
     return [["<motion held out", "mm", "°"], *rows, means]
 
 
 def scale_text(outcome: Outcome, sigma_scale: float) -> str:
-    """The board's true size, as found, and its σ."""
+    """Returns the estimated size of the board and its σ, in words."""
     result = outcome.result
     if outcome.unit_mm is not None:
         unit, sigma = outcome.unit_mm * result.scale, outcome.unit_mm * sigma_scale
@@ -103,8 +105,8 @@ def scale_text(outcome: Outcome, sigma_scale: float) -> str:
     text = f"board: {result.scale:.5f} ± {sigma_scale:.5f} times its stated size"
     if outcome.pitch_mm is None:
         return text
-    found, sigma = outcome.pitch_mm * result.scale, outcome.pitch_mm * sigma_scale
-    return f"{text}: pitch {found:.4f} ± {sigma:.4f} mm, stated {outcome.pitch_mm:g} mm"
+    pitch, sigma = outcome.pitch_mm * result.scale, outcome.pitch_mm * sigma_scale
+    return f"{text}: pitch {pitch:.4f} ± {sigma:.4f} mm, stated {outcome.pitch_mm:g} mm"
 
 
 def _headline(outcome: Outcome) -> str:
@@ -125,7 +127,7 @@ def _splits_text(outcome: Outcome) -> str:
 
 
 def _agreeing_text(outcome: Outcome) -> list[str]:
-    """Errors of the poses alone that agree with one another, where some do not."""
+    """Returns the errors without outliers in words, or nothing if there are no outliers."""
     bad = outcome.result.outliers
     means = outcome.held_out.means(~bad) if bad.any() and outcome.held_out is not None else {}
     return [f"without the {bad.sum()} left out above: {means_text(means)}"] if means else []
@@ -135,13 +137,13 @@ def means_text(means: dict[str, float]) -> str:
     parts = []
     for name, mean in means.items():
         head, unit, digits = ERRORS[name]
-        what, _, ending = head.rpartition(" ")
-        parts.append(f"{what} {number(mean * unit, digits)}{ending if ending == '°' else f' {ending}'}")
+        quantity, _, ending = head.rpartition(" ")
+        parts.append(f"{quantity} {number(mean * unit, digits)}{ending if ending == '°' else f' {ending}'}")
     return ", ".join(parts)
 
 
 def sigma_rows(outcome: Outcome) -> list[list[str]]:
-    """What errs, by how much, and how that is known."""
+    """Returns one row per σ: the quantity, its σ with unit, and whether it was estimated or stated."""
     rows = []
     for name, value in outcome.result.sigma.items():
         text, unit, factor = SIGMA_NAMES[name]
@@ -158,39 +160,39 @@ def turns_text(seen: Observability) -> str:
 
 
 def _compared_cells(outcome: Outcome) -> list[list[str]]:
-    """Heads, and a row for each method: means on poses held out, and how far from the result."""
-    known = [name for name in ERRORS if any(c.held_out and name in c.held_out.means() for c in outcome.compared)]
+    """Returns heads, and one row per method: mean errors on held-out poses, and distance from the result."""
+    kinds = [name for name in ERRORS if any(c.held_out and name in c.held_out.means() for c in outcome.compared)]
     rows = []
     for each in outcome.compared:
         means = each.held_out.means() if each.held_out else {}
-        cells = [number(means.get(n, np.nan) * ERRORS[n][1], ERRORS[n][2]) for n in known]
+        cells = [number(means.get(n, np.nan) * ERRORS[n][1], ERRORS[n][2]) for n in kinds]
         rows.append([each.method, *cells, *_off(each, outcome.result), each.reason])
-    rows.insert(0, ["<method", *(ERRORS[name][0] for name in known), "off mm", "off °", "<"])
+    rows.insert(0, ["<method", *(ERRORS[name][0] for name in kinds), "off mm", "off °", "<"])
     return rows if any(row[-1] for row in rows[1:]) else [row[:-1] for row in rows]
 
 
 def _arm_cells(arm: ArmFound) -> list[list[str]]:
-    """Heads, and a row for each axis: by how much it is off the robot's file, and σ."""
-    found: dict[str, list[str]] = {}
+    """Returns heads, and one row per axis: its deviation from the robot's file, and σ."""
+    cells_of_axis: dict[str, list[str]] = {}
     for name, value, sigma in zip(arm.names, arm.parameters, arm.sigma, strict=True):
         axis, component = name.split()
         unit, factor, digits = ("°", np.degrees(1.0), 4) if component.startswith("r") else ("mm", 1.0, 3)
         text = f"{component} {number(value * factor, digits)} ± {number(sigma * factor, digits)} {unit}"
-        found.setdefault(axis, []).append(text)
-    width = max(len(cells) for cells in found.values())
-    rows = [[axis, *cells, *[""] * (width - len(cells))] for axis, cells in found.items()]
+        cells_of_axis.setdefault(axis, []).append(text)
+    width = max(len(cells) for cells in cells_of_axis.values())
+    rows = [[axis, *cells, *[""] * (width - len(cells))] for axis, cells in cells_of_axis.items()]
     return [[f"<axis of {arm.robot}", "off its file", *[""] * (width - 1)], *rows]
 
 
 def _choice_cells(outcome: Outcome) -> list[list[str]]:
-    """Heads, and a row for each way of solving that was tried."""
-    found = outcome.choice
-    if found is None:
+    """Returns heads, and one row per way of solving that was tried."""
+    choice = outcome.choice
+    if choice is None:
         return []
     rows = [["<solved by", "held out mm", "splits", "<"]]
-    for each in found.tried:
-        said = "taken" if each.candidate == found.chosen else why_out(each)
-        rows.append([each.candidate.name, number(each.mean_mm(), 3), str(len(each.error_mm)), said])
+    for each in choice.tried:
+        outcome_of_way = "taken" if each.candidate == choice.chosen else why_out(each)
+        rows.append([each.candidate.name, number(each.mean_mm(), 3), str(len(each.error_mm)), outcome_of_way])
     return rows
 
 
@@ -202,10 +204,10 @@ def _off(each: Compared, result: HandEye) -> list[str]:
 
 
 def outcome_page(outcome: Outcome) -> str:
-    """The report."""
+    """Returns the report as a page."""
     result = outcome.result
     compared = _compared_cells(outcome)
-    seen = result.observability
+    observability = result.observability
     return render(
         "handeye/report/page.html.jinja",
         outcome=outcome,
@@ -235,45 +237,51 @@ def outcome_page(outcome: Outcome) -> str:
         poses=pose_rows(result),
         **verdict_parts(judged(outcome)),
         **coverage(outcome),
-        motions=seen and _motion_rows(seen),
-        sigma_deg=seen and np.degrees(seen.sigma_rad),
+        motions=observability and _motion_rows(observability),
+        sigma_deg=observability and np.degrees(observability.sigma_rad),
     )
 
 
 def verdict_parts(found: Verdict) -> dict:
-    """The word, its reasons and remedies, and all that was judged."""
+    """Returns the verdict's word and colour, its reasons with remedies, and rows of all findings, for the template."""
     rows = [
-        [each.title, verdict(each.word, VERDICTS[each.word]), each.value or NONE, each.limit or NONE, each.said]
-        for each in found.findings
+        [
+            finding.title,
+            verdict(finding.word, VERDICTS[finding.word]),
+            finding.value or NONE,
+            finding.limit or NONE,
+            finding.said,
+        ]
+        for finding in found.findings
     ]
-    reasons = [": ".join(filter(None, (each.said, each.remedy))) for each in found.reasons()]
+    reasons = [": ".join(filter(None, (finding.said, finding.remedy))) for finding in found.reasons()]
     return {"word": found.word, "verdict_colour": VERDICTS[found.word], "reasons": reasons, "findings": rows}
 
 
 def coverage(outcome: Outcome) -> dict:
-    """Of the image, of rotations, and the images themselves; None and empty where there is nothing to show."""
+    """Returns figures of image coverage, corners and turns, and overlays; None or empty if there is nothing to show."""
     shown, missing = overlays(outcome)
-    found: dict = {"image": None, "corners": None, "turns": None, "overlays": shown, "missing": missing}
+    content: dict = {"image": None, "corners": None, "turns": None, "overlays": shown, "missing": missing}
     views, pairs, board = outcome.views, outcome.pairs, outcome.result.reprojection
     if board is not None:
-        found["corners"] = uri(corner_figure(board))
+        content["corners"] = uri(corner_figure(board))
     if pairs is not None:
-        found["turns"] = uri(turns_figure(turns_between(pairs), outcome.result.observability))
+        content["turns"] = uri(turns_figure(turns_between(pairs), outcome.result.observability))
     if views is None or pairs is None:
-        return found
+        return content
     if board is None:
-        seen = np.concatenate([view.xy_px for view in views.views])
-        off = np.concatenate(by_robot(outcome.result, pairs, views)) - seen
+        measured = np.concatenate([view.xy_px for view in views.views])
+        residuals = np.concatenate(by_robot(outcome.result, pairs, views)) - measured
     else:
         used = [views.views[i].xy_px for i in np.unique(board.view)]
-        seen, off = np.concatenate(used), board.residuals_px
-    known = np.isfinite(off).all(1)
+        measured, residuals = np.concatenate(used), board.residuals_px
+    finite = np.isfinite(residuals).all(1)
     covered = image_coverage(views)
     size = views.camera.width, views.camera.height
-    figure, factor = image_figure(size, covered, seen[known], off[known])
-    by = "the adjustment" if board is not None else "robot and transforms"
-    found["image"] = uri(figure), f"{covered.share:.0%}", f"{factor:g}", by
-    return found
+    figure, factor = image_figure(size, covered, measured[finite], residuals[finite])
+    source = "the adjustment" if board is not None else "robot and transforms"
+    content["image"] = uri(figure), f"{covered.share:.0%}", f"{factor:g}", source
+    return content
 
 
 def matrix_text(pose: Rigid) -> str:
@@ -281,7 +289,7 @@ def matrix_text(pose: Rigid) -> str:
 
 
 def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
-    """(value, unit, what it is)."""
+    """Returns the tiles of the headline: (value, unit, text)."""
     result, tiles = outcome.result, []
     if outcome.held_out is not None:
         means = outcome.held_out.means()
@@ -299,26 +307,28 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
         said = f"robot's clock minus camera's, ± {1e3 * offset.sigma_s:.2g} ms"
         tiles.append((f"{1e3 * offset.seconds:.2f} ms", "", said))
     if result.sigma_scale is not None:
-        found = "" if outcome.pitch_mm is None else f": pitch {outcome.pitch_mm * result.scale:.3f} mm"
+        pitch = "" if outcome.pitch_mm is None else f": pitch {outcome.pitch_mm * result.scale:.3f} mm"
         tiles.append(
-            (f"{result.scale:.4f}", "", f"times its stated size is the board, ± {result.sigma_scale:.4f}{found}")
+            (f"{result.scale:.4f}", "", f"times its stated size is the board, ± {result.sigma_scale:.4f}{pitch}")
         )
     return tiles
 
 
 def adjusted(outcome: Outcome) -> list[list[str]] | None:
-    """Rows of the camera's parameters where they were adjusted."""
-    found = outcome.result.reprojection
-    if found is None or found.camera_covariance is None:
+    """Returns rows of the camera's parameters, or None if they were not adjusted."""
+    adjustment = outcome.result.reprojection
+    if adjustment is None or adjustment.camera_covariance is None:
         return None
-    sigma = dict(zip(parameter_names(outcome.colmap_model), np.sqrt(np.diag(found.camera_covariance)), strict=True))
-    shown = []
-    for name, value in zip(PARAMETER_NAMES, found.camera.parameters(), strict=True):
-        known = sigma.get(name, sigma.get("f") if name in ("fx", "fy") else None)
-        if value or known:
+    sigma = dict(
+        zip(parameter_names(outcome.colmap_model), np.sqrt(np.diag(adjustment.camera_covariance)), strict=True)
+    )
+    rows = []
+    for name, value in zip(PARAMETER_NAMES, adjustment.camera.parameters(), strict=True):
+        sigma_of_parameter = sigma.get(name, sigma.get("f") if name in ("fx", "fy") else None)
+        if value or sigma_of_parameter:
             digits, unit = (3, "px") if name[0] in "fc" else (6, "")
-            shown.append([name, number(value, digits), number(known, digits), unit])
-    return shown
+            rows.append([name, number(value, digits), number(sigma_of_parameter, digits), unit])
+    return rows
 
 
 def pose_rows(result: HandEye) -> list[list[str]]:

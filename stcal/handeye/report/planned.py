@@ -1,4 +1,4 @@
-"""Poses to take next: for the terminal, as a table, and for programs."""
+"""Report of the poses to take next: for the terminal, as a table, and for programs."""
 
 import csv
 import io
@@ -14,7 +14,7 @@ from stcal.io.table import POSE, pose_cells
 from stcal.report.text import NONE, number, text_table
 
 JOINT_DIGITS = 3
-"""Of joint values, deg or mm, on the terminal."""
+"""Number of digits of joint values (deg or mm) on the terminal."""
 
 
 class PlannedPose(Part):
@@ -26,7 +26,7 @@ class PlannedPose(Part):
 
 
 class HandEyePlanFile(ResultFile):
-    """Of ``handeye plan``."""
+    """Result file of ``handeye plan``."""
 
     format: Literal["stcal handeye plan 1"] = Field(description="the file's form and its version")
     setup: str = Field(description="`eye-in-hand` or `eye-to-hand`")
@@ -41,7 +41,7 @@ class HandEyePlanFile(ResultFile):
 
 
 def planned_text(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> str:
-    """Tables for the terminal."""
+    """Returns the tables for the terminal."""
     taken = int((~result.outliers).sum())
     rotvec = np.degrees([flange.log()[:3] for flange in planned.base_from_flange])
     heads = ["<pose", "worst σ, mm", "turn, °", "x, mm", "y, mm", "z, mm", "rx, °", "ry, °", "rz, °"]
@@ -56,7 +56,8 @@ def planned_text(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarr
     ]
     if joints:
         cells = [
-            [f"next {k + 1}", *(f"{of[k]:.{JOINT_DIGITS}f}" for of in joints.values())] for k in range(len(rotvec))
+            [f"next {k + 1}", *(f"{joint_values[k]:.{JOINT_DIGITS}f}" for joint_values in joints.values())]
+            for k in range(len(rotvec))
         ]
         lines += ["", *text_table([["<joints", *joints], *cells])]
     last = "joint limits and the image" if joints else "the image; give --robot for joint limits"
@@ -69,20 +70,20 @@ def planned_text(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarr
 
 
 def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray]) -> str:
-    """The table of ``--out`` (form: ``data_layout.md``)."""
+    """Returns the table of ``--out`` (form: ``data_layout.md``)."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     frames = {"base_from_flange": planned.base_from_flange, "camera_from_board": planned.camera_from_board}
     writer.writerow(["pose", "worst_sigma_mm", "turn_deg", *joints, *(f"{name}_{c}" for name in frames for c in POSE)])
     for k, turn in enumerate(planned.turn_rad):
-        own = [planned.sigma_mm[k + 1], np.degrees(turn), *(of[k] for of in joints.values())]
-        cells = [repr(float(value)) for value in own]
+        values = [planned.sigma_mm[k + 1], np.degrees(turn), *(of[k] for of in joints.values())]
+        cells = [repr(float(value)) for value in values]
         writer.writerow([k + 1, *cells, *(cell for poses in frames.values() for cell in pose_cells(poses[k]))])
     return stream.getvalue()
 
 
 def planned_file(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> HandEyePlanFile:
-    """All of it, for programs."""
+    """Returns the file of the planned poses, for programs."""
     rows = [
         {
             "base_from_flange": planned.base_from_flange[k].matrix(),

@@ -1,4 +1,4 @@
-"""A rig's calibration for the terminal, and as a page."""
+"""Report of a rig's calibration, for the terminal and as a page."""
 
 from itertools import combinations
 
@@ -25,7 +25,7 @@ from stcal.report.text import NONE, number, text_table
 
 
 def rig_text(outcome: RigOutcome) -> str:
-    """Tables for the terminal."""
+    """Returns the report for the terminal."""
     rig, frames = outcome.rig, FRAMES[outcome.rig.setup]
     lines = [_headline(outcome), f"verdict: {rig_judged(outcome).sentence()}"]
     for name, camera in zip(rig.names, rig.cameras, strict=True):
@@ -46,11 +46,11 @@ def rig_text(outcome: RigOutcome) -> str:
         ]
         lines += text_table(_held_out_cells(outcome))
     lines += ["", *(f"σ of {text}: {value} ({how})" for text, value, how in _shared_sigmas(outcome))]
-    one = rig.cameras[0]
-    if one.sigma_scale is not None:
-        lines.append(scale_text(outcome.cameras[0], one.sigma_scale))
-    if one.observability is not None:
-        lines.append(turns_text(one.observability))
+    first_camera = rig.cameras[0]
+    if first_camera.sigma_scale is not None:
+        lines.append(scale_text(outcome.cameras[0], first_camera.sigma_scale))
+    if first_camera.observability is not None:
+        lines.append(turns_text(first_camera.observability))
     return "\n".join(lines)
 
 
@@ -70,7 +70,7 @@ def _splits_text(outcome: RigOutcome) -> str:
 
 
 def _camera_cells(outcome: RigOutcome) -> list[list[str]]:
-    """Heads, and a row for each camera: images, σ of its corners, residuals, its σ with the others and by itself."""
+    """Returns heads, and one row per camera: images, σ of corners, residuals, σ of its pose jointly and alone."""
     rows = [
         [
             "<camera",
@@ -85,11 +85,11 @@ def _camera_cells(outcome: RigOutcome) -> list[list[str]]:
             "alone °",
         ]
     ]
-    for name, camera, own, alone in zip(
+    for name, camera, camera_outcome, alone in zip(
         outcome.rig.names, outcome.rig.cameras, outcome.cameras, outcome.alone, strict=True
     ):
         turn, shift = camera.rms()
-        unit = "× its own" if own.own_sigmas else "px"
+        unit = "× its own" if camera_outcome.own_sigmas else "px"
         joint, single = _worst(camera, outcome.widened), _worst(alone)
         cells = [str(int((~camera.outliers).sum())), number(camera.sigma["corner_px"], 3), unit]
         cells += [number(np.degrees(turn), 4), number(shift, 3)]
@@ -98,7 +98,7 @@ def _camera_cells(outcome: RigOutcome) -> list[list[str]]:
 
 
 def _worst(result: HandEye | None, widened: float = 1.0) -> tuple[str, str]:
-    """σ of rotation (°) and place (mm) in their worst directions, as the adjustment has them."""
+    """Returns σ of rotation (°) and place (mm) in their worst directions, from the adjustment, before widening."""
     if result is None or result.covariance is None:
         return NONE, NONE
     parts = result.covariance[:3, :3], result.covariance[3:, 3:]
@@ -112,11 +112,11 @@ def _held_out_cells(outcome: RigOutcome) -> list[list[str]]:
         return rows
     for name, held in zip(outcome.rig.names, outcome.held_out.cameras, strict=True):
         joint, alone, gain = held.means(), held.means("alone"), held.gain()
-        said = "cannot be found alone" if gain is None else _percent(gain)
-        each = [(joint, "board_mm", 1.0, 3), (alone, "board_mm", 1.0, 3)]
-        each += [(joint, "rotation_rad", np.degrees(1.0), 4), (alone, "rotation_rad", np.degrees(1.0), 4)]
-        cells = [number(means.get(key, np.nan) * unit, digits) for means, key, unit, digits in each]
-        rows.append([name, str(len(held.view)), *cells[:2], said, *cells[2:]])
+        gain_text = "cannot be found alone" if gain is None else _percent(gain)
+        columns = [(joint, "board_mm", 1.0, 3), (alone, "board_mm", 1.0, 3)]
+        columns += [(joint, "rotation_rad", np.degrees(1.0), 4), (alone, "rotation_rad", np.degrees(1.0), 4)]
+        cells = [number(means.get(key, np.nan) * unit, digits) for means, key, unit, digits in columns]
+        rows.append([name, str(len(held.view)), *cells[:2], gain_text, *cells[2:]])
     return rows
 
 
@@ -125,28 +125,28 @@ def _percent(share: float) -> str:
 
 
 def _shared_sigmas(outcome: RigOutcome) -> list[list[str]]:
-    """Of robot and board, once; of each camera's file by its name."""
-    found = []
+    """Returns rows of σ: those of robot and board once, those of each camera with its name."""
+    rows = []
     for name, camera in zip(outcome.rig.names, outcome.cameras, strict=True):
         for text, value, how in sigma_rows(camera):
             shared = text.startswith("robot") or text.startswith("corner on")
             row = [text if shared else f"{name}, {text}", value, how]
-            if row not in found:
-                found.append(row)
-    return sorted(found, key=lambda row: "," in row[0] and not row[0].startswith("robot"))
+            if row not in rows:
+                rows.append(row)
+    return sorted(rows, key=lambda row: "," in row[0] and not row[0].startswith("robot"))
 
 
 def rig_page(outcome: RigOutcome) -> str:
-    """The report."""
-    rig, frames, one = outcome.rig, FRAMES[outcome.rig.setup], outcome.rig.cameras[0]
+    """Returns the report as a page."""
+    rig, frames, first_camera = outcome.rig, FRAMES[outcome.rig.setup], outcome.rig.cameras[0]
     relative = []
     for first, second in combinations(rig.names, 2):
         pose, covariance = rig.relative(first, second)
         relative.append((f"{first}_from_{second}", transform_rows(pose, covariance), matrix_text(pose)))
     cameras = []
-    for name, camera, own in zip(rig.names, rig.cameras, outcome.cameras, strict=True):
+    for name, camera, camera_outcome in zip(rig.names, rig.cameras, outcome.cameras, strict=True):
         turn, shift = camera.rms()
-        errors = {} if own.held_out is None else own.held_out.means()
+        errors = {} if camera_outcome.held_out is None else camera_outcome.held_out.means()
         cameras.append(
             {
                 "name": name,
@@ -155,11 +155,11 @@ def rig_page(outcome: RigOutcome) -> str:
                 "matrix": matrix_text(camera.mount_from_camera),
                 "said": f"Residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
                 "errors": means_text(errors) if errors else "",
-                "adjusted": adjusted(own),
+                "adjusted": adjusted(camera_outcome),
                 "bars": pose_bars(camera),
                 "poses": pose_rows(camera),
-                "outliers": own.outliers(),
-                **coverage(own),
+                "outliers": camera_outcome.outliers(),
+                **coverage(camera_outcome),
             }
         )
     return render(
@@ -173,12 +173,12 @@ def rig_page(outcome: RigOutcome) -> str:
         heads=HEADS,
         cameras=cameras,
         relative=relative,
-        stand=(transform_rows(rig.stand_from_board, one.stand_covariance), matrix_text(rig.stand_from_board)),
+        stand=(transform_rows(rig.stand_from_board, first_camera.stand_covariance), matrix_text(rig.stand_from_board)),
         table_of_cameras=_camera_cells(outcome),
         held=_held_out_cells(outcome) if outcome.held_out else [],
         splits=_splits_text(outcome),
         sigmas=_shared_sigmas(outcome),
-        scale=scale_text(outcome.cameras[0], one.sigma_scale) if one.sigma_scale is not None else "",
+        scale=scale_text(outcome.cameras[0], first_camera.sigma_scale) if first_camera.sigma_scale is not None else "",
         good=GOOD,
         bad=BAD,
         left_out=outcome.left_out(),
@@ -187,14 +187,18 @@ def rig_page(outcome: RigOutcome) -> str:
 
 
 def _tiles(outcome: RigOutcome) -> list[tuple[str, str, str]]:
-    """(value, unit, what it is)."""
+    """Returns the tiles of the headline: (value, unit, text)."""
     rig, tiles = outcome.rig, []
     if outcome.held_out is not None:
         for name, held in zip(rig.names, outcome.held_out.cameras, strict=True):
             if means := held.means():
                 gain = held.gain()
-                beside = "" if gain is None else f", {number(held.means('alone')['board_mm'], 3)} mm if solved alone"
-                tiles.append((f"{means['board_mm']:.3f} mm", "", f"{name}: 3-D error at the board, held out{beside}"))
+                comparison = (
+                    "" if gain is None else f", {number(held.means('alone')['board_mm'], 3)} mm if solved alone"
+                )
+                tiles.append(
+                    (f"{means['board_mm']:.3f} mm", "", f"{name}: 3-D error at the board, held out{comparison}")
+                )
     sigma = rig.cameras[0].sigma
     if "robot_mm" in sigma:
         robot = f"σ of the robot's poses an axis, and {np.degrees(sigma.get('robot_rad', 0)):.3f}°"

@@ -1,4 +1,4 @@
-"""All that a rig's calibration found, as a file."""
+"""The result file of a rig's calibration, with all of its results."""
 
 from itertools import combinations
 from typing import Annotated, Literal
@@ -73,7 +73,7 @@ class RelativePose(Part):
 
 
 class HandEyeRigFile(ResultFile):
-    """Of ``handeye rig``: mm, rad, px; null where there is no value."""
+    """Result file of ``handeye rig``: mm, rad, px; null where there is no value."""
 
     format: Literal["stcal handeye rig 1"] = Field(description="the file's form and its version")
     version: str = Field(description="of stcal")
@@ -117,9 +117,9 @@ class HandEyeRigFile(ResultFile):
 
     @classmethod
     def of(cls, outcome: RigOutcome, whole: bool = False) -> "HandEyeRigFile":
-        """What ``--out`` holds; ``whole`` : what ``--json`` does, every split too."""
+        """Returns the content of ``--out``, or, if ``whole``, of ``--json``: with every split too."""
         rig, frames, held = outcome.rig, FRAMES[outcome.rig.setup], outcome.held_out
-        one = rig.cameras[0]
+        first_camera = rig.cameras[0]
         estimated = []
         for name, camera in zip(rig.names, rig.cameras, strict=True):
             estimated += [each if each in _shared(outcome) else f"{each}:{name}" for each in camera.estimated]
@@ -135,7 +135,7 @@ class HandEyeRigFile(ResultFile):
                 "covariance": rig.covariance,
                 "relative": [_relative(outcome, *pair) for pair in combinations(rig.names, 2)],
                 frames.board: rig.stand_from_board,
-                f"{frames.board}_covariance": one.stand_covariance,
+                f"{frames.board}_covariance": first_camera.stand_covariance,
                 "board": board_part(outcome.cameras[0]),
                 "sigma": _shared(outcome),
                 "estimated": list(dict.fromkeys(estimated)),
@@ -150,15 +150,15 @@ class HandEyeRigFile(ResultFile):
 
 
 def _shared(outcome: RigOutcome) -> dict[str, float]:
-    """σ of robot and board, the same for all cameras."""
+    """Returns σ of robot and board, which are the same for all cameras."""
     every = outcome.rig.cameras[0].sigma
     return {name: value for name, value in every.items() if name.startswith(("robot", "board"))}
 
 
 def _camera(outcome: RigOutcome, i: int, whole: bool) -> RigCameraPart:
-    own, result = outcome.cameras[i], outcome.rig.cameras[i]
+    camera_outcome, result = outcome.cameras[i], outcome.rig.cameras[i]
     held = None if outcome.held_out is None else outcome.held_out.cameras[i]
-    more = {"splits": _splits(held, result.names)} if whole and held is not None else {}
+    splits_part = {"splits": _splits(held, result.names)} if whole and held is not None else {}
     sigma = {name: value for name, value in result.sigma.items() if kind(name).startswith("camera")}
     return RigCameraPart.model_validate(
         {
@@ -166,15 +166,15 @@ def _camera(outcome: RigOutcome, i: int, whole: bool) -> RigCameraPart:
             FRAMES[result.setup].camera: result.mount_from_camera,
             "covariance": result.covariance,
             "corner_px": result.sigma["corner_px"],
-            "corner_px_is_factor": own.own_sigmas,
+            "corner_px_is_factor": camera_outcome.own_sigmas,
             "sigma": sigma,
-            "camera": camera_part(own),
+            "camera": camera_part(camera_outcome),
             "rms": dict(zip(RmsResidual.model_fields, result.rms(), strict=True)),
             "poses": poses_part(result),
-            "outliers": own.outliers(),
-            "left_out": [NamedReason(name=name, reason=reason) for name, reason in own.left_out],
+            "outliers": camera_outcome.outliers(),
+            "left_out": [NamedReason(name=name, reason=reason) for name, reason in camera_outcome.left_out],
             "held_out": _held_out(held),
-            **more,
+            **splits_part,
         }
     )
 

@@ -1,4 +1,4 @@
-"""A rig's calibration as it is reported, and what is thought of it."""
+"""Outcome of a rig's calibration with everything that its report shows, and the verdict on it."""
 
 from dataclasses import dataclass
 
@@ -15,25 +15,25 @@ MOTIONS = "Motions of the flange"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigOutcome:
-    """A rig's calibration as it is reported.
+    """A rig's calibration with everything that its report shows.
 
     Parameters
     ----------
     where : str
-        What it was made from.
+        Names of the files that were solved.
     rig : Rig
     cameras : tuple of Outcome
-        Each camera's part, as one calibration's.
+        The part of each camera, as the outcome of a calibration of its own.
     alone : tuple of HandEye or None
-        Each camera by itself; None where it cannot be found so.
+        Solution of each camera by itself; None if it cannot be solved alone.
     held_out : RigHeldOut, optional
-        Errors on poses of the robot held out.
+        Errors on held-out poses of the robot.
     notes : tuple of str
-        Besides those of the rig.
+        Notes in addition to those of the rig.
     understood : tuple of str
-        What files were taken for.
+        How files were interpreted.
     widened : float
-        By which σ of the transforms were multiplied, for solutions of parts of the poses scatter more than they say.
+        Factor by which σ of the transforms were widened, because solutions from subsets of the poses scatter more.
     """
 
     where: str
@@ -46,25 +46,25 @@ class RigOutcome:
     widened: float = 1.0
 
     def all_notes(self) -> tuple[str, ...]:
-        """Of the rig and its cameras, then the others."""
+        """Returns the notes of the rig and its cameras, then the others."""
         return (*self.rig.all_notes(), *self.notes)
 
     def left_out(self) -> list[tuple[str, str, str]]:
-        """(camera, image or row, why)."""
-        each = zip(self.rig.names, self.cameras, strict=True)
-        return [(name, what, why) for name, camera in each for what, why in camera.left_out]
+        """Returns (camera, image or row, reason) of everything that was left out."""
+        outcome_of_camera = zip(self.rig.names, self.cameras, strict=True)
+        return [(name, item, reason) for name, camera in outcome_of_camera for item, reason in camera.left_out]
 
 
 def rig_judged(outcome: RigOutcome) -> Verdict:
-    """What was found of each camera, by its name; of the robot's motions, once; and on the rig."""
-    found: list[Finding] = []
+    """Returns the verdict: findings of each camera under its name, of the robot's motions once, and of the rig."""
+    findings: list[Finding] = []
     for name, camera in zip(outcome.rig.names, outcome.cameras, strict=True):
-        for each in judged(camera).findings:
-            if each.title != MOTIONS:
-                found.append(_of(name, each, FRAMES[outcome.rig.setup].mount))
-            elif all(own.title != MOTIONS for own in found):
-                found.insert(0, each)
-    return Verdict((*found, *of_notes((*outcome.rig.notes, *outcome.notes))))
+        for finding in judged(camera).findings:
+            if finding.title != MOTIONS:
+                findings.append(_of(name, finding, FRAMES[outcome.rig.setup].mount))
+            elif all(earlier.title != MOTIONS for earlier in findings):
+                findings.insert(0, finding)
+    return Verdict((*findings, *of_notes((*outcome.rig.notes, *outcome.notes))))
 
 
 def _of(name: str, each: Finding, mount: str) -> Finding:
@@ -73,5 +73,5 @@ def _of(name: str, each: Finding, mount: str) -> Finding:
 
 
 def asides(outcome: RigOutcome) -> list[str]:
-    """Notes that take nothing from the result."""
+    """Returns the notes that do not put the result in doubt."""
     return [note for note in outcome.all_notes() if isinstance(note, Aside)]

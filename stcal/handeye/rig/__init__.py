@@ -1,1 +1,1 @@
-"""Several cameras of one robot about one board, solved together."""
+"""Hand-eye calibration of several cameras of one robot that see one board, solved together."""

@@ -1,4 +1,4 @@
-"""One call for a rig: X of every camera, Z, and what is doubtful."""
+"""Hand-eye calibration of a rig: X of every camera, Z, and notes on what is doubtful."""
 
 from dataclasses import dataclass, field, replace
 
@@ -26,25 +26,25 @@ from stcal.handeye.solve import HandEyeOptions, handeye, of_camera_file
 from stcal.parallel import one_thread
 
 BY_CHANCE = 1e-5
-"""Odds at which two good cameras are said to see two boards."""
+"""False-alarm probability of the note that two cameras place the board differently."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigOptions:
-    """What is known, and what is to be solved for.
+    """Options of a rig's calibration: known errors, and further unknowns.
 
     Parameters
     ----------
     noise : Noise
-        What is known of the errors of robot, corners and board; the rest is estimated, σ of corners of each camera by
-        itself. σ of the board's poses play no part.
+        Known σ of robot, corners and board. Unknown σ are estimated, those of corners for each camera separately. σ of
+        the board's poses are not used.
     refine : bool
-        Solve for the intrinsics too, of each camera from what is known of them (its ``prior``). Where not, their
-        errors become part of σ.
+        Solve for the intrinsics of each camera too, held by its ``prior``. If not, their uncertainty is propagated into
+        σ.
     with_scale : bool
         Solve for the board's true size too.
     symmetries : tuple of Rigid
-        All board_from_board after which the board looks the same, but for the identity.
+        All board_from_board except the identity that map the board onto itself.
     """
 
     noise: Noise = field(default_factory=Noise)
@@ -55,7 +55,7 @@ class RigOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _First:
-    """Of one camera by itself: ``x``, ``z``, ``scale``; ``views`` with their numbering put right; ``notes``."""
+    """First solution of one camera alone: ``x``, ``z``, ``scale``, ``views`` after repair of numbering, ``notes``."""
 
     x: Rigid
     z: Rigid
@@ -66,21 +66,21 @@ class _First:
 
 @one_thread()
 def handeye_rig(given: RigPoses, setup: Setup = "eye-in-hand", options: RigOptions | None = None) -> Rig:
-    """Where several cameras sit on one flange, or in one base, from one adjustment of all their corners.
+    """Returns the poses of several cameras on one flange, or in one base, from one adjustment of all their corners.
 
-    The images of one pose of the robot share its error, and all cameras the board and its place: a camera gains from
-    what the others see, and the cameras' poses in each other are known better than two calibrations would tell. A
-    camera of which too few images are there to find it by itself is found by means of the others.
+    The images from one pose of the robot share its error, and all cameras share the board and its pose. A camera
+    therefore gains from the images of the others, and relative poses of cameras are more accurate than from separate
+    calibrations. A camera with too few images to be solved alone is solved with the help of the others.
 
     Parameters
     ----------
     given : RigPoses
-        Poses of the robot, and what each camera saw from them.
+        Poses of the robot, and the views of each camera from them.
     setup : {"eye-in-hand", "eye-to-hand"}
         ``eye-in-hand``: cameras on the flange, board in the base; ``eye-to-hand``: cameras in the base, board on the
         flange.
     options : RigOptions, optional
-        The defaults where None.
+        Options of the solution; the defaults if None.
 
     Returns
     -------
@@ -89,9 +89,9 @@ def handeye_rig(given: RigPoses, setup: Setup = "eye-in-hand", options: RigOptio
     Raises
     ------
     InputError
-        Poses of a camera that contradict each other, or fit in another convention; the message names the camera.
+        Poses of a camera contradict each other, or follow another convention; the message names the camera.
     DegenerateError
-        No camera can be found by itself, or cameras that see the board at different places; the message names them.
+        No camera can be solved alone, or cameras see the board at different places; the message names them.
     ConvergenceError
         No minimum is reached.
 
@@ -102,26 +102,26 @@ def handeye_rig(given: RigPoses, setup: Setup = "eye-in-hand", options: RigOptio
     """
     options = options or RigOptions()
     firsts = [_first(given, i, setup, options) for i in range(len(given.cameras))]
-    known = [first for first in firsts if isinstance(first, _First)]
-    if not known:
+    solved = [first for first in firsts if isinstance(first, _First)]
+    if not solved:
         raise next(first for first in firsts if isinstance(first, DegenerateError))
-    given, known = _same_numbering(given, firsts, options.symmetries)
-    z, scale = start.mean_pose(Poses.of([first.z for first in known.values()])), 1.0
+    given, solved = _same_numbering(given, firsts, options.symmetries)
+    z, scale = start.mean_pose(Poses.of([first.z for first in solved.values()])), 1.0
     if options.with_scale:
-        scale = float(np.median([first.scale for first in known.values()]))
-    _require_one_board(given, known)
-    x = [known[i].x if i in known else _by_board(given, i, setup, z, scale) for i in range(len(given.cameras))]
+        scale = float(np.median([first.scale for first in solved.values()]))
+    _require_one_board(given, solved)
+    x = [solved[i].x if i in solved else _by_board(given, i, setup, z, scale) for i in range(len(given.cameras))]
     solution = adjust_rig(given, setup, (x, z, scale), options.noise, options.refine, options.with_scale)
-    return _rig(given, setup, options, solution, {i: first.notes for i, first in known.items()})
+    return _rig(given, setup, options, solution, {i: first.notes for i, first in solved.items()})
 
 
 def same_numbering(given: RigPoses, setup: Setup, symmetries: tuple[Rigid, ...]) -> RigPoses:
-    """With views of a symmetric board that were numbered from another end put right, as :func:`handeye_rig` does.
+    """Renumbers views of a symmetric board that were numbered from another end, as :func:`handeye_rig` does.
 
     Raises
     ------
     StcalError
-        As there.
+        See :func:`handeye_rig`.
     """
     if not symmetries:
         return given
@@ -131,57 +131,60 @@ def same_numbering(given: RigPoses, setup: Setup, symmetries: tuple[Rigid, ...])
 
 
 def alone(given: RigPoses, i: int, setup: Setup, options: RigOptions) -> HandEye:
-    """One camera of a rig by itself, as :func:`~stcal.handeye.handeye` finds it by method ``reprojection``.
+    """Solves for one camera of a rig by itself, with :func:`~stcal.handeye.handeye` and method ``reprojection``.
 
     Raises
     ------
     StcalError
-        As there.
+        See :func:`~stcal.handeye.handeye`.
     """
     camera = given.cameras[i]
     prior, one = camera.prior, options
     intrinsics = prior if options.refine else None
-    own = HandEyeOptions(one.noise, intrinsics, one.with_scale, one.symmetries, camera=prior)
-    return handeye(given.pairs(i), setup, "reprojection", camera.views, own)
+    options_of_camera = HandEyeOptions(one.noise, intrinsics, one.with_scale, one.symmetries, camera=prior)
+    return handeye(given.pairs(i), setup, "reprojection", camera.views, options_of_camera)
 
 
 def of_places(names: tuple[str, ...], found: list[HandEye | None]) -> tuple[str, ...]:
-    """Notes on cameras of which the board, as each finds it by itself, stands where others do not find it."""
+    """Returns notes on cameras whose own solutions, ``found``, place the board differently from other cameras' ones."""
     apart = {}
-    for i, one in enumerate(found):
-        for j, other in enumerate(found[:i]):
-            if one is None or other is None or one.stand_covariance is None or other.stand_covariance is None:
+    for i, later in enumerate(found):
+        for j, earlier in enumerate(found[:i]):
+            if later is None or earlier is None or later.stand_covariance is None or earlier.stand_covariance is None:
                 continue
-            off = Poses.of([one.stand_from_board]).difference(Poses.of([other.stand_from_board]))[0]
-            squared = float(off @ np.linalg.solve(one.stand_covariance + other.stand_covariance, off))
-            apart[j, i] = squared > chi2.ppf(1 - BY_CHANCE, len(off)), off
+            difference = Poses.of([later.stand_from_board]).difference(Poses.of([earlier.stand_from_board]))[0]
+            squared = float(difference @ np.linalg.solve(later.stand_covariance + earlier.stand_covariance, difference))
+            apart[j, i] = squared > chi2.ppf(1 - BY_CHANCE, len(difference)), difference
     notes = []
-    for names_of, against, off in _named({pair: far for pair, (far, _) in apart.items()}, len(names), apart):
+    for names_of, against, difference in _named({pair: far for pair, (far, _) in apart.items()}, len(names), apart):
         many = len(names_of) > 1
-        who, whom = ", ".join(names[k] for k in names_of), ", ".join(names[k] for k in against)
-        where = f"{np.linalg.norm(off[3:]):.2g} mm and {np.degrees(np.linalg.norm(off[:3])):.2g}°"
-        said = f"{who} and {whom} find the board {where} apart" if many or len(names) < 3 else ""
-        said = said or f"{who} finds the board {where} from where {whom} do{'es' * (len(against) == 1)}"
-        whose = "both" if not many and len(names) < 3 else who
-        notes.append(Grave(f"{said}, more than σ allow: check images, intrinsics and board of {whose}"))
+        accused, witnesses = ", ".join(names[k] for k in names_of), ", ".join(names[k] for k in against)
+        where = f"{np.linalg.norm(difference[3:]):.2g} mm and {np.degrees(np.linalg.norm(difference[:3])):.2g}°"
+        finding = f"{accused} and {witnesses} find the board {where} apart" if many or len(names) < 3 else ""
+        finding = finding or f"{accused} finds the board {where} from where {witnesses} do{'es' * (len(against) == 1)}"
+        whose = "both" if not many and len(names) < 3 else accused
+        notes.append(Grave(f"{finding}, more than σ allow: check images, intrinsics and board of {whose}"))
     return tuple(notes)
 
 
 def _named(apart: dict[tuple[int, int], bool], count: int, off: dict) -> list[tuple[list[int], list[int], np.ndarray]]:
-    """Which cameras contradict which, as few as explain it: those that contradict most of the others first."""
-    left, named = {pair for pair, far in apart.items() if far}, []
-    while left:
-        hits = [sum(k in pair for pair in left) for k in range(count)]
-        k = int(np.argmax(hits))
-        own = sorted(pair for pair in left if k in pair)
-        others = [pair[0] if pair[1] == k else pair[1] for pair in own]
-        named.append(([k], others, off[own[0]][1]))
-        left -= set(own)
+    """Explains contradicting pairs by few cameras: repeatedly names the camera with most contradictions.
+
+    Returns per camera its number, the numbers of the cameras that it contradicts, and one difference of poses.
+    """
+    unexplained, named = {pair for pair, far in apart.items() if far}, []
+    while unexplained:
+        contradictions = [sum(k in pair for pair in unexplained) for k in range(count)]
+        k = int(np.argmax(contradictions))
+        pairs_of_camera = sorted(pair for pair in unexplained if k in pair)
+        others = [pair[0] if pair[1] == k else pair[1] for pair in pairs_of_camera]
+        named.append(([k], others, off[pairs_of_camera[0]][1]))
+        unexplained -= set(pairs_of_camera)
     return named
 
 
 def _first(given: RigPoses, i: int, setup: Setup, options: RigOptions) -> "_First | DegenerateError":
-    """Of one camera by itself; why it has none, where its images are too few or turn too little."""
+    """Returns the first solution of one camera by itself, or the error if its images are too few or turn too little."""
     camera, pairs = given.cameras[i], given.pairs(i)
     if len(camera) < LEAST_POSES:
         return DegenerateError(
@@ -191,8 +194,8 @@ def _first(given: RigPoses, i: int, setup: Setup, options: RigOptions) -> "_Firs
     try:
         check(Loop.of(pairs, setup), setup, pairs.where, False)
         if options.symmetries:
-            mended = repair(pairs, setup, options.symmetries, views)
-            pairs, views, notes = mended.pairs, mended.views or views, mended.notes()
+            repaired = repair(pairs, setup, options.symmetries, views)
+            pairs, views, notes = repaired.pairs, repaired.views or views, repaired.notes()
     except DegenerateError as error:
         return error
     loop = Loop.of(pairs, setup)
@@ -202,58 +205,60 @@ def _first(given: RigPoses, i: int, setup: Setup, options: RigOptions) -> "_Firs
 
 
 def _same_numbering(given: RigPoses, firsts: list, symmetries: tuple[Rigid, ...]) -> tuple[RigPoses, dict[int, _First]]:
-    """Corners of a symmetric board numbered alike by all cameras, as the first one that stands for itself does."""
-    known, cameras = {}, list(given.cameras)
+    """Numbers the corners of a symmetric board alike in all cameras: as the first camera that was solved alone does."""
+    numbered, cameras = {}, list(given.cameras)
     for i, first in enumerate(firsts):
         if not isinstance(first, _First):
             continue
-        reference = next(iter(known.values()), first).z
+        reference = next(iter(numbered.values()), first).z
         turns = (Rigid(), *symmetries)
-        miss = [
+        deviations = [
             Rigid(reference.rotation.T @ (first.z @ turn).rotation).angle_rad()
             + float(np.linalg.norm((first.z @ turn).translation - reference.translation)) / 1e3
             for turn in turns
         ]
-        turn = turns[int(np.argmin(miss))]
+        turn = turns[int(np.argmin(deviations))]
         views = Views(first.views.camera, tuple(turned_view(view, turn) for view in first.views.views))
         notes = first.notes
         if turn is not turns[0]:
             notes += (Aside("all its views were numbered from another end of the board than those of the others"),)
-        known[i] = replace(first, z=first.z @ turn, views=views, notes=notes)
+        numbered[i] = replace(first, z=first.z @ turn, views=views, notes=notes)
         cameras[i] = replace(cameras[i], views=views)
-    return replace(given, cameras=tuple(cameras)), known
+    return replace(given, cameras=tuple(cameras)), numbered
 
 
 def _require_one_board(given: RigPoses, known: dict[int, _First]) -> None:
-    """Refuse cameras that see boards at different places, far beyond what noise makes."""
+    """Raises DegenerateError if cameras place the board so differently that noise cannot explain it."""
     reach = {i: float(np.median(np.linalg.norm(given.pairs(i).camera_from_board.translation, axis=1))) for i in known}
     apart = {}
-    for i, one in known.items():
-        for j, other in known.items():
+    for i, camera in known.items():
+        for j, earlier in known.items():
             if j < i:
-                off = Poses.of([one.z]).difference(Poses.of([other.z]))[0]
-                far = np.linalg.norm(off[3:]) > GROSS_SHARE * max(reach[i], reach[j])
-                apart[j, i] = bool(far or np.linalg.norm(off[:3]) > GROSS_RAD), off
+                difference = Poses.of([camera.z]).difference(Poses.of([earlier.z]))[0]
+                far = np.linalg.norm(difference[3:]) > GROSS_SHARE * max(reach[i], reach[j])
+                apart[j, i] = bool(far or np.linalg.norm(difference[:3]) > GROSS_RAD), difference
     named = _named({pair: far for pair, (far, _) in apart.items()}, len(given.cameras), apart)
     if not named:
         return
-    (odd, *_), others, off = named[0]
-    name, whom = given.cameras[odd].name, ", ".join(given.cameras[k].name for k in others)
-    away = f"{np.linalg.norm(off[3:]):.3g} mm and {np.degrees(np.linalg.norm(off[:3])):.3g}°"
-    pair = f"{name} and {whom} see it {away} apart" if len(known) < 3 else f"{name} sees it {away} from {whom}"
-    one = "both" if len(known) < 3 else name
+    (accused, *_), others, difference = named[0]
+    name, witnesses = given.cameras[accused].name, ", ".join(given.cameras[k].name for k in others)
+    away = f"{np.linalg.norm(difference[3:]):.3g} mm and {np.degrees(np.linalg.norm(difference[:3])):.3g}°"
+    pair = (
+        f"{name} and {witnesses} see it {away} apart" if len(known) < 3 else f"{name} sees it {away} from {witnesses}"
+    )
+    camera = "both" if len(known) < 3 else name
     raise DegenerateError(
         "E-RIG-CONTRADICTS",
         f"{given.where}: one board in one place needed, but {pair}; check images, intrinsics, board and poses of "
-        f"{one}, or leave one camera out",
+        f"{camera}, or leave one camera out",
     )
 
 
 def _by_board(given: RigPoses, i: int, setup: Setup, z: Rigid, scale: float) -> Rigid:
-    """X of a camera that its own images do not tell, from where the others see the board."""
+    """Returns X of a camera that cannot be solved alone, from the board's pose according to the other cameras."""
     loop = Loop.of(given.pairs(i), setup)
-    seen = Poses(loop.camera_from_board.rotation, scale * loop.camera_from_board.translation)
-    return start.mean_pose(loop.stand_from_mount.inverse() @ z @ seen.inverse())
+    scaled_poses = Poses(loop.camera_from_board.rotation, scale * loop.camera_from_board.translation)
+    return start.mean_pose(loop.stand_from_mount.inverse() @ z @ scaled_poses.inverse())
 
 
 def _rig(
@@ -263,27 +268,29 @@ def _rig(
     loops = [Loop.of(given.pairs(i), setup) for i in range(c)]
     rows = np.unique(np.concatenate([camera.rows for camera in given.cameras]))
     flange = given.base_from_flange[rows[~solution.outliers[rows]]]
-    seen = Observability.of(
+    observability = Observability.of(
         Loop(flange.inverse() if setup == "eye-to-hand" else flange, flange, setup == "eye-to-hand")
     )
-    most = int(np.argmax([used.sum() for used in solution.used]))
-    largest = loops[most][solution.used[most]]
+    best_camera = int(np.argmax([used.sum() for used in solution.used]))
+    largest = loops[best_camera][solution.used[best_camera]]
     if solution.sigma_scale is not None:
         require_scale(state.scale, solution.sigma_scale, largest, given.where)
     cameras = []
     for i, (camera, loop, used) in enumerate(zip(given.cameras, loops, solution.used, strict=True)):
         x, z, place = state.mount_from_camera[i], state.stand_from_board, slice(6 * i, 6 * i + 6)
-        at = resected(camera.images, camera.views, solution.found[i])
-        residuals = replace(loop, camera_from_board=at).residuals(x, z)
-        own = {kind(n): v for n, v in solution.sigma.items() if n.partition(":")[2] in ("", camera.name)}
-        whole = ~solution.outliers[camera.rows]
-        kept = tuple(name for name, use in zip(camera.images, used, strict=True) if use)
+        camera_from_board = resected(camera.images, camera.views, solution.found[i])
+        residuals = replace(loop, camera_from_board=camera_from_board).residuals(x, z)
+        sigma_of_camera = {kind(n): v for n, v in solution.sigma.items() if n.partition(":")[2] in ("", camera.name)}
+        with_robot_pose = ~solution.outliers[camera.rows]
+        used_images = tuple(name for name, use in zip(camera.images, used, strict=True) if use)
         notes = first_notes.get(i, ())
         notes += remarks.of_outliers(
-            tuple(name for name, use in zip(camera.images, whole, strict=True) if use), ~used[whole], residuals[whole]
+            tuple(name for name, use in zip(camera.images, with_robot_pose, strict=True) if use),
+            ~used[with_robot_pose],
+            residuals[with_robot_pose],
         )
-        notes += remarks.of_groups(kept, residuals[used]) + remarks.of_distance(loop)
-        notes += of_camera_file(float(solution.camera_gain[i]), own)
+        notes += remarks.of_groups(used_images, residuals[used]) + remarks.of_distance(loop)
+        notes += of_camera_file(float(solution.camera_gain[i]), sigma_of_camera)
         cameras.append(
             HandEye(
                 method="reprojection",
@@ -297,10 +304,10 @@ def _rig(
                 stand_covariance=solution.covariance[6 * c :, 6 * c :],
                 scale=state.scale,
                 sigma_scale=solution.sigma_scale,
-                sigma=own,
-                estimated=tuple(dict.fromkeys(kind(n) for n in solution.estimated if kind(n) in own)),
+                sigma=sigma_of_camera,
+                estimated=tuple(dict.fromkeys(kind(n) for n in solution.estimated if kind(n) in sigma_of_camera)),
                 reprojection=solution.found[i],
-                observability=seen,
+                observability=observability,
                 notes=notes,
             )
         )
@@ -317,7 +324,7 @@ def _rig(
 
 
 def alone_or_none(given: RigPoses, i: int, setup: Setup, options: RigOptions) -> HandEye | None:
-    """As :func:`alone`; None where one camera by itself cannot be found."""
+    """Returns :func:`alone`, or None if the camera cannot be solved alone."""
     try:
         return alone(given, i, setup, options)
     except StcalError:

@@ -1,4 +1,4 @@
-"""How good a rig's calibration is on poses of the robot that it has not seen, beside each camera by itself."""
+"""Cross-validation of a rig's calibration over the robot's poses, compared with each camera by itself."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -23,15 +23,15 @@ ERRORS = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraHeldOut:
-    """Errors of one camera on n views of poses of the robot that were held out.
+    """Errors of one camera on n views from held-out poses of the robot.
 
     Parameters
     ----------
     split, view : (n,) int arrays
-        Which split, and which view of the camera.
+        Number of the split, and of the camera's view.
     joint, alone : dict of str to (n,) array
-        Errors as of :class:`~stcal.handeye.HeldOutPoses`, by name: of all cameras solved together, and of this one by
-        itself from the same poses of the robot; NaN where it cannot be.
+        Errors of :class:`~stcal.handeye.HeldOutPoses` by name: from all cameras solved together, and from this camera
+        alone with the same poses of the robot. NaN if the camera cannot be solved alone.
     """
 
     split: np.ndarray
@@ -40,8 +40,10 @@ class CameraHeldOut:
     alone: dict[str, np.ndarray]
 
     def means(self, by: str = "joint") -> dict[str, float]:
-        """Means over all views for which ``joint`` and ``alone`` are both known, or, of ``joint``, over all where none
-        is; empty where there are none."""
+        """Returns mean errors over the views for which both ``joint`` and ``alone`` are known.
+
+        If ``alone`` is known for no view, the means of ``joint`` cover all views and those of ``alone`` are empty.
+        """
         both = np.isfinite(self.alone["board_mm"])
         rows = both if both.any() or by == "alone" else np.ones(len(both), bool)
         if not rows.any():
@@ -49,26 +51,28 @@ class CameraHeldOut:
         return {name: float(values[rows].mean()) for name, values in getattr(self, by).items()}
 
     def gain(self) -> float | None:
-        """By which share the 3-D error at the board is less than that of the camera by itself; None where that is not
-        known."""
+        """Returns the relative reduction of the 3-D error at the board against the camera alone, or None if unknown."""
         by_itself = self.means("alone")
         return 1 - self.means()["board_mm"] / by_itself["board_mm"] if by_itself else None
 
     def poses(self) -> HeldOutPoses | None:
-        """The same with as many views in every split, those beyond left out; None where a split has none."""
+        """Returns the joint errors with equally many views in every split, or None if a split has no view."""
         splits = np.unique(self.split)
-        each = [np.flatnonzero(self.split == k) for k in splits]
-        fewest = min(map(len, each), default=0)
+        rows_of_split = [np.flatnonzero(self.split == k) for k in splits]
+        fewest = min(map(len, rows_of_split), default=0)
         if not fewest:
             return None
-        rows = np.array([own[:fewest] for own in each])
+        rows = np.array([views[:fewest] for views in rows_of_split])
         return HeldOutPoses(self.view[rows], **{name: values[rows] for name, values in self.joint.items()})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigHeldOut:
-    """``rows`` : (s, k) poses of the robot held out in each split; ``cameras`` : errors of each camera;
-    ``mount_from_camera`` : (s, c, 4, 4) the solutions of the other poses of each split, mm."""
+    """Errors of a rig on held-out poses of the robot.
+
+    ``rows`` : (s, k) poses of the robot held out in each split; ``cameras`` : errors of each camera;
+    ``mount_from_camera`` : (s, c, 4, 4) solutions from the other poses of each split, mm.
+    """
 
     rows: np.ndarray
     cameras: tuple[CameraHeldOut, ...]
@@ -89,18 +93,18 @@ def cross_validate_rig(
     workers: int | None = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> RigHeldOut:
-    """Solve without some of the robot's poses, all cameras together and each by itself, and predict these.
+    """Solves without some of the robot's poses, all cameras together and each alone, and predicts these poses.
 
     Parameters
     ----------
     given, setup, options
-        As of :func:`~stcal.handeye.handeye_rig`.
+        See :func:`~stcal.handeye.handeye_rig`.
     rows : (s, k) int array
         Poses of the robot to hold out, from :func:`~stcal.handeye.splits`.
     workers : int or None
-        Processes, as many as cores where None.
+        Number of processes; as many as cores if None.
     progress : callable, optional
-        Called with the number of splits done, and that of all.
+        Called with the number of splits done, and the number of all splits.
 
     Returns
     -------
@@ -109,66 +113,73 @@ def cross_validate_rig(
     Raises
     ------
     StcalError
-        As of :func:`~stcal.handeye.handeye_rig`, where a split cannot be solved.
+        A split cannot be solved; see :func:`~stcal.handeye.handeye_rig`.
     """
     jobs = [(given, setup, options, out) for out in rows]
-    found: list[tuple[list[dict], np.ndarray]] = [([], np.zeros(0))] * len(jobs)
+    results: list[tuple[list[dict], np.ndarray]] = [([], np.zeros(0))] * len(jobs)
     for done, (i, errors) in enumerate(run_parallel(_errors_without, jobs, workers), 1):
-        found[i] = errors
+        results[i] = errors
         if progress:
             progress(done, len(jobs))
     cameras = []
     for i in range(len(given.cameras)):
-        each = [errors[i] for errors, _ in found]
-        split = np.repeat(np.arange(len(each)), [len(own["view"]) for own in each])
+        parts = [errors[i] for errors, _ in results]
+        split = np.repeat(np.arange(len(parts)), [len(camera_errors["view"]) for camera_errors in parts])
         joint, by_itself = (
-            {name: np.concatenate([own[by][name] for own in each]) for name in ERRORS} for by in ("joint", "alone")
+            {name: np.concatenate([camera_errors[by][name] for camera_errors in parts]) for name in ERRORS}
+            for by in ("joint", "alone")
         )
-        cameras.append(CameraHeldOut(split, np.concatenate([own["view"] for own in each]), joint, by_itself))
-    return RigHeldOut(rows, tuple(cameras), np.array([x for _, x in found]))
+        cameras.append(
+            CameraHeldOut(split, np.concatenate([camera_errors["view"] for camera_errors in parts]), joint, by_itself)
+        )
+    return RigHeldOut(rows, tuple(cameras), np.array([x for _, x in results]))
 
 
 def _errors_without(
     given: RigPoses, setup: Setup, options: RigOptions, out: np.ndarray
 ) -> tuple[list[dict], np.ndarray]:
-    """Of each camera the views of the poses ``out`` and their errors, and all X, (c, 4, 4)."""
-    kept = given.only(np.setdiff1d(np.arange(len(given)), out))
+    """Solves without the poses ``out``. Returns each camera's views of these and their errors, and all X, (c, 4, 4)."""
+    training = given.only(np.setdiff1d(np.arange(len(given)), out))
     try:
-        rig = handeye_rig(kept, setup, options)
+        rig = handeye_rig(training, setup, options)
     except DegenerateError as error:
         raise DegenerateError(error.code, f"without {', '.join(given.names[i] for i in out)}: {error}") from error
-    found = []
+    errors_of_cameras = []
     for i, camera in enumerate(given.cameras):
         held = np.flatnonzero(np.isin(camera.rows, out))
-        nothing = dict.fromkeys(ERRORS, np.full(len(held), np.nan))
-        own = {"view": held, "joint": nothing, "alone": nothing}
+        unknown = dict.fromkeys(ERRORS, np.full(len(held), np.nan))
+        camera_errors = {"view": held, "joint": unknown, "alone": unknown}
         if len(held):
             pairs, views = given.pairs(i)[held], camera.views[held]
-            own["joint"] = predicted(rig.cameras[i], pairs, views)
-            with suppress(StcalError):  # too few of its images may be left: it is then known by the others alone
-                own["alone"] = predicted(alone(kept, i, setup, options), pairs, views)
-        found.append(own)
-    return found, np.array([each.mount_from_camera.matrix() for each in rig.cameras])
+            camera_errors["joint"] = predicted(rig.cameras[i], pairs, views)
+            with suppress(
+                StcalError
+            ):  # with too few of its images left, the camera is solved by means of the others only
+                camera_errors["alone"] = predicted(alone(training, i, setup, options), pairs, views)
+        errors_of_cameras.append(camera_errors)
+    return errors_of_cameras, np.array([each.mount_from_camera.matrix() for each in rig.cameras])
 
 
 def rig_scatter(rig: Rig, held_out: RigHeldOut) -> float:
-    """As :func:`~stcal.handeye.scatter.scatter`, of all cameras at once: by how much solutions without some of the
-    robot's poses scatter about the one of all, in units of what its σ say."""
+    """Returns the scatter of solutions without some of the robot's poses, relative to what σ predict.
+
+    The formula is that of :func:`~stcal.handeye.scatter.scatter`, applied to all cameras at once.
+    """
     (s, k), c = held_out.rows.shape, len(rig.names)
-    off = []
+    differences = []
     for i, camera in enumerate(rig.cameras):
-        four = held_out.mount_from_camera[:, i]
-        each = Poses(four[:, :3, :3], four[:, :3, 3])
-        off.append(each.difference(Poses.of([camera.mount_from_camera] * s)))
-    flat, size = np.concatenate(off, axis=1), POSE * c
+        matrices = held_out.mount_from_camera[:, i]
+        solutions = Poses(matrices[:, :3, :3], matrices[:, :3, 3])
+        differences.append(solutions.difference(Poses.of([camera.mount_from_camera] * s)))
+    flat, size = np.concatenate(differences, axis=1), POSE * c
     squared = np.einsum("sa,ab,sb->s", flat, generalised_inverse(rig.covariance[:size, :size]), flat)
     images = sum(len(camera.names) for camera in rig.cameras)
-    left = POSE * images * (1 - k / len(rig.poses)) - len(rig.covariance) - 1
-    return float(np.sqrt(squared.mean() / size * left / (POSE * images * k / len(rig.poses))))
+    dof = POSE * images * (1 - k / len(rig.poses)) - len(rig.covariance) - 1
+    return float(np.sqrt(squared.mean() / size * dof / (POSE * images * k / len(rig.poses))))
 
 
 def widened_by_scatter(rig: Rig, held_out: RigHeldOut) -> tuple[Rig, float]:
-    """With σ that reach the :func:`rig_scatter`, and by what they were multiplied; a note where that is much."""
+    """Returns the rig with σ widened by the :func:`rig_scatter`, with a note if that is large, and the factor."""
     factor = rig_scatter(rig, held_out)
     if not factor > 1:
         return rig, 1.0

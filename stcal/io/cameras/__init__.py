@@ -1,1 +1,1 @@
-"""Cameras of other programs, and how far two are apart."""
+"""Cameras of other programs, and the difference between two cameras."""

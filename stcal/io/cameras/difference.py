@@ -1,4 +1,4 @@
-"""How far apart two cameras see the same rays, after the turn that brings them nearest."""
+"""Difference between two cameras: distances of their pixels for the same rays, after the best rotation."""
 
 from dataclasses import dataclass
 
@@ -10,41 +10,44 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 
 CELLS = 24
-"""Points along the shorter side."""
+"""Number of grid points along the shorter side of the image."""
 STEPS, STEP_RAD = 10, 1e-6
 LEAST_POINTS = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraDifference:
-    """``pixels`` : (r, c, 2) of the first camera; ``apart`` : (r, c, 2) px by which the second sees their rays
-    elsewhere, nan where one of them sees none; ``second_from_first`` : the turn."""
+    """The difference between two cameras over the image.
+
+    ``pixels`` : (r, c, 2) of the first camera; ``apart`` : (r, c, 2) px, offsets of the second camera's pixels for the
+    same rays, nan where one of the cameras has no ray; ``second_from_first`` : the best rotation.
+    """
 
     pixels: np.ndarray
     apart: np.ndarray
     second_from_first: Rigid
 
     def lengths(self) -> np.ndarray:
-        """(r, c) px."""
+        """Return the lengths (r, c) of the offsets, px."""
         return np.linalg.norm(self.apart, axis=2)
 
 
 def camera_difference(one: Camera, two: Camera) -> CameraDifference:
-    """Pixels of the second camera for the rays of the first one's, over its image.
+    """Return the difference between two cameras over the image.
 
-    The two see the same if their images differ by a turn of the camera: a principal point and a turn are alike.
+    Images that differ by a rotation of the camera count as equal: it acts like a shift of the principal point.
 
     Parameters
     ----------
     one, two : Camera
-        Of one image size.
+        Cameras of the same image size.
 
     Raises
     ------
     InputError
-        Two sizes.
+        The image sizes differ.
     DegenerateError
-        Nearly no pixel has a ray in both.
+        Too few pixels have a ray in both cameras.
     """
     if (one.width, one.height) != (two.width, two.height):
         raise InputError(
@@ -62,10 +65,13 @@ def camera_difference(one: Camera, two: Camera) -> CameraDifference:
     unit = [ray / np.linalg.norm(ray, axis=1)[:, None] for ray in (first[good], second[good])]
     turn = Rigid(align_rigid(unit[1], unit[0]).rotation, np.zeros(3))
     for _ in range(STEPS):
-        here = two.project(turn @ first[good]) - flat[good]
-        moved = [Rigid.exp([*step, 0, 0, 0]) @ turn for step in STEP_RAD * np.eye(3)]
-        slope = np.stack([two.project(each @ first[good]) - flat[good] - here for each in moved], axis=2) / STEP_RAD
-        step = -np.linalg.lstsq(slope.reshape(-1, 3), here.ravel())[0]
+        offset = two.project(turn @ first[good]) - flat[good]
+        rotations = [Rigid.exp([*step, 0, 0, 0]) @ turn for step in STEP_RAD * np.eye(3)]
+        slope = (
+            np.stack([two.project(rotated @ first[good]) - flat[good] - offset for rotated in rotations], axis=2)
+            / STEP_RAD
+        )
+        step = -np.linalg.lstsq(slope.reshape(-1, 3), offset.ravel())[0]
         turn = Rigid.exp([*step, 0, 0, 0]) @ turn
         if np.abs(step).max() < STEP_RAD**2:
             break
@@ -75,14 +81,14 @@ def camera_difference(one: Camera, two: Camera) -> CameraDifference:
 
 
 def image_grid(camera: Camera) -> np.ndarray:
-    """(r, c, 2) pixels over the image, its edges among them."""
+    """Return a grid of pixels (r, c, 2) over the image, edges included."""
     count = max(round(CELLS * camera.width / camera.height), 2), CELLS
     x, y = (np.linspace(-0.5, side - 0.5, n) for side, n in zip((camera.width, camera.height), count, strict=True))
     return np.stack(np.meshgrid(x, y), axis=-1)
 
 
 def rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """(n, 3) with z = 1 of pixels (n, 2); nan where the lens has none."""
+    """Return the rays (n, 3) with z = 1 of pixels (n, 2); nan where the lens has none."""
     try:
         return np.column_stack([camera.normalised_from_pixel(pixels), np.ones(len(pixels))])
     except ConvergenceError:

@@ -1,4 +1,4 @@
-"""A lens of ours fitted to one that no model here holds, and how far the two are apart."""
+"""Fit of a supported camera model to a lens of an unsupported one, and the residuals of the fit."""
 
 from dataclasses import dataclass
 
@@ -11,26 +11,29 @@ from stcal.io.cameras.foreign import ForeignLens
 from stcal.io.cameras.model import FISHEYE, CalibratedCamera, intrinsic_basis, parameter_names
 
 CANDIDATES = ("OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE")
-"""From few parameters to many, perspective and equidistant."""
+"""Camera models that are tried, from few parameters to many, perspective and equidistant."""
 AS_GOOD_PX = 1e-3
-"""By which more parameters must be nearer to be taken."""
+"""Reduction of the largest residual, in px, that a model with more parameters must reach to be preferred."""
 AZIMUTHS, RADII, STEPS = 72, 40, 1000
-"""Rays: directions about the axis, places along each, and steps in which the edge is looked for."""
+"""Numbers of azimuths of the rays, of radii along each, and of steps in the search for the edge of the image."""
 BEYOND = 0.01
-"""Of the image's size: rays are followed so far over its edge, so that all of it lies between them."""
+"""Share of the image's size by which rays extend beyond the edge, so that they enclose the whole image."""
 FAR_PX = 1e6
-"""Where a lens that is tried has no pixel."""
+"""Residual, in px, where the fitted lens projects a ray to no pixel."""
 MOST_STEPS, SETTLED = 200, 1e-14
 HALF = 0.5
-"""By more of it no focal length shrinks."""
+"""Largest share by which a focal length may shrink in the fit."""
 SMALL = 1e-6
-"""Steps about the axis for the focal lengths."""
+"""Step about the axis, in normalised coordinates, from which the initial focal lengths are computed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedLens:
-    """``camera`` : the fitted one; ``rms_px``, ``most_px`` : how far it is off over the image; ``share`` : of the
-    directions about the axis in which the image ends within 89° of the axis."""
+    """Result of fitting a lens.
+
+    ``camera`` : the fitted camera; ``rms_px``, ``most_px`` : RMS and largest residual over the image; ``share`` : share
+    of the azimuths in which the image ends within 89° of the axis.
+    """
 
     camera: CalibratedCamera
     rms_px: float
@@ -39,12 +42,12 @@ class FittedLens:
 
 
 def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
-    """The model of ours that is nearest to a lens over the image.
+    """Return the supported camera model that is nearest to a lens over the image.
 
     Parameters
     ----------
     lens : ForeignLens
-        To be fitted.
+        Lens to approximate.
     width, height : int
         Image size, px.
 
@@ -65,26 +68,30 @@ def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
 
 
 def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rays (n, 3) with z = 1 that the image sees, evenly over it, their pixels (n, 2), and the share as above."""
+    """Return rays (n, 3) with z = 1 spread evenly over the image, their pixels (n, 2), and :attr:`FittedLens.share`."""
     angle = np.linspace(0, WIDEST_RAD, STEPS + 1)[1:]
     far = np.array([width, height]) * BEYOND
     centre = lens.project(np.array([[0.0, 0.0, 1.0]]))[0]
     corners = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * [width, height] - 0.5 - centre
     around = np.concatenate([np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False), np.arctan2(*corners.T[::-1])])
     rays, pixels, ends = [], [], 0
-    for side in around:
-        own = np.column_stack([np.cos(side) * np.tan(angle), np.sin(side) * np.tan(angle), np.ones(STEPS)])
-        seen = lens.project(own)
-        radius = np.linalg.norm(seen - centre, axis=1)
-        inside = ((seen >= -0.5 - far) & (seen <= np.array([width, height]) - 0.5 + far)).all(axis=1)
-        grows = np.diff(radius, prepend=0) > 0  # beyond, the distortion folds over
+    for azimuth in around:
+        rays_of_azimuth = np.column_stack(
+            [np.cos(azimuth) * np.tan(angle), np.sin(azimuth) * np.tan(angle), np.ones(STEPS)]
+        )
+        pixels_of_azimuth = lens.project(rays_of_azimuth)
+        radius = np.linalg.norm(pixels_of_azimuth - centre, axis=1)
+        inside = ((pixels_of_azimuth >= -0.5 - far) & (pixels_of_azimuth <= np.array([width, height]) - 0.5 + far)).all(
+            axis=1
+        )
+        grows = np.diff(radius, prepend=0) > 0  # beyond this radius the distortion folds over
         good = np.logical_and.accumulate(inside & grows)
         count = int(good.sum())
         ends += count < STEPS and bool(grows[count])
         if count:
             at = np.searchsorted(radius[:count], np.linspace(0, radius[count - 1], RADII + 1)[1:])
-            rays.append(own[np.unique(np.minimum(at, count - 1))])
-            pixels.append(seen[np.unique(np.minimum(at, count - 1))])
+            rays.append(rays_of_azimuth[np.unique(np.minimum(at, count - 1))])
+            pixels.append(pixels_of_azimuth[np.unique(np.minimum(at, count - 1))])
     if sum(map(len, rays)) < AZIMUTHS:
         raise InputError(
             "E-CAMERA-NO-FIELD",
@@ -96,7 +103,7 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
 def _fitted(
     model: str, rays: np.ndarray, pixels: np.ndarray, lens: ForeignLens, size: tuple[int, int]
 ) -> CalibratedCamera:
-    """Least squares over the image: places farther out stand for more of it."""
+    """Fit one model by least squares; weights grow with the radius, since outer rays represent a larger area."""
     about = lens.project(np.array([[0, 0, 1], [SMALL, 0, 1], [0, SMALL, 1]]))
     focal = np.linalg.norm(about[1:] - about[0], axis=1) / SMALL
     start = Camera(*size, focal, about[0], np.zeros(12), FISHEYE in model)
@@ -114,10 +121,10 @@ def _fitted(
         return np.nan_to_num(away, nan=FAR_PX, posinf=FAR_PX, neginf=-FAR_PX).ravel()
 
     def slope(x: np.ndarray) -> np.ndarray:
-        by = camera_at(x).parameter_jacobian(rays[:, :2]) @ basis * scale
-        return (weight[:, :, None] * by).reshape(-1, len(names))
+        derivatives = camera_at(x).parameter_jacobian(rays[:, :2]) @ basis * scale
+        return (weight[:, :, None] * derivatives).reshape(-1, len(names))
 
-    found = least_squares(
+    solution = least_squares(
         off,
         np.zeros(len(names)),
         slope,  # pyright: ignore[reportArgumentType]
@@ -128,4 +135,4 @@ def _fitted(
         ftol=SETTLED,
         gtol=SETTLED,
     )
-    return CalibratedCamera.of(camera_at(found.x), model)
+    return CalibratedCamera.of(camera_at(solution.x), model)

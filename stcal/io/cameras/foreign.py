@@ -1,4 +1,4 @@
-"""Lenses that no model here holds: how they project, so that one of ours can be fitted to them."""
+"""Lenses of unsupported models: their projection, to which a supported model can be fitted."""
 
 import re
 import sqlite3
@@ -30,9 +30,9 @@ COLMAP_FOREIGN = {
     "FISHEYE": (15, 4),
     "EUCM": (16, 6),
 }
-"""COLMAP's models that are none of ours: their numbers in binary files, and how many parameters they have."""
+"""COLMAP's unsupported models: their numbers in binary files, and their numbers of parameters."""
 SPLINED = re.compile(r"LENSMODEL_SPLINED_STEREOGRAPHIC_order=([23])_Nx=(\d+)_Ny=(\d+)_fov_x_deg=(\d+)")
-"""mrcal's name of it, with its configuration."""
+"""Pattern of mrcal's name of a splined lens model, which includes its configuration."""
 NUMBERS = {
     **dict(
         enumerate(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"))
@@ -40,19 +40,19 @@ NUMBERS = {
     **{8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE", 10: "THIN_PRISM_FISHEYE"},
     **{number: name for name, (number, _) in COLMAP_FOREIGN.items()},
 }
-"""Names of COLMAP's models by their numbers in binary files and databases."""
+"""The names of COLMAP's models by their numbers in binary files and databases."""
 SQUARE = 1e-9
-"""Skew over focal length that is none."""
+"""Largest ratio of skew to focal length that counts as no skew."""
 MARGIN = {2: 1, 3: 2}
-"""Intervals of a spline of this order that lie beyond the stated field."""
+"""Number of intervals beyond the stated field of view, by the order of the spline."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForeignLens:
-    """A lens by its projection alone.
+    """A lens that is known by its projection only.
 
-    ``called`` : its model; ``project`` : pixels (n, 2) of rays (n, 3), z > 0, centre of the first pixel at (0, 0);
-    ``width``, ``height`` : px, or None where the file states none; ``source`` : the file.
+    ``called`` : name of its model; ``project`` : returns pixels (n, 2) of rays (n, 3), z > 0, centre of the first pixel
+    at (0, 0); ``width``, ``height`` : px, or None if the file states none; ``source`` : the file.
     """
 
     called: str
@@ -63,12 +63,12 @@ class ForeignLens:
 
 
 def of_colmap(model: str, width: float, height: float, params, source: str) -> CameraModel | ForeignLens:
-    """The camera of any of COLMAP's models but EQUIRECTANGULAR; ``params`` in its order and pixel origin.
+    """Return the camera of any of COLMAP's models but EQUIRECTANGULAR; ``params`` in its order and pixel origin.
 
     Raises
     ------
     InputError
-        An unknown model, a wrong number of parameters, or impossible values.
+        The model is unknown, the number of parameters is wrong, or values are impossible.
 
     References
     ----------
@@ -84,25 +84,25 @@ def of_colmap(model: str, width: float, height: float, params, source: str) -> C
             "E-CAMERA-COEFFICIENTS", f"camera file {source}: {len(numbers)} parameters for {model}, {count} needed"
         )
     double = model.startswith("SIMPLE_")
-    focal, rest = (numbers[:1] * 2, numbers[1:]) if double else (numbers[:2], numbers[2:])
+    focal, others = (numbers[:1] * 2, numbers[1:]) if double else (numbers[:2], numbers[2:])
     if model in ("SIMPLE_FISHEYE", "FISHEYE"):  # without distortion
-        return camera_from_colmap("OPENCV_FISHEYE", width, height, [*focal, *rest, 0, 0, 0, 0], source)
-    camera_from_colmap("PINHOLE", width, height, [*focal, *rest[:2]], source)  # which refuses impossible values
-    own, centre = np.array(rest[2:]), np.array(rest[:2]) - COLMAP_PIXEL_ORIGIN
-    if not np.isfinite(own).all():
+        return camera_from_colmap("OPENCV_FISHEYE", width, height, [*focal, *others, 0, 0, 0, 0], source)
+    camera_from_colmap("PINHOLE", width, height, [*focal, *others[:2]], source)  # refuses impossible values
+    coefficients, centre = np.array(others[2:]), np.array(others[:2]) - COLMAP_PIXEL_ORIGIN
+    if not np.isfinite(coefficients).all():
         raise InputError(
             "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
         )
 
     def project(rays: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
-            return centre + np.array(focal) * _colmap_normalised(rays, model.removeprefix("SIMPLE_"), own)
+            return centre + np.array(focal) * _colmap_normalised(rays, model.removeprefix("SIMPLE_"), coefficients)
 
     return ForeignLens(f"COLMAP's {model}", project, int(width), int(height), source)
 
 
 def _colmap_normalised(rays: np.ndarray, model: str, own: np.ndarray) -> np.ndarray:
-    """(n, 2)"""
+    """Return the distorted normalised coordinates (n, 2) of rays (n, 3); ``own`` : parameters of the model."""
     if model == "EUCM":
         return _on_plane(rays, "eucm", own)
     xy = rays[:, :2] / rays[:, 2:]
@@ -120,12 +120,12 @@ def _colmap_normalised(rays: np.ndarray, model: str, own: np.ndarray) -> np.ndar
 
 
 def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
-    """The camera of a COLMAP database, or that of the number ``choice``; the file is only read.
+    """Return the camera of a COLMAP database, or the one of number ``choice``; the file is opened read-only.
 
     Raises
     ------
     InputError
-        No cameras, several and no choice, or a model that is not known.
+        There is no camera, there are several and no choice, or the model is unknown.
     """
     try:
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
@@ -141,12 +141,12 @@ def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
 
 
 def one_of(names: list[str], choice: str, source: str) -> str:
-    """The camera ``choice`` of a file, or its only one.
+    """Return the name of the camera ``choice`` of a file, or of its only camera.
 
     Raises
     ------
     InputError
-        None, an unknown one, or several and no choice.
+        There is no camera, the choice is unknown, or there are several cameras and no choice.
     """
     if not names:
         raise InputError("E-CAMERA-NONE", f"camera file {source}: no camera in it, 1 needed")
@@ -160,16 +160,16 @@ def one_of(names: list[str], choice: str, source: str) -> str:
 
 
 def of_opencv(lens, given: np.ndarray, width: float, height: float, source: str) -> CameraModel | ForeignLens:
-    """The perspective camera of fx, fy, cx, cy and OpenCV's coefficients, thin prisms and a tilted sensor among them.
+    """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, also thin prisms and tilted sensor.
 
     Raises
     ------
     InputError
-        Coefficients of another number; impossible values.
+        The number of coefficients is wrong, or values are impossible.
     """
     if len(given) not in (12, 14) or not given[8:].any():
         return camera_from_opencv(lens, given, False, width, height, source)
-    camera_from_opencv(lens, given[:8], False, width, height, source)  # which refuses impossible values
+    camera_from_opencv(lens, given[:8], False, width, height, source)  # refuses impossible values
     if not np.isfinite(given).all():
         raise InputError(
             "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
@@ -188,13 +188,14 @@ def of_opencv(lens, given: np.ndarray, width: float, height: float, source: str)
 def of_skewed(
     lens, skew: float, given: np.ndarray, width: float, height: float, source: str
 ) -> CameraModel | ForeignLens:
-    """The perspective camera of fx, fy, cx, cy and OpenCV's coefficients; a foreign lens where its axes are skewed by
-    ``skew`` px: u = fx x + skew y + cx.
+    """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, or a foreign lens if it has skew.
+
+    ``skew`` : px, u = fx x + skew y + cx.
 
     Raises
     ------
     InputError
-        Coefficients of another number; impossible values.
+        The number of coefficients is wrong, or values are impossible.
     """
     camera = camera_from_opencv(lens, given, False, width, height, source)
     if not abs(skew) < abs(camera.focal[0]):
@@ -212,12 +213,12 @@ def of_skewed(
 
 
 def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignLens:
-    """Kalibr's omni, eucm and ds with radtan, equidistant, fov or no distortion.
+    """Return the lens of Kalibr's models omni, eucm, ds or pinhole with radtan, equidistant, fov or no distortion.
 
     Raises
     ------
     InputError
-        Numbers missing, or impossible ones.
+        Numbers are missing or impossible.
 
     References
     ----------
@@ -228,12 +229,16 @@ def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignL
     first = {"omni": 1, "eucm": 2, "ds": 2, "pinhole": 0}[lens]
     count = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}[distortion]
     numbers = np.array(values["intrinsics"], float)
-    own = np.array(values.get("distortion_coeffs", []) if count else [], float)
-    if numbers.shape != (first + 4,) or own.shape != (count,) or not np.isfinite([*numbers, *own]).all():
+    coefficients = np.array(values.get("distortion_coeffs", []) if count else [], float)
+    if (
+        numbers.shape != (first + 4,)
+        or coefficients.shape != (count,)
+        or not np.isfinite([*numbers, *coefficients]).all()
+    ):
         raise InputError(
             "E-CAMERA-COEFFICIENTS",
             f"camera file {source}: {lens} with {distortion} has {first + 4} intrinsics and {count} coefficients, "
-            f"finite numbers; {numbers.size} and {own.size} found",
+            f"finite numbers; {numbers.size} and {coefficients.size} found",
         )
     shape, focal, centre = numbers[:first], numbers[first : first + 2], numbers[first + 2 :]
     if (focal <= 0).any():
@@ -244,13 +249,13 @@ def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignL
 
     def project(rays: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
-            return centre + focal * _kalibr_distorted(_on_plane(rays, lens, shape), distortion, own)
+            return centre + focal * _kalibr_distorted(_on_plane(rays, lens, shape), distortion, coefficients)
 
     return ForeignLens(f"Kalibr's {lens} with {distortion}", project, width or None, height or None, source)
 
 
 def _on_plane(rays: np.ndarray, lens: str, shape: np.ndarray) -> np.ndarray:
-    """(n, 2) normalised coordinates; nan where a ray has none."""
+    """Return the normalised coordinates (n, 2) of rays (n, 3); nan where a ray has none."""
     z, length = rays[:, 2], np.linalg.norm(rays, axis=1)
     if lens == "omni":
         below = z + shape[0] * length
@@ -276,8 +281,8 @@ def _kalibr_distorted(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
 
 
 def _scaled(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
-    """Distorted along the radius: equidistant, by the field of view, or not."""
-    r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # where all of them are straight lines
+    """Return normalised coordinates (n, 2) with the radial distortion equidistant, fov, or none."""
+    r = np.maximum(np.sqrt((xy**2).sum(axis=1)), 1e-12)  # below this radius all these models are linear
     if kind == "fov":
         return xy * (np.arctan(2 * r * np.tan(k[0] / 2)) / (k[0] * r))[:, None]
     if kind == "equidistant":
@@ -287,20 +292,20 @@ def _scaled(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
 
 
 def of_splines(name: str, numbers: list[float], width: float, height: float, source: str) -> ForeignLens:
-    """mrcal's splined stereographic lens: ``u = 2 tan(θ / 2)`` along the ray, moved by a B-spline of u, times f.
+    """Return mrcal's splined stereographic lens: pixels are f · (u + B-spline of u), |u| = 2 tan(θ / 2).
 
     Raises
     ------
     InputError
-        Numbers missing.
+        The name is unknown, or numbers are missing.
     """
-    found = SPLINED.fullmatch(name)
-    if found is None:
+    match = SPLINED.fullmatch(name)
+    if match is None:
         raise InputError(
             "E-CAMERA-MODEL",
             f"camera file {source}: {name[:80]} is not splined in mrcal's words; write it anew with mrcal",
         )
-    order, columns, rows, wide = (int(word) for word in found.groups())
+    order, columns, rows, wide = (int(word) for word in match.groups())
     if columns <= MARGIN[order] + 1 or len(numbers) != 4 + 2 * columns * rows or not 0 < wide < 360:
         raise InputError(
             "E-CAMERA-COEFFICIENTS",
@@ -325,18 +330,19 @@ def of_splines(name: str, numbers: list[float], width: float, height: float, sou
 
 
 def refused(camera: CalibratedCamera, form: str, why: str) -> InputError:
-    """What a form cannot hold."""
+    """Return the error for a camera with a property ``why`` that a form cannot hold."""
     return InputError("E-CAMERA-FORM", f"{form} has no place for {why} of {camera.colmap_model}; write --form colmap")
 
 
 def of_cahvor(numbers, width: float, height: float, source: str) -> CameraModel | ForeignLens:
-    """mrcal's ``LENSMODEL_CAHVOR`` : fx, fy, cx, cy, two angles of the optical axis, r0, r1, r2; where the axis is that
-    of the image, it is a model of ours.
+    """Return the camera of mrcal's ``LENSMODEL_CAHVOR`` : fx, fy, cx, cy, two angles of the optical axis, r0, r1, r2.
+
+    If both angles are zero, it is a supported model.
 
     Raises
     ------
     InputError
-        A wrong number of parameters, or impossible values.
+        The number of parameters is wrong, or values are impossible.
 
     References
     ----------

@@ -1,7 +1,7 @@
-"""Cameras of other programs: Kalibr, mrcal, COLMAP's ``cameras.bin``; and each form written.
+"""Cameras of other programs: readers of Kalibr, mrcal, COLMAP's ``cameras.bin``; and writers of all forms.
 
-Pixel origins: (0, 0) is the centre of the first pixel in OpenCV, ROS, Kalibr and mrcal, (0.5, 0.5) in COLMAP and
-Metashape, whose principal point is counted from the middle of the image.
+Pixel origins: the centre of the first pixel is at (0, 0) in OpenCV, ROS, Kalibr and mrcal, at (0.5, 0.5) in COLMAP and
+Metashape; Metashape's principal point is relative to the middle of the image.
 """
 
 import ast
@@ -39,34 +39,36 @@ SUFFIXES = {
     ".xml": "metashape",
     ".mat": "matlab",
 }
-"""Form that a name asks for."""
+"""The form of a file by its suffix."""
 MRCAL = {f"LENSMODEL_{name}": count for name, count in (("PINHOLE", 0), *((f"OPENCV{n}", n) for n in (4, 5, 8, 12)))}
-"""Coefficients of mrcal's models that are OpenCV's."""
+"""Numbers of coefficients of those models of mrcal that are OpenCV's."""
 MM_PER_M = 1000.0
 KALIBR = ("pinhole", "omni", "eucm", "ds")
 SIGMA_FORMS = ("colmap", "metashape-cameras")
-"""That have a place for σ and correlations."""
+"""The forms that have a place for σ and correlations."""
 
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """``content`` of a file, and ``lost`` : what it has no place for."""
+    """The ``content`` of a file, and ``lost`` : properties of the camera that the file has no place for."""
 
     content: str | bytes
     lost: tuple[str, ...]
 
 
 def from_kalibr(values: Mapping, choice: str, source: str) -> CameraModel | ForeignLens:
-    """A camera of ``camchain.yaml``.
+    """Return a camera of ``camchain.yaml``.
 
     Raises
     ------
     InputError
-        Several cameras and no choice, an unknown one, another model.
+        There are several cameras and no choice, the choice is unknown, or the model is not supported.
     """
-    cameras = {str(name): each for name, each in values.items() if isinstance(each, dict) and "camera_model" in each}
-    own = cameras[one_of(list(cameras), choice, source)]
-    lens, distortion = own.get("camera_model"), own.get("distortion_model", "none")
+    cameras = {
+        str(name): value for name, value in values.items() if isinstance(value, dict) and "camera_model" in value
+    }
+    entry = cameras[one_of(list(cameras), choice, source)]
+    lens, distortion = entry.get("camera_model"), entry.get("distortion_model", "none")
     if lens not in KALIBR or distortion not in ("radtan", "equidistant", "fov", "none"):
         raise InputError(
             "E-CAMERA-MODEL",
@@ -74,21 +76,21 @@ def from_kalibr(values: Mapping, choice: str, source: str) -> CameraModel | Fore
             "none are read",
         )
     if lens != "pinhole" or distortion == "fov":
-        return of_kalibr(lens, distortion, own, source)
-    fx, fy, cx, cy = np.array(own["intrinsics"], float).tolist()
-    width, height = (float(side) for side in own.get("resolution", (0, 0)))
-    given = np.array(own.get("distortion_coeffs", []), float)
+        return of_kalibr(lens, distortion, entry, source)
+    fx, fy, cx, cy = np.array(entry["intrinsics"], float).tolist()
+    width, height = (float(side) for side in entry.get("resolution", (0, 0)))
+    given = np.array(entry.get("distortion_coeffs", []), float)
     coefficients = given if distortion != "none" else np.zeros(0)
     return camera_from_opencv([fx, fy, cx, cy], coefficients, distortion == "equidistant", width, height, source)
 
 
 def from_mrcal(text: str, source: str) -> CameraModel | ForeignLens:
-    """A ``.cameramodel`` whose lens model is OpenCV's, or splined.
+    """Return the camera of a ``.cameramodel`` whose lens model is OpenCV's, CAHVOR, or splined.
 
     Raises
     ------
     InputError
-        No such file, or another lens model.
+        The text is no such file, or has another lens model.
     """
     try:
         values = ast.literal_eval(text.strip())
@@ -113,12 +115,12 @@ def from_mrcal(text: str, source: str) -> CameraModel | ForeignLens:
 
 
 def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
-    """The camera of ``cameras.bin``, or that of the number ``choice``.
+    """Return the camera of ``cameras.bin``, or the one of number ``choice``.
 
     Raises
     ------
     InputError
-        Not of that form, several and no choice, or a model that is not supported.
+        The content has another form, there are several cameras and no choice, or the model is not supported.
     """
     try:
         (count,) = struct.unpack_from("<Q", content, 0)
@@ -142,21 +144,21 @@ def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel 
 
 
 def written(camera: CalibratedCamera, form: str, name: str) -> Written:
-    """The file of a camera.
+    """Return the file of a camera.
 
     Parameters
     ----------
     camera : CalibratedCamera
-        To write.
+        Camera to write.
     form : str
         One of :data:`WRITERS`.
     name : str
-        Of the camera, where the form has a place.
+        Name of the camera, for forms that have a place for it.
 
     Raises
     ------
     InputError
-        A lens that the form cannot hold, with the form that can; a name that is no word.
+        The form cannot hold the lens (the message names one that can), or the name is no word.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InputError(
@@ -178,15 +180,15 @@ def _colmap_binary(camera: CalibratedCamera, _: str) -> bytes:
 
 
 def _fisheye_four(camera: CalibratedCamera, form: str) -> list[float]:
-    """k1 … k4 of an equidistant camera that has nothing else."""
-    rest = [*camera.distortion[2:4], *camera.distortion[8:]]
-    if any(rest):
+    """Return k1 … k4 of an equidistant camera; refuse one with further coefficients."""
+    others = [*camera.distortion[2:4], *camera.distortion[8:]]
+    if any(others):
         raise refused(camera, form, "p1, p2 and prisms")
     return [float(camera.distortion[i]) for i in (0, 1, 4, 5)]
 
 
 def _coefficients(camera: CalibratedCamera) -> list[float]:
-    """5 or 8 of the perspective ones, as few as hold the lens."""
+    """Return the first 5 or 8 coefficients of a perspective camera, as few as represent the lens."""
     count = 8 if camera.distortion[5:8].any() else 5
     return [float(k) for k in camera.distortion[:count]]
 
@@ -239,21 +241,22 @@ def _kalibr(camera: CalibratedCamera, name: str) -> str:
 
 
 def kalibr_chain(cameras: Sequence[tuple[str, CalibratedCamera, Rigid]]) -> str:
-    """``camchain.yaml`` of several cameras, each with its name and camera_from_first; Kalibr numbers them, and states
-    each camera in the one before it, in metres.
+    """Return the ``camchain.yaml`` of several cameras, each given by name, camera and camera_from_first.
+
+    Kalibr numbers the cameras, and states the pose of each relative to the camera before it, in metres.
 
     Raises
     ------
     InputError
-        A lens that the form cannot hold.
+        The form cannot hold a lens.
     """
     parts = []
     for number, (name, camera, pose) in enumerate(cameras):
         parts.append(f"# cam{number}: {name}\n{_kalibr(camera, f'cam{number}')}")
         if number:
-            own = (pose @ cameras[number - 1][2].inverse()).matrix()
-            own[:3, 3] /= MM_PER_M
-            parts.append("".join(["  T_cn_cnm1:\n", *(f"  - {row}\n" for row in own.tolist())]))
+            matrix = (pose @ cameras[number - 1][2].inverse()).matrix()
+            matrix[:3, 3] /= MM_PER_M
+            parts.append("".join(["  T_cn_cnm1:\n", *(f"  - {row}\n" for row in matrix.tolist())]))
     return "".join(parts)
 
 
@@ -282,4 +285,4 @@ WRITERS: Mapping[str, Callable[[CalibratedCamera, str], str | bytes]] = {
     "matlab": mat,
     "zhang": zhang,
 }
-"""Of a camera called so, by form."""
+"""Writers by form: each returns the file of a camera and its name."""

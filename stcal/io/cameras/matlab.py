@@ -1,6 +1,6 @@
-"""Cameras of MATLAB: structures of its Computer Vision Toolbox, and the files of Bouguet's toolbox.
+"""Cameras of MATLAB: structures of its Computer Vision Toolbox, and files of Bouguet's toolbox.
 
-The toolbox counts pixels from (1, 1), the centre of the first; Bouguet's from (0, 0), as OpenCV does.
+In MATLAB's toolbox the centre of the first pixel is at (1, 1); in Bouguet's it is at (0, 0), as in OpenCV.
 """
 
 import io
@@ -19,27 +19,27 @@ from stcal.io.cameras.model import CalibratedCamera, CameraModel
 HEADS = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 PIXEL_ORIGIN = 1.0
 STRUCTURE = "RadialDistortion"
-"""Field of every structure that ``toStruct`` makes of a camera."""
+"""Name of a field of every structure that ``toStruct`` makes of a camera."""
 BOUGUET = ("fc", "cc", "kc")
 BOUGUET_SIGMAS = 3.0
-"""Its ``…_error`` are three times σ (vision.caltech.edu/bouguetj/calib_doc, "Description of the calibration
+"""Factor from σ to Bouguet's ``…_error`` (vision.caltech.edu/bouguetj/calib_doc, "Description of the calibration
 parameters")."""
 HEAD_BYTES = 116
-"""Of text that begins a file; scipy puts the time there."""
+"""Length of the text at the beginning of a file; scipy writes the time into it."""
 
 
 def is_mat(content: bytes) -> bool:
-    """Whether a file begins as MATLAB's do."""
+    """Return True if a file begins as a MATLAB file."""
     return content.startswith(HEADS)
 
 
 def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
-    """A camera of a ``.mat`` file; ``choice`` : of several, by the variable's name.
+    """Return a camera of a ``.mat`` file; ``choice`` : name of the variable if there are several cameras.
 
     Raises
     ------
     InputError
-        Version 7.3, which is HDF5; objects in place of structures; no camera, or several and no choice.
+        The file is of version 7.3 (HDF5), has objects in place of structures, no camera, or several and no choice.
     """
     if content.startswith(HEADS[1]):
         raise InputError("E-CAMERA-UNREADABLE", f"camera file {source}: of MATLAB 7.3 (HDF5); save it with '-v7'")
@@ -47,30 +47,30 @@ def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignL
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MatReadWarning)
             values = loadmat(io.BytesIO(content), simplify_cells=True)
-    except Exception as error:  # what is damaged fails in many ways, names that are not bound among them
+    except Exception as error:  # damaged files fail in many ways, also with unbound names
         reason = " ".join(str(error).split())[:150]
         raise InputError(
             "E-CAMERA-UNREADABLE", f"camera file {source}: not readable as a .mat file ({reason}); save it again"
         ) from error
     if all(name in values for name in BOUGUET):
         return _from_bouguet(values, source)
-    found = dict(_structures({key: each for key, each in values.items() if not key.startswith("__")}, ""))
-    if not found:
+    structures = dict(_structures({key: value for key, value in values.items() if not key.startswith("__")}, ""))
+    if not structures:
         raise InputError(
             "E-CAMERA-CONTENT",
             f"camera file {source}: no structure of a camera; save toStruct(cameraParams), since objects of MATLAB "
             "can be read by MATLAB alone",
         )
-    return from_structure(found[one_of(list(found), choice, source)], source)
+    return from_structure(structures[one_of(list(structures), choice, source)], source)
 
 
 def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
-    """The camera of what ``toStruct`` makes of ``cameraParameters`` or ``cameraIntrinsics``, as a structure or as JSON.
+    """Return the camera of ``toStruct(cameraParameters)`` or ``toStruct(cameraIntrinsics)``, as a structure or as JSON.
 
     Raises
     ------
     InputError
-        A fisheye lens; a field that is missing.
+        The lens is a fisheye lens, or a field is missing.
     """
     if "MappingCoefficients" in values:
         raise InputError(
@@ -89,8 +89,8 @@ def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
                 "E-CAMERA-CONTENT",
                 f"camera file {source}: no K, IntrinsicMatrix or FocalLength; save toStruct(cameraParams)",
             )
-        (fx, fy), (cx, cy), own = focal, centre, _numbers(values, "Skew", source, 1)
-        skew = 0.0 if own is None else own[0]
+        (fx, fy), (cx, cy), skews = focal, centre, _numbers(values, "Skew", source, 1)
+        skew = 0.0 if skews is None else skews[0]
     size = _numbers(values, "ImageSize", source)
     height, width = (0.0, 0.0) if size is None or not size.size else size[:2]
     radial = _numbers(values, STRUCTURE, source)
@@ -102,36 +102,36 @@ def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
 
 
 def _structures(values: Mapping, where: str):
-    """(name, structure) of every camera, however deep."""
+    """Yield name and structure of every camera, at any depth."""
     if STRUCTURE in values or "MappingCoefficients" in values:
         yield where or "camera", values
         return
-    for key, each in values.items():
-        if isinstance(each, Mapping):
-            yield from _structures(each, f"{where}.{key}" if where else str(key))
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _structures(value, f"{where}.{key}" if where else str(key))
 
 
 def _numbers(values: Mapping, key: str, source: str, count: int = 0) -> np.ndarray | None:
     if values.get(key) is None:
         return None
     try:
-        found = np.asarray(values[key], float)
+        numbers = np.asarray(values[key], float)
     except (TypeError, ValueError) as error:
         raise InputError(
             "E-CAMERA-CONTENT", f"camera file {source}: {key} is no list of numbers; save it again"
         ) from error
-    if (count and found.size != count) or (key in ("K", "IntrinsicMatrix") and found.size != 9):
+    if (count and numbers.size != count) or (key in ("K", "IntrinsicMatrix") and numbers.size != 9):
         raise InputError(
-            "E-CAMERA-COEFFICIENTS", f"camera file {source}: {key} of {found.size} numbers; {count or 9} needed"
+            "E-CAMERA-COEFFICIENTS", f"camera file {source}: {key} of {numbers.size} numbers; {count or 9} needed"
         )
-    return found.ravel() if key not in ("K", "IntrinsicMatrix") else found
+    return numbers.ravel() if key not in ("K", "IntrinsicMatrix") else numbers
 
 
 def _known(values: Mapping, key: str, source: str, count: int) -> np.ndarray:
-    found = _numbers(values, key, source, count)
-    if found is None:
+    numbers = _numbers(values, key, source, count)
+    if numbers is None:
         raise InputError("E-CAMERA-CONTENT", f"camera file {source}: {key} is empty; {count} numbers needed")
-    return found
+    return numbers
 
 
 def _from_bouguet(values: Mapping, source: str) -> CameraModel | ForeignLens:
@@ -149,7 +149,7 @@ def _from_bouguet(values: Mapping, source: str) -> CameraModel | ForeignLens:
 
 
 def mat(camera: CalibratedCamera, name: str) -> bytes:
-    """A structure with the fields of ``cameraIntrinsics`` and of ``toStruct(cameraParams)``."""
+    """Return a ``.mat`` file with a structure of the fields of ``cameraIntrinsics`` and ``toStruct(cameraParams)``."""
     k = camera.distortion
     if camera.fisheye or k[5:].any():
         raise InputError(
@@ -160,7 +160,7 @@ def mat(camera: CalibratedCamera, name: str) -> bytes:
     (fx, fy), (cx, cy) = camera.focal, camera.centre + PIXEL_ORIGIN
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     radial = [k[0], k[1], k[4]] if k[4] else [k[0], k[1]]
-    own = {
+    fields = {
         "FocalLength": [fx, fy],
         "PrincipalPoint": [cx, cy],
         "ImageSize": [float(camera.height), float(camera.width)],
@@ -173,24 +173,24 @@ def mat(camera: CalibratedCamera, name: str) -> bytes:
     stream = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("error", MatWriteWarning)
-        savemat(stream, {name: own}, oned_as="row")
+        savemat(stream, {name: fields}, oned_as="row")
     content = stream.getvalue()
     return HEADS[0] + b", written by stcal".ljust(HEAD_BYTES - len(HEADS[0])) + content[HEAD_BYTES:]
 
 
 def is_zhang(rows: list[list[str]]) -> bool:
-    """Whether lines are those of Zhang's calibration: five words, two, and then rows of three; none a key."""
+    """Return True if the rows are a file of Zhang's calibration: five words, two, then rows of three, and no keys."""
     counts = [len(row) for row in rows]
     return counts[:2] == [5, 2] and set(counts[2:]) <= {3} and not any(":" in word for word in rows[0] + rows[1])
 
 
 def from_zhang(rows: list[list[str]], source: str) -> CameraModel | ForeignLens:
-    """α, c, β, u0, v0, then k1, k2, then poses, which are passed over (Zhang 2000; the file of his page).
+    """Return the camera of α, c, β, u0, v0, then k1, k2; poses are ignored (Zhang 2000; the file of his page).
 
     Raises
     ------
     InputError
-        What is no number.
+        A word is no number.
     """
     try:
         (fx, skew, fy, cx, cy), (k1, k2) = ([float(word) for word in row] for row in rows[:2])
@@ -202,11 +202,11 @@ def from_zhang(rows: list[list[str]], source: str) -> CameraModel | ForeignLens:
 
 
 def zhang(camera: CalibratedCamera, _: str) -> str:
-    """Zhang's five numbers, and k1, k2."""
+    """Return the text of Zhang's five numbers, and k1, k2."""
     if camera.fisheye or camera.distortion[2:].any():
-        what = "the equidistant projection" if camera.fisheye else "more than k1, k2"
+        lost = "the equidistant projection" if camera.fisheye else "more than k1, k2"
         raise InputError(
-            "E-CAMERA-FORM", f"zhang has no place for {what} of {camera.colmap_model}; write --form colmap"
+            "E-CAMERA-FORM", f"zhang has no place for {lost} of {camera.colmap_model}; write --form colmap"
         )
     (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
     k1, k2 = camera.distortion[:2].tolist()

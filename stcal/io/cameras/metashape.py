@@ -1,8 +1,8 @@
-"""Agisoft Metashape's cameras: a lens alone (``<calibration>``), or all sensors of exported cameras, with covariances.
+"""Agisoft Metashape's cameras: a single lens (``<calibration>``), or all sensors of exported cameras, with covariances.
 
-The principal point is counted from the middle of the image; ``b1`` is what the horizontal focal length exceeds the
-vertical one by, ``p1`` and ``p2`` are OpenCV's p2 and p1 (Metashape Professional's user manual, appendix D). Beside an
-adjusted calibration stands a ``<covariance>`` of the parameters that were adjusted, in their own units.
+The principal point is relative to the middle of the image; ``b1`` is the horizontal minus the vertical focal length;
+``p1`` and ``p2`` are OpenCV's p2 and p1 (Metashape Professional's user manual, appendix D). An adjusted calibration has
+a ``<covariance>`` of its adjusted parameters, in the units of the parameters.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -25,21 +25,22 @@ from stcal.io.covariance import Rows, require_covariance
 
 NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
 ROOTS = ("document", "chunk", "sensors", "sensor")
-"""Of files with sensors."""
+"""Root elements of files with sensors."""
 KINDS = ("frame", "fisheye", "equidistant_fisheye")
 HELD_PX = 1e-3
-"""What a parameter that was held fixed may move at the edge of the image: a covariance without it were singular."""
+"""σ of a parameter that was held fixed, as its effect at the corner of the image in px; without it a covariance would
+be singular."""
 OWN = {"f": "fy", "p1": "p2", "p2": "p1"} | {name: name for name in ("cx", "cy", "k1", "k2", "k3", "k4")}
-"""OpenCV's names of parameters; ``b1`` and ``f`` together are fx."""
+"""OpenCV's names of Metashape's parameters; ``b1`` and ``f`` together are fx."""
 
 
 def from_calibration(root: ElementTree.Element, source: str) -> CameraModel:
-    """A ``<calibration>`` : frame or fisheye, without skew.
+    """Return the camera of a ``<calibration>`` with frame or fisheye projection and without skew.
 
     Raises
     ------
     InputError
-        Another projection, values that have no place in OpenCV's model, or none where they must be.
+        The projection is another one, or a value has no place in OpenCV's model.
     """
     texts = {child.tag: (child.text or "").strip() for child in root}
     kind = texts.get("projection", root.get("type", "frame"))
@@ -64,17 +65,18 @@ def from_calibration(root: ElementTree.Element, source: str) -> CameraModel:
 
 
 def from_cameras(root: ElementTree.Element, choice: str, source: str) -> CameraModel:
-    """A sensor of exported cameras, or of a project's ``doc.xml``, as adjusted, with its covariance.
+    """Return a sensor of exported cameras, or of a project's ``doc.xml``, as adjusted, with its covariance.
 
     Raises
     ------
     InputError
-        No calibrated sensor, several and no choice, or a covariance that is none; and as :func:`from_calibration`.
+        There is no calibrated sensor, there are several and no choice, or the covariance is invalid; further errors as
+        :func:`from_calibration`.
     """
     sensors = {}
     for number, sensor in enumerate(root.iter("sensor")):
-        found = sensor.findall("calibration")
-        adjusted = [each for each in found if each.get("class", "adjusted") == "adjusted"] or found
+        calibrations = sensor.findall("calibration")
+        adjusted = [item for item in calibrations if item.get("class", "adjusted") == "adjusted"] or calibrations
         if adjusted:
             name = sensor.get("label") or sensor.get("id") or str(number)
             sensors[name if name not in sensors else f"{name} {number}"] = (adjusted[-1], sensor.find("covariance"))
@@ -82,8 +84,8 @@ def from_cameras(root: ElementTree.Element, choice: str, source: str) -> CameraM
         raise InputError(
             "E-CAMERA-NONE", f"camera file {source}: no sensor with a calibration; export the cameras after alignment"
         )
-    own, covariance = sensors[one_of(list(sensors), choice, source)]
-    camera = from_calibration(own, source)
+    chosen, covariance = sensors[one_of(list(sensors), choice, source)]
+    camera = from_calibration(chosen, source)
     return camera if covariance is None else _with_covariance(camera, covariance, source)
 
 
@@ -122,7 +124,7 @@ def _with_covariance(camera: CameraModel, stated: ElementTree.Element, source: s
 
 
 def _model(colmap_model: str, names: list[str]) -> str:
-    """The model with a place for these of Metashape's parameters, and for those that it has already."""
+    """Return the COLMAP model that has these parameters of Metashape, and those of ``colmap_model``."""
     if FISHEYE in colmap_model:
         return "THIN_PRISM_FISHEYE" if {"p1", "p2"} & set(names) else colmap_model
     if "k3" in names or "k4" in names:
@@ -132,13 +134,13 @@ def _model(colmap_model: str, names: list[str]) -> str:
 
 
 def _edge(camera: CameraModel) -> np.ndarray:
-    """By which each parameter (16,) changes when it moves the corner of the image by :data:`HELD_PX`."""
+    """Return the change of each parameter (16,) that moves the corner of the image by :data:`HELD_PX`."""
     width, height = camera.width or 2 * camera.centre[0], camera.height or 2 * camera.centre[1]
     focal = float(camera.focal.mean())
     reach = np.hypot(width, height) / 2 / focal
     powers = np.array([3, 5, 2, 2, 7, 9, 11, 13, 2, 4, 2, 4])
     if FISHEYE not in camera.colmap_model:
-        powers[5:8] = [3, 5, 7]  # of the bottom
+        powers[5:8] = [3, 5, 7]  # k4, k5, k6 are in the denominator
     return HELD_PX * np.concatenate([[1 / reach] * 2, [1.0] * 2, reach ** -powers.astype(float) / focal])
 
 
@@ -152,12 +154,12 @@ def _values(camera: CalibratedCamera, form: str) -> dict[str, float]:
 
 
 def calibration(camera: CalibratedCamera) -> str:
-    """The lens alone.
+    """Return the text of a ``<calibration>`` : the lens only.
 
     Raises
     ------
     InputError
-        One that Metashape has no model for.
+        Metashape has no model for the lens.
     """
     root = ElementTree.Element("calibration")
     parts = {"projection": _kind(camera), "width": camera.width, "height": camera.height}
@@ -167,7 +169,7 @@ def calibration(camera: CalibratedCamera) -> str:
 
 
 def cameras(camera: CalibratedCamera, name: str) -> str:
-    """Exported cameras with one sensor and no image; errors as of :func:`calibration`."""
+    """Return the text of exported cameras with one sensor and no image; errors as :func:`calibration`."""
     values = _values(camera, "metashape-cameras")
     size = {"width": str(camera.width), "height": str(camera.height)}
     root = ElementTree.Element("document", version="1.5.0")
@@ -175,10 +177,10 @@ def cameras(camera: CalibratedCamera, name: str) -> str:
     sensors = ElementTree.SubElement(chunk, "sensors", next_id="1")
     sensor = ElementTree.SubElement(sensors, "sensor", id="0", label=name, type=_kind(camera))
     ElementTree.SubElement(sensor, "resolution", size)
-    own = ElementTree.SubElement(sensor, "calibration", {"type": _kind(camera), "class": "adjusted"})
-    ElementTree.SubElement(own, "resolution", size)
+    element = ElementTree.SubElement(sensor, "calibration", {"type": _kind(camera), "class": "adjusted"})
+    ElementTree.SubElement(element, "resolution", size)
     for tag, value in values.items():
-        ElementTree.SubElement(own, tag).text = repr(float(value))
+        ElementTree.SubElement(element, tag).text = repr(float(value))
     if camera.covariance is not None:
         names, matrix = _covariance(camera, camera.covariance)
         stated = ElementTree.SubElement(sensor, "covariance")
@@ -188,7 +190,7 @@ def cameras(camera: CalibratedCamera, name: str) -> str:
 
 
 def _covariance(camera: CalibratedCamera, covariance: np.ndarray) -> tuple[list[str], np.ndarray]:
-    """Metashape's names of the parameters that the model has, and their covariance."""
+    """Return Metashape's names of the parameters of the camera's model, and their covariance."""
     basis = intrinsic_basis(camera.colmap_model)
     rows = np.zeros((len(NAMES), len(PARAMETER_NAMES)))
     for row, name in enumerate(NAMES):
@@ -196,15 +198,15 @@ def _covariance(camera: CalibratedCamera, covariance: np.ndarray) -> tuple[list[
             rows[row, PARAMETER_NAMES.index(OWN[name])] = 1
     rows[NAMES.index("b1"), [PARAMETER_NAMES.index("fx"), PARAMETER_NAMES.index("fy")]] = [1, -1]
     if not camera.fisheye:
-        rows[NAMES.index("k4")] = 0  # OpenCV's is another
+        rows[NAMES.index("k4")] = 0  # OpenCV's k4 is another parameter
     by_model = rows @ basis
-    there = np.flatnonzero(by_model.any(axis=1))
-    matrix = by_model[there] @ covariance @ by_model[there].T
-    return [NAMES[i] for i in there], matrix
+    present = np.flatnonzero(by_model.any(axis=1))
+    matrix = by_model[present] @ covariance @ by_model[present].T
+    return [NAMES[i] for i in present], matrix
 
 
 def without_sigma(camera: CalibratedCamera) -> list[str]:
-    """Parameters whose σ Metashape has no place for; they are 0."""
+    """Return the parameters, all of them 0, for whose σ Metashape has no place."""
     rational = not camera.fisheye and camera.colmap_model == "FULL_OPENCV"
     prisms = camera.colmap_model == "THIN_PRISM_FISHEYE"
     return ["σ of k4, k5 and k6"] * rational + ["σ of the thin prisms"] * prisms

@@ -1,6 +1,6 @@
-"""Camera models, made of the parameters of COLMAP or OpenCV, and ``cameras.txt``; each with its pixel origin.
+"""Camera models from the parameters of COLMAP or OpenCV, each with its pixel origin; and writing of ``cameras.txt``.
 
-Files are read by :mod:`stcal.io.cameras.read`.
+:mod:`stcal.io.cameras.read` reads the files.
 """
 
 from dataclasses import dataclass, replace
@@ -16,14 +16,14 @@ COLMAP_PIXEL_ORIGIN = 0.5
 """COLMAP's coordinate of the centre of the top-left pixel; OpenCV's, and ours, is 0."""
 
 SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
-"""Comments of ``cameras.txt`` that state the uncertainty of its parameters."""
+"""Beginnings of the comments of ``cameras.txt`` that state the uncertainty of its parameters."""
 
 MAX_FOCAL_RATIO = 10.0
-"""Between fx and fy; anamorphic lenses have 2."""
+"""Largest ratio between fx and fy; anamorphic lenses have 2."""
 SQUARE_WITHIN = 1e-6
-"""Of correlations of a parameter with itself, which are 1."""
+"""Largest deviation from 1 of the correlation of a parameter with itself."""
 FARTHEST = 1e12
-"""Of any parameter: its square is still a number."""
+"""Largest value of any parameter, whose square does not overflow."""
 MAX_SIDE_PX = 1_000_000
 """Longest image side that a camera file may state, px."""
 
@@ -32,7 +32,7 @@ EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt")
 DISTORTION_COUNTS = (0, 4, 5, 8, 12, 14)
 """Numbers of distortion coefficients that OpenCV knows."""
 
-# Places of COLMAP's parameters in fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4.
+# Indices of COLMAP's parameters in fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4.
 _COLMAP_LAYOUT = {
     "SIMPLE_PINHOLE": [(0, 1), 2, 3],
     "PINHOLE": [0, 1, 2, 3],
@@ -49,17 +49,17 @@ COLMAP_MODELS = tuple(_COLMAP_LAYOUT)
 """Camera models that stcal supports."""
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 FISHEYE = "FISHEYE"
-"""In the names of COLMAP's equidistant models."""
+"""Part of the names of COLMAP's equidistant models."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraModel:
     """A camera as its file states it.
 
-    ``focal``, ``centre``, ``distortion`` : as in :class:`Camera`, pixel origin already OpenCV's;
-    ``colmap_model`` : the COLMAP model that holds it exactly;
-    ``width``, ``height`` : px, or None where the file states none (see :meth:`sized`);
-    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None where the file states none.
+    ``focal``, ``centre``, ``distortion`` : as in :class:`Camera`, with OpenCV's pixel origin;
+    ``colmap_model`` : the COLMAP model that represents the camera exactly;
+    ``width``, ``height`` : px, or None if the file states none (see :meth:`sized`);
+    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None if the file states none.
     """
 
     focal: np.ndarray
@@ -72,16 +72,16 @@ class CameraModel:
     covariance: np.ndarray | None = None
 
     def sized(self, width: int, height: int) -> Camera:
-        """The camera; a size that the file does not state is taken from the arguments."""
+        """Return the camera; the arguments give the size if the file does not state it."""
         size = self.width or width, self.height or height
         return Camera(*size, self.focal, self.centre, self.distortion, FISHEYE in self.colmap_model)
 
     def calibrated(self, width: int, height: int) -> "CalibratedCamera":
-        """The same with its model and covariance."""
+        """Return the camera of :meth:`sized` with its model and covariance."""
         return CalibratedCamera.of(self.sized(width, height), self.colmap_model, self.covariance)
 
     def require_inside(self, width: int, height: int, image: str) -> None:
-        """Refuse an image that the principal point is outside of: a file that states no size may be another camera's.
+        """Refuse an image without the principal point: a file that states no size may belong to another camera.
 
         Raises
         ------
@@ -99,10 +99,10 @@ class CameraModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedCamera(Camera):
-    """A camera of known size and what is stated of its parameters.
+    """A camera of known size with the covariance of its parameters.
 
-    ``colmap_model`` : the COLMAP model that holds it exactly;
-    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None where none is stated.
+    ``colmap_model`` : the COLMAP model that represents the camera exactly;
+    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None if unknown.
     """
 
     colmap_model: str = "FULL_OPENCV"
@@ -110,12 +110,12 @@ class CalibratedCamera(Camera):
 
     @classmethod
     def of(cls, camera: Camera, colmap_model: str, covariance: np.ndarray | None = None) -> "CalibratedCamera":
-        """``camera`` with its model and covariance."""
+        """Return ``camera`` with its model and covariance."""
         lens = camera.focal, camera.centre, camera.distortion, FISHEYE in colmap_model
         return cls(camera.width, camera.height, *lens, colmap_model, covariance)
 
     def colmap_params(self) -> list[float]:
-        """Parameters in COLMAP's order and pixel origin."""
+        """Return the parameters in COLMAP's order and pixel origin."""
         flat = self.parameters()
         flat[2:4] += COLMAP_PIXEL_ORIGIN
         return [float(flat[p[0] if isinstance(p, tuple) else p]) for p in _COLMAP_LAYOUT[self.colmap_model]]
@@ -123,7 +123,7 @@ class CalibratedCamera(Camera):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPrior:
-    """Intrinsics as observations: ``covariance`` (q, q) of the parameters of ``colmap_model``, in its order."""
+    """A prior of the intrinsics: ``covariance`` (q, q) of the parameters of ``colmap_model``, in its order."""
 
     colmap_model: str
     covariance: np.ndarray
@@ -131,17 +131,18 @@ class CameraPrior:
 
 WITHOUT_DISTORTION = ("SIMPLE_PINHOLE", "PINHOLE")
 PRIOR_FOCAL = 1e-3
-"""σ of the focal lengths where the camera file states none, relative …"""
+"""Relative σ of the focal lengths if the camera file states none; as for the three constants below, a calibration of
+some weeks ago, or of another copy of the lens, is about as accurate."""
 PRIOR_CENTRE = 2e-3
-"""… of the principal point, in image widths …"""
+"""σ of the principal point if the camera file states none, in image widths."""
 PRIOR_RADIAL = 0.01
-"""… of k1 … k6 (and a tenth of each) …"""
+"""σ of k1 … k6 if the camera file states none; a tenth of the coefficient if that is larger."""
 PRIOR_TANGENTIAL = 1e-3
-"""… and of p1, p2, s1 … s4: what a calibration of some weeks ago, or of another copy of the lens, is worth."""
+"""σ of p1, p2, s1 … s4 if the camera file states none."""
 
 
 def camera_prior(camera: CalibratedCamera) -> CameraPrior:
-    """The intrinsics as observations with the covariance of their file, or with that of a calibration of some age."""
+    """Return a prior of the intrinsics, with the covariance of the camera file or else of an old calibration."""
     if camera.covariance is not None:
         return CameraPrior(camera.colmap_model, camera.covariance)
     radial = np.maximum(PRIOR_RADIAL, 0.1 * np.abs(camera.distortion))
@@ -152,15 +153,18 @@ def camera_prior(camera: CalibratedCamera) -> CameraPrior:
 
 
 def refinable(camera: CalibratedCamera) -> CalibratedCamera:
-    """The same for a refinement: a file without distortion, and without σ that say that there is none, leaves the
-    lens's distortion out; it is refined as OPENCV, from zero."""
+    """Return the camera with the model to refine.
+
+    A camera without distortion and without covariance is refined as OPENCV, starting from zero distortion: its file
+    says nothing of the lens's distortion.
+    """
     if camera.covariance is None and camera.colmap_model in WITHOUT_DISTORTION:
         return replace(camera, colmap_model="OPENCV")
     return camera
 
 
 def intrinsic_basis(colmap_model: str) -> np.ndarray:
-    """Derivative (16, q) of fx, fy, cx, cy, k1, k2, p1, p2, k3 … k6, s1 … s4 by the q parameters of a COLMAP model."""
+    """Return the derivative (16, q) of :data:`PARAMETER_NAMES` by the q parameters of a COLMAP model."""
     layout = _COLMAP_LAYOUT[colmap_model]
     basis = np.zeros((len(PARAMETER_NAMES), len(layout)))
     for column, place in enumerate(layout):
@@ -169,7 +173,7 @@ def intrinsic_basis(colmap_model: str) -> np.ndarray:
 
 
 def parameter_names(colmap_model: str) -> list[str]:
-    """Names of the parameters of a COLMAP model, in its order."""
+    """Return the names of the parameters of a COLMAP model, in its order."""
     layout = _COLMAP_LAYOUT[colmap_model]
     return ["f" if isinstance(place, tuple) else PARAMETER_NAMES[place] for place in layout]
 
@@ -180,7 +184,7 @@ def write_cameras_txt(path: str | Path, camera: CalibratedCamera) -> None:
 
 
 def cameras_txt(camera: CalibratedCamera) -> str:
-    """The text of :func:`write_cameras_txt`."""
+    """Return the text of the file that :func:`write_cameras_txt` writes."""
     params, covariance = " ".join(map(repr, camera.colmap_params())), camera.covariance
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] (centre of the first pixel at 0.5, 0.5)"]
     if covariance is not None:
@@ -223,12 +227,12 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path)
 
 
 def camera_from_colmap(colmap_model: str, width: float, height: float, params, source: str | Path) -> CameraModel:
-    """The camera of COLMAP's ``params`` (its order, its pixel origin); ``source`` : where they come from.
+    """Return the camera of COLMAP's ``params`` (in its order and pixel origin); ``source`` : their file, for messages.
 
     Raises
     ------
     InputError
-        A camera model that stcal does not support, a wrong number of parameters, or impossible values.
+        The camera model is not supported, the number of parameters is wrong, or values are impossible.
     """
     if colmap_model not in _COLMAP_LAYOUT:
         known = ", ".join(_COLMAP_LAYOUT)
@@ -257,25 +261,25 @@ def camera_from_opencv(
     path: str | Path,
     tangential: bool = False,
 ) -> CameraModel:
-    """The camera of fx, fy, cx, cy and OpenCV's coefficients.
+    """Return the camera of fx, fy, cx, cy and OpenCV's coefficients.
 
     Parameters
     ----------
     lens : sequence of 4 float
-        px, pixel origin of OpenCV.
+        fx, fy, cx, cy, px, with OpenCV's pixel origin.
     given : (k,) array
-        k1, k2, p1, p2, k3 …; of an equidistant camera k1 to k4, or with ``tangential`` k1, k2, p1, p2, k3, k4.
+        k1, k2, p1, p2, k3 …; for an equidistant camera k1 to k4, or with ``tangential`` k1, k2, p1, p2, k3, k4.
     fisheye, tangential : bool
-        Equidistant; and which of both.
+        Equidistant projection; and whether ``given`` has p1, p2.
     width, height : float
-        px; 0 where the file states none.
+        Image size, px; 0 if the file states none.
     path : str or Path
-        For messages.
+        Camera file, for messages.
 
     Raises
     ------
     InputError
-        Coefficients of another number, or that no model here has; impossible values.
+        The number of coefficients is wrong, no supported model has them, or values are impossible.
     """
     path, size = Path(path), (width or None, height or None)
     if fisheye:

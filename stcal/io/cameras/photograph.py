@@ -1,4 +1,4 @@
-"""What a photograph's EXIF tells of its camera: a start for a refinement."""
+"""Approximate camera from a photograph's EXIF, as the start of a refinement."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,28 +12,32 @@ from stcal.io.cameras.model import CalibratedCamera, camera_from_opencv
 HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")
 """First bytes of JPEG, TIFF and PNG."""
 FILM_DIAGONAL_MM = 43.2666
-"""Of 36 × 24 mm; CIPA DCG-001 states focal lengths "in 35 mm film" by the diagonal, some makers by the width: they are
-4 % apart in an image of 4 : 3."""
+"""Diagonal of 36 × 24 mm. CIPA DCG-001 states focal lengths "in 35 mm film" by the diagonal, some makers by the width;
+the two differ by 4 % in an image of 4 : 3."""
 UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
-"""Of ``FocalPlaneResolutionUnit``."""
+"""Lengths, in mm, of the values of ``FocalPlaneResolutionUnit``."""
 SIGMA_FOCAL, SIGMA_SQUARE = 0.05, 1e-3
-"""Relative: of the focal length, which is the nominal one at infinity, and between fx and fy."""
+"""Relative σ of the focal length, which EXIF states nominally and at infinity, and of the ratio of fx to fy."""
 SIGMA_CENTRE = 0.02
-"""In image widths."""
+"""σ of the principal point, in image widths."""
 SIGMA_RADIAL, SIGMA_TANGENTIAL = 0.2, 5e-3
-"""Of the distortion, of which EXIF says nothing."""
+"""σ of radial and tangential distortion, which EXIF does not state."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photograph:
-    """``camera`` : as OPENCV without distortion, with σ of what is not known; ``told`` : by which entries."""
+    """The camera of a photograph.
+
+    ``camera`` : OPENCV model without distortion, with a covariance for what EXIF leaves open; ``told`` : the EXIF
+    entries that were used, in words.
+    """
 
     camera: CalibratedCamera
     told: str
 
 
 def is_photograph(path: str | Path) -> bool:
-    """Whether a file begins as an image does."""
+    """Return True if a file begins with the bytes of an image."""
     try:
         with open(path, "rb") as stream:
             return stream.read(4).startswith(HEADS)
@@ -42,17 +46,17 @@ def is_photograph(path: str | Path) -> bool:
 
 
 def camera_of_photograph(path: str | Path) -> Photograph:
-    """The camera as a photograph's EXIF has it.
+    """Return the camera that a photograph's EXIF describes.
 
     Parameters
     ----------
     path : str or Path
-        JPEG, TIFF or PNG.
+        JPEG, TIFF or PNG file.
 
     Raises
     ------
     InputError
-        Unreadable, or without a focal length.
+        The file is unreadable, or states no focal length.
     """
     try:
         with Image.open(path) as image:
@@ -62,7 +66,7 @@ def camera_of_photograph(path: str | Path) -> Photograph:
         raise InputError(
             "E-CAMERA-UNREADABLE", f"camera file {path}: no photograph that can be read ({reason}); give another"
         ) from error
-    focal, told = _focal_px(exif, width, height)
+    focal, source = _focal_px(exif, width, height)
     if focal is None:
         raise InputError(
             "E-CAMERA-EXIF",
@@ -70,24 +74,24 @@ def camera_of_photograph(path: str | Path) -> Photograph:
             "`stcal-sfm calibrate-camera`",
         )
     if exif.get(ExifTags.Base.ExifImageWidth, width) not in (width, height):
-        told += f", of {exif[ExifTags.Base.ExifImageWidth]} px before it was made {width} px wide"
+        source += f", of {exif[ExifTags.Base.ExifImageWidth]} px before it was made {width} px wide"
     centre = [(width - 1) / 2, (height - 1) / 2]
-    own = camera_from_opencv([focal, focal, *centre], np.zeros(0), False, width, height, path).sized(width, height)
+    camera = camera_from_opencv([focal, focal, *centre], np.zeros(0), False, width, height, path).sized(width, height)
     sigma = np.array([1, 1, *[SIGMA_CENTRE * width] * 2, *[SIGMA_RADIAL] * 2, *[SIGMA_TANGENTIAL] * 2])
     covariance = np.diag(sigma**2)
     covariance[:2, :2] = SIGMA_FOCAL**2 * focal**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 * focal**2 / 2 * np.eye(2)
-    return Photograph(CalibratedCamera.of(own, "OPENCV", covariance), told)
+    return Photograph(CalibratedCamera.of(camera, "OPENCV", covariance), source)
 
 
 def _focal_px(exif: dict, width: int, height: int) -> tuple[float | None, str]:
-    """Of this image, and the entries that tell it."""
+    """Return the focal length in px of this image, None if unknown, and the EXIF entries used, in words."""
     full = _positive(exif.get(ExifTags.Base.ExifImageWidth)) or max(width, height)
-    shrunk = max(width, height) / max(full, _positive(exif.get(ExifTags.Base.ExifImageHeight)) or 0)
+    scale = max(width, height) / max(full, _positive(exif.get(ExifTags.Base.ExifImageHeight)) or 0)
     focal_mm = _positive(exif.get(ExifTags.Base.FocalLength))
     per_unit = _positive(exif.get(ExifTags.Base.FocalPlaneXResolution))
     unit_mm = UNIT_MM.get(exif.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
     if focal_mm and per_unit and unit_mm:
-        pitch_um = 1e3 * unit_mm / per_unit / shrunk
+        pitch_um = 1e3 * unit_mm / per_unit / scale
         return focal_mm / pitch_um * 1e3, f"focal length {focal_mm:g} mm, pixels of {pitch_um:.3g} µm"
     film_mm = _positive(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
     if film_mm:

@@ -1,4 +1,4 @@
-"""A camera file of any kind, told by its content."""
+"""Reading of camera files of any kind, which is recognised by the content."""
 
 import re
 import struct
@@ -30,23 +30,23 @@ from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.plain_yaml import load_yaml
 
 SQLITE = b"SQLite format 3\0"
-"""First bytes of a database."""
+"""First bytes of an SQLite database."""
 
 
 def read_camera(path: str | Path, name: str = "") -> CameraModel:
-    """Read a camera file of any supported kind, told apart by content.
+    """Read a camera file of any supported kind, which is recognised by the content.
 
     Parameters
     ----------
     path : str or Path
         COLMAP, OpenCV, ROS, ROS-Industrial, Kalibr, mrcal or Metashape (``data_layout.md``).
     name : str
-        Of the camera in files of several.
+        Name of the camera in a file of several.
 
     Raises
     ------
     InputError
-        Missing or malformed file, more than one camera, or a lens that no model here holds.
+        The file is missing or malformed, holds more than one camera, or a lens of an unsupported model.
     """
     lens = read_lens(path, name)
     if isinstance(lens, CameraModel):
@@ -59,7 +59,7 @@ def read_camera(path: str | Path, name: str = "") -> CameraModel:
 
 
 def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
-    """The lens of a camera file, also one that no model here holds; arguments and errors as of :func:`read_camera`."""
+    """Read the lens of a camera file, also of an unsupported model; arguments and errors as :func:`read_camera`."""
     path = Path(path)
     try:
         database = path.is_file() and _starts_with(path, SQLITE)
@@ -105,7 +105,7 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
         values = _yaml_values(text)
         if matlab.STRUCTURE in values or "MappingCoefficients" in values:
             return matlab.from_structure(values, str(path))
-        if any(isinstance(each, dict) and "camera_model" in each for each in values.values()):
+        if any(isinstance(value, dict) and "camera_model" in value for value in values.values()):
             return forms.from_kalibr(values, name, str(path))
         return _from_opencv(values, path)
     except InputError:
@@ -119,7 +119,7 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
 
 
 def _stated_covariance(text: str, names: list[str], path: Path) -> np.ndarray | None:
-    """Covariance (q, q) of the comments that :func:`write_cameras_txt` makes; None without them."""
+    """Return the covariance (q, q) in the comments of :func:`write_cameras_txt`; None if there are none."""
     stated = {
         key: [line.split()[2:] for line in text.splitlines() if line.startswith(key)] for key in (SIGMA, CORRELATION)
     }
@@ -145,11 +145,11 @@ def _stated_covariance(text: str, names: list[str], path: Path) -> np.ndarray | 
 
 
 def _require_sigmas(sigma: np.ndarray, correlation: np.ndarray, names: list[str]) -> None:
-    """What their product does not show: a sign, and a scale."""
-    for name, own, self_correlation in zip(names, sigma, np.diagonal(correlation), strict=True):
-        if not 0 < own <= MAX_SIDE_PX:
+    """Refuse invalid σ, and correlations of a parameter with itself other than 1: the covariance hides such errors."""
+    for name, sigma_of_name, self_correlation in zip(names, sigma, np.diagonal(correlation), strict=True):
+        if not 0 < sigma_of_name <= MAX_SIDE_PX:
             raise InputError(
-                "E-CAMERA-COVARIANCE", f"σ of {name} is {own:g}, a positive number up to {MAX_SIDE_PX} needed"
+                "E-CAMERA-COVARIANCE", f"σ of {name} is {sigma_of_name:g}, a positive number up to {MAX_SIDE_PX} needed"
             )
         if not abs(self_correlation - 1) <= SQUARE_WITHIN:
             raise InputError(
@@ -204,7 +204,7 @@ def _from_opencv(values: dict, path: Path) -> CameraModel | ForeignLens:
     model = values.get("distortion_model", "plumb_bob")
     given = np.asarray(values.get("distortion_coefficients", []), float).ravel()
     lens = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
-    # A missing size, or 0, is one the file does not state.
+    # A missing size, or 0, means that the file states none.
     sides = [values.get(f"image_{side}") for side in ("width", "height")]
     if any(isinstance(side, bool) for side in sides):
         raise InputError(
@@ -221,7 +221,7 @@ def _from_opencv(values: dict, path: Path) -> CameraModel | ForeignLens:
 
 
 def _from_industrial(values: dict, path: Path) -> CameraModel:
-    """ROS-Industrial's: the form has no place for the distortion, which may be there all the same."""
+    """Return the camera of a ROS-Industrial file as OPENCV: the lens may have distortion, though the form has not."""
     missing = [key for key in PARAMETER_NAMES[:4] if key not in values]
     if missing:
         raise InputError(

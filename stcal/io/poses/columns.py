@@ -28,16 +28,19 @@ TRIPLES = {
     ("roll", "pitch", "yaw"): {"deg": "rpy", "rad": "rpy"},
     ("rpy_roll", "rpy_pitch", "rpy_yaw"): {"deg": "rpy", "rad": "rpy"},
 }
-"""Names of three columns, and by the unit that follows them the convention that they have where none is said; with
-another unit, or none, it is open."""
+"""Default conventions of columns with these three names, by the unit that follows the names; with another unit, or
+none, the convention is open."""
 BY_AXIS = (("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("rpy_roll", "rpy_pitch", "rpy_yaw"))
 _EULER = re.compile(r"euler_([xyz]{3}|[XYZ]{3})_1_(deg|rad)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turned:
-    """``rotation`` : (m, 3, 3); ``words`` : how they are written; ``columns`` : in which; ``stated`` : by these,
-    and by no option."""
+    """Rotations that were read from a table.
+
+    ``rotation`` : (m, 3, 3); ``words`` : the convention; ``columns`` : names of the columns; ``stated`` : True if the
+    columns alone define the convention, without an option.
+    """
 
     rotation: np.ndarray
     words: str
@@ -49,34 +52,34 @@ class Turned:
 
 
 def places_of(table: Table) -> tuple[str, ...]:
-    """Of each row, for messages."""
+    """Return the place of each row, for messages."""
     return tuple(f"line {line}" for line in table.lines)
 
 
 def find_column(table: Table, prefix: str, name: str) -> str | None:
-    """A column by its name, in capital letters too."""
+    """Return the column of a name, also in capital letters; None if there is none."""
     return next((c for c in (f"{prefix}{name}", f"{prefix}{name.upper()}") if c in table), None)
 
 
 def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) -> Turned | None:
-    """Rotations in the columns that begin with a prefix; None where there are none.
+    """Return the rotations in the columns that begin with a prefix; None if there are none.
 
-    ``rotation`` : name of the convention, as of ``--rotation``, for angles whose columns do not say it.
+    ``rotation`` : name of the convention, from ``--rotation``, for angles whose columns leave it open.
 
     Raises
     ------
     InputError
-        Some columns of a rotation only, none that is one, or a convention that must be said.
+        Only some columns of a rotation exist, values are no rotation, or the convention must be given.
     """
     places, where = places_of(table), table.where
     if f"{prefix}qw" in table or f"{prefix}qx" in table:
         table.has_rotation(prefix)
-        standing = [c for c in table.columns if c in {prefix + q for q in QUATERNION}]
+        quaternion_columns = [c for c in table.columns if c in {prefix + q for q in QUATERNION}]
         by_order = table.quaternions != "wxyz"
-        columns = [standing[3], *standing[:3]] if by_order else [prefix + q for q in QUATERNION]
+        columns = [quaternion_columns[3], *quaternion_columns[:3]] if by_order else [prefix + q for q in QUATERNION]
         words = "quaternions x, y, z, w by the order of their columns" if by_order else "quaternions by name"
-        found = of_quaternions(np.column_stack([table.numbers(c) for c in columns]), places, where)
-        return Turned(found, words, tuple(columns))
+        matrices = of_quaternions(np.column_stack([table.numbers(c) for c in columns]), places, where)
+        return Turned(matrices, words, tuple(columns))
     for unit in ANGLES:
         columns = [f"{prefix}rotvec_{axis}_{unit}" for axis in "xyz"]
         if (values := _all(table, columns)) is not None:
@@ -93,25 +96,26 @@ def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) 
 
 
 def _all(table: Table, columns: list[str]) -> np.ndarray | None:
-    """(m, k) of columns; None where one of them is missing from the first on, an error where a later one is."""
-    there = [column for column in columns if column in table]
-    if not there:
+    """Return the values (m, k) of columns; None if all columns are missing, an error if only some are."""
+    present = [column for column in columns if column in table]
+    if not present:
         return None
-    if len(there) < len(columns):
+    if len(present) < len(columns):
         missing = next(column for column in columns if column not in table)
         raise InputError(
-            "E-TABLE-COLUMN-MISSING", f"{table.where}: {', '.join(there)} without {missing}; all {len(columns)} needed"
+            "E-TABLE-COLUMN-MISSING",
+            f"{table.where}: {', '.join(present)} without {missing}; all {len(columns)} needed",
         )
     return np.column_stack([table.numbers(column) for column in columns])
 
 
 def _triple(table: Table, prefix: str, rotation: str | None) -> Turned | None:
-    """Three angles, or a vector, of the convention that their names say, or the user."""
+    """Return rotations of three angles, or a rotation vector, by the convention of their names or of the user."""
     for triple, named in TRIPLES.items():
         for unit in (*ANGLES, ""):
             columns = [find_column(table, prefix, f"{name}_{unit}" if unit else name) for name in triple]
-            found = tuple(column for column in columns if column is not None)
-            if len(found) < len(triple):
+            names = tuple(column for column in columns if column is not None)
+            if len(names) < len(triple):
                 continue
             what = ", ".join(triple) if triple in BY_AXIS else "".join(triple)
             if rotation is None and unit in named:
@@ -121,26 +125,26 @@ def _triple(table: Table, prefix: str, rotation: str | None) -> Turned | None:
             if unit and convention.unit not in ("", unit) and "-" in (rotation or "") and _own_unit(rotation):
                 raise InputError(
                     "E-OPTION-CONTRADICTS",
-                    f"{table.where}: {found[0]} and --rotation {rotation} are of two units; correct one",
+                    f"{table.where}: {names[0]} and --rotation {rotation} are of two units; correct one",
                 )
             convention = Convention(convention.order, unit or convention.unit)
-            values = np.column_stack([table.numbers(column) for column in found])
+            values = np.column_stack([table.numbers(column) for column in names])
             turned, words = rotations(values, convention, places_of(table), table.where, triple in BY_AXIS)
-            return Turned(turned, f"{', '.join(found)} as {words}", found, stated=False)
+            return Turned(turned, f"{', '.join(names)} as {words}", names, stated=False)
     return None
 
 
 def _four(table: Table, prefix: str, rotation: str | None) -> Turned | None:
-    """Quaternions of unnamed order."""
+    """Return the rotations of quaternions q1 … q4, whose order the user must give."""
     columns = [find_column(table, prefix, f"q{i}") for i in (1, 2, 3, 4)]
-    found = tuple(column for column in columns if column is not None)
-    if len(found) < len(columns):
+    names = tuple(column for column in columns if column is not None)
+    if len(names) < len(columns):
         return None
-    values = np.column_stack([table.numbers(column) for column in found])
+    values = np.column_stack([table.numbers(column) for column in names])
     turned, words = turned_values(values, rotation, "q1, q2, q3, q4", places_of(table), table.where)
-    return Turned(turned, words, found, stated=False)
+    return Turned(turned, words, names, stated=False)
 
 
 def _own_unit(rotation: str | None) -> bool:
-    """Whether the user wrote a unit, and not a robot's name that has one."""
+    """Return True if the option states a unit itself, instead of a robot's name that implies one."""
     return (rotation or "").endswith(tuple(f"-{unit}" for unit in ANGLES))

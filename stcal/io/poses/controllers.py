@@ -1,4 +1,4 @@
-"""Poses as controllers of robots write them: KUKA, ABB, Universal Robots, FANUC, Yaskawa; each is read back here."""
+"""Poses in the form of robot controllers, written and read: KUKA, ABB, Universal Robots, FANUC, Yaskawa."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -11,51 +11,56 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.poses.text import fixed, joined, without_comments
 
 METRE_MM = 1000.0
-"""ROS, URDF and Universal Robots have metres."""
+"""Millimetres per metre, the unit of ROS, URDF and Universal Robots."""
 MM_DIGITS, DEG_DIGITS, UNIT_DIGITS = 6, 9, 12
-"""Printed of mm (nanometres), degrees, and of quaternions, radians and metres."""
+"""Digits of printed mm (to a nanometre), of degrees, and of quaternions, radians and metres."""
 YASKAWA_MM_DIGITS, YASKAWA_DEG_DIGITS = 3, 4
-"""What fields of a JBI file hold."""
+"""Digits of the fields of a JBI file."""
 NUMBER = r"(-?\d+\.\d+)"
 
 
 @dataclass(frozen=True, slots=True)
 class PoseText:
-    """``write`` : the pose as text; ``form`` : that text, with its numbers as groups; ``pose`` : back from these."""
+    """The text form of a pose.
+
+    ``write`` : returns the text of a pose; ``form`` : pattern of that text with its numbers as groups; ``pose`` :
+    returns the pose of these numbers.
+    """
 
     write: Callable[[Rigid], str]
     form: re.Pattern[str]
     pose: Callable[[Sequence[float]], Rigid]
 
     def read(self, text: str) -> list[Rigid]:
-        """All poses below the comments."""
-        return [self.pose([float(v) for v in found.groups()]) for found in self.form.finditer(without_comments(text))]
+        """Return all poses of a text, without those in comments."""
+        return [self.pose([float(v) for v in match.groups()]) for match in self.form.finditer(without_comments(text))]
 
     def first(self, text: str) -> Rigid:
-        """The first pose below the comments."""
+        """Return the first pose of a text, without those in comments."""
         return self.read(text)[0]
 
 
 def roll_pitch_yaw(pose: Rigid) -> np.ndarray:
-    """(3,) rad, about the fixed axes X, Y, Z, in this order.
+    """Return roll, pitch and yaw (3,), rad, about the fixed axes X, Y, Z, in this order.
 
-    At a pitch of ±90° roll and yaw are one turn. The roll is what the other two leave, so that the rotation is right to
-    the last digits there and beside it, where angles taken from single elements lose half of theirs.
+    At a pitch of ±90° only the sum or difference of roll and yaw is determined. Roll is therefore computed from the
+    rotation that remains after pitch and yaw. This keeps full precision at and near ±90°, where angles computed from
+    single matrix elements lose half of their digits.
     """
     r = pose.rotation
     pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
     yaw = np.arctan2(r[1, 0], r[0, 0])
-    left = from_roll_pitch_yaw([0.0, pitch, yaw]).T @ r
-    return np.array([np.arctan2(left[2, 1], left[1, 1]), pitch, yaw])
+    remaining = from_roll_pitch_yaw([0.0, pitch, yaw]).T @ r
+    return np.array([np.arctan2(remaining[2, 1], remaining[1, 1]), pitch, yaw])
 
 
 def from_roll_pitch_yaw(angles) -> np.ndarray:
-    """The rotation (3, 3)."""
+    """Return the rotation (3, 3) of roll, pitch and yaw, rad: the inverse of :func:`roll_pitch_yaw`."""
     return Rotation.from_euler("xyz", angles).as_matrix()
 
 
 def _by_angles(pose: Rigid) -> np.ndarray:
-    """(6,) x, y, z in mm, and degrees about the fixed axes X, Y, Z in this order."""
+    """Return x, y, z in mm, and degrees about the fixed axes X, Y, Z in this order, (6,)."""
     return np.append(pose.translation, np.degrees(roll_pitch_yaw(pose)))
 
 
@@ -104,12 +109,12 @@ KUKA = PoseText(
     re.compile(",".join(f"{axis} {NUMBER}" for axis in "XYZABC")),
     lambda v: _of_angles([*v[:3], *reversed(v[3:])]),
 )
-"""mm, and degrees A about Z, B about the new Y, C about the newest X: Rz(A) Ry(B) Rx(C)."""
+"""Form of KUKA: mm, and degrees A about Z, B about the new Y, C about the newest X: Rz(A) Ry(B) Rx(C)."""
 ABB = PoseText(_abb, re.compile(rf"\[{','.join([NUMBER] * 3)}\],\[{','.join([NUMBER] * 4)}\]"), _of_abb)
-"""mm, and quaternion q1 (the real part) to q4."""
+"""Form of ABB: mm, and quaternion q1 (the real part) to q4."""
 UR = PoseText(_ur, re.compile(rf"p\[{', '.join([NUMBER] * 6)}\]"), _of_ur)
-"""Metres, and rotation vector in rad."""
+"""Form of Universal Robots: metres, and rotation vector in rad."""
 FANUC = PoseText(_fanuc, re.compile(r",\s+".join(rf"{axis} = {NUMBER} +(?:mm|deg)" for axis in "XYZWPR")), _of_angles)
-"""mm, and degrees W, P, R about the fixed X, Y, Z in this order: Rz(R) Ry(P) Rx(W)."""
+"""Form of FANUC: mm, and degrees W, P, R about the fixed X, Y, Z in this order: Rz(R) Ry(P) Rx(W)."""
 YASKAWA = PoseText(_yaskawa, re.compile(rf"^C\d+={','.join([NUMBER] * 6)}$", re.MULTILINE), _of_angles)
-"""mm, and degrees Rx, Ry, Rz as FANUC's W, P, R; one C line of a JBI file."""
+"""Form of Yaskawa: mm, and degrees Rx, Ry, Rz as FANUC's W, P, R; one C line of a JBI file."""

@@ -1,4 +1,4 @@
-"""Tables of instruments, as of laser trackers: a file says which of their columns are which of ours."""
+"""Tables of instruments such as laser trackers, read by a file that maps their columns to the package's names."""
 
 import csv
 from pathlib import Path
@@ -26,15 +26,15 @@ class _ColumnsFile(Strict):
 
 
 def read_mapped(path: str | Path, columns: str | Path, what: str, quaternions: Order = "wxyz") -> Table:
-    """Read a table with another header, delimiter or decimal point; its columns that are not mapped keep their names.
+    """Read a table with another header, delimiter or decimal point; columns that are not mapped keep their names.
 
-    ``columns`` : the map (TOML; form: ``data_layout.md``); ``quaternions`` : as of
+    ``columns`` : the map (TOML; form: ``data_layout.md``); ``quaternions`` : see
     :func:`~stcal.io.table.read_table`.
 
     Raises
     ------
     InputError
-        Unreadable, a column that is not there, or a row of another length.
+        The file is unreadable, a column is missing, or a row has another length.
     """
     form, where = load_toml(columns, _ColumnsFile, WHAT, "give its path"), f"{what} {path}"
     try:
@@ -58,13 +58,18 @@ def read_mapped(path: str | Path, columns: str | Path, what: str, quaternions: O
         if len(row) != len(names):
             wrong = f"{len(row)} cells, {len(names)} needed"
             raise InputError("E-COLUMNS-FILE", f"{where}: line {line}: {wrong}; check delimiter in {columns}")
-    at = {ours: _place(own, names, f"{where}: {ours} = {own!r} of {columns}") for ours, own in form.columns.items()}
+    at = {
+        ours: _place(theirs, names, f"{where}: {ours} = {theirs!r} of {columns}")
+        for ours, theirs in form.columns.items()
+    }
     taken = {*at.values(), *(k for k, name in enumerate(names) if not form.header or not name or name in at)}
-    others = {name: k for k, name in enumerate(names) if k not in taken}
-    found = {name: [row[k] for _, row in rows] for name, k in (at | others).items()}
+    unmapped = {name: k for k, name in enumerate(names) if k not in taken}
+    cells_of = {name: [row[k] for _, row in rows] for name, k in (at | unmapped).items()}
     if form.decimal_comma:
-        found = {name: [v.replace(",", ".") if _is_decimal(v) else v for v in own] for name, own in found.items()}
-    return Table(where, dict(found), [line for line, _ in rows], quaternions)
+        cells_of = {
+            name: [v.replace(",", ".") if _is_decimal(v) else v for v in theirs] for name, theirs in cells_of.items()
+        }
+    return Table(where, dict(cells_of), [line for line, _ in rows], quaternions)
 
 
 def _cells(line: str, delimiter: str, where: str) -> list[str]:
@@ -77,7 +82,7 @@ def _cells(line: str, delimiter: str, where: str) -> list[str]:
 
 
 def _place(theirs: str | int, names: list[str], where: str) -> int:
-    """Index of a column by its name, or by its number from 1."""
+    """Return the index of a column by its name, or by its number from 1."""
     if isinstance(theirs, int):
         if theirs > len(names):
             raise InputError("E-COLUMNS-FILE", f"{where}: there are {len(names)} columns; correct the number")

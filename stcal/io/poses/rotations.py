@@ -1,4 +1,4 @@
-"""Numbers that state a rotation: in which convention, and in which unit."""
+"""Conventions and units of the numbers that state a rotation."""
 
 import re
 from collections.abc import Sequence
@@ -25,8 +25,8 @@ ALIASES: dict[str, tuple[str, str]] = {
     "rpy": ("xyz", ""),
     "abb-quaternion": ("wxyz", ""),
 }
-"""Names by robot: order of axes as SciPy writes it (small: about fixed axes, capital: about the turned ones), or what
-else, and unit of angles, empty where it is not said."""
+"""Conventions by name of the robot: form and unit of the angles, empty if it is open. The form is an order of axes as
+in SciPy (lower case: fixed axes, upper case: rotated axes), a rotation vector or a quaternion."""
 LIKELY = {
     "abc": "kuka-abc or mitsubishi-abc",
     "wpr": "fanuc-wpr",
@@ -35,25 +35,28 @@ LIKELY = {
     "rx, ry, rz": "ur-rotvec, yaskawa, staubli, xyz, XYZ or ZYX",
     "quaternions": "wxyz or xyzw",
 }
-"""What to say for columns of such names."""
+"""Suggestions for ``--rotation`` by the names of the columns."""
 _ORDER = re.compile(r"[xyz]{3}|[XYZ]{3}")
 
 
 @dataclass(frozen=True, slots=True)
 class Convention:
-    """``order`` : :data:`ROTATION_VECTOR`, one of :data:`QUATERNIONS`, or an order of axes; ``unit`` of angles, empty
-    where it is not said."""
+    """A convention for rotations.
+
+    ``order`` : :data:`ROTATION_VECTOR`, one of :data:`QUATERNIONS`, or an order of axes; ``unit`` : unit of the angles,
+    empty if it is open.
+    """
 
     order: str
     unit: str = ""
 
     @property
     def count(self) -> int:
-        """Numbers that state a rotation."""
+        """The count of numbers that state a rotation."""
         return 4 if self.order in QUATERNIONS else 3
 
     def words(self) -> str:
-        """For what is said of a file."""
+        """Return the convention in words, for messages."""
         if self.order in QUATERNIONS:
             return f"quaternions {', '.join(self.order)}"
         if self.order == ROTATION_VECTOR:
@@ -63,12 +66,12 @@ class Convention:
 
 
 def convention_of(name: str) -> Convention:
-    """Of a name that the user gives: ``kuka-abc``, ``ZYX``, ``zyx-rad``, ``rotvec-deg``.
+    """Return the convention of a name that the user gives, such as ``kuka-abc``, ``ZYX``, ``zyx-rad``, ``rotvec-deg``.
 
     Raises
     ------
     InputError
-        None of them.
+        The name is unknown.
     """
     if name in ALIASES:
         return Convention(*ALIASES[name])
@@ -85,37 +88,37 @@ def convention_of(name: str) -> Convention:
 
 
 def said_convention(rotation: str | None, what: str, where: str, count: int = 3) -> Convention:
-    """That of ``--rotation``, ``rotation``; ``what`` : the names of the columns, or what stands in their place.
+    """Return the convention of the option ``--rotation``; ``what`` : names of the columns, or their description.
 
     Raises
     ------
     InputError
-        Not given, or of another number of values.
+        The option is not given, or its convention has another number of values.
     """
     if rotation is None:
         likely = LIKELY["quaternions"] if count == len("wxyz") else LIKELY.get(what, "kuka-abc, ur-rotvec, xyz or ZYX")
         form = "quaternions" if count == len("wxyz") else "Euler angles in any order of axes or rotation vectors"
         raise InputError("E-ROTATION-AMBIGUOUS", f"{where}: {what} may be {form}; give --rotation, like {likely}")
-    found = convention_of(rotation)
-    if found.count != count:
+    convention = convention_of(rotation)
+    if convention.count != count:
         raise InputError(
             "E-OPTION-CONTRADICTS",
-            f"{where}: {what} are {count} numbers, --rotation {rotation} is of {found.count}; correct the option",
+            f"{where}: {what} are {count} numbers, --rotation {rotation} is of {convention.count}; correct the option",
         )
-    return found
+    return convention
 
 
 def rotations(
     values: np.ndarray, convention: Convention, places: tuple[str, ...], where: str, by_axis: bool = False
 ) -> tuple[np.ndarray, str]:
-    """Matrices (m, 3, 3) of three angles, or a vector, each (m, 3); and how they were read, in words.
+    """Return matrices (m, 3, 3) of Euler angles or rotation vectors (m, 3), and the convention used, in words.
 
-    ``by_axis`` : the columns are named by the axes x, y, z and not by the order of turning.
+    ``by_axis`` : True if the columns are named by the axes x, y, z and not in the order of the rotations.
 
     Raises
     ------
     InputError
-        Not finite, or of a unit that cannot be told.
+        Values are not finite, or their unit is ambiguous.
     """
     require_finite(values, places, where)
     unit, guessed = convention.unit, False
@@ -141,7 +144,7 @@ def rotations(
 def turned_values(
     values: np.ndarray, rotation: str | None, what: str, places: tuple[str, ...], where: str
 ) -> tuple[np.ndarray, str]:
-    """Rotations (m, 3, 3) of (m, 3) or (m, 4) numbers whose convention only the user knows, and how they were read."""
+    """Return rotations (m, 3, 3) of numbers (m, 3) or (m, 4) in the user's convention, and the convention in words."""
     convention = said_convention(rotation, what, where, values.shape[1])
     if convention.order in QUATERNIONS:
         order = [0, 1, 2, 3] if convention.order == "wxyz" else [3, 0, 1, 2]
@@ -150,40 +153,40 @@ def turned_values(
 
 
 def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
-    """Matrices (m, 3, 3) brought onto rotations, from the few digits with which files state them.
+    """Return matrices (m, 3, 3) projected onto rotations, since files state few digits.
 
     Raises
     ------
     InputError
-        One that is no rotation: which, by how much, and what it looks like.
+        A matrix is no rotation; the message names it, the deviation, and its likely cause.
     """
     require_finite(rotation, places, where)
     u, size, vt = np.linalg.svd(rotation)
     off = np.abs(size - 1).max(axis=1)
-    with np.errstate(over="ignore", invalid="ignore"):  # of what is refused by its size
+    with np.errstate(over="ignore", invalid="ignore"):  # matrices that are refused by their size
         determinant = np.linalg.det(rotation)
     bad = np.flatnonzero((off > UNIT_WITHIN) | (determinant < 0))
     if len(bad):
         i = bad[0]
-        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
         if off[i] <= UNIT_WITHIN:
-            what = "a reflection, determinant −1; a rotation, +1, needed: change the sign of one axis"
+            finding = "a reflection, determinant −1; a rotation, +1, needed: change the sign of one axis"
         else:
-            what = (
+            finding = (
                 f"not a rotation: its axes are stretched by {size[i].min():.4g} to {size[i].max():.4g}, "
                 f"1 ± {UNIT_WITHIN:g} needed; correct it, or write more digits"
             )
-        raise InputError("E-ROTATION-IMPROPER", f"{where}: {places[i]}: the 3×3 part is {what}{more}")
+        raise InputError("E-ROTATION-IMPROPER", f"{where}: {places[i]}: the 3×3 part is {finding}{suffix}")
     return u @ vt
 
 
 def of_quaternions(wxyz: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
-    """Rotations (m, 3, 3) of (m, 4).
+    """Return the rotations (m, 3, 3) of quaternions (m, 4), w first.
 
     Raises
     ------
     InputError
-        One that is not of unit length.
+        A quaternion is not of unit length.
     """
     require_finite(wxyz, places, where)
     require_unit(wxyz, places.__getitem__, where, "correct it")
@@ -191,11 +194,11 @@ def of_quaternions(wxyz: np.ndarray, places: Sequence[str], where: str) -> np.nd
 
 
 def require_finite(values: np.ndarray, places: Sequence[str], where: str) -> None:
-    """Refuse what is no number."""
+    """Refuse values (m, …) that are not finite; the message names the row."""
     bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
     if len(bad):
-        more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
+        suffix = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
         raise InputError(
             "E-TABLE-NUMBER",
-            f"{where}: {places[bad[0]]}: a value that is not finite, numbers needed{more}; take it out",
+            f"{where}: {places[bad[0]]}: a value that is not finite, numbers needed{suffix}; take it out",
         )

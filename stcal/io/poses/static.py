@@ -1,5 +1,4 @@
-"""Fixed transforms of a tree of frames as ROS has them: messages, joints of URDF, and programs that publish them;
-lengths in metres."""
+"""Static transforms of ROS, with lengths in metres: messages, joints of URDF, and programs that publish them."""
 
 import ast
 import json
@@ -19,14 +18,14 @@ from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw, roll_pitch
 from stcal.io.poses.text import fixed
 
 ARGUMENTS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
-"""Of ROS 2's ``static_transform_publisher``."""
+"""Arguments of ROS 2's ``static_transform_publisher``."""
 METRE_DIGITS, QUATERNION_DIGITS = 12, 15
-"""Of arguments, written without exponents: 10⁻⁹ mm."""
+"""Digits of the arguments, which are written without exponents; the last digit of a length is 10⁻⁹ mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Static:
-    """A fixed transform of a tree of frames, ``parent_from_child``."""
+    """A static transform in a tree of frames; ``pose`` : parent_from_child."""
 
     parent: str
     child: str
@@ -34,34 +33,34 @@ class Static:
 
 
 def metres(pose: Rigid) -> list[float]:
-    """Its translation."""
+    """Return the translation of a pose in metres."""
     return [float(v) / METRE_MM for v in pose.translation]
 
 
 def xyzw(pose: Rigid) -> list[float]:
-    """Its quaternion, in the order of ROS, w ≥ 0."""
+    """Return the quaternion of a pose in the order of ROS, w ≥ 0."""
     return [float(v) for v in Rotation.from_matrix(np.array(pose.rotation)).as_quat(canonical=True)]
 
 
 def pose_of_metres(translation_m, quaternion_xyzw) -> Rigid:
-    """Back from these."""
+    """Return the pose of a translation in metres and a quaternion; inverse of :func:`metres` and :func:`xyzw`."""
     turn = Rotation.from_quat([float(v) for v in quaternion_xyzw]).as_matrix()
     return Rigid(turn, [METRE_MM * float(v) for v in translation_m])
 
 
 def messages(statics: Iterable[Static]) -> str:
-    """YAML of ``geometry_msgs/TransformStamped``, a document for each."""
-    return "---\n".join(yaml.safe_dump(_message(each), sort_keys=False, allow_unicode=True) for each in statics)
+    """Return the YAML of ``geometry_msgs/TransformStamped``, one document for each transform."""
+    return "---\n".join(yaml.safe_dump(_message(static), sort_keys=False, allow_unicode=True) for static in statics)
 
 
 def read_messages(text: str) -> list[Static]:
-    """Back from :func:`messages`."""
-    found = []
+    """Return the transforms in a text of :func:`messages`."""
+    statics = []
     for document in yaml.safe_load_all(text):
-        own = document["transform"]
-        pose = pose_of_metres([own["translation"][c] for c in "xyz"], [own["rotation"][c] for c in "xyzw"])
-        found.append(Static(document["header"]["frame_id"], document["child_frame_id"], pose))
-    return found
+        transform = document["transform"]
+        pose = pose_of_metres([transform["translation"][c] for c in "xyz"], [transform["rotation"][c] for c in "xyzw"])
+        statics.append(Static(document["header"]["frame_id"], document["child_frame_id"], pose))
+    return statics
 
 
 def _message(each: Static) -> dict:
@@ -77,7 +76,7 @@ def _message(each: Static) -> dict:
 
 
 def fixed_joint(each: Static) -> str:
-    """A joint of URDF."""
+    """Return a fixed joint of URDF."""
     name = quoteattr(f"{each.parent}_to_{each.child}")
     origin = " ".join(repr(v) for v in metres(each.pose))
     angles = " ".join(repr(float(v)) for v in roll_pitch_yaw(each.pose))
@@ -91,7 +90,7 @@ def fixed_joint(each: Static) -> str:
 
 
 def static_of_joint(joint: ElementTree.Element) -> Static:
-    """Back from :func:`fixed_joint`."""
+    """Return the transform of a joint of :func:`fixed_joint`."""
     parts = {part.tag: part.attrib for part in joint}
     place, angles = ([float(v) for v in parts["origin"][key].split()] for key in ("xyz", "rpy"))
     pose = Rigid(from_roll_pitch_yaw(angles), METRE_MM * np.array(place))
@@ -99,73 +98,75 @@ def static_of_joint(joint: ElementTree.Element) -> Static:
 
 
 def ros2_commands(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
-    """A shell script of ``ros2 run tf2_ros static_transform_publisher``, a call for each transform; all but the last go
-    on in the background."""
+    """Return a shell script with a call of ``ros2 run tf2_ros static_transform_publisher`` for each transform.
+
+    All calls but the last one continue in the background. ``said`` : lines of a comment.
+    """
     calls = [shlex.join(["ros2", "run", "tf2_ros", "static_transform_publisher", *_arguments(t)]) for t in statics]
     head = ["#!/bin/sh", *(f"# {line}" for line in said)]
     return "\n".join(head) + "\n" + " &\n".join(calls) + "\n"
 
 
 def read_ros2_commands(text: str) -> list[Static]:
-    """Back from :func:`ros2_commands`."""
+    """Return the transforms in a script of :func:`ros2_commands`."""
     calls = [line.removesuffix("&") for line in text.splitlines() if line.startswith("ros2 ")]
     return [_static_of_arguments(shlex.split(call)[4:]) for call in calls]
 
 
 def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
-    """A launch file of ROS 1, as MoveIt's calibration plugin writes it.
+    """Return a launch file of ROS 1, as MoveIt's calibration plugin writes it.
 
     Raises
     ------
     InputError
-        A name with white space, at which ``roslaunch`` would split it.
+        A name has white space, at which ``roslaunch`` would split it.
     """
     lines = ["<launch>", *(f"  <!-- {line} -->" for line in said)]
-    for each in statics:
-        names = each.parent, each.child
+    for static in statics:
+        names = static.parent, static.child
         if spaced := [name for name in names if name.split() != [name]]:
             raise InputError(
                 "E-FRAME-NAME", f"frames: {spaced[0]!r} has white space, at which roslaunch splits; give another name"
             )
         words = [
-            *plain_numbers(metres(each.pose), METRE_DIGITS),
-            *plain_numbers(xyzw(each.pose), QUATERNION_DIGITS),
+            *plain_numbers(metres(static.pose), METRE_DIGITS),
+            *plain_numbers(xyzw(static.pose), QUATERNION_DIGITS),
             *names,
         ]
-        node = f"{each.child}_broadcaster".replace("/", "_")
+        node = f"{static.child}_broadcaster".replace("/", "_")
         lines.append(f'  <node pkg="tf2_ros" type="static_transform_publisher" name={quoteattr(node)}')
         lines.append(f"      args={quoteattr(' '.join(words))} />")
     return "\n".join(lines) + "\n</launch>\n"
 
 
 def read_ros1_launch(text: str) -> list[Static]:
-    """Back from :func:`ros1_launch`."""
-    found = []
+    """Return the transforms in a launch file of :func:`ros1_launch`."""
+    statics = []
     for node in ElementTree.fromstring(text).findall("node"):
         words = node.attrib["args"].split()
-        found.append(Static(words[7], words[8], pose_of_metres(words[:3], words[3:7])))
-    return found
+        statics.append(Static(words[7], words[8], pose_of_metres(words[:3], words[3:7])))
+    return statics
 
 
 def ros2_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
-    """A launch file of ROS 2, as MoveIt 2's calibration plugin writes it."""
+    """Return a launch file of ROS 2, as MoveIt 2's calibration plugin writes it."""
     lines = [f"# {line}" for line in said]
     lines += ["from launch import LaunchDescription", "from launch_ros.actions import Node", "", ""]
     lines += ["def generate_launch_description() -> LaunchDescription:", "    nodes = ["]
-    for each in statics:
+    for static in statics:
         lines += ["        Node(", '            package="tf2_ros",']
         lines += ['            executable="static_transform_publisher",', '            output="log",']
         lines += ["            arguments=["]
-        lines += [f"                {json.dumps(word, ensure_ascii=False)}," for word in _arguments(each)]
+        lines += [f"                {json.dumps(word, ensure_ascii=False)}," for word in _arguments(static)]
         lines += ["            ],", "        ),"]
     return "\n".join([*lines, "    ]", "    return LaunchDescription(nodes)"]) + "\n"
 
 
 def read_ros2_launch(text: str) -> list[Static]:
-    """Back from :func:`ros2_launch`."""
+    """Return the transforms in a launch file of :func:`ros2_launch`."""
     words = [node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.keyword) and node.arg]
     lists = [ast.literal_eval(node) for node in words if isinstance(node, ast.List)]
-    return [_static_of_arguments(each) for each in lists]
+    return [_static_of_arguments(arguments) for arguments in lists]
 
 
 def _arguments(each: Static) -> list[str]:
@@ -181,5 +182,5 @@ def _static_of_arguments(words: list[str]) -> Static:
 
 
 def plain_numbers(values, digits: int) -> list[str]:
-    """Their texts without exponents, and without a minus before zero."""
+    """Return the texts of numbers without exponents, and without a minus before zero."""
     return [fixed(v, digits) for v in values]

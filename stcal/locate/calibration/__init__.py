@@ -1,1 +1,1 @@
-"""The target's own calibration."""
+"""Calibration of the target."""

@@ -1,7 +1,7 @@
-"""The target's own calibration: where its tags' corners lie, from photographs with a board in the same plane.
+"""Calibration of the target: corners of its tags, from photographs with a board in the same plane.
 
-First as in the patent (step S3): the board's pose in each image, each corner where its ray meets the board's plane,
-{obj} in the middle of a chosen tag. Then one adjustment of all poses and corners, with σ.
+The start follows the patent (step S3): the board's pose in each image, each corner at the intersection of its ray with
+the board's plane, {obj} in the middle of a chosen tag. Then one adjustment refines all poses and corners, with σ.
 """
 
 from collections.abc import Sequence
@@ -26,27 +26,27 @@ MIN_BOARD_POINTS = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedLayout:
-    """A target's calibration.
+    """Result of a target's calibration.
 
     Parameters
     ----------
     layout : TargetLayout
-        With σ and covariance of all corners.
+        Layout with the covariance of all corners.
     published : (n, 4, 2) array
-        mm, corners in {obj} as the patent leaves them, before the adjustment.
+        Corners in {obj} by the method of the patent, before the adjustment, mm.
     board_from_obj : Rigid
-        Where {obj} lies on the board.
+        Pose of {obj} on the board.
     adjusted : AdjustedLayout
-        Poses and residuals.
+        Poses and residuals of the adjustment.
     images : tuple of str
-        Those used.
+        Names of the images used.
     counts : (n,) int array
-        Images that show each tag.
+        Number of images that show each tag.
     unseen : tuple of int
-        Rows of the plan without a corner, which the layout lacks.
+        Rows of the plan whose tags no image shows; the layout lacks them.
     deviation_mm : (n,) array
-        Largest distance of a corner from its nominal place, the nominal target laid over this one; NaN where the plan
-        has no place.
+        Largest distance of a tag's corner from its nominal place, after the nominal target is fitted to the calibrated
+        one; NaN if the plan has no place.
     left_out : tuple of str
         Images that were not used, and why.
     """
@@ -71,22 +71,22 @@ def calibrate(
     camera: Camera,
     symmetries: Sequence[Rigid] = (),
 ) -> CalibratedLayout:
-    """Corners of a target's tags in {obj}, from photographs with a board in the same plane.
+    """Calibrates the corners of a target's tags in {obj}, from photographs with a board in the same plane.
 
     Parameters
     ----------
     plan : LayoutPlan
-        Which tags, and which of them holds the origin of {obj}.
+        Tags of the target, and the tag that holds the origin of {obj}.
     views : sequence of BoardView or None
-        Of the board in m images; None where it is not seen.
+        Views of the board in m images; None if it is not seen.
     tags : sequence of Tags
-        m of them.
+        Tags in the m images.
     names : sequence of str
-        Of the images.
+        Names of the images.
     camera : Camera
-        That took them, at their size.
+        Camera that took the images, at their size.
     symmetries : sequence of Rigid
-        board_from_board after which the board looks the same; the tags then tell how it lies in each image.
+        All board_from_board that map the board onto itself. The tags then decide the board's numbering in each image.
 
     Returns
     -------
@@ -96,20 +96,20 @@ def calibrate(
     Raises
     ------
     DegenerateError
-        Fewer than two images with board and tags, or the tag that holds {obj} is in none of them.
+        Fewer than two images show board and tags, or none of them shows the tag that holds {obj}.
     """
     rows = {tag: row for row, tag in enumerate(plan.tags)}
     images, left_out = [], []
-    for name, view, found in zip(names, views, tags, strict=True):
-        own = [k for k, tag in enumerate(found.tags) if tag in rows]
-        if view is None or len(view) < MIN_BOARD_POINTS or not own:
-            left_out.append(f"{name}: {'no tag of the layout' if own == [] else 'the board is not seen'}")
+    for name, view, detected in zip(names, views, tags, strict=True):
+        listed = [k for k, tag in enumerate(detected.tags) if tag in rows]
+        if view is None or len(view) < MIN_BOARD_POINTS or not listed:
+            left_out.append(f"{name}: {'no tag of the layout' if listed == [] else 'the board is not seen'}")
             continue
-        twice = [tag for _, tag in (t for t in found.repeated if t in rows)]
-        if twice:
-            left_out.append(f"{name}: tag {twice[0]} is seen twice")
+        repeated = [tag for _, tag in (t for t in detected.repeated if t in rows)]
+        if repeated:
+            left_out.append(f"{name}: tag {repeated[0]} is seen twice")
             continue
-        images.append(_image(name, view, found, own, rows, camera))
+        images.append(_image(name, view, detected, listed, rows, camera))
     if len(images) < MIN_IMAGES:
         raise DegenerateError(
             "E-LAYOUT-FEW-IMAGES",
@@ -118,21 +118,21 @@ def calibrate(
         )
     if symmetries:
         images = _turned_alike(images, symmetries)
-    seen = np.array(sorted({int(row) for image in images for row in image.rows}))
-    if plan.origin not in seen:
+    seen_rows = np.array(sorted({int(row) for image in images for row in image.rows}))
+    if plan.origin not in seen_rows:
         raise DegenerateError(
             "E-LAYOUT-UNLINKED",
             f"layout: tag {plan.tags[plan.origin][1]}, which holds the origin, is in none of {len(images)} images; "
             "show it, or name another origin in the layout file",
         )
-    images = [image.numbered(np.searchsorted(seen, image.rows)) for image in images]
-    start = _median_corners(images, len(seen))
+    images = [image.numbered(np.searchsorted(seen_rows, image.rows)) for image in images]
+    start = _median_corners(images, len(seen_rows))
     adjusted = adjust(images, start)
-    return _collected(plan, images, seen, start, adjusted, left_out)
+    return _collected(plan, images, seen_rows, start, adjusted, left_out)
 
 
 def _image(name: str, view: BoardView, found: Tags, own: list[int], rows: dict, camera: Camera) -> ImageCorners:
-    """Board and tags of one image without the lens, and the pose of the board."""
+    """Returns board and tags of one image in normalised coordinates, and the pose of the board."""
     board_seen = camera.normalised_from_pixel(view.xy_px)
     xy = view.xyz_board[:, :2]
     pose = refine_planar_pose(camera_from_plane(fit_homography(xy, board_seen)), xy, board_seen)
@@ -153,39 +153,39 @@ def _image(name: str, view: BoardView, found: Tags, own: list[int], rows: dict, 
 
 
 def _normalised(covariance_px2: np.ndarray, ideal: np.ndarray, camera: Camera) -> np.ndarray:
-    back = np.linalg.inv(camera.distort_jacobian(ideal)[1] * camera.focal[:, None])
-    return back @ covariance_px2 @ np.swapaxes(back, 1, 2)
+    normalised_from_px = np.linalg.inv(camera.distort_jacobian(ideal)[1] * camera.focal[:, None])
+    return normalised_from_px @ covariance_px2 @ np.swapaxes(normalised_from_px, 1, 2)
 
 
 def _tag_covariances(found: Tags, own: list[int]) -> np.ndarray:
-    """(k, 8, 8) px²: of each corner, and of the shift that a tag's edges share."""
-    way = corners_by_edges(found.corners_px[own]).reshape(-1, 8)
-    full = found.edge_sigma_px()[own, None, None] ** 2 * way[:, :, None] * way[:, None, :]
+    """Returns the covariance of each tag's corners, (k, 8, 8) px²: single corners, and the edges' common shift."""
+    direction = corners_by_edges(found.corners_px[own]).reshape(-1, 8)
+    full = found.edge_sigma_px()[own, None, None] ** 2 * direction[:, :, None] * direction[:, None, :]
     for corner in range(4):
-        at = slice(2 * corner, 2 * corner + 2)
-        full[:, at, at] += found.covariance_px2[own, corner]
+        coordinates = slice(2 * corner, 2 * corner + 2)
+        full[:, coordinates, coordinates] += found.covariance_px2[own, corner]
     return full
 
 
 def plane_points(camera_from_plane: Rigid, seen: np.ndarray) -> np.ndarray:
-    """Where the rays of normalised coordinates (n, 2) meet the plane, (n, 2) mm in its frame."""
+    """Returns where the rays of normalised coordinates (n, 2) meet the plane, (n, 2) mm in its frame."""
     rotation = camera_from_plane.rotation
     return apply_homography(np.linalg.inv(np.column_stack([rotation[:, :2], camera_from_plane.translation])), seen)
 
 
 def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -> list[ImageCorners]:
-    """Of the ways in which a board may lie, in each image the one that puts the tags where the first image has them."""
+    """Chooses in each image the numbering of a symmetric board that places the tags where the first image has them."""
     order = sorted(range(len(images)), key=lambda i: -len(images[i].rows))
-    turned, known = list(images), {}
+    turned, place_of_tag = list(images), {}
     for i in order:
         image = images[i]
         choices = [image, *(image.turned(symmetry) for symmetry in symmetries)]
         places = [plane_points(choice.pose, choice.seen).reshape(-1, 4, 2) for choice in choices]
-        common = [k for k, row in enumerate(image.rows) if row in known]
+        common = [k for k, row in enumerate(image.rows) if row in place_of_tag]
         if common:
-            there = np.array([known[image.rows[k]] for k in common])
-            best = int(np.argmin([np.abs(place[common] - there).sum() for place in places]))
-        elif known:
+            expected = np.array([place_of_tag[image.rows[k]] for k in common])
+            best = int(np.argmin([np.abs(place[common] - expected).sum() for place in places]))
+        elif place_of_tag:
             raise DegenerateError(
                 "E-LAYOUT-UNLINKED",
                 f"layout: {image.name} shares no tag with the other images, and the board looks the same turned; "
@@ -194,12 +194,14 @@ def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -
         else:
             best = 0
         turned[i] = choices[best]
-        known |= {row: place for row, place in zip(image.rows, places[best], strict=True) if row not in known}
+        place_of_tag |= {
+            row: place for row, place in zip(image.rows, places[best], strict=True) if row not in place_of_tag
+        }
     return turned
 
 
 def _median_corners(images: Sequence[ImageCorners], count: int) -> np.ndarray:
-    """(count, 4, 2) mm on the board: the median over all images, which one misread tag does not move."""
+    """Returns each corner's median over all images, (count, 4, 2) mm on the board, robust against a misread tag."""
     places = np.full((len(images), count, 4, 2), np.nan)
     for i, image in enumerate(images):
         places[i, image.rows] = plane_points(image.pose, image.seen).reshape(-1, 4, 2)
@@ -207,7 +209,7 @@ def _median_corners(images: Sequence[ImageCorners], count: int) -> np.ndarray:
 
 
 def _collected(plan, images, seen, start, adjusted: AdjustedLayout, left_out) -> CalibratedLayout:
-    """Corners in {obj}: a frame that rests on the corners of one tag, and so on their errors."""
+    """Returns the calibration in {obj}. The frame is defined by the corners of one tag, and depends on their errors."""
     origin = int(np.flatnonzero(seen == plan.origin)[0])
     turn, shift = obj_from_plane(adjusted.corners_mm[origin])
     by_corner = _by_board_corners(adjusted.corners_mm, origin, turn)
@@ -238,35 +240,35 @@ def _collected(plan, images, seen, start, adjusted: AdjustedLayout, left_out) ->
 
 
 def _by_board_corners(corners: np.ndarray, origin: int, turn: np.ndarray) -> np.ndarray:
-    """Derivative (8n, 8n) of all coordinates in {obj} by those on the board.
+    """Returns the derivative (8n, 8n) of all coordinates in {obj} by those on the board.
 
-    To first order, with q the corners of the origin tag about its middle and s the sum of q·q over the square's: the
-    turn changes by the mean of their small rotations.
+    The derivative is of first order. The rotation of {obj} changes by the mean of the small rotations of the origin
+    tag's corners about its middle.
     """
     n = corners.size // 2
     rows = slice(4 * origin, 4 * origin + 4)
     flat = corners.reshape(-1, 2)
     middle = flat[rows].mean(0)
-    nominal = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ turn  # the square's corners in the axes of the board
-    away = flat[rows] - middle
-    ahead = nominal @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # turned by a quarter, x to y
-    by_angle = ahead / np.sum(nominal * away)
-    by = np.zeros((n, 2, n, 2))
-    by[np.arange(n), :, np.arange(n)] = np.eye(2)
-    by[:, :, rows] -= np.eye(2)[None, :, None, :] / 4
+    nominal = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ turn  # corners of the square in the axes of the board
+    offset = flat[rows] - middle
+    quarter_turn = nominal @ np.array([[0.0, 1.0], [-1.0, 0.0]])  # quarter turn from x to y
+    by_angle = quarter_turn / np.sum(nominal * offset)
+    jacobian = np.zeros((n, 2, n, 2))
+    jacobian[np.arange(n), :, np.arange(n)] = np.eye(2)
+    jacobian[:, :, rows] -= np.eye(2)[None, :, None, :] / 4
     swing = (flat - middle) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-    by[:, :, rows] -= swing[:, :, None, None] * by_angle[None, None]
-    return np.einsum("ij,njmk->nimk", turn, by).reshape(2 * n, 2 * n)
+    jacobian[:, :, rows] -= swing[:, :, None, None] * by_angle[None, None]
+    return np.einsum("ij,njmk->nimk", turn, jacobian).reshape(2 * n, 2 * n)
 
 
 def _deviation(nominal: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Largest distance of a tag's corners from their nominal places, all nominal ones laid over the others at once."""
-    known = np.isfinite(nominal).all((1, 2))
+    """Returns the largest distance of each tag's corners from their nominal places, after one fit of all tags."""
+    placed = np.isfinite(nominal).all((1, 2))
     deviation = np.full(len(nominal), np.nan)
-    if known.any():
-        a, b = corners[known].reshape(-1, 2), nominal[known].reshape(-1, 2)
+    if placed.any():
+        a, b = corners[placed].reshape(-1, 2), nominal[placed].reshape(-1, 2)
         u, _, vt = np.linalg.svd((a - a.mean(0)).T @ (b - b.mean(0)))
         turn = u @ np.diag([1.0, np.linalg.det(u @ vt)]) @ vt
-        off = np.linalg.norm((b - b.mean(0)) @ turn.T + a.mean(0) - a, axis=1)
-        deviation[known] = off.reshape(-1, 4).max(1)
+        distance = np.linalg.norm((b - b.mean(0)) @ turn.T + a.mean(0) - a, axis=1)
+        deviation[placed] = distance.reshape(-1, 4).max(1)
     return deviation

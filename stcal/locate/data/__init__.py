@@ -1,1 +1,1 @@
-"""The target's layout, its scenes and the photographs of its calibration."""
+"""Data of locate: the target's layout, its scenes, and the photographs of its calibration."""

@@ -1,4 +1,4 @@
-"""Exposure series by hardware: a camera over V4L2 or UVC through OpenCV, or a simulated one."""
+"""Capture of exposure series by a camera over V4L2 or UVC through OpenCV, or by a simulated camera."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class CapturedRow(Part):
 
 
 class CaptureFile(ResultFile):
-    """``capture.json`` of a scene: what was asked for, and what was set."""
+    """Content of ``capture.json`` of a scene: the settings asked for, and those really set."""
 
     format: Literal["stcal capture 1"] = Field(description="the file's form and its version")
     version: str = Field(description="of stcal")
@@ -39,7 +39,10 @@ class CaptureFile(ResultFile):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """``gain`` : as asked for; ``settle_s`` : after each change of exposure."""
+    """Settings of a capture.
+
+    ``gain`` : gain to set, None to leave it; ``settle_s`` : time to wait after each change of exposure, s.
+    """
 
     gain: float | None = None
     settle_s: float = 0.3
@@ -50,12 +53,12 @@ class Settings:
 
 
 def scene_folder(out: Path, scene: str) -> Path:
-    """The new folder of a scene.
+    """Returns the path of a new folder for a scene.
 
     Raises
     ------
     InputError
-        A name that is none, or a scene that is there.
+        The name is invalid, or the scene exists.
     """
     folder = out / checked_name(scene, "scene")
     if folder.exists():
@@ -70,20 +73,20 @@ def capture(
     settings: Settings,
     taken: Callable[[CapturedRow], None] | None = None,
 ) -> CaptureFile:
-    """Take an exposure series: ``<folder>/<exposure>.png`` and ``capture.json`` with what was really set.
+    """Takes an exposure series and writes ``<folder>/<exposure>.png`` and ``capture.json`` with the settings used.
 
     Parameters
     ----------
     source
         The camera.
     exposures
-        In its driver's unit, from :func:`~stcal.locate.data.exposures.exposure_times`.
+        Exposures in the unit of the camera's driver, from :func:`~stcal.locate.data.exposures.exposure_times`.
     folder
-        Of the scene; made, and written only when all images are taken.
+        Folder of the scene. It is created and written only after all images are taken.
     settings
         Gain and settle time.
     taken
-        Called with each image's row.
+        Called with the row of each image.
 
     Returns
     -------
@@ -96,11 +99,11 @@ def capture(
     """
     rows, images = [], []
     for exposure in exposures:
-        image, really = source.expose(float(exposure), settings.settle_s)
+        image, exposure_set = source.expose(float(exposure), settings.settle_s)
         row = CapturedRow(
             image=f"{exposure:.6g}.png",
             exposure=float(exposure),
-            exposure_set=really,
+            exposure_set=exposure_set,
             saturated_share=float((image >= SATURATED).mean()),
             dark_share=float((image <= DARK).mean()),
         )

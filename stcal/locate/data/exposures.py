@@ -1,4 +1,4 @@
-"""Scenes: one target in one place, photographed at several exposures; and the tags that each of these shows."""
+"""Scenes (one target in one place, photographed at several exposures), and the tags that each exposure shows."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,11 +22,11 @@ class SceneFiles:
     Parameters
     ----------
     name : str
-        Of the scene.
+        Name of the scene.
     files : tuple of ImageFile
-        The exposures.
+        Files of the exposures.
     skipped : tuple of str
-        What lies beside them and is none, with reasons.
+        Files beside them that are not exposures, with reasons.
     """
 
     name: str
@@ -36,7 +36,7 @@ class SceneFiles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
-    """What one image shows: ``tags``; ``size`` : width and height, px."""
+    """One readable image: the ``tags`` that it shows, and its ``size`` (width and height, px)."""
 
     name: str
     tags: Tags
@@ -59,25 +59,25 @@ class SceneTags:
     exposures: tuple[Exposure | Unreadable, ...]
 
     def readable(self) -> list[Exposure]:
-        """Those with an image."""
+        """Returns the exposures whose image could be read."""
         return [exposure for exposure in self.exposures if isinstance(exposure, Exposure)]
 
     def unreadable(self) -> list[Unreadable]:
-        """Those without."""
+        """Returns the exposures whose image could not be read."""
         return [exposure for exposure in self.exposures if isinstance(exposure, Unreadable)]
 
 
 CAPTURED = "capture.json"
-"""What ``capture`` writes beside the images of a scene."""
+"""Name of the file that ``capture`` writes beside the images of a scene."""
 
 
 def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
-    """``count`` exposure times from ``shortest`` to ``longest`` in a geometric series, in their unit.
+    """Returns ``count`` exposure times from ``shortest`` to ``longest`` in a geometric series, in their unit.
 
     Raises
     ------
     InputError
-        Times that are not positive or not in order, or fewer than one of them.
+        Times are not positive or not in order, or ``count`` does not fit them.
     """
     if not (0 < shortest <= longest < np.inf) or count < 1 or (count == 1 and shortest < longest):
         raise InputError(
@@ -89,7 +89,7 @@ def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
 
 
 def find_scenes(path: str | Path) -> list[SceneFiles]:
-    """Scenes in a folder.
+    """Finds the scenes in a folder.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def find_scenes(path: str | Path) -> list[SceneFiles]:
     Raises
     ------
     InputError
-        Nothing there, or no image.
+        The path does not exist, or holds no image.
     """
     path = Path(path)
     if path.is_file():
@@ -115,32 +115,32 @@ def find_scenes(path: str | Path) -> list[SceneFiles]:
     files, skipped = find_images(path)
     scenes = []
     for group in dict.fromkeys(file.group for file in files):
-        others = [s for s in skipped if (Path(s.name).parent.name or TOP_GROUP) == group]
-        left_out = tuple(f"{s.name}: {s.reason}" for s in others if Path(s.name).name != CAPTURED)
+        skipped_in_group = [s for s in skipped if (Path(s.name).parent.name or TOP_GROUP) == group]
+        left_out = tuple(f"{s.name}: {s.reason}" for s in skipped_in_group if Path(s.name).name != CAPTURED)
         name = real_place(path).name if group == TOP_GROUP else group
         scenes.append(SceneFiles(name, tuple(f for f in files if f.group == group), left_out))
     return scenes
 
 
 def read_scenes(scenes: Sequence[SceneFiles], layout: TargetLayout, workers: int | None = None) -> Iterator[SceneTags]:
-    """The tags of each scene. Every image is decoded once, while others are searched for tags beside it."""
+    """Yields the tags of each scene. Each image is decoded once, while other threads search earlier images for tags."""
     dictionaries = layout.dictionaries()
     with ThreadPoolExecutor(workers) as pool:
         for scene in scenes:
-            # Decoding stays in this thread: it listens to what the decoders write to standard error.
-            found = [_begin(file, dictionaries, pool) for file in scene.files]
-            yield SceneTags(scene.name, tuple(finish() for finish in found))
+            # Decoding stays in this thread, because it captures what the decoders write to standard error.
+            pending = [_begin(file, dictionaries, pool) for file in scene.files]
+            yield SceneTags(scene.name, tuple(finish() for finish in pending))
 
 
 def detect(image: np.ndarray, name: str, dictionaries: Sequence[str]) -> Exposure:
-    """The tags of a decoded image."""
+    """Finds the tags of a decoded image."""
     return Exposure(name, find_tags(image, dictionaries), (image.shape[1], image.shape[0]))
 
 
 def _begin(
     file: ImageFile, dictionaries: Sequence[str], pool: ThreadPoolExecutor
 ) -> Callable[[], Exposure | Unreadable]:
-    """Begin the search for tags; the result is waited for when it is called."""
+    """Starts the search for tags, and returns a function that waits for its result."""
     try:
         image = grey_8bit(decode(read_bytes(file.path, IMAGE_BYTES), file.name))
     except (InputError, OSError) as error:

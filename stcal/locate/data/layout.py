@@ -1,4 +1,4 @@
-"""The target: which tags it has, where their corners lie in {obj}, and how well that is known."""
+"""Layout of the target: its tags, their corners in {obj}, and the covariance of the corners."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ WHAT = "layout file"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LayoutPlan:
-    """A target as it is meant to be, for its calibration.
+    """Nominal target, for its calibration.
 
     Parameters
     ----------
     name : str
-        Of the target.
+        Name of the target.
     tags : tuple of (str, int)
-        n of them, dictionary and id.
+        Dictionary and id of the n tags.
     size_mm : (n,) array
-        Sides, NaN where not given.
+        Side lengths, NaN if not given.
     origin : int
-        Row of the tag in whose middle {obj} lies.
+        Row of the tag whose middle is the origin of {obj}.
     corners_mm : (n, 4, 2) array
-        In the plane of the target, NaN where a place is not given.
+        Nominal corners in the plane of the target, NaN if a place is not given.
     """
 
     name: str
@@ -41,25 +41,25 @@ class LayoutPlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetLayout:
-    """A target whose corners are known.
+    """Target with known corners.
 
     {obj} : origin in the middle of the tag in row ``origin``, X along its upper edge, Y down, Z into the target.
 
     Parameters
     ----------
     name : str
-        Of the target.
+        Name of the target.
     tags : tuple of (str, int)
-        n of them, dictionary and id; the ids differ.
+        Dictionary and id of the n tags; the ids differ.
     corners_mm : (n, 4, 2) array
-        Top left, top right, bottom right, bottom left as printed, in {obj}.
+        Top left, top right, bottom right, bottom left corner as printed, in {obj}.
     covariance_mm2 : (8n, 8n) array
-        Of all their coordinates, mm², tag by tag, corner by corner, x before y.
+        Covariance of all coordinates, mm², tag by tag, corner by corner, x before y.
     origin : int
         Row of the tag that holds the origin.
     sigma_px, tag_sigma_px : float
-        What print, lens and flatness add to the measured σ of a corner, for each by itself and for the four of a tag
-        together, as the calibration's residuals say.
+        σ due to print, lens and flatness, in addition to the measured σ of a corner: of each corner by itself, and of
+        the four corners of a tag together. Estimated from the residuals of the calibration.
     """
 
     name: str
@@ -76,20 +76,20 @@ class TargetLayout:
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (8 * n, 8 * n), "corners' covariance"))
 
     def dictionaries(self) -> tuple[str, ...]:
-        """Each once."""
+        """Returns each dictionary of the tags once."""
         return tuple(dict.fromkeys(dictionary for dictionary, _ in self.tags))
 
     def rows(self) -> dict[tuple[str, int], int]:
-        """Row of each tag."""
+        """Returns the row of each tag."""
         return {tag: row for row, tag in enumerate(self.tags)}
 
     def sigma_mm(self) -> np.ndarray:
-        """(n, 4, 2) of each coordinate."""
+        """Returns σ of each coordinate, (n, 4, 2) mm."""
         return np.sqrt(np.maximum(np.diag(self.covariance_mm2), 0)).reshape(-1, 4, 2)
 
 
 def load_plan(path: str | Path) -> LayoutPlan:
-    """Read a layout file whose tags may be without a place.
+    """Reads a layout file whose tags may lack a place.
 
     Parameters
     ----------
@@ -103,18 +103,18 @@ def load_plan(path: str | Path) -> LayoutPlan:
     Raises
     ------
     InputError
-        Unreadable, not as ``data_layout.md`` has it, or an id twice.
+        The file is unreadable, does not follow ``data_layout.md``, or repeats an id.
     """
     return _plan(load_toml(path, TagsFile, WHAT, REMEDY), f"{WHAT} {path}")
 
 
 def load_layout(path: str | Path) -> TargetLayout:
-    """Read a layout file: a calibrated one, or one whose tags have nominal places.
+    """Reads a layout file: a calibrated one, or one whose tags have nominal places.
 
     Parameters
     ----------
     path
-        As of :func:`load_plan`.
+        The TOML file.
 
     Returns
     -------
@@ -124,7 +124,7 @@ def load_layout(path: str | Path) -> TargetLayout:
     Raises
     ------
     InputError
-        As :func:`load_plan`, or a tag without a place.
+        See :func:`load_plan`; or a tag has no place.
     """
     where = f"{WHAT} {path}"
     data = load_toml(path, TagsFile, WHAT, REMEDY)
@@ -144,7 +144,7 @@ def load_layout(path: str | Path) -> TargetLayout:
 
 
 def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
-    """The file :func:`load_layout` reads."""
+    """Returns the text of a layout file for :func:`load_layout`."""
     lines = [f"# {comment}" for comment in comments]
     lines += ['type = "tags"', f"name = {toml_string(layout.name)}", f"origin = {layout.tags[layout.origin][1]}"]
     lines += [f"sigma_px = {layout.sigma_px:.6g}", f"tag_sigma_px = {layout.tag_sigma_px:.6g}"]
@@ -160,14 +160,14 @@ def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
 
 
 def square(size_mm: float) -> np.ndarray:
-    """Corners (4, 2) of a tag about its middle."""
+    """Returns the corners (4, 2) of a tag about its middle."""
     return size_mm / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
 
 
 def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Turn (2, 2) and shift (2,) into the frame in the middle of a tag with these corners (4, 2).
+    """Returns rotation (2, 2) and translation (2,) into the frame in the middle of a tag with ``corners`` (4, 2).
 
-    Least squares between them and a square, whose size does not matter.
+    The fit is a least-squares fit of a square to the corners; the size of the square does not matter.
     """
     nominal = square(1.0)
     middle = corners.mean(0)
@@ -180,11 +180,11 @@ def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _plan(data: TagsFile, where: str) -> LayoutPlan:
     ids = [tag.id for tag in data.tag]
-    twice = [i for i in ids if ids.count(i) > 1]
-    if twice:
+    repeated = [i for i in ids if ids.count(i) > 1]
+    if repeated:
         raise InputError(
             "E-TAG-REPEATED",
-            f"{where}: id {twice[0]} occurs {ids.count(twice[0])} times; ids must differ, in all families",
+            f"{where}: id {repeated[0]} occurs {ids.count(repeated[0])} times; ids must differ, in all families",
         )
     origin = ids[0] if data.origin is None else data.origin
     if origin not in ids:
@@ -211,10 +211,10 @@ def _in_obj(corners: np.ndarray, origin: int) -> np.ndarray:
 
 
 def _without_rounding(covariance: np.ndarray) -> np.ndarray:
-    """The same without the negative eigenvalues that rounding makes of zeros."""
+    """Returns the covariance without the negative eigenvalues that rounding makes of zeros."""
     value, vector = np.linalg.eigh(covariance)
     return (vector * np.maximum(value, 0)) @ vector.T
 
 
 def _finite(matrix: np.ndarray) -> np.ndarray:
-    return matrix + 0.0  # no minus before zero
+    return matrix + 0.0  # turns -0.0 into 0.0

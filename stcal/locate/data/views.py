@@ -1,4 +1,4 @@
-"""Board and tags in the photographs of a calibration, whatever found them."""
+"""Board and tags in the photographs of a target's calibration."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,11 @@ from stcal.geometry.rigid import Rigid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationImages:
-    """``names`` of m readable images of one size, ``views`` of the board in them, None where it is not seen, ``tags``;
-    ``camera``; ``symmetries`` : turns after which the board looks the same; ``left_out`` : files not used, and why."""
+    """Images of a target's calibration.
+
+    ``names`` : names of m readable images of one size; ``views`` : views of the board in them, None if it is not seen;
+    ``symmetries`` : rotations that map the board onto itself; ``left_out`` : files that are not used, and why.
+    """
 
     names: tuple[str, ...]
     views: tuple[BoardView | None, ...]

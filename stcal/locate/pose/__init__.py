@@ -1,1 +1,1 @@
-"""The pose of a target in one scene, and whether it may be trusted."""
+"""Pose of a target in one scene, and whether it may be trusted."""

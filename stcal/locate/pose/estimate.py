@@ -1,6 +1,6 @@
-"""camera_from_obj from the corners of one scene, with covariance, and with the second solution that a plane may leave.
+"""Pose camera_from_obj from the corners of one scene, with covariance, and the second pose that a plane may allow.
 
-Both are found (:mod:`stcal.geometry.plane_poses`) and refined, and compared by their χ².
+Both poses are computed (:mod:`stcal.geometry.plane_poses`) and refined, and compared by χ².
 """
 
 from dataclasses import dataclass, replace
@@ -31,23 +31,23 @@ from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pose.problem import PlanarProblem, descent_near, project, weighed
 
 START_PX = 2.0
-"""Scale of the loss by which a start is chosen: one tag's own pose is off so much at the other tags."""
+"""Scale of the loss that selects a start, in px: typical error of one tag's pose at the other tags."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenTags:
-    """Tags of a layout in one scene.
+    """Corners of a layout's tags in one scene.
 
     Parameters
     ----------
     rows : (k,) int array
-        Of the layout.
+        Rows of the tags in the layout.
     corners_px : (k, 4, 2) array
-        In the image as it is.
+        Corners in the image, with distortion.
     covariance_px2 : (k, 4, 2, 2) array
-        Of the corners, what the layout adds to single ones included.
+        Covariances of the corners, including the layout's additional σ of single corners.
     edge_sigma_px : (k,) array
-        σ of a shift that all edges of a tag share.
+        σ of the common shift of all edges of a tag.
     """
 
     rows: np.ndarray
@@ -66,38 +66,38 @@ class SeenTags:
         return len(self.rows)
 
     def select(self, keep) -> "SeenTags":
-        """Those tags only."""
+        """Returns the selected tags."""
         return SeenTags(self.rows[keep], self.corners_px[keep], self.covariance_px2[keep], self.edge_sigma_px[keep])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjPose(ImageFit):
-    """Where the target is in one scene.
+    """Pose of the target in one scene.
 
     Parameters
     ----------
     camera_from_obj : Rigid
-        mm.
+        The pose, mm.
     covariance : (6, 6) array
-        rad and mm, left perturbation in the camera frame.
+        Covariance, rad and mm, left perturbation in the camera frame.
     rows : (k,) int array
-        Of the layout's tags used.
+        Rows of the tags used in the layout.
     outliers : tuple of int
-        Rows of those left out because they contradict the others.
+        Rows of the tags that were left out because they contradict the others.
     residuals_px : (4k, 2) array
         Measured minus projected corners.
     weights : (4k,) array
-        Huber's.
+        Huber's weights.
     chi2 : float
-        Of the residuals against their whole covariance.
+        χ² of the residuals with their full covariance.
     redundancy : int
-        Coordinates measured, less the six of the pose.
+        Number of measured coordinates minus the six unknowns of the pose.
     foreshortening : float
         Cosine between the target's normal and the line of sight to the middle of its corners.
     extent_px : float
-        Of the corners in the image across their longer direction.
+        Extent of the corners in the image across their longer direction.
     delta_chi2 : float
-        By which the second solution is worse; infinite where there is none.
+        χ² of the second solution minus that of the pose; infinite if there is no second solution.
     second : Rigid or None
         The second solution, camera_from_obj.
     """
@@ -116,21 +116,22 @@ class ObjPose(ImageFit):
     second: Rigid | None = None
 
     def sigma_rad(self) -> float:
-        """Of the rotation, about the worst axis."""
+        """Returns σ of the rotation about the worst axis."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
     def sigma_mm(self) -> float:
-        """Of the translation, along the worst direction."""
+        """Returns σ of the translation along the worst direction."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
 
 
 def locate(
     seen: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None = None, where: str = "scene"
 ) -> ObjPose:
-    """The target's pose from the corners of its tags in one scene: camera_from_obj.
+    """Estimates the target's pose camera_from_obj from the corners of its tags in one scene.
 
-    The first step minimises the corners' residuals with Huber's loss, from the best of all poses that single tags and
-    all of them together leave, and from its mirror image. The second weighs them by their whole covariance.
+    The first step minimises the corners' residuals with Huber's loss. It starts from the best pose of all tags together
+    or of a single tag, and from the mirror image of this pose. The second step weighs the residuals by their full
+    covariance.
 
     Parameters
     ----------
@@ -139,21 +140,21 @@ def locate(
     layout : TargetLayout
         The target, with the covariance of its corners.
     camera : Camera
-        At the size of the image.
+        The camera at the size of the image.
     prior : CameraPrior, optional
-        Covariance of the intrinsics, which are exact where None.
+        Covariance of the intrinsics; they are exact if None.
     where : str
         Name of the scene, for messages.
 
     Returns
     -------
     ObjPose
-        The better of the minima, with the second solution where there is one.
+        The better minimum, with the second solution if there is one.
 
     Raises
     ------
     DegenerateError
-        No tag, tags that contradict one another, or corners that leave the rotation open.
+        There is no tag, the tags contradict one another, or the corners do not determine the rotation.
     ConvergenceError
         No minimum is reached.
     """
@@ -161,13 +162,13 @@ def locate(
         raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
     problem = problem_of(seen, layout, camera, prior)
     start = PoseStack.of(_start(problem, where))
-    keep, outliers, whole = np.arange(len(seen)), [], problem
+    keep, outliers, all_corners = np.arange(len(seen)), [], problem
     failure = f"{where}: no pose found; check layout and camera file"
     while True:
         middle = Rigid(np.eye(3), np.append(problem.xy.mean(0), 0.0))
-        both = two_minima(partial(descent_near, problem), start, middle, failure)
-        found = both.minima
-        excess = found.length[0].reshape(-1, 4).max(1) / both.outlier_limit
+        two = two_minima(partial(descent_near, problem), start, middle, failure)
+        minima = two.minima
+        excess = minima.length[0].reshape(-1, 4).max(1) / two.outlier_limit
         worst = int(excess.argmax())
         if excess[worst] <= 1:
             break
@@ -180,9 +181,9 @@ def locate(
                 f"{where}: {len(outliers)} of {len(seen)} tags contradict the others ({names}); check that layout and "
                 "camera file belong to the images",
             )
-        problem = whole.select((4 * keep[:, None] + np.arange(4)).ravel())
-        start = found.poses[[0]]
-    pose = _answer(problem, found, seen.rows[keep], tuple(outliers))
+        problem = all_corners.select((4 * keep[:, None] + np.arange(4)).ravel())
+        start = minima.poses[[0]]
+    pose = _answer(problem, minima, seen.rows[keep], tuple(outliers))
     if pose.sigma_rad() > MAX_SIGMA_RAD:
         raise DegenerateError(
             "E-LOCATE-OPEN", f"{where}: its tags leave the rotation open; show more tags, or larger ones"
@@ -191,51 +192,53 @@ def locate(
 
 
 def problem_of(seen: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None = None) -> PlanarProblem:
-    """The corners with everything that is known of them."""
+    """Returns the corners with their full noise model."""
     rows = (8 * seen.rows[:, None] + np.arange(8)).ravel()
     pixels = seen.corners_px.reshape(-1, 2)
     ideal = camera.normalised_from_pixel(pixels)
     px_by_seen = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
-    back = np.linalg.inv(px_by_seen)
-    common = np.concatenate([_by_edges(seen, back), _by_tag(len(seen), back)], axis=2)
-    known = np.diag(np.append(seen.edge_sigma_px**2, np.full(2 * len(seen), layout.tag_sigma_px**2)))
+    seen_by_px = np.linalg.inv(px_by_seen)
+    common = np.concatenate([_by_edges(seen, seen_by_px), _by_tag(len(seen), seen_by_px)], axis=2)
+    common_covariance = np.diag(np.append(seen.edge_sigma_px**2, np.full(2 * len(seen), layout.tag_sigma_px**2)))
     if prior is not None:
-        by_camera = back @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
+        by_camera = seen_by_px @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
         common = np.concatenate([common, by_camera], axis=2)
-        known = np.asarray(block_diag(known, prior.covariance))
-    noise = back @ seen.covariance_px2.reshape(-1, 2, 2) @ np.swapaxes(back, 1, 2)
+        common_covariance = np.asarray(block_diag(common_covariance, prior.covariance))
+    noise = seen_by_px @ seen.covariance_px2.reshape(-1, 2, 2) @ np.swapaxes(seen_by_px, 1, 2)
     xy = layout.corners_mm[seen.rows].reshape(-1, 2)
-    return PlanarProblem(xy, ideal, noise, px_by_seen, layout.covariance_mm2[np.ix_(rows, rows)], common, known)
+    return PlanarProblem(
+        xy, ideal, noise, px_by_seen, layout.covariance_mm2[np.ix_(rows, rows)], common, common_covariance
+    )
 
 
 def _by_edges(seen: SeenTags, back: np.ndarray) -> np.ndarray:
-    """Derivative (4k, 2, k) of the corners by the shift of each tag's edges, px."""
+    """Returns the derivative (4k, 2, k) of the corners by the shift of each tag's edges, px."""
     k = len(seen)
-    by = np.zeros((k, 4, 2, k))
-    by[np.arange(k), :, :, np.arange(k)] = corners_by_edges(seen.corners_px)
-    return back @ by.reshape(4 * k, 2, k)
+    jacobian = np.zeros((k, 4, 2, k))
+    jacobian[np.arange(k), :, :, np.arange(k)] = corners_by_edges(seen.corners_px)
+    return back @ jacobian.reshape(4 * k, 2, k)
 
 
 def _by_tag(k: int, back: np.ndarray) -> np.ndarray:
-    """Derivative (4k, 2, 2k) of the corners by the shift of each tag as a whole, px."""
-    by = np.zeros((k, 4, 2, k, 2))
-    by[np.arange(k), :, :, np.arange(k)] = np.eye(2)
-    return back @ by.reshape(4 * k, 2, 2 * k)
+    """Returns the derivative (4k, 2, 2k) of the corners by the shift of each whole tag, px."""
+    jacobian = np.zeros((k, 4, 2, k, 2))
+    jacobian[np.arange(k), :, :, np.arange(k)] = np.eye(2)
+    return back @ jacobian.reshape(4 * k, 2, 2 * k)
 
 
 def _start(problem: PlanarProblem, where: str) -> Rigid:
-    """Of the poses of all corners together and of each tag alone, the one that fits most corners."""
+    """Returns the pose that fits most corners, among those from all corners together and from each tag alone."""
     tags = [slice(4 * k, 4 * k + 4) for k in range(len(problem.xy) // 4)]
     for sets in ([slice(None)], tags):
         poses = _poses(problem, sets)
         if poses is None:
             continue
         view = project(problem, poses)
-        off = np.linalg.norm((problem.px_by_seen @ view.residual[..., None])[..., 0], axis=2)
-        score = np.where(view.before, np.log1p((off / START_PX) ** 2).sum(1), np.inf)
+        distance = np.linalg.norm((problem.px_by_seen @ view.residual[..., None])[..., 0], axis=2)
+        score = np.where(view.before, np.log1p((distance / START_PX) ** 2).sum(1), np.inf)
         best = int(score.argmin())
-        # Where all corners agree, none is wrong, and single tags have nothing to add.
-        if np.isfinite(score[best]) and (sets is tags or len(tags) == 1 or off[best].max() < 2 * START_PX):
+        # If all corners agree with one pose, none is wrong, and poses of single tags are not needed.
+        if np.isfinite(score[best]) and (sets is tags or len(tags) == 1 or distance[best].max() < 2 * START_PX):
             return poses[best]
     raise DegenerateError(
         "E-LOCATE-NO-POSE", f"{where}: no pose shows the tags' corners so; check layout, camera file and tags"
@@ -243,35 +246,35 @@ def _start(problem: PlanarProblem, where: str) -> Rigid:
 
 
 def _poses(problem: PlanarProblem, sets: list[slice]) -> Poses | None:
-    """Both poses of each set of corners."""
-    found = []
-    for part in sets:
+    """Returns both poses of each set of corners, or None if no set gives a pose."""
+    poses = []
+    for corners in sets:
         try:
-            found += poses_of_plane(problem.xy[part], problem.seen[part]).poses
+            poses += poses_of_plane(problem.xy[corners], problem.seen[corners]).poses
         except DegenerateError:
             continue
-    return Poses.of(found) if found else None
+    return Poses.of(poses) if poses else None
 
 
 def _answer(problem: PlanarProblem, found: Minima, rows: np.ndarray, outliers: tuple[int, ...]) -> ObjPose:
-    """Decide between the minima, and collect."""
-    own = weights_of(found.length)
-    if len(own) == 1:
-        return _collected(problem, weighed(problem, found.poses, own[0]), own[0], rows, outliers)
-    # Both minima weigh the corners alike, as the stricter of the two does, or an outlier of one of them could decide.
-    pair = [weighed(problem, found.poses[[i]], own.min(0)) for i in range(2)]
+    """Chooses the better minimum, and returns it with the other one as the second solution."""
+    weights = weights_of(found.length)
+    if len(weights) == 1:
+        return _collected(problem, weighed(problem, found.poses, weights[0]), weights[0], rows, outliers)
+    # Both minima use the same weights, the smaller of the two. Otherwise an outlier of one minimum could decide.
+    pair = [weighed(problem, found.poses[[i]], weights.min(0)) for i in range(2)]
     delta = float(pair[1].chi2[0] - pair[0].chi2[0])
     better = int(delta < 0)
-    best = weighed(problem, found.poses[[better]], own[better])
-    pose = _collected(problem, best, own[better], rows, outliers)
+    best = weighed(problem, found.poses[[better]], weights[better])
+    pose = _collected(problem, best, weights[better], rows, outliers)
     return replace(pose, delta_chi2=abs(delta), second=pair[1 - better].poses.rigid(0))
 
 
 def _collected(problem: PlanarProblem, best: Weighed, weights: np.ndarray, rows, outliers: tuple[int, ...]) -> ObjPose:
-    """One minimum, as if there were no second one."""
+    """Returns the pose of one minimum, without a second solution."""
     pose = best.poses.rigid(0)
     middle = pose @ np.append(problem.xy.mean(0), 0.0)
-    off = problem.in_px(problem.seen - problem.seen.mean(0))
+    offset = problem.in_px(problem.seen - problem.seen.mean(0))
     covariance = np.linalg.inv(best.normal[0])
     return ObjPose(
         camera_from_obj=pose,
@@ -283,13 +286,13 @@ def _collected(problem: PlanarProblem, best: Weighed, weights: np.ndarray, rows,
         chi2=float(best.chi2[0]),
         redundancy=2 * len(problem.xy) - 6,
         foreshortening=float(pose.rotation[:, 2] @ middle / np.linalg.norm(middle)),
-        extent_px=float(np.ptp(off @ np.linalg.svd(off, full_matrices=False)[2][1])),
+        extent_px=float(np.ptp(offset @ np.linalg.svd(offset, full_matrices=False)[2][1])),
     )
 
 
 def covering_both(pose: ObjPose) -> ObjPose:
-    """The pose with a covariance that covers its second solution too, by the odds of both."""
+    """Returns the pose with a covariance that also covers its second solution, weighted by the odds of both."""
     if pose.second is None:
         return pose
-    away = step_between(PoseStack.of(pose.camera_from_obj), PoseStack.of(pose.second))
-    return replace(pose, covariance=covariance_of_both(pose.covariance, away, pose.delta_chi2))
+    step = step_between(PoseStack.of(pose.camera_from_obj), PoseStack.of(pose.second))
+    return replace(pose, covariance=covariance_of_both(pose.covariance, step, pose.delta_chi2))

@@ -1,5 +1,7 @@
-"""The published way, step by step as written, to compare with: CN patent "monocular visual target positioning",
-Anhui Yuanguji, steps S5 to S9. Every step is a function that can be replaced."""
+"""The method of the CN patent "monocular visual target positioning" (Anhui Yuanguji), steps S5 to S9, for comparison.
+
+The steps follow the text of the patent. Every step is a function that can be replaced.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,25 +22,25 @@ ASSUMED = (
     "errors are RMS over the corners; exposures form a geometric series; S_dis, J_lim, E_lim and E_ratio as given"
 )
 SAME_RAD, SAME_SHARE = 1e-3, 1e-3
-"""T_a and T_b are the same pose when they differ by less: turned, and shifted in shares of the distance."""
+"""T_a and T_b are the same pose if they differ by less: in rotation, and in translation as a share of the distance."""
 TINY_PX = 1e-9
-"""Error of a pose that fits exactly, for the ratio."""
+"""Error that stands for an exact fit in the ratio of errors, in px."""
 
 
 @dataclass(frozen=True, slots=True)
 class PatentOptions:
-    """The patent's thresholds, which it names and gives no values for.
+    """Thresholds of the patent, which names them but gives no values.
 
     Parameters
     ----------
     area_share : float
-        S_dis, of the largest area that an exposure's tags span.
+        S_dis, least area that an exposure's tags span, as a share of the largest area.
     min_det_j : float
-        J_lim, 1/mm²; a target of any size seen straight from 10 m has 10⁻⁸.
+        J_lim, 1/mm². A target of any size that is seen frontally from 10 m has 10⁻⁸.
     max_error_px : float
-        E_lim, RMS.
+        E_lim, largest RMS error.
     min_error_ratio : float
-        E_ratio, of the second solution's error to the first's.
+        E_ratio, least ratio of the second solution's error to the first's.
     """
 
     area_share: float = 0.8
@@ -57,22 +59,22 @@ class PatentOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatentExposure:
-    """How one exposure fared.
+    """Result of one exposure.
 
     Parameters
     ----------
     exposure : int
-        Its index.
+        Index of the exposure.
     tags : int
-        Of the layout, seen in it.
+        Number of the layout's tags in it.
     area_px2 : float or None
-        That their triangles span; None where others show more tags.
+        Area that the triangles of the tags span; None if other exposures show more tags.
     candidate : bool
-        Whether it was among those whose poses were compared.
+        Whether its poses were compared with those of other exposures.
     poses : (Rigid, Rigid) or None
-        T_a and T_b, the one of the smaller error first; None where it is no candidate, or has none.
+        T_a and T_b, the one with the smaller error first; None if it is no candidate, or has no pose.
     errors_px : (float, float) or None
-        RMS of both.
+        RMS errors of both poses.
     det_j : float or None
         Determinant of the homography's derivative at the normalised centre, 1/mm².
     """
@@ -88,30 +90,30 @@ class PatentExposure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PatentPose:
-    """What the patent's method says of a scene.
+    """Result of the patent's method for one scene.
 
     Parameters
     ----------
     exposure : int
-        Index of the one that was kept.
+        Index of the exposure that was chosen.
     candidates : tuple of int
-        Those it was chosen from.
+        Indices of the exposures whose poses were compared.
     camera_from_obj : Rigid
         The better pose.
     second : Rigid
         The second solution.
     errors_px : (float, float)
-        RMS of both there, the smaller first.
+        RMS errors of both poses in the chosen exposure, the smaller first.
     det_j : float
         Determinant of the homography's derivative at the normalised centre, 1/mm².
     tags : int
         Number of tags used.
     verdict : Verdict
-        Of the patent's gate.
+        Verdict of the patent's gate.
     exposures : tuple of PatentExposure
-        How each fared, in their order.
+        Results of all exposures, in their order.
     same : bool
-        Whether both poses are one.
+        Whether both poses are the same.
     """
 
     exposure: int
@@ -127,19 +129,19 @@ class PatentPose:
 
 
 def most_tags(corners: Sequence[np.ndarray]) -> list[int]:
-    """S5: indices of the exposures with the most tags; ``corners`` : (k, 4, 2) px of each."""
+    """Returns the indices of the exposures with the most tags (S5); ``corners`` : (k, 4, 2) px of each exposure."""
     most = max(len(each) for each in corners)
     return [i for i, each in enumerate(corners) if len(each) == most]
 
 
 def largest_area(corners: Sequence[np.ndarray], chosen: Sequence[int], share: float) -> list[int]:
-    """S5: of the chosen exposures those whose tags span more than ``share`` of the largest area."""
+    """Returns the chosen exposures whose tags span more than ``share`` of the largest area (S5)."""
     area = {i: triangulated_area(corners[i].reshape(-1, 2)) for i in chosen}
     return [i for i in chosen if area[i] > share * max(area.values())]
 
 
 def triangulated_area(points: np.ndarray) -> float:
-    """Sum of the Delaunay triangles' areas by Heron's formula, px²; 0 for points on a line."""
+    """Returns the sum of the Delaunay triangles' areas by Heron's formula, px²; 0 for collinear points."""
     try:
         triangles = points[Delaunay(points).simplices]
     except QhullError:
@@ -150,18 +152,18 @@ def triangulated_area(points: np.ndarray) -> float:
 
 
 def reprojection_rms(pose: Rigid, xy_obj: np.ndarray, pixels: np.ndarray, camera: Camera) -> float:
-    """S7: RMS distance of the projected corners from the measured ones, px."""
-    at = pose @ np.column_stack([xy_obj, np.zeros(len(xy_obj))])
-    if (at[:, 2] <= 0).any():
+    """Returns the RMS distance of the projected corners from the measured ones, px (S7)."""
+    xyz = pose @ np.column_stack([xy_obj, np.zeros(len(xy_obj))])
+    if (xyz[:, 2] <= 0).any():
         return np.inf
-    return float(np.sqrt(((camera.project(at) - pixels) ** 2).sum(1).mean()))
+    return float(np.sqrt(((camera.project(xyz) - pixels) ** 2).sum(1).mean()))
 
 
 def same_pose(a: Rigid, b: Rigid) -> bool:
-    """S8: whether T_a and T_b are equivalent."""
-    away = a @ b.inverse()
+    """True if T_a and T_b are equivalent (S8)."""
+    difference = a @ b.inverse()
     shift = np.linalg.norm(a.translation - b.translation)
-    return away.angle_rad() < SAME_RAD and bool(shift < SAME_SHARE * np.linalg.norm(a.translation))
+    return difference.angle_rad() < SAME_RAD and bool(shift < SAME_SHARE * np.linalg.norm(a.translation))
 
 
 def locate_as_patent(
@@ -172,38 +174,38 @@ def locate_as_patent(
     where: str = "scene",
     solve: Callable[[np.ndarray, np.ndarray], PlanePoses] = poses_of_plane,
 ) -> PatentPose:
-    """S5 to S9: the exposure whose IPPE pose has the smallest reprojection error, and the gate.
+    """Finds the exposure whose IPPE pose has the smallest reprojection error, and applies the gate (S5 to S9).
 
     Raises
     ------
     DegenerateError
-        No exposure shows a tag, or none a pose.
+        No exposure shows a tag, or no exposure gives a pose.
     """
     options = options or PatentOptions()
     rows = layout.rows()
-    known = [[k for k, tag in enumerate(tags.tags) if tag in rows] for tags in exposures]
-    corners = [tags.corners_px[own] for tags, own in zip(exposures, known, strict=True)]
-    if not any(known):
+    listed = [[k for k, tag in enumerate(tags.tags) if tag in rows] for tags in exposures]
+    corners = [tags.corners_px[own] for tags, own in zip(exposures, listed, strict=True)]
+    if not any(listed):
         raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
     most = most_tags(corners)
     chosen = largest_area(corners, most, options.area_share)
-    fared = {i: PatentExposure(i, len(own)) for i, own in enumerate(known)}
+    results = {i: PatentExposure(i, len(own)) for i, own in enumerate(listed)}
     for i in most:
-        fared[i] = replace(fared[i], area_px2=triangulated_area(corners[i].reshape(-1, 2)), candidate=i in chosen)
+        results[i] = replace(results[i], area_px2=triangulated_area(corners[i].reshape(-1, 2)), candidate=i in chosen)
     for i in chosen:
-        xy = layout.corners_mm[[rows[exposures[i].tags[k]] for k in known[i]]].reshape(-1, 2)
+        xy = layout.corners_mm[[rows[exposures[i].tags[k]] for k in listed[i]]].reshape(-1, 2)
         pixels = corners[i].reshape(-1, 2)
         try:
-            found = solve(xy, camera.normalised_from_pixel(pixels))
+            plane_poses = solve(xy, camera.normalised_from_pixel(pixels))
         except DegenerateError:
             continue
         (low, first), (high, second) = sorted(
-            ((reprojection_rms(pose, xy, pixels, camera), pose) for pose in found.poses), key=lambda each: each[0]
+            ((reprojection_rms(pose, xy, pixels, camera), pose) for pose in plane_poses.poses), key=lambda each: each[0]
         )
-        fared[i] = replace(fared[i], poses=(first, second), errors_px=(low, high), det_j=found.determinant)
+        results[i] = replace(results[i], poses=(first, second), errors_px=(low, high), det_j=plane_poses.determinant)
     solved = [
         (each.errors_px, each.poses, each.det_j, i)
-        for i, each in fared.items()
+        for i, each in results.items()
         if each.errors_px is not None and each.poses is not None and each.det_j is not None
     ]
     if not solved:
@@ -220,15 +222,15 @@ def locate_as_patent(
         second=second,
         errors_px=errors,
         det_j=det_j,
-        tags=len(known[i]),
+        tags=len(listed[i]),
         verdict=verdict,
-        exposures=tuple(fared.values()),
+        exposures=tuple(results.values()),
         same=same,
     )
 
 
 def gate(det_j: float, error_px: float, error_ratio: float, same: bool, options: PatentOptions) -> Verdict:
-    """S9: reject unless det J, the error, and (for two different poses) the ratio of the errors keep their limits."""
+    """Accepts if det J, the error, and (for two different poses) the ratio of the errors keep their limits (S9)."""
     checks = [
         PoseCheck("det J", det_j, at_least=options.min_det_j, unit="/mm²"),
         PoseCheck("error", error_px, at_most=options.max_error_px, unit=" px"),

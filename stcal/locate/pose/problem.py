@@ -1,4 +1,4 @@
-"""What corners of a planar target say of its pose, and the descent to the poses that fit them best, several at once."""
+"""Residuals of a planar target's corners, and the descent to the poses that fit them best, several poses at once."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -12,20 +12,20 @@ from stcal.geometry.pose_descent import Minima, Normal, PoseStack, block_diagona
 from stcal.geometry.rigid import Poses, skew
 
 SETTLED = 1e-5
-"""A step that lowers χ² by less moves the pose by less than a hundredth of its σ."""
+"""Decrease of χ² at which the descent ends. A step that lowers χ² by less moves the pose by less than σ/100."""
 WEIGH_STEPS, WEIGHED = 60, 1e-6
-"""A step of under a thousandth of σ is the last. What many corners share, the intrinsics say, can move a pose by many
-σ of its single corners."""
+"""Largest number of steps, and the least decrease of χ²: a step of less than σ/1000 is the last. Errors that many
+corners share, such as those of the intrinsics, can move a pose by many σ due to single corners."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanarProblem:
-    """n corners of a plane, what was measured of them, and what is known of everything else; the lens taken out.
+    """Measurements of n corners of a plane with their noise model, in normalised coordinates without distortion.
 
-    ``xy`` : (n, 2) mm in {obj}; ``seen`` : (n, 2) normalised coordinates; ``noise`` : (n, 2, 2) their covariance;
-    ``px_by_seen`` : (n, 2, 2) jacobian of the lens; ``shape`` : (2n, 2n) mm² covariance of ``xy``; ``common`` :
-    (n, 2, q) derivative of ``seen`` by what several corners share, the edges of each tag and the intrinsics, where
-    these are not held, and ``prior`` : (q, q) its covariance.
+    ``xy`` : (n, 2) corners in {obj}, mm; ``seen`` : (n, 2) their normalised coordinates; ``noise`` : (n, 2, 2)
+    covariance of ``seen``; ``px_by_seen`` : (n, 2, 2) jacobian of the lens; ``shape`` : (2n, 2n) covariance of ``xy``,
+    mm²; ``common`` : (n, 2, q) derivative of ``seen`` by parameters that several corners share: shifts of each tag's
+    edges and of each tag, and the intrinsics if they are not exact; ``prior`` : (q, q) covariance of these parameters.
     """
 
     xy: np.ndarray
@@ -37,20 +37,23 @@ class PlanarProblem:
     prior: np.ndarray
 
     def select(self, keep: np.ndarray) -> "PlanarProblem":
-        """Those corners only."""
+        """Returns the selected corners."""
         rows = (2 * keep[:, None] + np.arange(2)).ravel()
-        own = (self.xy[keep], self.seen[keep], self.noise[keep], self.px_by_seen[keep])
-        return PlanarProblem(*own, self.shape[np.ix_(rows, rows)], self.common[keep], self.prior)
+        points = (self.xy[keep], self.seen[keep], self.noise[keep], self.px_by_seen[keep])
+        return PlanarProblem(*points, self.shape[np.ix_(rows, rows)], self.common[keep], self.prior)
 
     def in_px(self, residual: np.ndarray) -> np.ndarray:
-        """Residuals (n, 2) in the image as it is, px."""
+        """Returns the residuals (n, 2) in the image with distortion, px."""
         return (self.px_by_seen @ residual[..., None])[..., 0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectedCorners:
-    """h poses and what they show: ``residual`` (h, n, 2) measured minus projected; its negative derivatives ``by_pose``
-    (h, n, 2, 6) and ``by_corner`` (h, n, 2, 2); ``before`` : (h,) whether all corners lie before the camera."""
+    """Residuals of h poses.
+
+    ``residual`` : (h, n, 2) measured minus projected; ``by_pose`` : (h, n, 2, 6) and ``by_corner`` : (h, n, 2, 2) its
+    negative derivatives; ``before`` : (h,) whether all corners are in front of the camera.
+    """
 
     poses: Poses | PoseStack
     residual: np.ndarray
@@ -60,13 +63,13 @@ class ProjectedCorners:
 
 
 def project(problem: PlanarProblem, poses: Poses | PoseStack) -> ProjectedCorners:
-    """Residuals of h poses, and their derivatives."""
+    """Returns the residuals of h poses, and their derivatives."""
     turned = np.einsum("hij,nj->hni", poses.rotation[:, :, :2], problem.xy)
-    at = turned + poses.translation[:, None]
-    depth = at[..., 2]
+    xyz = turned + poses.translation[:, None]
+    depth = xyz[..., 2]
     before = (depth > 0).all(1)
     depth = np.where(np.abs(depth) > 1e-9, depth, 1e-9)
-    uv = at[..., :2] / depth[..., None]
+    uv = xyz[..., :2] / depth[..., None]
     by_point = np.zeros((*uv.shape, 3))
     by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth
     by_point[..., 2] = -uv / depth[..., None]
@@ -75,17 +78,17 @@ def project(problem: PlanarProblem, poses: Poses | PoseStack) -> ProjectedCorner
 
 
 def descent_near(problem: PlanarProblem, pose: PoseStack) -> Descend:
-    """The descent with each corner's residual, near a pose, one of σ 1: noise, what corners share, and the layout's."""
+    """Returns the descent with residuals of single corners whitened near a pose by noise, shared and layout errors."""
     by_corner = project(problem, pose).by_corner[0]
     n = len(problem.xy)
-    own = problem.shape.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
+    shape_of_corner = problem.shape.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
     shared = problem.common @ problem.prior @ np.swapaxes(problem.common, 1, 2)
-    full = problem.noise + shared + by_corner @ own @ np.swapaxes(by_corner, 1, 2)
+    full = problem.noise + shared + by_corner @ shape_of_corner @ np.swapaxes(by_corner, 1, 2)
     return partial(_descend, problem, np.linalg.inv(np.linalg.cholesky(full)))
 
 
 def _descend(problem: PlanarProblem, whiten: np.ndarray, poses: PoseStack, huber: float) -> Minima:
-    """The minima next to h poses, Huber's loss on the residuals whitened by (n, 2, 2)."""
+    """Returns the minima next to h poses, with Huber's loss on residuals that are whitened by ``whiten`` (n, 2, 2)."""
 
     def evaluate(poses: PoseStack) -> Normal:
         view = project(problem, poses)
@@ -95,8 +98,11 @@ def _descend(problem: PlanarProblem, whiten: np.ndarray, poses: PoseStack, huber
 
 
 def weighed(problem: PlanarProblem, pose: PoseStack, weights: np.ndarray) -> Weighed:
-    """A pose by the whole covariance of its corners: the image's noise (over Huber's ``weights`` (n,)), what corners
-    share, and the layout's covariance add up."""
+    """Estimates a pose with the full covariance of its corners.
+
+    The covariance is the sum of image noise (divided by Huber's ``weights`` (n,)), shared errors, and the layout's
+    covariance.
+    """
     noise = block_diagonal(problem.noise / weights[:, None, None])
     common = problem.common.reshape(2 * len(problem.xy), -1)
     noise += common @ problem.prior @ common.T
@@ -107,13 +113,13 @@ def weighed(problem: PlanarProblem, pose: PoseStack, weights: np.ndarray) -> Wei
         view = project(problem, poses)
         r, a = view.residual.reshape(1, -1, 1), view.by_pose.reshape(1, -1, 6)
         solved = np.linalg.solve(full, np.concatenate([a, r], axis=2))
-        back = np.swapaxes(a, 1, 2) @ solved
+        weighted = np.swapaxes(a, 1, 2) @ solved
         cost = (np.swapaxes(r, 1, 2) @ solved[..., 6:])[:, 0, 0]
-        return NormalEquations(np.where(view.before, cost, np.inf), back[..., :6], -back[..., 6])
+        return NormalEquations(np.where(view.before, cost, np.inf), weighted[..., :6], -weighted[..., 6])
 
-    # A second solution that is far worse may end anywhere near: what it says is that the first one is better.
-    found = minimise(
+    # A second solution that is far worse need not converge: it only shows that the first one is better.
+    minimum = minimise(
         pose, linearise, PoseStack.moved, select=select_rows, damping=1e-6, least_gain=WEIGHED, max_steps=WEIGH_STEPS
     ).state
-    view = project(problem, found)
-    return weigh(view.residual, view.by_pose, full, found)
+    view = project(problem, minimum)
+    return weigh(view.residual, view.by_pose, full, minimum)

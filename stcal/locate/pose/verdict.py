@@ -1,4 +1,4 @@
-"""Whether a pose may be trusted: each value beside its limit, and accept, ambiguous or reject."""
+"""Verdict on a pose: each value beside its limit, and accept, ambiguous or reject."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -16,26 +16,27 @@ Decision = Literal["accept", "ambiguous", "reject"]
 
 @dataclass(frozen=True, slots=True)
 class VerdictOptions:
-    """The limits.
+    """Limits of the verdict.
 
     Parameters
     ----------
     min_tags : int
-        Tags used.
+        Least number of tags used.
     min_spread_px : float
-        The corners' extent across their longer direction.
+        Least extent of the corners across their longer direction.
     min_foreshortening : float
-        Cosine between the target's normal and the line of sight, which is det J of a target of any size and distance.
+        Least cosine between the target's normal and the line of sight. It replaces det J for a target of any size
+        and distance.
     max_p : float
-        Odds of residuals as large as a pose is rejected for.
+        Significance level: a pose is rejected if its residuals are so large that chance makes them more rarely.
     flip_odds : float
-        At most these odds of the second solution, for Gaussian errors.
+        Largest odds of the second solution, for Gaussian errors.
     sigma_margin : float
-        By which all σ may be too small without that becoming untrue.
+        Factor by which all σ may be too small while ``flip_odds`` still holds.
     equal_deg : float
-        Two solutions nearer than this are one, and its covariance covers both.
+        Two solutions nearer than this count as one, whose covariance covers both.
     max_sigma_deg, max_sigma_mm : float
-        Of rotation and position in their worst direction; no limit where None.
+        Largest σ of rotation and position in their worst direction; no limit if None.
     """
 
     min_tags: int = 1
@@ -64,7 +65,7 @@ class VerdictOptions:
 
 @dataclass(frozen=True, slots=True)
 class PoseCheck:
-    """One value beside its limit: ``value`` must be ``at_least`` or ``at_most`` what stands there."""
+    """One value and its limit: ``value`` must not be less than ``at_least``, or not greater than ``at_most``."""
 
     name: str
     value: float
@@ -74,28 +75,28 @@ class PoseCheck:
 
     @property
     def passed(self) -> bool:
-        """Whether it is; a value that is no number is not."""
+        """True if the value keeps its limit; False for NaN."""
         low = self.at_least is None or self.value >= self.at_least
         return low and (self.at_most is None or self.value <= self.at_most)
 
     def text(self) -> str:
-        """``foreshortening 0.11, at least 0.17 needed``."""
+        """Returns the check in words: ``foreshortening 0.11, at least 0.17 needed``."""
         limit = f"at least {self.at_least:.3g}" if self.at_least is not None else f"at most {self.at_most:.3g}"
         return f"{self.name} {self.value:.3g}{self.unit}, {limit}{self.unit} needed"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
-    """Whether a pose may be used.
+    """Verdict on whether a pose may be used.
 
     Parameters
     ----------
     decision : {"accept", "ambiguous", "reject"}
-        Ambiguous: the second solution is not worse by enough.
+        Ambiguous: χ² of the second solution is not sufficiently larger.
     checks : tuple of PoseCheck
-        Each value beside its limit.
+        All values with their limits.
     reasons : tuple of str
-        Checks that are not passed, in words.
+        Failed checks, in words.
     """
 
     decision: Decision
@@ -104,7 +105,7 @@ class Verdict:
 
 
 def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose, Verdict]:
-    """The verdict on a pose, and the pose with a covariance that covers both where two are called one."""
+    """Judges a pose. Returns the pose, its covariance widened where two solutions count as one, and the verdict."""
     options = options or VerdictOptions()
     apart_deg = _apart_deg(pose)
     if pose.second is not None and apart_deg <= options.equal_deg:
@@ -134,7 +135,7 @@ def judge(pose: ObjPose, options: VerdictOptions | None = None) -> tuple[ObjPose
 
 
 def needed_delta(pose: ObjPose, options: VerdictOptions) -> float:
-    """Δχ² that decides between two poses."""
+    """Returns the Δχ² that decides between two poses."""
     return deciding_delta(options.flip_odds, options.sigma_margin, pose.chi2_per_redundancy())
 
 
@@ -143,8 +144,8 @@ def _chi2_limit(redundancy: int, p: float) -> float:
 
 
 def _apart_deg(pose: ObjPose) -> float:
-    """Angle between the pose and its second solution; 0 where there is none."""
+    """Returns the angle between the pose and its second solution, or 0 if there is none."""
     if pose.second is None:
         return 0.0
-    away = Poses.of([pose.second]).difference(Poses.of([pose.camera_from_obj]))[0]
-    return float(np.degrees(np.linalg.norm(away[:3])))
+    difference = Poses.of([pose.second]).difference(Poses.of([pose.camera_from_obj]))[0]
+    return float(np.degrees(np.linalg.norm(difference[:3])))

@@ -1,1 +1,1 @@
-"""What was found, for people, programs and robots."""
+"""Reports and files of locate, for people, programs and robots."""

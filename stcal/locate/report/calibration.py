@@ -1,4 +1,4 @@
-"""What the calibration of a layout found, as text and JSON."""
+"""Report of a layout's calibration, as text and JSON."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ FEW_IMAGES = 3
 
 
 def calibrated_text(result: CalibratedLayout) -> str:
-    """Totals, and a line for each tag."""
+    """Returns the report as text: totals, and a line for each tag."""
     layout, adjusted = result.layout, result.adjusted
     lines = [
         f"{len(result.images)} images, {len(layout.tags)} tags; residuals {adjusted.board_rms_px:.3f} px of the board, "
@@ -21,40 +21,40 @@ def calibrated_text(result: CalibratedLayout) -> str:
     for row, ((dictionary, tag), count) in enumerate(zip(layout.tags, result.counts, strict=True)):
         sigma = 1000 * np.sqrt((layout.sigma_mm()[row] ** 2).sum(1).mean())
         nominal = result.deviation_mm[row]
-        far = f"{nominal:15.3f}" if np.isfinite(nominal) else f"{'–':>15}"
+        cell = f"{nominal:15.3f}" if np.isfinite(nominal) else f"{'–':>15}"
         side = sides_mm(layout.corners_mm[row]).mean()
         mark = "  origin" if row == layout.origin else ""
         lines.append(
-            f"{tag:>5}  {dictionary:<24} {count:>6}  {side:8.3f}  {sigma:8.1f}  {1000 * moved[row]:14.1f}  {far}{mark}"
+            f"{tag:>5}  {dictionary:<24} {count:>6}  {side:8.3f}  {sigma:8.1f}  {1000 * moved[row]:14.1f}  {cell}{mark}"
         )
     return "\n".join(lines)
 
 
 def sides_mm(corners: np.ndarray) -> np.ndarray:
-    """(4,) of a tag."""
+    """Returns the side lengths of a tag, (4,)."""
     return np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
 
 
 def warnings(result: CalibratedLayout, names: tuple[tuple[str, int], ...]) -> list[str]:
-    """What makes the result worse than its σ may say; ``names`` : tags of the plan."""
-    found = []
+    """Returns warnings that the result may be worse than its σ; ``names`` : tags of the plan."""
+    messages = []
     if result.unseen:
         tags = ", ".join(str(names[row][1]) for row in result.unseen)
-        found.append(f"tags that no image shows, left out of the layout: {tags}")
+        messages.append(f"tags that no image shows, left out of the layout: {tags}")
     few = [tag[1] for tag, count in zip(result.layout.tags, result.counts, strict=True) if count < FEW_IMAGES]
     if few:
-        found.append(f"tags in fewer than {FEW_IMAGES} images, a misread one would not be noticed: {few}")
+        messages.append(f"tags in fewer than {FEW_IMAGES} images, a misread one would not be noticed: {few}")
     if result.adjusted.downweighted > 0.1:
-        found.append(
+        messages.append(
             f"{result.adjusted.downweighted:.0%} of the tags seen are outliers; is target and board one plane?"
         )
     if not result.adjusted.settled:
-        found.append("the σ of board and tags still change at the end of the adjustment; add images")
-    return found
+        messages.append("the σ of board and tags still change at the end of the adjustment; add images")
+    return messages
 
 
 def calibrated_file(result: CalibratedLayout) -> CalibratedLayoutFile:
-    """Everything but the covariance, which the layout file holds."""
+    """Returns the result file, without the covariance, which the layout file holds."""
     layout, adjusted = result.layout, result.adjusted
     return CalibratedLayoutFile.model_validate(
         {

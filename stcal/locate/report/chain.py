@@ -1,4 +1,4 @@
-"""From the camera to the robot: base_from_obj = base_from_flange · flange_from_camera · camera_from_obj · offset."""
+"""Chain from camera to robot: base_from_goal = base_from_flange · flange_from_camera · camera_from_obj · offset."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ ROBOT = "base_from_flange_"
 
 
 class HandEyeRead(Part):
-    """What of the file of ``stcal handeye`` is needed here."""
+    """Part of the file of ``stcal handeye`` that is read here."""
 
     format: Literal["stcal handeye 1"] = "stcal handeye 1"
     flange_from_camera: Pose | None = None
@@ -28,7 +28,7 @@ class HandEyeRead(Part):
 
 
 class RegistrationRead(Part):
-    """What of the file of ``stcal register`` is needed here: a is the camera's frame, b the robot's base."""
+    """Part of the file of ``stcal register`` that is read here: a is the camera's frame, b the robot's base."""
 
     format: Literal["stcal registration 1"] = "stcal registration 1"
     model: str
@@ -38,20 +38,23 @@ class RegistrationRead(Part):
 
 
 class OffsetFile(Part):
-    """Where to go in the target's frame, exact."""
+    """File of the goal's pose in the target's frame, which is exact."""
 
     obj_from_goal: Pose
 
 
 ROTATION_WITHIN = 1e-6
-"""Of RᵀR − 1: a rigid registration is written with all its digits."""
+"""Largest element of RᵀR − 1 of a rotation. The file of a rigid registration holds all digits."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GoalChain:
-    """``mount`` : flange_from_camera of a camera on the flange, base_from_camera of a fixed one; ``flange`` :
-    base_from_flange by scene, empty for a fixed camera; ``offset`` : obj_from_goal, exact; ``source`` : of ``mount``,
-    for messages."""
+    """Chain of transforms from the camera to the robot's base.
+
+    ``mount`` : flange_from_camera of a camera on the flange, base_from_camera of a fixed camera; ``moving`` : whether
+    the camera is on the flange; ``flange`` : base_from_flange by scene, empty for a fixed camera; ``offset`` :
+    obj_from_goal, exact; ``source`` : origin of ``mount``, for messages.
+    """
 
     mount: UncertainRigid
     moving: bool
@@ -60,12 +63,12 @@ class GoalChain:
     source: str = "hand-eye file"
 
     def base_from_goal(self, scene: str, camera_from_obj: UncertainRigid) -> UncertainRigid:
-        """The target's pose (with the offset) in the robot's base; the errors of all links add up.
+        """Returns the target's pose with the offset in the robot's base; its covariance holds the errors of all links.
 
         Raises
         ------
         InputError
-            No robot pose of this scene.
+            There is no robot pose of this scene.
         """
         chain = self.mount @ camera_from_obj @ UncertainRigid.exact(self.offset)
         if not self.moving:
@@ -77,7 +80,7 @@ class GoalChain:
         return self.flange[scene] @ chain
 
     def without_pose(self, scenes: Sequence[str]) -> list[str]:
-        """Scenes that the robot poses lack."""
+        """Returns the scenes without a robot pose."""
         return [scene for scene in scenes if self.moving and scene not in self.flange]
 
 
@@ -88,23 +91,23 @@ def read_chain(
     quaternions: Order = "wxyz",
     key: str = "scene",
 ) -> GoalChain:
-    """Read the hand-eye file of ``stcal handeye``, the robot's poses by scene, and the offset.
+    """Reads the hand-eye file of ``stcal handeye``, the robot's poses by scene, and the offset.
 
-    ``quaternions`` : of the robot's poses, ``xyzw`` where the columns hold x, y, z, w in the order in which they stand.
-    ``key`` : the column of the robot's poses that names the scenes.
+    ``quaternions`` : order of the robot's quaternions, ``xyzw`` if their columns hold x, y, z, w in this order.
+    ``key`` : column of the robot's poses that names the scenes.
 
     Raises
     ------
     InputError
-        A file that is not as ``data_layout.md`` has it, or robot poses that are missing, or given for a fixed camera.
+        A file does not follow ``data_layout.md``, or robot poses are missing, or are given for a fixed camera.
     """
     mounted = read_result(hand_eye, HandEyeRead, "hand-eye file", "give the file of stcal handeye")
     where = f"hand-eye file {hand_eye}"
     either = {MOVING: mounted.flange_from_camera, FIXED: mounted.base_from_camera}
-    found = {name: matrix for name, matrix in either.items() if matrix is not None}
-    if len(found) != 1:
-        raise InputError("E-HANDEYE-FILE", f"{where}: {' and '.join(found) or 'neither'}; {MOVING} or {FIXED} needed")
-    [(name, matrix)] = found.items()
+    given = {name: matrix for name, matrix in either.items() if matrix is not None}
+    if len(given) != 1:
+        raise InputError("E-HANDEYE-FILE", f"{where}: {' and '.join(given) or 'neither'}; {MOVING} or {FIXED} needed")
+    [(name, matrix)] = given.items()
     covariance = np.zeros((6, 6)) if mounted.covariance is None else mounted.covariance
     mount = UncertainRigid(Rigid.from_matrix(matrix), covariance)
     moving = name == MOVING
@@ -122,23 +125,23 @@ def read_chain(
 
 
 def read_registered(registration: str | Path, offset: str | Path | None = None) -> GoalChain:
-    """Read the file of ``stcal register`` for points that a fixed camera (a) and the robot (b, its base) measured.
+    """Reads the file of ``stcal register`` for points that a fixed camera (a) and the robot (b, its base) measured.
 
     Raises
     ------
     InputError
-        A file that is not as ``data_layout.md`` has it, or a registration that is not rigid.
+        A file does not follow ``data_layout.md``, or the registration is not rigid.
     """
     advice = "give the file of stcal register --out"
     read = read_result(registration, RegistrationRead, "registration file", advice)
     where = f"registration file {registration}"
     linear = read.b_from_a[:3, :3]
-    off = float(np.abs(linear.T @ linear - np.eye(3)).max())
-    if read.covariance.shape != (6, 6) or off > ROTATION_WITHIN or np.linalg.det(linear) < 0:
+    residual = float(np.abs(linear.T @ linear - np.eye(3)).max())
+    if read.covariance.shape != (6, 6) or residual > ROTATION_WITHIN or np.linalg.det(linear) < 0:
         kind = read.method if read.method == "liu2017" else read.model
         raise InputError(
             "E-REGISTER-FILE",
-            f"{where}: b_from_a is no rigid motion ({kind}: RᵀR is {off:.2g} from 1); base_from_camera needs one, "
+            f"{where}: b_from_a is no rigid motion ({kind}: RᵀR is {residual:.2g} from 1); base_from_camera needs one, "
             "register with --model rigid",
         )
     mount = UncertainRigid(Rigid.from_matrix(read.b_from_a), read.covariance)
@@ -153,16 +156,19 @@ def _offset(offset: str | Path | None) -> Rigid:
 
 
 def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", key: str = "scene") -> dict[str, UncertainRigid]:
-    """base_from_flange of each scene, named in column ``key``, from ``x_mm … qz``, or ``base_from_flange_x_mm …``."""
+    """Reads base_from_flange of each scene from the columns ``x_mm … qz``, or ``base_from_flange_x_mm …``.
+
+    Column ``key`` names the scenes.
+    """
     table = read_table(path, "robot poses", quaternions)
     prefix = ROBOT if any(column.startswith(ROBOT) for column in table.columns) else ""
     poses, covariances = table.poses(prefix), table.pose_covariances(prefix)
-    found = {}
+    pose_of_scene = {}
     for row, (name, pose) in enumerate(zip(table.text(key), poses, strict=True)):
-        if name in found:
+        if name in pose_of_scene:
             raise InputError(
                 "E-TABLE-ROW-REPEATED",
                 f"{table.where}: line {table.lines[row]}: scene {name} again; every scene once needed",
             )
-        found[name] = UncertainRigid(pose, np.zeros((6, 6)) if covariances is None else covariances[row])
-    return found
+        pose_of_scene[name] = UncertainRigid(pose, np.zeros((6, 6)) if covariances is None else covariances[row])
+    return pose_of_scene

@@ -1,4 +1,4 @@
-"""What ``locate calibrate`` writes with ``--json``."""
+"""The file that ``locate calibrate`` writes with ``--json``."""
 
 from typing import Literal
 
@@ -24,7 +24,7 @@ class TagRow(Part):
 
 
 class CalibratedLayoutFile(ResultFile):
-    """Of ``locate calibrate``."""
+    """Result file of ``locate calibrate``."""
 
     format: Literal["stcal layout calibration 1"] = Field(description="the file's form and its version")
     unit: Literal["mm"] = Field(description="of all lengths")

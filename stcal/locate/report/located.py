@@ -1,4 +1,4 @@
-"""What ``locate run`` writes with ``--json``."""
+"""The file that ``locate run`` writes with ``--json``."""
 
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
@@ -101,7 +101,7 @@ class SceneRow(Part):
 
 
 class LocatedFile(ResultFile):
-    """Of ``locate run``: everything, rejected and ambiguous poses too."""
+    """Result file of ``locate run``, with rejected and ambiguous poses too."""
 
     format: Literal["stcal located 1"] = Field(description="the file's form and its version")
     unit: Literal["mm"] = Field(description="of all lengths")
@@ -110,7 +110,7 @@ class LocatedFile(ResultFile):
 
     @classmethod
     def of(cls, results: Sequence[Located], layout: TargetLayout, chain: GoalChain | None = None) -> "LocatedFile":
-        """The file of all scenes; ``chain`` : to the robot's base."""
+        """Returns the file of all scenes; ``chain`` : chain to the robot's base."""
         scenes = [_scene(each, layout, chain) for each in results]
         return cls(format="stcal located 1", unit="mm", layout=layout.name, scenes=scenes)
 
@@ -151,17 +151,17 @@ def _exposure(own: Exposure | Unreadable) -> ExposureRow:
 def _patent(each: Located, patent: PatentPose) -> PatentRow:
     names = [exposure.name for exposure in each.tags.readable()]
     rows = []
-    for own in patent.exposures:
-        first, second = own.poses or (None, None)
+    for exposure_result in patent.exposures:
+        first, second = exposure_result.poses or (None, None)
         rows.append(
             {
-                "image": names[own.exposure],
-                "tags": own.tags,
-                "area_px2": own.area_px2,
-                "candidate": own.candidate,
-                "kept": own.exposure == patent.exposure,
-                "errors_px": own.errors_px,
-                "det_j": own.det_j,
+                "image": names[exposure_result.exposure],
+                "tags": exposure_result.tags,
+                "area_px2": exposure_result.area_px2,
+                "candidate": exposure_result.candidate,
+                "kept": exposure_result.exposure == patent.exposure,
+                "errors_px": exposure_result.errors_px,
+                "det_j": exposure_result.det_j,
                 "camera_from_obj": first,
                 "twin": second,
             }

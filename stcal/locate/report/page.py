@@ -1,4 +1,4 @@
-"""The page of ``locate run``: verdicts, values beside their limits, and what was found drawn on the images."""
+"""Report of ``locate run`` as a page: verdicts, values and limits, and the images with tags and axes drawn."""
 
 import base64
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ def run_page(
     model: CameraModel,
     chain: GoalChain | None = None,
 ) -> str:
-    """The whole page, which opens off line."""
+    """Returns the whole page, which opens offline."""
     return render(
         "locate/report/page.html.jinja",
         layout=layout,
@@ -47,33 +47,33 @@ def run_page(
 
 def _overview(results: Sequence[Located]) -> list[list]:
     rows = []
-    for each in results:
-        pose, fit = camera_from_obj(each), each.pose
+    for located in results:
+        pose, fit = camera_from_obj(located), located.pose
         place = [None] * 3 if pose is None else pose.translation
         sigma = [None] * 3 if fit is None else [fit.sigma_mm(), np.degrees(fit.sigma_rad()), fit.rms_px()]
         rows.append(
             [
-                each.name,
-                _decision(each),
-                len(each.merged.seen) if each.merged else 0,
-                len(each.tags.readable()),
+                located.name,
+                _decision(located),
+                len(located.merged.seen) if located.merged else 0,
+                len(located.tags.readable()),
                 *(number(v, 2) for v in place),
                 *(number(v, 3) for v in sigma),
-                "; ".join(each.verdict.reasons),
+                "; ".join(located.verdict.reasons),
             ]
         )
     return rows
 
 
 def _in_base(results: Sequence[Located], chain: GoalChain | None) -> list[list[str]]:
-    """base_from_goal of the accepted scenes."""
+    """Returns rows of base_from_goal of the accepted scenes."""
     if chain is None:
         return []
     rows = []
-    for each in accepted(results):
-        goal = chain.base_from_goal(each.name, uncertain(each)).rigid
+    for located in accepted(results):
+        goal = chain.base_from_goal(located.name, uncertain(located)).rigid
         place, turn = goal.translation, np.degrees(goal.log()[:3])
-        rows.append([each.name, *(number(v, 2) for v in place), *(number(v, 3) for v in turn)])
+        rows.append([located.name, *(number(v, 2) for v in place), *(number(v, 3) for v in turn)])
     return rows
 
 
@@ -83,11 +83,11 @@ def _decision(each: Located) -> Markup:
 
 
 def _scene(each: Located, files: SceneFiles, layout: TargetLayout, model: CameraModel) -> dict:
-    """Values of a scene as the template shows them."""
+    """Returns the values of a scene for the template."""
     by_name = {file.name: file for file in files.files}
     shown = each.tags.readable()
     best = best_exposure(shown, layout)
-    few = shown if len(shown) > 1 else []
+    all_if_several = shown if len(shown) > 1 else []
     return {
         "decision": _decision(each),
         "reasons": each.verdict.reasons,
@@ -104,20 +104,22 @@ def _scene(each: Located, files: SceneFiles, layout: TargetLayout, model: Camera
         "patent": [] if each.patent is None else patent_cells(each),
         "assumed": "" if each.patent is None else ASSUMED,
         "best": best and _picture(best, by_name[best.name], each, layout, model, WIDE_PX),
-        "small": [_picture(own, by_name[own.name], None, layout, model, SMALL_PX) for own in few],
+        "small": [_picture(own, by_name[own.name], None, layout, model, SMALL_PX) for own in all_if_several],
     }
 
 
 def best_exposure(exposures: Sequence[Exposure], layout: TargetLayout) -> Exposure | None:
-    """The one with most tags of the layout; of several that with the smallest σ of their corners and edges, which
-    darkness and saturation raise. None where there is none."""
-    known = layout.rows()
+    """Returns the exposure with most tags of the layout, or None if there is no exposure.
+
+    Among several, it is the one with the smallest σ of corners and edges; darkness and saturation increase these σ.
+    """
+    rows = layout.rows()
 
     def rank(exposure: Exposure) -> tuple[int, float]:
-        own = [tag in known for tag in exposure.tags.tags]
+        in_layout = [tag in rows for tag in exposure.tags.tags]
         corners = np.trace(exposure.tags.covariance_px2, axis1=2, axis2=3)
-        variance = (corners + exposure.tags.edge_sigma_px()[:, None] ** 2)[own]
-        return sum(own), -float(np.median(variance)) if any(own) else 0.0
+        variance = (corners + exposure.tags.edge_sigma_px()[:, None] ** 2)[in_layout]
+        return sum(in_layout), -float(np.median(variance)) if any(in_layout) else 0.0
 
     return max(exposures, key=rank, default=None)
 
@@ -125,17 +127,17 @@ def best_exposure(exposures: Sequence[Exposure], layout: TargetLayout) -> Exposu
 def _picture(
     exposure: Exposure, file: ImageFile, each: Located | None, layout: TargetLayout, model: CameraModel, width_px: int
 ) -> dict:
-    """The image with the outlines of its tags; with the axes of {obj} and the tags' places where ``each`` is given."""
+    """Returns the image with the outlines of its tags; with axes of {obj} and names of tags if ``each`` is given."""
     grey = grey_8bit(decode(read_bytes(file.path, IMAGE_BYTES), file.name))
     width, height = exposure.size
-    known = layout.rows()
+    rows = layout.rows()
     tags = []
     for tag, corners in zip(exposure.tags.tags, exposure.tags.corners_px, strict=True):
         points = " ".join(f"{x:.2f},{y:.2f}" for x, y in corners)
         name = "" if each is None else str(tag[1])
-        tags.append((points, COLOURS[2] if tag in known else COLOURS[1], name, *corners.mean(0)))
+        tags.append((points, COLOURS[2] if tag in rows else COLOURS[1], name, *corners.mean(0)))
     pose = None if each is None else camera_from_obj(each)
-    count = sum(tag in known for tag in exposure.tags.tags)
+    count = sum(tag in rows for tag in exposure.tags.tags)
     return {
         "shown_px": width_px,
         "width": width,
@@ -149,7 +151,7 @@ def _picture(
 
 
 def _axes(pose, layout: TargetLayout, camera: Camera) -> list[tuple]:
-    """(start, tip, colour, name) of X, Y and Z of {obj}, a third of the target long; one behind the camera: none."""
+    """Returns (start, tip, colour, name) of X, Y, Z of {obj}, a third of the target long; none if behind the camera."""
     length = float(np.ptp(layout.corners_mm.reshape(-1, 2), axis=0).max()) / 3
     ends = pose @ (length * np.vstack([np.zeros(3), np.eye(3)]))
     if (ends[:, 2] <= 0).any():

@@ -1,4 +1,4 @@
-"""What σ the residuals have, and what covariance follows for the transform."""
+"""Estimation of σ from the residuals, and the covariance of the transform that follows from it."""
 
 from dataclasses import dataclass, replace
 
@@ -11,9 +11,9 @@ from stcal.register.core.models import Model, Transform, unit_covariance
 from stcal.register.core.problem import Problem
 
 CONTRADICTED_AT = 0.01
-"""Given σ are scaled when so small residuals as theirs have less than this chance (two-sided would be twice)."""
+"""Significance level of the one-sided χ² test; stated σ are scaled if the test rejects them."""
 WIDE = 8.0
-"""Beyond so many σ nothing is cut off: the tail of χ²₃ is 1e-13."""
+"""Threshold in σ beyond which nothing is cut off; the tail of χ²₃ is 1e-13."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,12 +39,12 @@ class Covariance:
 
 
 def kept_share(cut: float) -> float:
-    """Share of points within ``cut`` σ: χ²₃."""
+    """Returns the fraction of points within ``cut`` σ, from χ²₃."""
     return float(chdtr(3, cut**2))
 
 
 def kept_variance(cut: float) -> float:
-    """Share of the points' whole square sum that those within ``cut`` σ hold: χ²₅."""
+    """Returns the fraction of the total sum of squares that points within ``cut`` σ contribute, from χ²₅."""
     return float(chdtr(5, cut**2))
 
 
@@ -118,7 +118,7 @@ def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold
 
 
 def shifted_too(covariance: Covariance, off_mm: np.ndarray) -> Covariance:
-    """Covariance of a fit that lies between two groups of points: that of a shift (3,) of all points added, mm."""
+    """Returns the covariance of a fit between two groups of points: a common shift (3,), mm, is added as an error."""
     p = len(covariance.matrix)
     by_step = np.zeros(p)
     by_step[slice(3, None, 4) if p == 12 else slice(3, 6)] = off_mm

@@ -47,7 +47,7 @@ class Model:
         return max(self.sample, self.parameters // 3 + 1)
 
     def redundancy(self, n: int) -> int:
-        """Of a fit to n point pairs."""
+        """Returns the redundancy of a fit to n point pairs."""
         return 3 * n - self.parameters
 
 
@@ -261,7 +261,7 @@ def _normal(
 def _about(
     model: Model, transform: Transform, origin: np.ndarray, xyz_a: np.ndarray, precision: np.ndarray, xyz_b: np.ndarray
 ) -> NormalEquations:
-    """Over the parameters about a point ``origin`` of a, with inverse covariances."""
+    """Returns the normal equations of the parameters about a point ``origin`` of a, with inverse covariances."""
     cost, normal, gradient = 0.0, np.zeros((model.parameters,) * 2), np.zeros(model.parameters)
     for rows in _chunks(len(xyz_a)):
         by_step = jacobian(model, transform, xyz_a[rows] - origin)
@@ -274,7 +274,7 @@ def _about(
 
 
 def _isotropic_normal(model: Model, transform: Transform, from_origin: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """From the points' second moments, so that a million points need no Jacobian each."""
+    """Returns the normal matrix, computed from the points' second moments instead of one Jacobian for each point."""
     second, total = (from_origin * weights[:, None]).T @ from_origin, weights.sum()
     normal = np.zeros((model.parameters,) * 2)
     if model.name == "affine":

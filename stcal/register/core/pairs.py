@@ -20,7 +20,7 @@ KINDS = "weight, sigma_mm, or cov_x_x … cov_z_z"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Corresponding points of two frames as a file states them; weights, or covariances, or neither.
+    """The corresponding points of two frames, as read from a file, with weights, covariances or neither.
 
     Parameters
     ----------

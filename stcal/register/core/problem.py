@@ -28,7 +28,7 @@ class PointNoise:
     sigma_mm: float | None = None
 
     def __getitem__(self, rows: np.ndarray) -> "PointNoise":
-        """Of the points chosen by a mask or by indices."""
+        """Returns the noise of the points selected by a mask or by indices."""
         return self if self.precision is None else PointNoise(self.precision[rows], self.sigma_mm)
 
 
@@ -58,7 +58,7 @@ class Problem:
 
     @property
     def redundancy(self) -> int:
-        """Of a fit to all of them."""
+        """Redundancy of a fit to all points."""
         return self.model.redundancy(len(self))
 
     def fit(self) -> Transform:
@@ -122,7 +122,7 @@ def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None)
 
 
 def _require_positive(given: np.ndarray, name: str) -> None:
-    """Of weights or variances (n,), or covariances (n, 3, 3)."""
+    """Refuse weights or variances (n,), or covariances (n, 3, 3), that are not positive."""
     if given.ndim == 3:
         fault = first_fault(given, OF_POINT, definite=True)
         trouble = fault and f"row {fault.row + 1}: {fault.reason}"

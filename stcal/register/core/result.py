@@ -25,7 +25,7 @@ class ErrorFigures:
 
     @classmethod
     def of(cls, lengths: np.ndarray) -> "ErrorFigures":
-        """Of lengths (n,), mm."""
+        """Returns the figures of lengths (n,), mm."""
         if not len(lengths):
             return cls(0, np.nan, np.nan, np.nan)
         return cls(len(lengths), float(lengths.mean()), float(np.sqrt((lengths**2).mean())), float(lengths.max()))
@@ -149,7 +149,7 @@ class Registration:
 
     @property
     def inlier_errors(self) -> ErrorFigures:
-        """Of the inliers' residuals."""
+        """Error figures of the inliers' residuals."""
         return ErrorFigures.of(np.linalg.norm(self.residuals[self.inliers], axis=1))
 
     @property

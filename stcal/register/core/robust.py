@@ -26,9 +26,10 @@ SUBSET = 500
 CLEAN_SETS_WITH_OUTLIER = 0.001
 """Sets without outliers in which one point or more is called one."""
 LEVERAGE_UP_TO = 10_000
-"""With more points the fit's own uncertainty adds under 0.02 % to a residual."""
+"""Largest number of points for which leverage is considered; beyond it the fit's uncertainty adds under 0.02 % to a
+residual."""
 MAX_ROUNDS = 50
-"""Of fit, σ and inliers; a set that comes again ends them earlier."""
+"""Largest number of iterations of fit, σ and inliers; a set that recurs ends them earlier."""
 NESTED = 6
 """Consensus within a consensus: gross errors hide smaller ones."""
 BY_CHANCE = 0.01
@@ -36,7 +37,8 @@ BY_CHANCE = 0.01
 DISTINCT = 5.0
 """σ between two transforms; nearer ones are one."""
 MOST_OF_REST = 0.5
-"""Of many outliers some always lie near some transform; half of them do for a reason."""
+"""Fraction of the outliers that must agree with another transform. A few of many outliers always lie near some
+transform by chance; half of them do not."""
 AS_GOOD = 0.5
 """A second transform with this share of the points of the one found makes the answer ambiguous: with up to 60 % wrong
 points, all in one other motion, the true ones are 40 : 60 of the wrong."""

@@ -23,7 +23,7 @@ from stcal.register.core.models import Model, hypotheses
 from stcal.register.core.problem import Problem
 
 FALSE_ALARMS = 1e-4
-"""Expected number of sets declared in data without outliers. So few, because a chance set of few points claims a
+"""Expectation of sets declared in data without outliers. It is small because a chance set of few points claims a
 σ far too small. Real ones are far below: ten of 20 points that agree to 0.15 mm, the others off by 5 mm, have 1e-14."""
 LEAST_REDUNDANCY = 6
 """Redundancy of the smallest consensus: four points rigidly, five in similarity, six affinely."""
@@ -32,22 +32,22 @@ MISSED = 1e-9
 LEAST_SHARE = 0.25
 """Samples are drawn until a consensus of this share cannot have been missed; below it may be."""
 CLEAN_PER_WIDE = 3
-"""Of clean samples one in so many is wide enough to lead to the optimum; measured: every second one does."""
+"""Number of clean samples assumed for each one wide enough to lead to the optimum; measured: every second one does."""
 EXHAUSTIVE = 2000
 """Up to so many samples are all tried (23 points rigidly)."""
 BATCH = 500
 """Samples scored at once."""
 MOST_SAMPLES = 20_000
-"""Above what is ever needed: at the least share 3900 samples of three points, 15 900 of four."""
+"""Largest number of samples, above any need: ``LEAST_SHARE`` takes 3900 samples of three points, 15 900 of four."""
 REFINED = 6
 """So many of the best samples of a batch are refined."""
 MAX_STEPS = 30
-"""Of concentration, which ends by itself after a few: the score falls in each, and there are finitely many sets."""
+"""Largest number of concentration steps. They end after a few: each lowers the score, and the sets are finite."""
 TINY = 1e-24
 """Square sums below this share of the points' own are rounding."""
 
 Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Of squared distances (s, n): value of each row, less is better, and the square up to which its set reaches."""
+"""Score of squared distances (s, n): value of each row (less is better), and the largest square in the row's set."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,7 +177,7 @@ def _concentrated(problem: Problem, score: Score, inliers: np.ndarray) -> Consen
 
 
 def _squares_of_many(linear: np.ndarray, translation: np.ndarray, problem: Problem) -> np.ndarray:
-    """Squared distances (s, n) under s transforms."""
+    """Returns the squared distances (s, n) under s transforms."""
     turned = (linear.reshape(-1, 3) @ problem.xyz_a.T).reshape(len(linear), 3, -1)
     residual = problem.xyz_b.T - translation[:, :, None]
     residual -= turned

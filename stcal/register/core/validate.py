@@ -9,7 +9,7 @@ from stcal.register.core.models import Transform
 from stcal.register.core.result import ErrorFigures, HeldOutPoints
 
 TRIED = 20_000
-"""Of more points a sample is cross-validated: its errors are then known to 1 %."""
+"""Largest number of points that are all cross-validated; of more points a sample is, whose errors are known to 1 %."""
 
 
 def held_out(

@@ -24,11 +24,12 @@ from stcal.register.core.search import FALSE_ALARMS, by_share, chernoff, search
 TRIED = 200
 """Points that are looked at: a shift of 4 σ of half of them is seen then."""
 MAX_ROUNDS = 30
-"""Of assigning and fitting, which ends by itself: the square sum falls in each."""
+"""Largest number of rounds of assigning and fitting; each lowers the sum of squares, so that they end earlier."""
 FEW = 16
 """Points up to which square sums take the place of determinants (see above)."""
 SPHERICAL = 0.1
-"""Of 16 points with noise three times as large along one axis half are told so; the others are too few to mislead."""
+"""Significance level of anisotropic noise. It detects half of the sets of 16 points whose noise is three times as
+large along one axis; in the other sets the effect is too weak to mislead."""
 TOGETHER = 0.01
 """Chance of scattered groups to seem to lie together."""
 

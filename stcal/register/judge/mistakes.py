@@ -21,9 +21,10 @@ UNITS = {1000.0: ("m", "m"), 25.4: ("inches", "in"), 10.0: ("cm", "cm")}
 UNIT_WITHIN = 0.08
 """Outliers move the median ratio of distances by a few per cent; the factors are far apart."""
 PAIRS = 4000
-"""Of points, whose distances are compared."""
+"""Number of pairs of points whose distances are compared."""
 MIRROR_RATIO = 4.0
-"""Mirrored points fit a mirrored frame to noise, a right one to their thickness; bent frames never gain so much."""
+"""Ratio of misfits that indicates a mirrored frame. Mirrored points fit a mirrored frame to noise, and a correct frame
+only to their thickness; bent frames never gain so much."""
 MIRROR_CHANCE = 1e-4
 """Right frames called mirrored, were their points thick only by noise: so many."""
 NAMED_BELOW_RAD = np.radians(15)

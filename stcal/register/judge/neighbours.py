@@ -5,7 +5,7 @@ from scipy.spatial import KDTree
 from scipy.special import ndtr
 
 NEIGHBOURS = 2000
-"""Of so many points residuals are compared with the nearest neighbour's …"""
+"""Number of points whose residuals are compared with the nearest neighbour's …"""
 FEWEST_NEIGHBOURS = 20
 """… and of no fewer: the sum of fewer products is not normal."""
 BY_NEIGHBOURS = 1e-4

@@ -21,9 +21,9 @@ from stcal.register.judge.neighbours import neighbours_alike
 from stcal.register.judge.shifts import Shifted
 
 LOW_REDUNDANCY = 6
-"""Below so many degrees of freedom σ is uncertain by more than 30 %."""
+"""Degrees of freedom below which σ is uncertain by more than 30 %."""
 MAJORITY = 0.5
-"""Of the point pairs; where fewer agree, a note says so."""
+"""Fraction of the point pairs below which a note says that few agree."""
 TIGHT = 2.5
 """A threshold of 2.5 σ cuts off a tenth of the good points; below it the covariance of few points is too small."""
 

@@ -22,9 +22,9 @@ from stcal.register.judge.neighbours import FEWEST_NEIGHBOURS, neighbours_alike
 TRIED = 200
 """Points that are looked at."""
 NEEDED, ALONG = 14.5, 9.2
-"""Of the gain in log likelihood: along any direction, and along the first principal axis."""
+"""Gain in log likelihood that is needed: along any direction, and along the first principal axis."""
 LEAST_SHARE = 0.15
-"""Of the points in a group."""
+"""Smallest fraction of the points in a group."""
 ROUNDS = 60
 NARROWEST = 0.01
 """Variance of a group over that of all, along the shift."""
@@ -123,7 +123,7 @@ def _by_kurtosis(unit: np.ndarray) -> np.ndarray:
 
 
 def _parted(unit: np.ndarray, axis: np.ndarray) -> _Parted:
-    """Of residuals (n, d) of unit scatter, in two groups, at first those above the median along ``axis`` and below."""
+    """Divides residuals (n, d) of unit scatter into two groups, starting from the median along ``axis``."""
     along = unit @ axis
     first = (along > np.median(along)).astype(float)
     low, high, apart = 0.0, 0.0, 0.0

@@ -12,11 +12,11 @@ VIEWS = ((0, 1), (0, 2), (1, 2))
 """Horizontal and vertical axis of each view."""
 MOST_ARROWS = 1500
 ARROW_SHARE, FEW = 0.12, 80
-"""Of the picture's side that the RMS residual of the inliers takes up, of so few points; less among more."""
+"""Fraction of the picture's side for the inliers' RMS residual, and the number of points above which it shrinks."""
 LONGEST_SHARE = 0.3
-"""Of the picture's side; longer arrows of outliers are cut off there."""
+"""Longest arrow of an outlier, as a fraction of the picture's side; longer arrows are cut off."""
 MOST_LABELS = 60
-"""Of arrows cut off, the longest; more lie over each other."""
+"""Largest number of labels, for the longest of the arrows cut off; more labels would overlap."""
 RASTER = 41
 MARGIN = 0.25
 

@@ -41,7 +41,7 @@ class Units(Part):
 
 
 class MeanRmsMax(Part):
-    """Of lengths, null where there are none."""
+    """Mean, RMS and maximum of lengths; null if there are none."""
 
     mean_mm: Finite
     rms_mm: Finite
@@ -135,7 +135,7 @@ class RobotPart(Part):
 
 
 class RegistrationFile(ResultFile):
-    """Of ``register``; lengths in mm, angles in rad."""
+    """Result file of ``register``; lengths in mm, angles in rad."""
 
     format: Literal["stcal registration 1"] = Field(description="the file's form and its version")
     pairs: str = Field(description="the file of the points")
@@ -260,7 +260,7 @@ def _alternative(other: Alternative, lines: Sequence[int]) -> OtherTransform:
 
 
 def _outliers(found: Findings) -> list[WrongPairRow]:
-    """Made without being checked one by one: a registration holds finite residuals, and there may be many thousands."""
+    """Returns the rows of outliers without validation: residuals are finite, and there may be many thousands."""
     rows = found.registration.outliers
     residuals, lengths = found.registration.residuals[rows], found.length_mm[rows].tolist()
     return [

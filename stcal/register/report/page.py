@@ -170,7 +170,7 @@ def _cube_lines(found: Findings) -> list[str]:
 
 
 def holds(reach: Cubes) -> list[str]:
-    """Of a fit to the inner cube: how far it errs there, and farther out."""
+    """Returns how large the errors of a fit to the inner cube are there, and farther out."""
     first = reach.errors[0]
     outside = [(side, e) for side, e in zip(reach.sides_mm[1:], first[1:], strict=True) if e]
     if first[0] is None or not outside:

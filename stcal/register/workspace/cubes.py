@@ -14,9 +14,9 @@ from stcal.register.core.validate import held_out
 SHARES = (0.25, 0.5, 0.75, 1.0)
 """Sides of the cubes, of that which holds all points."""
 LEAST_POINTS = 10
-"""In the inner cube: 30 numbers for a rigid transform's six."""
+"""Fewest points in the inner cube: 30 coordinates for the six parameters of a rigid transform."""
 DIGITS = 2
-"""Of the outer side, rounded up."""
+"""Significant digits of the outer side, which is rounded up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

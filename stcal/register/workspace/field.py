@@ -181,8 +181,8 @@ def _in_mm(model: Model) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Likelihood:
-    """Restricted likelihood of length and variance ratio. ``y`` : (m, 3) residuals, ``motions`` : (m, 3, p), both over
-    the root of the points' relative variance ``variance`` : (m,)."""
+    """The restricted likelihood of length and variance ratio. ``y`` : (m, 3) residuals, ``motions`` : (m, 3, p), both
+    over the root of the points' relative variance ``variance`` : (m,)."""
 
     model: Model
     transform: Transform
@@ -240,7 +240,8 @@ class _Likelihood:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Kriged:
-    """Generalised least squares with unit covariance C of each component: C⁻¹ y, C⁻¹ J, (JᵀC⁻¹J)⁻¹, β, C⁻¹ (y − J β),
+    """The generalised least-squares solution with unit covariance C of each component:
+    C⁻¹ y, C⁻¹ J, (JᵀC⁻¹J)⁻¹, β, C⁻¹ (y − J β),
     and the variance factor."""
 
     own: np.ndarray

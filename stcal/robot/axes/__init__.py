@@ -1,1 +1,1 @@
-"""The axis method: a robot from sweeps of its joints."""
+"""The axis method: identification of a robot from sweeps of its joints."""

@@ -1,4 +1,4 @@
-"""What ``axes`` writes with ``--json``."""
+"""The file that ``axes`` writes with ``--json``."""
 
 from typing import Literal
 
@@ -77,7 +77,7 @@ class LeaveOneOutRows(Part):
 
 
 class AxesFile(ResultFile):
-    """Of ``axes``."""
+    """The result file of ``axes``."""
 
     format: Literal["stcal axes 1"] = Field(description="the file's form and its version")
     version: str = Field(description="of stcal")

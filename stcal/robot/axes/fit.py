@@ -16,41 +16,43 @@ from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
 from stcal.robot.axes.sweeps import Arc
 
 GROSS = 6.0
-"""σ from which a point is left out and named: 1 in 10⁷ of normal ones."""
+"""Residual, in σ, beyond which a point is left out and named: 1 in 10⁷ of normal ones."""
 NEAR_AXIS = 10.0
-"""Radii below so many σ of a point are of no use: noise bends them by σ²/2r, a twentieth of σ here."""
+"""Radius, in σ of a point, below which an arc is of no use: noise biases radii by σ²/2r, a twentieth of σ here."""
 ROUNDING = 1e-12
-"""Relative size of what rounding leaves of coordinates."""
+"""Relative size of the rounding error of coordinates."""
 STANDS_STILL_MM = 1.0
-"""Sweeps move a reflector by more, unless it is on the axis."""
+"""Motion of a reflector below which it stands still; sweeps move it by more, unless it is on the axis."""
 WEAK_RAD = 0.02
-"""σ of a direction beyond which an axis is not known: its covariance rests on small angles."""
+"""σ of a direction beyond which an axis is not known; its covariance is valid for small angles only."""
 MOTION = np.radians(2.0)
-"""Joints, gears and zero positions are true to hundredths of this; also the share of a sliding joint's way."""
+"""Largest difference of the observed motion from the joint's values; for a sliding joint also the largest share of its
+way. Joints, gears and zero positions are true to hundredths of this."""
 LONGER = "sweep further, or with reflectors farther apart"
 QUIET = 1e-3
-"""Share of the largest arc below which no residual can hide a gross error that bent the first axis."""
+"""Share of the largest arc below which residuals are too small to hide a gross error that bent the first axis."""
 STARTS, REWEIGHTINGS = 60, 30
 WEIGHTS_SETTLED = 1e-3
-"""A weight that changes by less moves an axis by less than a thousandth of its σ."""
+"""Change of the weights below which they have converged; it moves an axis by less than a thousandth of its σ."""
 SINGULAR, TINY = 1e-10, 1e-300
-"""Ratio of singular values below which arcs do not determine an axis; and what keeps a division by 0 off."""
+"""Ratio of singular values below which arcs do not determine an axis; and a number that prevents division by 0."""
 FIRST_SIZE = 0.05
-"""Arcs of this share of the largest one give the first axis and σ, by which the smaller are judged."""
+"""Size of an arc, as a share of the largest one, from which on it is used for the first axis and σ, by which the
+smaller arcs are judged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxisFit:
     """The axis of one joint.
 
-    ``world_from_axis`` : z of this frame is the joint's positive direction, the origin lies on the axis, at the foot of
-    the centroid of what was measured; ``arcs``, ``radii``, ``heights`` : of the arcs used, (a,) mm, heights above the
-    origin (nan along a prismatic joint); ``near`` : arcs too close to the axis to be used; ``rows`` : (k,) rows used,
-    one for each point of each arc; ``residuals`` : (k, 2) mm, radial and axial (across the line, for a prismatic
-    joint); ``weights`` : (k,), 0 for what is grossly wrong; ``gain`` : (p, k, 3) derivative of the axis by the points,
-    p being 4 (rx, ry rad, tx, ty mm in the axis's own frame) or 2 (rx, ry); ``sigma_mm`` : of one coordinate;
-    ``redundancy`` : numbers measured beyond those needed; ``span`` : what the joint moved, rad or mm; ``settled`` :
-    whether the robust weights had come to rest.
+    ``world_from_axis`` : z of this frame is the joint's positive direction; the origin lies on the axis, at the foot of
+    the measured points' centroid; ``arcs``, ``radii``, ``heights`` : of the arcs used, (a,) mm, heights above the
+    origin (nan for a prismatic joint); ``near`` : arcs too close to the axis to be used; ``rows`` : (k,) rows used, one
+    for each point of each arc; ``residuals`` : (k, 2) mm, radial and axial (across the line for a prismatic joint);
+    ``weights`` : (k,), 0 for gross errors; ``gain`` : (p, k, 3) derivative of the axis by the points, where p is 4 (rx,
+    ry rad, tx, ty mm in the axis's own frame) or 2 (rx, ry); ``sigma_mm`` : σ of one coordinate; ``redundancy`` :
+    number of redundant measured numbers; ``span`` : range of the joint's values, rad or mm; ``settled`` : whether the
+    robust weights converged.
     """
 
     joint: int
@@ -70,23 +72,24 @@ class AxisFit:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(p, p) of the axis by the noise of its own points, in its own frame."""
+        """Covariance (p, p) of the axis by the noise of its own points, in its own frame."""
         return self.sigma_mm**2 * np.einsum("pkc,qkc->pq", self.gain, self.gain)
 
     @property
     def outliers(self) -> np.ndarray:
-        """Rows that are left out as grossly wrong."""
+        """Rows that are left out as gross errors."""
         return np.unique(self.rows[self.weights == 0])
 
     def influence(self, points: np.ndarray) -> np.ndarray:
-        """(k, p) by which the axis changes without each of the ``points`` (k, 3), mm, that it was fitted to: linear."""
+        """Returns the change (k, p) of the axis, linear, without each of the ``points`` (k, 3), mm, to which it was
+        fitted."""
         axes, prismatic = self.world_from_axis.rotation, len(self.gain) == 2
         across = np.broadcast_to(axes.T[:2], (len(points), 2, 3)).copy()
         if not prismatic:
             local = (points - self.world_from_axis.translation) @ axes
             outward = local[:, :2] / np.maximum(np.linalg.norm(local[:, :2], axis=1), TINY)[:, None]
             across[:, 0], across[:, 1] = outward @ axes[:, :2].T, axes[:, 2]
-        step = np.einsum("pkc,kvc->kpv", self.gain, across)  # of the axis, by the residuals
+        step = np.einsum("pkc,kvc->kpv", self.gain, across)  # derivative of the axis by the residuals
         weight = np.maximum(self.weights, TINY)
         normal = np.linalg.inv(np.einsum("kpv,kqv,k->pq", step, step, 1 / weight))
         lever = np.einsum("kpv,pq,kqu,k->kvu", step, normal, step, 1 / weight)
@@ -97,15 +100,16 @@ class AxisFit:
         return -(step @ without)[:, :, 0]
 
     def lengths(self) -> np.ndarray:
-        """(k',) lengths of the residuals of the points used, mm."""
+        """Returns the lengths (k',) of the residuals of the points used, mm."""
         return np.linalg.norm(self.residuals[self.weights > 0], axis=1)
 
 
 def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: bool, where: str) -> AxisFit:
-    """The axis of a joint from all its arcs, by least squares of the points' distances to their circles or lines.
+    """Returns the axis of a joint by least squares of the distances of its arcs' points to their circles or lines.
 
-    Robust: Huber weights (Huber 1964) on the points' residuals with a median σ; what is off by :data:`GROSS` σ is left
-    out. The first axis is the one with the least median residual among those that leave one point out.
+    The fit is robust: Huber weights (Huber 1964) on the points' residuals with a median σ; points off by more than
+    :data:`GROSS` σ are left out. The first axis is the one with the least median residual among those that leave one
+    point out.
 
     Parameters
     ----------
@@ -114,7 +118,7 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
     moved : (m,) array
         Kinematic values of this joint, rad or mm.
     arcs : list of Arc
-        Of this joint.
+        The arcs of this joint.
     prismatic : bool
         Whether the joint slides.
     where : str
@@ -125,7 +129,7 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
     DegenerateError
         No redundancy, reflectors on the axis, or arcs too short to give a direction.
     InputError
-        Motion seen about the axis that is not the joint's.
+        The motion observed about the axis is not that of the joint's values.
     """
     size = np.array([_spread(points[arc.rows]) for arc in arcs])
     if size.max() <= ROUNDING * max(np.abs(points).max(), 1.0) * 1e3:
@@ -135,9 +139,9 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
     fit.solve(moved)
     if not prismatic:
         small = [i for i in range(len(arcs)) if i not in use]
-        more = [i for i in small if fit.radius_of(points[arcs[i].rows]) > NEAR_AXIS * fit.sigma()]
-        if more:
-            use = sorted(use + more)
+        added = [i for i in small if fit.radius_of(points[arcs[i].rows]) > NEAR_AXIS * fit.sigma()]
+        if added:
+            use = sorted(use + added)
             fit = _AxisFitting(points, [arcs[i] for i in use], prismatic, where, fit.frame)
             fit.solve(moved)
     fit.orient(moved)
@@ -145,7 +149,7 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
 
 
 def refit_axis(fit: AxisFit, points: np.ndarray, left_out: np.ndarray) -> Rigid:
-    """world_from_axis without some rows, from moved points; the weights of the fit are kept."""
+    """Returns world_from_axis from moved points, without the rows ``left_out``; the weights of the fit are kept."""
     again = _AxisFitting(points, list(fit.arcs), fit.gain.shape[0] == 2, f"joint {fit.joint + 1}", fit.world_from_axis)
     again.weights = np.where(np.isin(fit.rows, left_out), 0.0, fit.weights)
     again.descend()
@@ -164,7 +168,7 @@ def _on_axis(where: str, spread: float) -> str:
 
 
 class _AxisFitting:
-    """A fit under way: frame of the axis and weights change, the points stay."""
+    """A fit in progress: the frame of the axis and the weights change, the points stay."""
 
     def __init__(self, points: np.ndarray, arcs: list[Arc], prismatic: bool, where: str, frame: Rigid | None = None):
         self.arcs, self.prismatic, self.where = arcs, prismatic, where
@@ -178,7 +182,8 @@ class _AxisFitting:
         self.floor = ROUNDING * max(np.abs(self.points).max(), self.size)
 
     def solve(self, moved: np.ndarray) -> None:
-        """Start, Huber's iteration, gross points out, until nothing changes; ``moved`` : (m,) values of the joint."""
+        """Starts, iterates with Huber weights, and leaves out gross errors until nothing changes; ``moved`` : (m,)
+        values of the joint."""
         if self.redundancy() < 1:
             raise DegenerateError(
                 "E-AXES-FEW",
@@ -203,16 +208,19 @@ class _AxisFitting:
         self.require_known()
 
     def start(self, moved: np.ndarray) -> None:
-        """The axis from all points; where some stand out, from all but one (of many points: but a few), or but those of
-        one value of the joint, (k,), such that the median residual is least. The weights say which were used."""
+        """Sets the axis from all points; if some points stand out, from the subset with the least median residual.
+
+        A subset leaves out one point (of many points a few), or the points of one of the joint's values ``moved`` (k,).
+        The weights say which points were used.
+        """
         count = len(self.rows)
         value = np.unique(moved, return_inverse=True)[1]
         points, values = (np.arange(n) % min(n, STARTS) for n in (count, value.max() + 1))
         sets = [np.ones(count), *(points != out for out in np.unique(points))]
         sets += [values[value] != out for out in np.unique(values) if value.max() > 1]
         least = np.inf
-        for i, kept in enumerate(sets):
-            self.weights = np.asarray(kept, float)
+        for i, subset in enumerate(sets):
+            self.weights = np.asarray(subset, float)
             self.frame = self.linear_start()
             length = np.linalg.norm(self.residuals(), axis=1)
             if np.median(length) < least:
@@ -223,7 +231,8 @@ class _AxisFitting:
         self.frame, self.weights = best
 
     def linear_start(self) -> Rigid:
-        """Direction from the arcs' common scatter, place from the circles' common centre (Kåsa 1976)."""
+        """Returns the axis: its direction from the arcs' common scatter, its place from the circles' common centre
+        (Kåsa 1976)."""
         centred = self.demean(self.points)
         _, axes = np.linalg.eigh((self.weights[:, None] * centred).T @ centred)
         middle = self.points.mean(axis=0)
@@ -238,23 +247,24 @@ class _AxisFitting:
         return Rigid(frame, middle + frame[:, :2] @ centre)
 
     def local(self) -> np.ndarray:
-        """(k, 3) points in the axis's frame."""
+        """Returns the points (k, 3) in the axis's frame."""
         return (self.points - self.frame.translation) @ self.frame.rotation
 
     def values(self) -> np.ndarray:
-        """(k, 2) of which each arc has but one: radius and height, or the place across a line."""
+        """Returns values (k, 2) that are constant along an arc: radius and height, or the place across a line."""
         local = self.local()
         if self.prismatic:
             return local[:, :2]
         return np.column_stack([np.hypot(local[:, 0], local[:, 1]), local[:, 2]])
 
     def means(self) -> np.ndarray:
-        """(2, a) weighted means of the values by arc."""
+        """Returns the weighted means (2, a) of the values by arc."""
         weighted = self.member * self.weights[:, None]
         return (self.values().T @ weighted) / np.maximum(weighted.sum(axis=0), TINY)
 
     def demean(self, values: np.ndarray) -> np.ndarray:
-        """(k, c) less each arc's weighted mean: its radius and height are eliminated (variable projection)."""
+        """Returns values (k, c) minus each arc's weighted mean, which eliminates its radius and height (variable
+        projection)."""
         weighted = self.member * self.weights[:, None]
         means = (weighted.T @ values) / np.maximum(weighted.sum(axis=0), TINY)[:, None]
         return values - self.member @ means
@@ -263,7 +273,7 @@ class _AxisFitting:
         return self.demean(self.values())
 
     def radius_of(self, points: np.ndarray) -> float:
-        """Mean distance from the axis."""
+        """Returns the mean distance of ``points`` from the axis."""
         local = (points - self.frame.translation) @ self.frame.rotation
         return float(np.hypot(local[:, 0], local[:, 1]).mean())
 
@@ -272,21 +282,21 @@ class _AxisFitting:
         return int(2 * kept.sum() - (2 if self.prismatic else 4) - 2 * (self.member[kept].any(axis=0)).sum())
 
     def sigma(self) -> float:
-        """Of one coordinate, mm."""
+        """Returns σ of one coordinate, mm."""
         return float(np.sqrt((self.weights[:, None] * self.residuals() ** 2).sum() / max(self.redundancy(), 1)))
 
     def huber(self) -> np.ndarray:
-        """(k,) weights by the lengths of the residuals."""
+        """Returns weights (k,) by the lengths of the residuals."""
         length = np.linalg.norm(self.residuals(), axis=1)
         return huber_weights(length, HUBER * self.robust_sigma(length))
 
     def robust_sigma(self, length: np.ndarray) -> float:
-        """Of one coordinate, from the median length, mm."""
+        """Returns σ of one coordinate from the median length, mm."""
         redundancy = self.redundancy(np.ones(len(length))) / (2 * len(length))
         return max(robust_sigma(length, 2, redundancy), self.floor)
 
     def points_jacobian(self) -> np.ndarray:
-        """(k, 2, 3) derivative of the values by the points."""
+        """Returns the derivative (k, 2, 3) of the values by the points."""
         local, axes = self.local(), self.frame.rotation
         if self.prismatic:
             return np.broadcast_to(axes[:, :2].T, (len(local), 2, 3))
@@ -294,7 +304,7 @@ class _AxisFitting:
         return np.stack([outward @ axes[:, :2].T, np.broadcast_to(axes[:, 2], (len(local), 3))], axis=1)
 
     def jacobian(self) -> np.ndarray:
-        """(k, 2, p) derivative of the residuals by rx, ry, tx, ty of the axis in its own frame."""
+        """Returns the derivative (k, 2, p) of the residuals by rx, ry, tx, ty of the axis in its own frame."""
         u, v, w = self.local().T
         zero = np.zeros_like(u)
         if self.prismatic:
@@ -306,7 +316,7 @@ class _AxisFitting:
         return self.demean(np.moveaxis(values, 2, 0).reshape(k, -1)).reshape(k, 2, -1)
 
     def inverse(self) -> np.ndarray:
-        """(p, k, 2) : the step of Gauss and Newton from the residuals."""
+        """Returns the matrix (p, k, 2) that makes the Gauss-Newton step from the residuals."""
         jacobian = self.jacobian()
         k, _, p = jacobian.shape
         root = np.repeat(np.sqrt(self.weights), 2)
@@ -317,7 +327,7 @@ class _AxisFitting:
         return -(unit[:, None] * (vt.T / s) @ u.T * root).reshape(p, k, 2)
 
     def descend(self) -> None:
-        """Least squares, the weights being fixed."""
+        """Minimises the squares with fixed weights."""
         self.inverse()  # refuses arcs that determine no axis
         start, twists = self.frame, np.eye(6)[[0, 1] if self.prismatic else [0, 1, 3, 4]]
 
@@ -327,27 +337,27 @@ class _AxisFitting:
             jacobian = self.jacobian().reshape(len(root), -1)
             return NormalEquations.of(root * self.residuals().ravel(), root[:, None] * jacobian)
 
-        found = minimise(
+        minimum = minimise(
             start,
             linearise,
             lambda frame, step: self.centred(frame @ Rigid.exp(step @ twists)),
             least_gain=self.floor**2,
         )
-        self.frame = found.required(f"{self.where}: axis", "are these single-joint sweeps?").state
+        self.frame = minimum.required(f"{self.where}: axis", "are these single-joint sweeps?").state
 
     def centred(self, frame: Rigid) -> Rigid:
-        """With its origin at the foot of the points' centroid."""
+        """Returns the frame with its origin at the foot of the points' centroid."""
         shift = frame.inverse() @ self.points.mean(axis=0)
         if not self.prismatic:
             shift[:2] = 0
         return Rigid(frame.rotation, frame @ shift)
 
     def gain(self) -> np.ndarray:
-        """(p, k, 3) derivative of the axis by the points."""
+        """Returns the derivative (p, k, 3) of the axis by the points."""
         return np.einsum("pkv,kvc->pkc", self.inverse(), self.points_jacobian())
 
     def require_known(self) -> None:
-        """Refuse an axis whose σ is beyond what its linear covariance can say."""
+        """Refuses an axis whose σ is too large for its linear covariance."""
         if not self.prismatic and (self.means()[0] <= NEAR_AXIS * self.sigma()).all():
             raise DegenerateError("E-AXES-UNDETERMINED", _on_axis(self.where, self.size))
         sigma = self.sigma() * np.linalg.norm(self.gain(), axis=2)
@@ -366,12 +376,12 @@ class _AxisFitting:
             )
 
     def orient(self, moved: np.ndarray) -> None:
-        """z along positive motion, and the motion seen against the joint's."""
+        """Turns z along positive motion, and refuses motion that does not match the joint's values."""
         moved, local = moved[self.rows], self.local()
         if self.prismatic:
-            way = self.demean(np.column_stack([local[:, 2], moved]))
-            turned = (self.weights * way[:, 0]) @ way[:, 1] < 0
-            off = np.abs((-1 if turned else 1) * way[:, 0] - way[:, 1])
+            travel = self.demean(np.column_stack([local[:, 2], moved]))
+            turned = (self.weights * travel[:, 0]) @ travel[:, 1] < 0
+            deviation = np.abs((-1 if turned else 1) * travel[:, 0] - travel[:, 1])
             allowed, unit, shown = MOTION * np.ptp(moved) + GROSS * self.sigma(), "mm", 1.0
         else:
             place = local[:, 0] + 1j * local[:, 1]
@@ -379,21 +389,21 @@ class _AxisFitting:
             with_it, against = ((place * np.exp(-1j * sign * moved)) @ weighted for sign in (1, -1))
             turned = np.abs(against).sum() > np.abs(with_it).sum()
             arm = self.member @ (against if turned else with_it)
-            off = np.abs(np.angle(place * np.exp(-1j * (-1 if turned else 1) * moved) * arm.conj()))
+            deviation = np.abs(np.angle(place * np.exp(-1j * (-1 if turned else 1) * moved) * arm.conj()))
             near = GROSS * self.sigma() / np.maximum(np.abs(place), TINY)
             allowed, unit, shown = MOTION + near, "°", np.degrees(1.0)
-        wrong = np.flatnonzero((off > allowed) & (self.weights > 0))
+        wrong = np.flatnonzero((deviation > allowed) & (self.weights > 0))
         if len(wrong):
             raise InputError(
                 "E-AXES-JOINT-VALUES",
-                f"{self.where}: the motion seen is off its values by up to {off[wrong].max() * shown:.3g} "
+                f"{self.where}: the motion seen is off its values by up to {deviation[wrong].max() * shown:.3g} "
                 f"{unit}; check the column's unit, the coupling in the robot file, and that positions and rows match",
             )
         if turned:
             self.frame = Rigid(self.frame.rotation * [1, -1, -1], self.frame.translation)
 
     def result(self, moved: np.ndarray, near: tuple[Arc, ...]) -> AxisFit:
-        """What was found, for joint values ``moved`` (m,)."""
+        """Returns the result for joint values ``moved`` (m,)."""
         radii, heights = self.means()
         if self.prismatic:
             radii, heights = np.full((2, len(self.arcs)), np.nan)
@@ -416,5 +426,5 @@ class _AxisFitting:
 
 
 def _frame(x: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """(3, 3) right-handed axes from two perpendicular ones."""
+    """Returns right-handed axes (3, 3) from two perpendicular ones."""
     return np.column_stack([x, np.cross(z, x), z])

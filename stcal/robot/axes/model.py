@@ -1,4 +1,4 @@
-"""From the axes of all joints to a robot: Denavit–Hartenberg rows, tools, what they are worth, what to refuse."""
+"""The robot from the axes of all joints: Denavit–Hartenberg rows, tools, their σ, and what to refuse."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Chain, Robot
 
 TOOL_GROSS = 6.0
-"""Median distances from which a row does not count for a reflector's place on the flange."""
+"""Distance, in median distances, beyond which a row does not count for a reflector's place on the flange."""
 ROW_VALUES = ("a", "alpha", "d", "theta", "beta")
 
 
@@ -31,10 +31,11 @@ class AxesResult:
     """A robot by the axis method.
 
     ``fits`` : one for each joint, with the joints before it at zero; ``covariance`` : (p, p) of all axes together, 4 or
-    2 each in their own frames, with what each inherits from the unwinding of those before; ``robot`` : its rows, base
-    and tools; ``row_sigma`` : (n, 5) of a, alpha, d, theta, beta (mm, rad), 0 where the nominal value is kept;
-    ``tool_spread_mm`` : RMS of each reflector about its place on the flange; ``chain`` : the axes; ``off`` : of each
-    axis, lines of rows that are off their arcs and were left out, mm; ``notes`` : what was passed over.
+    2 parameters of each in its own frame, including what each axis inherits from the unwinding of those before;
+    ``robot`` : its rows, base and tools; ``row_sigma`` : (n, 5) of a, alpha, d, theta, beta (mm, rad), 0 where the
+    nominal value is kept; ``tool_spread_mm`` : RMS of each reflector about its place on the flange; ``chain`` : the
+    axes; ``off`` : for each axis, lines of the rows that were left out and how far they are off their arcs, mm;
+    ``notes`` : what was passed over.
     """
 
     fits: tuple[AxisFit, ...]
@@ -57,22 +58,23 @@ class AxesResult:
 def robot_from_sweeps(
     data: Measurements, nominal: Robot, still_rad: float = STILL_RAD, places: np.ndarray | None = None
 ) -> AxesResult:
-    """The axis method: axes, robot, and how far to trust them.
+    """Returns the axes, the robot, and their uncertainty by the axis method.
 
-    Axes do not determine everything: what :func:`~stcal.robot.kinematics.dh.robot_from_chain` keeps of the nominal
-    robot is kept, and the orientation of tools.
+    Axes do not determine everything. What :func:`~stcal.robot.kinematics.dh.robot_from_chain` keeps of the nominal
+    robot is kept here, and so is the orientation of tools.
 
     Parameters
     ----------
     data : Measurements
         Positions of one or more reflectors in sweeps of single joints.
     nominal : Robot
-        Convention, joint types, coupling, and about how the arm is built.
+        Convention, joint types, coupling, and approximate build of the arm.
     still_rad : float
-        Revolute joints stand still within this.
+        Change of a revolute joint's value up to which the joint stands still.
     places : (k, 3) array, optional
-        Take orientations too, by virtual reflectors at these places of the target's frame, mm, k ≥ 3 and not in line:
-        those of :func:`~stcal.robot.axes.orientations.ring`, or points of a real target. Positions alone where None.
+        Places of virtual reflectors in the target's frame, mm, k ≥ 3 and not in line, by which orientations are used
+        too: those of :func:`~stcal.robot.axes.orientations.ring`, or points of a real target. If None, positions alone
+        are used.
 
     Returns
     -------
@@ -113,8 +115,8 @@ def robot_from_sweeps(
         tools, spread = virtual.tools(tools, spread)
     robot = robot_from_chain(axes, tools, nominal)
     if virtual is None:
-        kept = {name: nominal.tools[name].rotation if name in nominal.tools else np.eye(3) for name in tools}
-        robot = replace(robot, tools={n: Rigid(kept[n], t.translation) for n, t in robot.tools.items()})
+        orientation = {name: nominal.tools[name].rotation if name in nominal.tools else np.eye(3) for name in tools}
+        robot = replace(robot, tools={n: Rigid(orientation[n], t.translation) for n, t in robot.tools.items()})
     row_sigma = sigma_of(jacobian_by_axes(lambda f: _row_values(f, nominal), frames, nominal), covariance).reshape(
         -1, 5
     )
@@ -141,20 +143,21 @@ def robot_from_sweeps(
 
 
 def _tools(data: Measurements, last: Rigid, unwound: np.ndarray):
-    """Places of the reflectors in the last joint's frame, from all rows (medians: some may be grossly wrong)."""
+    """Returns the places of the reflectors in the last joint's frame, from all rows, and their spread; it starts at
+    medians, as some rows may be gross errors."""
     names, tools, spread = np.array(data.targets), {}, {}
     for name in dict.fromkeys(data.targets):
-        seen = last.inverse() @ unwound[names == name]
-        place = np.median(seen, axis=0)
-        far = np.linalg.norm(seen - place, axis=1)
+        points = last.inverse() @ unwound[names == name]
+        place = np.median(points, axis=0)
+        far = np.linalg.norm(points - place, axis=1)
         good = far <= TOOL_GROSS * max(np.median(far), TINY)
-        place = seen[good].mean(axis=0)
+        place = points[good].mean(axis=0)
         tools[name] = Rigid(np.eye(3), place)
-        spread[name] = float(np.sqrt(((seen[good] - place) ** 2).sum(axis=1).mean()))
+        spread[name] = float(np.sqrt(((points[good] - place) ** 2).sum(axis=1).mean()))
     return tools, spread
 
 
 def _row_values(frames: list[Rigid], nominal: Robot) -> np.ndarray:
-    """(5 n,) of the rows that these axes give."""
+    """Returns the values (5 n,) of the rows that these axes give."""
     robot = robot_from_chain(chain_through(frames, nominal), {}, nominal)
     return np.array([[getattr(row, key) for key in ROW_VALUES] for row in robot.rows]).ravel()

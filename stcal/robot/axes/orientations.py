@@ -1,6 +1,6 @@
-"""Orientations in sweeps: a pose is several virtual reflectors, which the axis method takes like others.
+"""Orientations in sweeps: a pose counts as several virtual reflectors, which the axis method takes like others.
 
-Zhang & Wei (2017) measure poses of their target, of which the axis method as usually written takes positions alone.
+Zhang & Wei (2017) measure poses of their target; the axis method, as usually written, uses their positions alone.
 """
 
 from dataclasses import dataclass, replace
@@ -16,13 +16,14 @@ from stcal.robot.kinematics.measurements import Measurements
 SHORTEST_MM, LONGEST_MM = 1.0, 10_000.0
 ANGLES = 2 * np.pi / 3 * np.arange(3)
 UNIT_PLACES = np.column_stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(3)])
-"""Of the reflectors about the target's origin, in its XY plane: their mean is the origin."""
+"""Places of the reflectors about the target's origin, in its XY plane; their mean is the origin."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VirtualReflectors:
-    """``data`` : k rows for each of m poses; ``places`` : (k, 3) of the reflectors, target's frame, mm; ``pose`` :
-    (km,) number of the pose of each row; ``lever`` : (km, 3) from their mean, of RMS length 1, instrument's frame."""
+    """Virtual reflectors of poses. ``data`` : k rows for each of m poses; ``places`` : (k, 3) places of the reflectors
+    in the target's frame, mm; ``pose`` : (km,) number of the pose of each row; ``lever`` : (km, 3) vectors from the
+    reflectors' mean, of RMS length 1, in the instrument's frame."""
 
     data: Measurements
     places: Array
@@ -35,10 +36,11 @@ class VirtualReflectors:
         freeze(self, "lever", (len(self.data), 3), "levers")
 
     def by_pose(self, response: np.ndarray) -> np.ndarray:
-        """(p, 6 m) response to the poses' own noise of that (p, km, 3) to the noise of rows taken for independent.
+        """Returns the response (p, 6 m) to the noise of poses, given the ``response`` (p, km, 3) to the noise of
+        independent rows.
 
-        A pose errs by a translation of the reflectors' mean and by a rotation that moves them as much (RMS):
-        √(1 + ⅔) of it together.
+        A pose errs by a translation of the reflectors' mean, and by a rotation that moves the reflectors as much (RMS);
+        both together are √(1 + ⅔) of it.
         """
         by_row = np.concatenate([np.broadcast_to(np.eye(3), (len(self.lever), 3, 3)), -skew(self.lever)], axis=2)
         shared = np.zeros((len(response), int(self.pose.max()) + 1, 6))
@@ -46,15 +48,16 @@ class VirtualReflectors:
         return np.sqrt(3 / 5) * shared.reshape(len(response), -1)
 
     def tools(self, places: dict[str, Rigid], spread_mm: dict[str, float]) -> tuple[dict[str, Rigid], dict[str, float]]:
-        """Poses of the targets from the places of their reflectors, and RMS of these about their places."""
+        """Returns the poses of the targets from the places of their reflectors, and the RMS of the reflectors about
+        these places."""
         tools, spread = {}, {}
         for name in dict.fromkeys(self.data.targets):
             target, _, number = name.rpartition(SEPARATOR)
             if number == "1":
-                own = [f"{target}{SEPARATOR}{i + 1}" for i in range(len(self.places))]
-                xyz = np.array([places[each].translation for each in own])
+                names = [f"{target}{SEPARATOR}{i + 1}" for i in range(len(self.places))]
+                xyz = np.array([places[each].translation for each in names])
                 tools[target] = align_rigid(xyz, self.places)
-                spread[target] = float(np.sqrt(np.mean([spread_mm[each] ** 2 for each in own])))
+                spread[target] = float(np.sqrt(np.mean([spread_mm[each] ** 2 for each in names])))
         return tools, spread
 
 
@@ -62,7 +65,8 @@ SEPARATOR = " point "
 
 
 def length_of(data: Measurements) -> float | None:
-    """Distance at which the stated σ of rotations is worth that of positions, mm; None where none are stated."""
+    """Returns the distance, mm, at which the stated σ of rotations is worth that of positions; None if no σ are
+    stated."""
     if data.rotations is None or data.covariance is None:
         return None
     variance = np.einsum("mii->mi", np.asarray(data.covariance))
@@ -73,7 +77,8 @@ def length_of(data: Measurements) -> float | None:
 
 
 def ring(length_mm: float) -> np.ndarray:
-    """(3, 3) places at ``length_mm`` from the target's origin, where an error of rotation is worth one of position.
+    """Returns places (3, 3) at ``length_mm`` from the target's origin; an error of rotation is worth one of position
+    there.
 
     Raises
     ------
@@ -88,12 +93,12 @@ def ring(length_mm: float) -> np.ndarray:
 
 
 def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflectors:
-    """Reflectors that each pose carries along at ``places`` (k, 3) of its target, mm; k ≥ 3, not in line.
+    """Returns reflectors that each pose carries at ``places`` (k, 3) of its target, mm; k ≥ 3, not in line.
 
     Raises
     ------
     InputError
-        No orientations.
+        The measurements have no orientations.
     """
     if data.rotations is None or data.positions is None:
         raise InputError(
@@ -106,7 +111,7 @@ def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflect
     carried, lever = (np.einsum("mij,kj->mki", data.rotations, each).reshape(-1, 3) for each in (places, lever))
     row = np.repeat(np.arange(m), k)
     at = row.tolist()
-    own = replace(
+    virtual = replace(
         data,
         lines=[data.lines[i] for i in at],
         q=data.q[row],
@@ -116,4 +121,4 @@ def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflect
         covariance=None,
         common=None,
     )
-    return VirtualReflectors(own, places, row, lever)
+    return VirtualReflectors(virtual, places, row, lever)

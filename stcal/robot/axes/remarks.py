@@ -1,4 +1,4 @@
-"""What to say of fitted axes: outliers, reflectors too close or on no arc, zero positions."""
+"""Remarks on fitted axes: outliers, reflectors too close or on no arc, zero positions."""
 
 import numpy as np
 
@@ -10,37 +10,38 @@ from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 
 FEW = 3
-"""Outliers of a joint that are named one by one."""
+"""Largest number of outliers of a joint that are named one by one."""
 ONE_LINE_MM = 10.0
-"""Axes meant to be one, as of a SCARA's spindle, are made closer than this."""
+"""Largest distance between axes that are meant to be one line, such as those of a SCARA's spindle."""
 
 
 def off_mm(fit: AxisFit) -> dict[int, float]:
-    """How far each outlier (its row) is off its arc, the farthest first."""
-    found = {}
+    """Returns how far each outlier (by its row) is off its arc, mm, the farthest first."""
+    distances = {}
     for row in fit.outliers:
-        here = (fit.rows == row) & (fit.weights == 0)
-        found[int(row)] = float(np.linalg.norm(fit.residuals[here], axis=1).max())
-    return dict(sorted(found.items(), key=lambda item: -item[1]))
+        of_row = (fit.rows == row) & (fit.weights == 0)
+        distances[int(row)] = float(np.linalg.norm(fit.residuals[of_row], axis=1).max())
+    return dict(sorted(distances.items(), key=lambda item: -item[1]))
 
 
 def _outliers_said(data: Measurements, fit: AxisFit) -> list[str]:
-    """One line for each of a few outliers, one for all of many."""
-    off, limit = off_mm(fit), f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out"
-    if len(off) <= FEW:
+    """Returns a line for each of a few outliers, or one line for all of many."""
+    off_arc, limit = off_mm(fit), f"{GROSS:g} σ is {GROSS * fit.sigma_mm:.2g} mm; left out"
+    if len(off_arc) <= FEW:
         return [
             f"line {data.lines[row]}, {called(data.targets[row])}: {size:.3g} mm off its arc about joint "
             f"{fit.joint + 1}, {limit}"
-            for row, size in off.items()
+            for row, size in off_arc.items()
         ]
-    first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off.items())[:FEW])
+    first = ", ".join(f"{data.lines[row]} ({size:.3g} mm)" for row, size in list(off_arc.items())[:FEW])
     return [
-        f"joint {fit.joint + 1}: {len(off)} of {len(set(fit.rows.tolist()))} rows are off their arcs, {limit}; the "
+        f"joint {fit.joint + 1}: {len(off_arc)} of {len(set(fit.rows.tolist()))} rows are off their arcs, {limit}; the "
         f"farthest are lines {first}; all are in --json"
     ]
 
 
 def remarks(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robot) -> list[str]:
+    """Returns remarks on the fitted axes and the robot that they make."""
     notes = [
         f"joint {fit.joint + 1}: the weights of its points still change after {REWEIGHTINGS} rounds; look at them"
         for fit in fits
@@ -57,7 +58,7 @@ def remarks(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robo
     for i, (row, wanted) in enumerate(zip(robot.rows, nominal.rows, strict=True)):
         after = robot.rows[i if robot.convention == "standard" else min(i + 1, len(fits) - 1)]
         one_line = abs(np.sin(after.alpha)) < np.sin(PARALLEL_RAD) and abs(after.a) < ONE_LINE_MM
-        if abs(row.theta - wanted.theta) > AGREES_RAD and not one_line:  # of one line with the next, theta is chance
+        if abs(row.theta - wanted.theta) > AGREES_RAD and not one_line:  # on one line theta is arbitrary
             notes.append(
                 f"joint {i + 1}: theta is {np.degrees(row.theta):.2f}°, {np.degrees(wanted.theta):.2f}° in the robot "
                 "file: its zero position is elsewhere"
@@ -66,7 +67,7 @@ def remarks(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robo
 
 
 def _alone(data: Measurements, fits: list[AxisFit]) -> list[str]:
-    """Of reflectors that are on no arc."""
+    """Returns notes on reflectors that are on no arc."""
     swept = {data.targets[row] for fit in fits for row in fit.rows.tolist()}
     notes = []
     for name in dict.fromkeys(data.targets):

@@ -1,4 +1,4 @@
-"""The axis method's result for the terminal, for programs, and as a page."""
+"""Reports of the axis method for the terminal, for programs, and as a page."""
 
 from collections.abc import Mapping
 
@@ -22,7 +22,7 @@ SPREAD_HEADS = ("joints", "distance mm", "D-H a mm")
 
 
 def axes_text(result: AxesResult) -> str:
-    """Tables for the terminal."""
+    """Returns tables for the terminal."""
     lines = ["Axes: residuals as RMS of a coordinate, and as mean and RMS length of the points' vectors"]
     lines += text_table([AXIS_HEADS, *[_axis_cells(fit) for fit in result.fits]])
     lines += ["", "Pairs of axes: robust distance, and the common normal of Denavit and Hartenberg"]
@@ -101,7 +101,7 @@ def _row_cells(result: AxesResult) -> list[list[str]]:
 
 
 def axes_file(result: AxesResult) -> AxesFile:
-    """Everything as plain values: mm, rad; None where there is no value."""
+    """Returns the result as plain values: mm, rad; None where there is no value."""
     distance, normal = (result.without_one.spread(name) for name in ("distance", "normal"))
     return AxesFile.model_validate(
         {
@@ -184,7 +184,7 @@ def _pair_json(pair: Pair) -> dict:
 
 
 def axes_page(result: AxesResult, where: str) -> str:
-    """The report of ``axes``."""
+    """Returns the report page of ``axes``."""
     return render(
         "robot/axes/page.html.jinja",
         robot=result.robot.name,

@@ -1,4 +1,4 @@
-"""Sweeps of single joints in measured data: which rows are arcs of one joint and one reflector."""
+"""Sweeps of single joints in measured data: rows that are arcs of one joint and one reflector."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -11,12 +11,13 @@ from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 
 STILL_RAD = np.radians(1.5e-3)
-"""Joint values this close are one: a controller shows 0.001°, and coupling adds two of them. 0.05 mm at 2 m."""
+"""Difference up to which joint values are equal: a controller shows 0.001°, and coupling adds two of them. It is 0.05
+mm at 2 m."""
 STILL_MM = 2e-3
 DISTINCT = {"revolute": 3, "prismatic": 2}
-"""Positions that give an arc its radius and height, or a line its direction."""
+"""Number of positions that give an arc its radius and height, or a line its direction."""
 NOT_MOVED_MM = 1.0
-"""Sweeps of a whole arm move a reflector on its flange by more."""
+"""Motion of a reflector below which it does not move; sweeps of a whole arm move a reflector on its flange by more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,10 +33,10 @@ class Arc:
 
 
 def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) -> tuple[list[Arc], list[str]]:
-    """Arcs of all joints, and what was passed over with the reason.
+    """Returns the arcs of all joints, and notes on arcs that are not used, with the reason.
 
     Rows of one reflector that differ in exactly one *kinematic* joint value (the controller's after coupling) form an
-    arc; a row may belong to several. Positions a full turn apart are one position of the joint that turns; a joint that
+    arc; a row may belong to several. Positions a full turn apart are one position of the joint that turns. A joint that
     should stand still must not be a full turn away, where gears and backlash need not repeat.
 
     Raises
@@ -56,20 +57,20 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
         groups = defaultdict(list)
         for row, others in enumerate(np.delete(same, j, axis=1)):
             groups[data.targets[row], *others.tolist()].append(row)
-        found = 0
+        arc_count = 0
         for (target, *_), rows in groups.items():
             values = kinematic[rows, j]
             places = values if robot.prismatic[j] else np.mod(values + STILL_RAD, 2 * np.pi)
             distinct = len(set(_clusters(places, still[j])))
             if distinct >= DISTINCT[joint.type]:
                 arcs.append(Arc(j, target, rows))
-                found += 1
+                arc_count += 1
             elif distinct > 1:
                 notes.append(
                     f"joint {j + 1}, {called(target)}, line {data.lines[rows[0]]}: an arc of {distinct} positions is "
                     f"not used, {DISTINCT[joint.type]} needed"
                 )
-        if not found:
+        if not arc_count:
             missing.append(str(j + 1))
     if missing:
         raise InputError(
@@ -82,7 +83,7 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
 
 
 def called(target: str) -> str:
-    """How a reflector is called in messages."""
+    """Returns the name of a reflector in messages."""
     return f"reflector {target}" if target else "the reflector"
 
 
@@ -101,7 +102,7 @@ def _require_motion(data: Measurements) -> None:
 
 
 def _clusters(values: np.ndarray, still: float) -> np.ndarray:
-    """Number of the cluster that each value belongs to; neighbours closer than ``still`` are one."""
+    """Returns the number of the cluster of each value; neighbours closer than ``still`` are in one cluster."""
     order = np.argsort(values)
     label = np.empty(len(values), int)
     label[order] = np.concatenate([[0], np.cumsum(np.diff(values[order]) > still)])

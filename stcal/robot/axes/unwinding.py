@@ -1,4 +1,4 @@
-"""Axes in order: each is fitted to points with the joints before it undone."""
+"""Fits of the axes in order, each to points with the joints before it undone."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,18 +14,18 @@ from stcal.robot.kinematics.model import Robot
 def fit_axes(
     data: Measurements, robot: Robot, arcs: list[Arc], virtual: VirtualReflectors | None = None
 ) -> tuple[list[AxisFit], np.ndarray, np.ndarray, list[list[np.ndarray]]]:
-    """Fits in order, each on points with the joints before unwound; covariance of all; points with all unwound; and of
-    each axis the derivatives by those before it.
+    """Returns the fits in order, each to points with the joints before unwound; the covariance of all; the points with
+    all joints unwound; and for each axis its derivatives by those before it.
 
     The covariance counts a row once, however many sweeps it belongs to, and a pose once for all its reflectors.
     """
     kinematic = data.q @ robot.coupling.T
     points, m = np.array(data.points()), len(data)
-    turned = np.broadcast_to(np.eye(3), (m, 3, 3))  # what unwinding has turned the noise by
+    turned = np.broadcast_to(np.eye(3), (m, 3, 3))  # rotation of the noise by unwinding
     fits, response, inherited, passed = [], [], [], []
     for j, sliding in enumerate(robot.prismatic):
-        own = [arc for arc in arcs if arc.joint == j]
-        fit = fit_axis(points, kinematic[:, j], own, bool(sliding), f"{data.where}: joint {j + 1}")
+        joint_arcs = [arc for arc in arcs if arc.joint == j]
+        fit = fit_axis(points, kinematic[:, j], joint_arcs, bool(sliding), f"{data.where}: joint {j + 1}")
         # derivative of this axis by σ-scaled noise of every row: its own, and through the axes before it
         to_noise = np.zeros((len(fit.gain), m, 3))
         own_noise = fit.sigma_mm * np.einsum("pkc,kcd->kpd", fit.gain, turned[fit.rows])
@@ -45,7 +45,7 @@ def fit_axes(
 
 
 def unwound_by(axis: Rigid, points: np.ndarray, value: np.ndarray, sliding: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations (m, 3, 3) that undo the joint's values, and the points after that."""
+    """Returns the rotations (m, 3, 3) that undo the joint's values, and the points after that."""
     z, origin = axis.rotation[:, 2], axis.translation
     if sliding:
         return np.broadcast_to(np.eye(3), (len(points), 3, 3)), points - value[:, None] * z
@@ -54,16 +54,16 @@ def unwound_by(axis: Rigid, points: np.ndarray, value: np.ndarray, sliding: bool
 
 
 def _unwinding_jacobian(axis: Rigid, before: np.ndarray, after: np.ndarray, turn: np.ndarray, count: int) -> np.ndarray:
-    """(m, 3, p) derivative of the unwound points by rx, ry, tx, ty of the axis in its frame.
+    """Returns the derivative (m, 3, p) of the unwound points by rx, ry, tx, ty of the axis in its frame.
 
-    Moving the axis by a small motion D makes of its unwinding U the motion D U D⁻¹: δ = D(U x) − U(D x).
+    A small motion D of the axis turns its unwinding U into D U D⁻¹: δ = D(U x) − U(D x).
     """
     columns = []
     for component in (0, 1, 3, 4)[:count]:
         direction = axis.rotation[:, component % 3]
         if component < 3:
-            here, there = (np.cross(direction, points - axis.translation) for points in (after, before))
+            after_shift, before_shift = (np.cross(direction, points - axis.translation) for points in (after, before))
         else:
-            here = there = np.broadcast_to(direction, after.shape)
-        columns.append(here - np.einsum("mij,mj->mi", turn, there))
+            after_shift = before_shift = np.broadcast_to(direction, after.shape)
+        columns.append(after_shift - np.einsum("mij,mj->mi", turn, before_shift))
     return np.stack(columns, axis=2)

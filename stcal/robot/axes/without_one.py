@@ -1,4 +1,4 @@
-"""What the axes become without one row of the sweeps."""
+"""Leave-one-out of the axes: their values without one row of the sweeps."""
 
 from dataclasses import dataclass
 
@@ -12,16 +12,16 @@ from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 
 REFITTED = 200
-"""Rows of the sweeps up to which every one is left out by fitting again; of more by influence: of 600 rows the spread
-is 1 to 4 % less so."""
+"""Largest number of rows of the sweeps for which each is left out by a new fit; of more rows each is left out by
+influence. For 600 rows the spread is 1 to 4 % less so."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LeaveOneOut:
-    """What each pair's values become without one row of the sweeps (all its reflectors).
+    """The values of each pair without one row of the sweeps (all its reflectors).
 
-    ``lines`` : of each row left out, its first; ``distance``, ``normal`` : (r, n − 1) mm, as in :class:`Pair`; nan
-    where there is none, or where the rest does not determine an axis.
+    ``lines`` : first line of each row that was left out; ``distance``, ``normal`` : (r, n − 1) mm, as in :class:`Pair`;
+    nan where there is no value, or where the remaining rows do not determine an axis.
     """
 
     lines: tuple[int, ...]
@@ -35,7 +35,7 @@ class LeaveOneOut:
             object.__setattr__(self, name, values)
 
     def spread(self, name: str) -> np.ndarray:
-        """(n − 1,) largest less smallest of ``distance`` or ``normal``; nan where there is none."""
+        """Returns the largest minus the smallest ``distance`` or ``normal``, (n − 1,); nan where there is none."""
         values = getattr(self, name)
         known = np.isfinite(values)
         high, low = np.where(known, values, -np.inf).max(axis=0), np.where(known, values, np.inf).min(axis=0)
@@ -45,7 +45,7 @@ class LeaveOneOut:
 def leave_one_out(
     data: Measurements, fits: list[AxisFit], nominal: Robot, passed: list[list[np.ndarray]]
 ) -> LeaveOneOut:
-    """All axes again without each row; what comes after a changed axis is unwound and fitted again."""
+    """Returns the values without each row; what comes after a changed axis is unwound and fitted again."""
     kinematic = data.q @ nominal.coupling.T
     start = [np.array(data.points())]
     for j, fit in enumerate(fits):
@@ -63,7 +63,7 @@ def leave_one_out(
 def _refitted(
     rows: list[int], fits: list[AxisFit], start: list[np.ndarray], kinematic: np.ndarray, nominal: Robot
 ) -> np.ndarray:
-    """(n − 1, 6) of the pairs without these rows; nan where the rest determines no axis."""
+    """Returns the values (n − 1, 6) of the pairs without these rows; nan if the remaining rows determine no axis."""
     first = next(j for j, fit in enumerate(fits) if np.isin(fit.rows, rows).any())
     frames, points = [fit.world_from_axis for fit in fits[:first]], start[first]
     try:
@@ -82,29 +82,32 @@ def _by_influence(
     passed: list[list[np.ndarray]],
     nominal: Robot,
 ) -> np.ndarray:
-    """(r, n − 1, 6) of the pairs without each instant's rows, linear in what these change: a row left out is one whose
-    residual is that by the others (Cook & Weisberg 1982, "Residuals and Influence in Regression")."""
+    """Returns the values (r, n − 1, 6) of the pairs without each instant's rows, linear in the changes.
+
+    Leaving a row out is giving it the residual by the fit of the others (Cook & Weisberg 1982, "Residuals and Influence
+    in Regression").
+    """
     number = np.zeros(len(start[0]), int)
     for i, rows in enumerate(instants):
         number[rows] = i
     changes = []
-    for fit, points, by in zip(fits, start, passed, strict=False):
-        own = np.zeros((len(instants), len(fit.gain)))
-        np.add.at(own, number[fit.rows], fit.influence(points[fit.rows]))
-        for before, derivative in zip(changes, by, strict=True):
-            own += before @ derivative.T
-        changes.append(own)
+    for fit, points, derivatives in zip(fits, start, passed, strict=False):
+        change = np.zeros((len(instants), len(fit.gain)))
+        np.add.at(change, number[fit.rows], fit.influence(points[fit.rows]))
+        for before, derivative in zip(changes, derivatives, strict=True):
+            change += before @ derivative.T
+        changes.append(change)
     frames = [fit.world_from_axis for fit in fits]
-    here = pair_values(frames, nominal)
+    values = pair_values(frames, nominal)
     slope = jacobian_by_axes(lambda f: pair_values(f, nominal), frames, nominal)
-    return (here + np.concatenate(changes, axis=1) @ slope.T).reshape(len(instants), -1, 6)
+    return (values + np.concatenate(changes, axis=1) @ slope.T).reshape(len(instants), -1, 6)
 
 
 def _instants(data: Measurements) -> list[list[int]]:
-    """Rows that were measured together: the same joint values, each reflector once."""
-    instants, seen = {}, {}
+    """Returns the groups of rows that were measured together: the same joint values, each reflector once."""
+    instants, counts = {}, {}
     for row, (q, target) in enumerate(zip(data.q, data.targets, strict=True)):
         values = q.tobytes()
-        seen[values, target] = seen.get((values, target), 0) + 1
-        instants.setdefault((values, seen[values, target]), []).append(row)
+        counts[values, target] = counts.get((values, target), 0) + 1
+        instants.setdefault((values, counts[values, target]), []).append(row)
     return list(instants.values())

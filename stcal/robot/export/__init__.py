@@ -1,4 +1,4 @@
-"""Compensated points in the files of controllers, each read back as it is made."""
+"""Export of compensated points to files of controllers; each file is read back when it is made."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,27 +19,27 @@ from stcal.robot.use.targets import poses_of
 
 As = Literal["joints", "poses"]
 SAME_MM, SAME_RAD = 10.0**-MM_DIGITS, 1e-9
-"""Poses read back are off by no more than the digits printed; Yaskawa's have fewer."""
+"""Largest differences of poses that are read back, by the digits printed; Yaskawa's have fewer digits."""
 YASKAWA_SAME_MM, YASKAWA_SAME_RAD = 10.0**-YASKAWA_MM_DIGITS, 5e-6
 SHOWN = 6
-"""Lines that are named in a note."""
+"""Largest number of lines that are named in a note."""
 
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """``text`` of the file; ``notes`` : what stands in it, and what does not."""
+    """An exported file. ``text`` : of the file; ``notes`` : what the file holds, and what it does not."""
 
     text: str
     notes: tuple[str, ...]
 
 
 def require_form(form: str) -> None:
-    """Refuse a form that is none.
+    """Refuses an unknown form.
 
     Raises
     ------
     InputError
-        With those there are.
+        The form is unknown; the message names the known ones.
     """
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
@@ -53,30 +53,30 @@ def exported(
     wanted: As = "joints",
     pulses_per_deg: Sequence[float] | None = None,
 ) -> Exported:
-    """The points that are reached, as a controller reads them.
+    """Returns the points that are reached, as a controller reads them.
 
     Parameters
     ----------
     result : Compensated
     robot : Robot
-        Whose joint values these are.
+        The robot whose joint values these are.
     form : str
-        Of :data:`~stcal.robot.export.files.FORMS`.
+        One of :data:`~stcal.robot.export.files.FORMS`.
     path : Path
-        The file; controllers have its name, without its ending, inside too.
+        The file. Controllers have its name, without its ending, inside the file too.
     wanted : {"joints", "poses"}
-        Joint values, or the poses that the controller, which knows the nominal robot, has to be told for them.
+        Joint values, or the poses that must be commanded to the controller, which knows the nominal robot.
     pulses_per_deg : sequence of float, optional
-        Of each joint, for Yaskawa's joint values; without them its file has poses.
+        Pulses per degree of each joint, for Yaskawa's joint values; without them its file has poses.
 
     Raises
     ------
     InputError
-        No such form, no row reached, joints that the controller has no place for, poses without a nominal robot or of
-        several tools, or pulses of another number.
+        An unknown form, no row that is reached, joints for which the controller has no place, poses without a nominal
+        robot or of several tools, or a wrong number of pulses.
     """
     require_form(form)
-    where, own = f"--export {form}={path}", FORMS[form]
+    where, controller = f"--export {form}={path}", FORMS[form]
     rows = np.flatnonzero(result.found.usable)
     if not len(rows):
         raise InputError("E-EXPORT-UNREACHED", f"{where}: none of {len(result)} rows is reached; nothing to write")
@@ -89,21 +89,25 @@ def exported(
     points = _points(result, robot, rows, program_name(path.stem), pulses_per_deg)
     head = [f"stcal {stcal.__version__}: robot {robot.name}, {len(rows)} of {len(result)} points"]
     if wanted == "poses":
-        poses, said = _poses(result, rows, where)
-        points, head = points.with_poses(poses), [*head, said]
-        notes.append(f"{said}; {own.unknown}")
+        poses, description = _poses(result, rows, where)
+        points, head = points.with_poses(poses), [*head, description]
+        notes.append(f"{description}; {controller.unknown}")
     else:
-        reason = own.refuses(points)
+        reason = controller.refuses(points)
         if reason:
             raise InputError("E-ROBOT-MISMATCH", f"{where}: {reason}; joint values of robot {robot.name} do not fit")
         head.append("joint values that the controller must be told")
-    gone = np.flatnonzero(~result.found.usable)
-    if len(gone):
-        named = ", ".join(str(result.targets.lines[i]) for i in gone[:SHOWN]) + (", …" if len(gone) > SHOWN else "")
-        notes.append(f"left out, as they are not reached: line{'s' * (len(gone) > 1)} {named}")
-        head.append(f"left out, as they are not reached: {len(gone)} lines, the first {result.targets.lines[gone[0]]}")
-    text = own.write(points, [ascii_text(line) for line in head])
-    if not _same(own.read(text), points, form):
+    unreached = np.flatnonzero(~result.found.usable)
+    if len(unreached):
+        named = ", ".join(str(result.targets.lines[i]) for i in unreached[:SHOWN]) + (
+            ", …" if len(unreached) > SHOWN else ""
+        )
+        notes.append(f"left out, as they are not reached: line{'s' * (len(unreached) > 1)} {named}")
+        head.append(
+            f"left out, as they are not reached: {len(unreached)} lines, the first {result.targets.lines[unreached[0]]}"
+        )
+    text = controller.write(points, [ascii_text(line) for line in head])
+    if not _same(controller.read(text), points, form):
         raise StcalError("E-EXPORT-READ-BACK", f"{where}: the file does not give the points back; use another form")
     return Exported(text, tuple(f"{where}: {note}" for note in [f"{len(rows)} points, {wanted}", *notes]))
 
@@ -113,16 +117,17 @@ def _points(
 ) -> Points:
     targets, labels = result.targets, []
     for i in rows:
-        more = [f"{column} {own[i]}" for column, own in targets.names.items()]
-        more += [f"target {targets.tools[i]}"] if targets.tools[i] else []
-        labels.append(ascii_text(", ".join([f"line {targets.lines[i]}", *more])))
+        details = [f"{column} {own[i]}" for column, own in targets.names.items()]
+        details += [f"target {targets.tools[i]}"] if targets.tools[i] else []
+        labels.append(ascii_text(", ".join([f"line {targets.lines[i]}", *details])))
     pulses = None if pulses_per_deg is None else tuple(pulses_per_deg)
     joints = np.where(robot.prismatic, result.found.q[rows], np.degrees(result.found.q[rows]))
     return Points(name, tuple(labels), joints, robot.prismatic, None, pulses)
 
 
 def _poses(result: Compensated, rows: np.ndarray, where: str) -> tuple[Poses, str]:
-    """Of the nominal robot at the compensated joint values; and of which tool they are."""
+    """Returns the poses of the nominal robot at the compensated joint values, and a description of them with their
+    tool."""
     if result.controller is None:
         raise InputError(
             "E-COMPENSATE-POSES",
@@ -137,8 +142,8 @@ def _poses(result: Compensated, rows: np.ndarray, where: str) -> tuple[Poses, st
             "joints, needed",
         )
     x, y, z = result.controller.tool(names[0]).translation
-    said = f"poses in the robot's base, of the tool at {x:.3f}, {y:.3f}, {z:.3f} mm on the flange"
-    return poses_of(result.controller, targets, result.found.q[rows]), said
+    description = f"poses in the robot's base, of the tool at {x:.3f}, {y:.3f}, {z:.3f} mm on the flange"
+    return poses_of(result.controller, targets, result.found.q[rows]), description
 
 
 def _require_pulses(pulses: Sequence[float], robot: Robot, where: str) -> None:
@@ -151,15 +156,15 @@ def _require_pulses(pulses: Sequence[float], robot: Robot, where: str) -> None:
 
 
 def _same(found: Poses | np.ndarray, points: Points, form: str) -> bool:
-    """Whether a file that was read back has these points."""
+    """Returns True if a file that was read back has these points."""
     if isinstance(found, Poses) != (points.poses is not None):
         return False
     if isinstance(found, Poses) and points.poses is not None:
         mm, rad = (YASKAWA_SAME_MM, YASKAWA_SAME_RAD) if form == "yaskawa" else (SAME_MM, SAME_RAD)
         if len(found) != len(points.poses):
             return False
-        off = found.difference(points.poses)
-        return bool(np.abs(off[:, 3:]).max() <= mm and np.abs(off[:, :3]).max() <= rad)
+        difference = found.difference(points.poses)
+        return bool(np.abs(difference[:, 3:]).max() <= mm and np.abs(difference[:, :3]).max() <= rad)
     values, digit = FORMS[form].values(points)
     found = np.asarray(found)
     return found.shape == values.shape and bool(np.abs(found - values).max() <= 0.51 * digit)

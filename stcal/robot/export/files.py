@@ -1,6 +1,6 @@
-"""Points as files of controllers hold them: Yaskawa JBI, FANUC LS, KUKA dat, ABB mod, URScript.
+"""Files of controllers with points: Yaskawa JBI, FANUC LS, KUKA dat, ABB mod, URScript.
 
-Joint values in degrees, and mm of prismatic joints; pulses for Yaskawa, rad for Universal Robots.
+Joint values are in degrees, and in mm for prismatic joints; pulses for Yaskawa, rad for Universal Robots.
 """
 
 import re
@@ -15,16 +15,17 @@ from stcal.io.poses.controllers import ABB, DEG_DIGITS, FANUC, KUKA, NUMBER, UNI
 from stcal.io.poses.text import fixed, joined, without_comments
 
 REMARK = 32
-"""Characters of a remark in a FANUC program, and of a JBI file's."""
+"""Largest number of characters of a remark, in a FANUC program and in a JBI file."""
 NOTHING = "9E9,9E9,9E9,9E9,9E9,9E9"
-"""ABB's external axes that are not there."""
+"""Values of ABB's external axes that do not exist."""
 QUARTER_DEG = 90.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """``name`` of the program; ``labels`` : of m points, for comments; ``joints`` : (m, n) deg or mm; ``sliding`` : of
-    each joint; ``poses`` : m, in place of joint values, or None; ``pulses_per_deg`` : (n,) or None."""
+    """Points of a program. ``name`` : of the program; ``labels`` : (m,) for comments; ``joints`` : (m, n) deg or mm;
+    ``sliding`` : (n,) mask of the prismatic joints; ``poses`` : m poses in place of joint values, or None;
+    ``pulses_per_deg`` : (n,) or None."""
 
     name: str
     labels: tuple[str, ...]
@@ -37,17 +38,18 @@ class Points:
         return len(self.labels)
 
     def with_poses(self, poses: Poses) -> "Points":
-        """To be written as these."""
+        """Returns the points with ``poses`` in place of joint values."""
         return replace(self, poses=poses)
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A controller's file.
+    """The form of a controller's file.
 
-    ``write`` : text of points, below lines of comment; ``pose`` : how it writes these; ``axes`` : joint values in a
-    text; ``values`` : (m, n) of these in the file's unit, and their last digit; ``refuses`` : why joint values cannot
-    be written, or ""; ``unknown`` : what is not told of a pose.
+    ``write`` : returns the text of points, below lines of comment; ``pose`` : how poses are written; ``axes`` : pattern
+    of joint values in a text; ``values`` : returns joint values (m, n) in the file's unit, and their last digit;
+    ``refuses`` : returns why joint values cannot be written, or ""; ``unknown`` : what the file does not tell of a
+    pose.
     """
 
     write: Callable[[Points, Sequence[str]], str]
@@ -58,16 +60,16 @@ class Form:
     values: Callable[[Points], tuple[np.ndarray, float]] = lambda points: (points.joints, 10.0**-DEG_DIGITS)
 
     def read(self, text: str) -> Poses | np.ndarray:
-        """Poses, or joint values (m, n) as they are written."""
+        """Returns the poses, or the joint values (m, n) as they are written."""
         poses = self.pose.read(text)
         if poses:
             return Poses.of(poses)
-        found = self.axes.finditer(without_comments(text))
-        return np.array([[float(v) for v in re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?", each[1])] for each in found])
+        matches = self.axes.finditer(without_comments(text))
+        return np.array([[float(v) for v in re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?", each[1])] for each in matches])
 
 
 def most(count: int) -> Callable[[Points], str]:
-    """A controller that has so many joints or fewer."""
+    """Returns a check that refuses more than ``count`` joints."""
 
     def refuses(points: Points) -> str:
         n = points.joints.shape[1]
@@ -101,19 +103,19 @@ def _kuka(points: Points, head: Sequence[str]) -> str:
 def _abb(points: Points, head: Sequence[str]) -> str:
     lines = [f"MODULE {points.name}", *(f"  ! {line}" for line in head)]
     for i, label in enumerate(points.labels):
-        own = points.joints[i]
+        joints = points.joints[i]
         if points.poses is None:
-            six = joined(np.pad(own, (0, 6 - len(own))), DEG_DIGITS)
+            six = joined(np.pad(joints, (0, 6 - len(joints))), DEG_DIGITS)
             frame = f"jointtarget p{i + 1}:=[[{six}],[{NOTHING}]]"
         else:
-            quarters = ",".join(str(int(v)) for v in np.floor(_of_six(own, (0, 3, 5)) / QUARTER_DEG))
+            quarters = ",".join(str(int(v)) for v in np.floor(_of_six(joints, (0, 3, 5)) / QUARTER_DEG))
             frame = f"robtarget p{i + 1}:=[{ABB.write(points.poses[i])},[{quarters},0],[{NOTHING}]]"
         lines += [f"  ! {label}", f"  CONST {frame};"]
     return "\n".join([*lines, "ENDMODULE"]) + "\n"
 
 
 def _of_six(joints: np.ndarray, which: tuple[int, ...]) -> np.ndarray:
-    """Values of some joints; 0 of those that an arm does not have."""
+    """Returns the values of some joints; 0 for joints that an arm does not have."""
     return np.pad(joints, (0, max(0, 6 - len(joints))))[list(which)]
 
 
@@ -210,4 +212,4 @@ FORMS = {
         lambda points: (np.radians(points.joints), 10.0**-UNIT_DIGITS),
     ),
 }
-"""By the word of ``--export``."""
+"""The form for each word of ``--export``."""

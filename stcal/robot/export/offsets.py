@@ -1,4 +1,4 @@
-"""What differs from the nominal robot, as controllers take it: D-H values, and the joints' zeros."""
+"""Differences from the nominal robot, as controllers take them: D-H values, and the joints' zeros."""
 
 import csv
 import io
@@ -18,25 +18,25 @@ LENGTH_AT, ANGLE_AT = DH.index("d"), DH.index("theta")
 
 
 def zeros(result: Identified, nominal: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the controller's joint values should be where they are 0 now, and their σ, (n,) rad or mm; (n,) which of
-    them the data tell.
+    """Returns the joint values that the controller should have where it has 0 now, their σ, and a mask of those that
+    the data determine.
 
-    The identified rows have θ + Δ, or d + Δ of prismatic joints, where the nominal ones have θ; with the coupling C the
-    joints turn by C q. Nominal rows do the same with q + C⁻¹ Δ.
+    All are (n,), rad or mm. The identified rows have θ + Δ, or d + Δ for prismatic joints, where the nominal ones have
+    θ; with the coupling C the joints turn by C q. Nominal rows do the same with q + C⁻¹ Δ.
     """
     at = np.where(nominal.prismatic, LENGTH_AT, ANGLE_AT)
-    each, back = np.arange(len(at)), np.linalg.inv(nominal.coupling)
-    change = back @ (dh_values(result.robot) - dh_values(nominal))[each, at]
-    jacobian = back @ result.adjustment.rows.by_parameters(result.robot)[each, at]
+    joints, back = np.arange(len(at)), np.linalg.inv(nominal.coupling)
+    change = back @ (dh_values(result.robot) - dh_values(nominal))[joints, at]
+    jacobian = back @ result.adjustment.rows.by_parameters(result.robot)[joints, at]
     k = jacobian.shape[1]
     sigma = np.sqrt(np.einsum("nk,kl,nl->n", jacobian, result.covariance[:k, :k], jacobian).clip(0))
-    open_ = result.dh_sigma[each, at] == 0
+    open_ = result.dh_sigma[joints, at] == 0
     open_[[turn for turn, _ in result.adjustment.rows.coaxial]] = True
     return change, sigma, (np.abs(back) > 0) @ open_ == 0
 
 
 def offsets_csv(result: Identified, nominal: Robot) -> str:
-    """The table of ``--offsets`` (form: ``data_layout.md``)."""
+    """Returns the table of ``--offsets`` (form: ``data_layout.md``)."""
     before, values, sigma = dh_values(nominal) * SHOWN, dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
     change, change_sigma, known = zeros(result, nominal)
     stream = io.StringIO()
@@ -45,8 +45,8 @@ def offsets_csv(result: Identified, nominal: Robot) -> str:
 
     def row(joint: int, name: str, old: float, new: float, deviation: float, unit: str, told: bool) -> None:
         shown = [fixed(v, DIGITS[unit]) for v in (old, new, new - old)]
-        own = fixed(deviation, DIGITS[unit]) if told else ""
-        writer.writerow([joint, name, *shown, own, unit, "yes" if told else "no"])
+        sigma_text = fixed(deviation, DIGITS[unit]) if told else ""
+        writer.writerow([joint, name, *shown, sigma_text, unit, "yes" if told else "no"])
 
     for i, slides in enumerate(nominal.prismatic):
         for name, unit, old, new, deviation in zip(DH, UNITS, before[i], values[i], sigma[i], strict=True):

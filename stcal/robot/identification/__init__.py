@@ -1,1 +1,1 @@
-"""Kinematic parameters from poses, positions or distances."""
+"""Identification of a robot's kinematic parameters from poses, positions or distances."""

@@ -1,10 +1,10 @@
-"""Which observations agree, however the others err: least trimmed squares over random subsets.
+"""Least trimmed squares over random subsets: which observations agree, however the others err.
 
-Huber's weights bound what an observation pulls, but in a set of few rows some that are wrong together bend the solution
-until they fit. Least trimmed squares (Rousseeuw 1984) asks for the solution whose better half fits best, and stands
-nearly half of the rows being anything; it is found from many small subsets by concentration steps (Rousseeuw & Van
-Driessen, Data Mining and Knowledge Discovery 12, 2006), and what the solution of the agreeing rows, with its own
-uncertainty, makes unlikely is called an error.
+Huber weights bound the pull of an observation. In a set of few rows, however, several wrong rows together bend the
+solution until they fit. Least trimmed squares (Rousseeuw 1984) seeks the solution whose better half fits best, and
+tolerates any errors in nearly half of the rows. It is found from many small subsets by concentration steps (Rousseeuw &
+Van Driessen, Data Mining and Knowledge Discovery 12, 2006). Rows that are unlikely by the solution of the agreeing
+rows, with its own uncertainty, are called errors.
 """
 
 from collections.abc import Sequence
@@ -18,77 +18,82 @@ from stcal.robot.identification.adjustment import Weighting, parameter_units
 from stcal.robot.identification.residuals import Observed, State, linear, moved
 
 SUBSETS, SEED = 1000, 0
-"""Of as few rows as determine all: with a quarter of 40 rows wrong, one in forty of them is clean."""
+"""Number of random subsets, each of as few rows as determine all parameters, and seed. With a quarter of 40 rows wrong,
+one subset in forty is clean."""
 KEPT_SUBSETS, FIRST_STEPS, STEPS = 20, 2, 50
-"""Subsets that are followed to their end, and concentration steps before and then."""
+"""Number of subsets that are followed to their end, and numbers of concentration steps before and after their
+choice."""
 MOST_ROWS = 400
-"""That are searched; of more a random part, whose share of errors is theirs."""
+"""Largest number of rows that are searched. Of more rows a random sample is searched, with the same share of errors."""
 HELD = 1e-4
-"""Information of each parameter (of 1 mm) about where it starts, in units of that of one observation: what a subset
-leaves open stays nominal within a hundred times the noise."""
+"""Information on each parameter (of 1 mm) about its start, in units of that of one observation. What a subset leaves
+open stays nominal within a hundred times the noise."""
 FALSE_ALARM = 1e-3
-"""Probability that of all rows of a good set one is called wrong."""
+"""False-alarm probability of a set: that any row of a good set is called wrong."""
 TINY = 1e-300
 ROUNDS, SEARCHES = 6, 2
-"""Of linear solutions, the third of which is as good as exact; and searches, the second with σ of positions and
-orientations that the first one's solution leaves."""
+"""Number of linear solutions, the third of which is practically exact; and number of searches. The second search uses σ
+of positions and orientations from the residuals of the first solution."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """``white`` : (r, w) residuals in units of σ; ``slope`` : (r, w, k) by the parameters, of about 1 mm each."""
+    """A linear problem. ``white`` : (r, w) residuals in units of σ; ``slope`` : (r, w, k) derivatives of the model by
+    the parameters, of about 1 mm each."""
 
     white: np.ndarray
     slope: np.ndarray
 
     def of(self, rows: np.ndarray) -> "_Problem":
-        """Those rows."""
+        """Returns the problem of these rows alone."""
         return _Problem(self.white[rows], self.slope[rows])
 
     def solved(self, masks: np.ndarray) -> np.ndarray:
-        """Steps (s, k) by the rows of each mask (s, r)."""
+        """Returns the steps (s, k) that solve the rows of each mask (s, r)."""
         r, _, k = self.slope.shape
         normal = np.einsum("rwa,rwb->rab", self.slope, self.slope).reshape(r, k * k)
         pull = np.einsum("rwa,rw->ra", self.slope, self.white)
         share = masks.astype(float)
-        held = (share @ normal).reshape(-1, k, k) + HELD * np.eye(k)
-        return np.linalg.solve(held, (share @ pull)[:, :, None])[:, :, 0]
+        information = (share @ normal).reshape(-1, k, k) + HELD * np.eye(k)
+        return np.linalg.solve(information, (share @ pull)[:, :, None])[:, :, 0]
 
     def left(self, steps: np.ndarray) -> np.ndarray:
-        """(s, r, w) what steps (s, k) leave."""
+        """Returns the residuals (s, r, w) after steps (s, k)."""
         r, w, k = self.slope.shape
         return (self.white.ravel() - steps @ self.slope.reshape(r * w, k).T).reshape(-1, r, w)
 
     def squares(self, steps: np.ndarray) -> np.ndarray:
-        """Squared lengths (s, r) of what steps (s, k) leave."""
+        """Returns the squared lengths (s, r) of the residuals after steps (s, k)."""
         return (self.left(steps) ** 2).sum(2)
 
     def leverage(self, good: np.ndarray) -> np.ndarray:
-        """(r, w) variance of a row's prediction by the good ones (r,), in units of σ²."""
-        own = self.slope[good].reshape(-1, self.slope.shape[2])
-        inverse = np.linalg.inv(own.T @ own + HELD * np.eye(own.shape[1]))
+        """Returns the variance (r, w) of each row's prediction by the ``good`` rows (r,), in units of σ²."""
+        slopes = self.slope[good].reshape(-1, self.slope.shape[2])
+        inverse = np.linalg.inv(slopes.T @ slopes + HELD * np.eye(slopes.shape[1]))
         return ((self.slope @ inverse) * self.slope).sum(2)
 
 
 def agreeing(state: State, seen: Observed, weighting: Weighting) -> np.ndarray:
-    """(r,) of bool: which observations agree with a solution near ``state``; all where too few are more than needed.
+    """Returns a mask (r,) of the observations that agree with a solution near ``state``.
+
+    All agree if there are too few observations beyond those needed.
 
     Parameters
     ----------
     state : State
-        Where the search starts; steps from it are linear.
+        Start of the search; steps from it are linear.
     seen : Observed
         r observations.
     weighting : Weighting
-        Their σ up to a common factor.
+        σ of the observations, up to a common factor.
     """
     good = every = np.ones(len(seen), bool)
     for step in range(ROUNDS):
-        left, derivative = linear(state, seen)
+        errors, derivative = linear(state, seen)
         units = parameter_units(derivative)
         if step:
-            weighting = _reweighed(weighting, left, seen)
-        problem = _Problem(weighting.whiten(left, seen), weighting.whiten(derivative * units, seen))
+            weighting = _reweighed(weighting, errors, seen)
+        problem = _Problem(weighting.whiten(errors, seen), weighting.whiten(derivative * units, seen))
         r, w, k = problem.slope.shape
         half = (r + k // w + 1) // 2 + 1
         if half >= r:
@@ -104,48 +109,50 @@ def agreeing(state: State, seen: Observed, weighting: Weighting) -> np.ndarray:
 
 
 def _reweighed(weighting: Weighting, left: np.ndarray, seen: Observed) -> Weighting:
-    """With σ by the medians of what a solution leaves, (r, w): of positions, and of orientations."""
+    """Returns the weighting with σ from the medians of the residuals ``left`` (r, w), of positions and of
+    orientations."""
     white = weighting.whiten(left, seen)
-    of = {name: float(np.median(np.abs(white[:, at]))) for name, at in weighting.columns(white.shape[1]).items()}
-    return weighting.with_values({name: weighting.value(name) * (value or 1.0) for name, value in of.items()})
+    medians = {name: float(np.median(np.abs(white[:, at]))) for name, at in weighting.columns(white.shape[1]).items()}
+    return weighting.with_values({name: weighting.value(name) * (value or 1.0) for name, value in medians.items()})
 
 
 def _trimmed(problem: _Problem, half: int) -> np.ndarray:
-    """(r,) of bool: the rows of the best half."""
+    """Returns a mask (r,) of the rows of the best half."""
     rng, count = np.random.default_rng(SEED), len(problem.white)
-    part = np.sort(rng.permutation(count)[:MOST_ROWS])
-    own = problem.of(part)
-    r, w, k = own.slope.shape
+    rows = np.sort(rng.permutation(count)[:MOST_ROWS])
+    sample = problem.of(rows)
+    r, w, k = sample.slope.shape
     wanted = half * r // count
-    few = np.zeros((SUBSETS, r), bool)
-    np.put_along_axis(few, rng.random((SUBSETS, r)).argpartition(k // w + 1, axis=1)[:, : k // w + 1], True, axis=1)
-    steps = own.solved(few)
+    subsets = np.zeros((SUBSETS, r), bool)
+    np.put_along_axis(subsets, rng.random((SUBSETS, r)).argpartition(k // w + 1, axis=1)[:, : k // w + 1], True, axis=1)
+    steps = sample.solved(subsets)
     for _ in range(FIRST_STEPS):
-        steps = own.solved(_smallest(own.squares(steps), wanted))
-    cost = np.sort(own.squares(steps), axis=1)[:, :wanted].sum(1)
+        steps = sample.solved(_smallest(sample.squares(steps), wanted))
+    cost = np.sort(sample.squares(steps), axis=1)[:, :wanted].sum(1)
     steps, last = steps[np.argsort(cost)[:KEPT_SUBSETS]], np.inf
     for _ in range(STEPS):
-        squares = own.squares(steps)
+        squares = sample.squares(steps)
         cost = np.sort(squares, axis=1)[:, :wanted].sum(1)
         if cost.sum() >= last * (1 - 1e-9):
             break
         last = cost.sum()
-        steps = own.solved(_smallest(squares, wanted))
+        steps = sample.solved(_smallest(squares, wanted))
     return _smallest(problem.squares(steps[[cost.argmin()]]), half)[0]
 
 
 def _smallest(squares: np.ndarray, wanted: int) -> np.ndarray:
-    """Masks (s, r) of so many smallest of each row."""
+    """Returns masks (s, r) of the ``wanted`` smallest values in each row."""
     masks = np.zeros(squares.shape, bool)
     np.put_along_axis(masks, squares.argpartition(wanted - 1, axis=1)[:, :wanted], True, axis=1)
     return masks
 
 
 def _tested(problem: _Problem, good: np.ndarray, half: int | None, kinds: Sequence[slice]) -> np.ndarray:
-    """The rows that are within chance of the solution of the good ones, over again until they stay.
+    """Returns the rows that fit the solution of the good rows within chance, repeated until they stay the same.
 
-    ``half`` : how many are good because they are the smallest; ``kinds`` : columns of one σ each, which the good rows
-    tell: by one for both, positions of a small σ pass with what orientations of a large one allow.
+    ``half`` : number of good rows if they are good because they are the smallest; ``kinds`` : columns with one σ each,
+    estimated from the good rows. With one σ for all, positions of a small σ would pass within the limit that
+    orientations of a large σ allow.
     """
     r, w, _ = problem.slope.shape
     for _ in range(STEPS):
@@ -155,15 +162,15 @@ def _tested(problem: _Problem, good: np.ndarray, half: int | None, kinds: Sequen
         if redundancy < 1:
             return np.ones(r, bool)
         share = 1.0
-        if half is not None:  # the mean of the smallest squares of so many
+        if half is not None:  # mean square of so many smallest ones, in σ²
             limit = chi2.ppf(half / r, w)
             share, half = chi2.cdf(limit, w + 2) / (half / r), None
         length = np.zeros(r)
-        for own in kinds:
-            left_over = max(squares[good, own].size - leverage[good, own].sum(), 1.0)
-            variance = max(squares[good, own].sum(), TINY) / left_over / share
-            apart = leverage[:, own].mean(1)
-            length += squares[:, own].sum(1) / variance / np.where(good, np.maximum(1 - apart, 1e-3), 1 + apart)
+        for columns in kinds:
+            left_over = max(squares[good, columns].size - leverage[good, columns].sum(), 1.0)
+            variance = max(squares[good, columns].sum(), TINY) / left_over / share
+            lever = leverage[:, columns].mean(1)
+            length += squares[:, columns].sum(1) / variance / np.where(good, np.maximum(1 - lever, 1e-3), 1 + lever)
         new = length <= w * ratio_limit(FALSE_ALARM / r, w, redundancy)
         if (new == good).all():
             break

@@ -1,4 +1,4 @@
-"""Pictures of residuals: by joint, and in space."""
+"""Figures of residuals, by joint and in space."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,19 +12,19 @@ from stcal.robot.identification.residuals import Observed, State, as_seen, tips_
 from stcal.robot.kinematics.forward import joint_frames
 
 ARROW_SHARE, LONGEST_SHARE = 0.12, 0.3
-"""Of the picture's side: a typical residual, and the longest that is drawn."""
+"""Lengths of a typical residual and of the longest one drawn, as shares of the picture's side."""
 FEW_ARROWS = 60
-"""More are drawn shorter and thinner."""
+"""Number of arrows beyond which they are drawn shorter and thinner."""
 LEAST_MOTION = 1e-6
-"""Of the largest: a joint that moves the tool by less does not move it."""
+"""Share of the largest motion of the tool below which a joint counts as not moving it."""
 FEW = 200
-"""Rows, of more than which points are small."""
+"""Number of rows beyond which points are drawn small."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """What is drawn: ``residuals`` (r, 6), (r, 3) or (r, 1) measured minus modelled, rad and mm in the world's axes, of
-    the observations ``seen`` by ``state``; ``good`` : (r,) of bool, rows that are not wrong."""
+    """Residuals for a figure. ``residuals`` : (r, 6), (r, 3) or (r, 1) measured minus modelled, rad and mm in the
+    world's axes, of the observations ``seen`` by ``state``; ``good`` : (r,) mask of the rows that are not errors."""
 
     state: State
     world_from_base: Rigid
@@ -34,18 +34,18 @@ class Drawn:
     colour: str = COLOURS[0]
 
     def tips(self) -> Poses:
-        """world_from_tool of the rows of the file."""
+        """Returns world_from_tool of the rows of the file."""
         return tips_of(self.state, self.seen.data)
 
 
 def joints_figure(shown: Drawn, findings: Iterable[Finding]):
-    """Residual along each joint's own motion against its value, of good rows that it moves; a curve where it was found
-    to go with it."""
-    seen, chain, tip = shown.seen, shown.state.chain, shown.tips()
-    data = seen.data
+    """Returns a figure of the residual along each joint's own motion against its value, for good rows that the joint
+    moves; with a fitted curve for joints that a finding names."""
+    observations, chain, tip = shown.seen, shown.state.chain, shown.tips()
+    data = observations.data
     turned, origins = joint_frames(chain, data.q, data.conditions)
     values, n, carries = data.q @ chain.coupling.T, len(chain), chain.carries(data.targets)
-    found = shown.residuals[:, -3:]
+    errors = shown.residuals[:, -3:]
     across = min(n, 3)
     down = -(-n // across)
     height = 0.35 + 1.75 * down
@@ -57,13 +57,13 @@ def joints_figure(shown: Drawn, findings: Iterable[Finding]):
             axes.set_visible(False)
             continue
         z, sliding = turned[i][:, :, 2], chain.prismatic[i]
-        own = [z * 0, z] if sliding else [z, np.cross(z, tip.translation - origins[i])]
-        own = np.hstack(own) * carries[i, :, None]
-        motion = as_seen(shown.state, seen, tip, own[:, :, None])[:, -found.shape[1] :, 0]
+        twist = [z * 0, z] if sliding else [z, np.cross(z, tip.translation - origins[i])]
+        twist = np.hstack(twist) * carries[i, :, None]
+        motion = as_seen(shown.state, observations, tip, twist[:, :, None])[:, -errors.shape[1] :, 0]
         size = np.linalg.norm(motion, axis=1)
         moves = shown.good & (size > LEAST_MOTION * max(size.max(), 1e-300))
-        along = np.einsum("rw,rw->r", motion[moves], found[moves]) / size[moves]
-        at = values[seen.first[moves], i] * (1 if sliding else np.degrees(1))
+        along = np.einsum("rw,rw->r", motion[moves], errors[moves]) / size[moves]
+        at = values[observations.first[moves], i] * (1 if sliding else np.degrees(1))
         axes.axhline(0, color="#9aa0a8", lw=0.7)
         axes.plot(at, along, "o", color=shown.colour, ms=3 if len(at) <= FEW else 1.4, mew=0)
         if turns_of.get(i + 1) and len(at) > 3:
@@ -79,32 +79,32 @@ def joints_figure(shown: Drawn, findings: Iterable[Finding]):
 
 
 def _wave(degrees: np.ndarray, turns: int) -> np.ndarray:
-    """(m, 3) constant, cosine and sine."""
+    """Returns a constant, a cosine and a sine, (m, 3), with ``turns`` periods a turn."""
     angle = turns * np.radians(degrees)
     return np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1)
 
 
 def space_picture(shown: Drawn) -> dict[str, str]:
-    """Residuals of positions from above and from the side, exaggerated, with a bar that shows how long one is:
-    ``picture`` and ``caption``."""
+    """Returns ``picture`` and ``caption`` of the residuals of positions from above and from the side, exaggerated, with
+    a scale bar."""
     good, colour, base_from_world = shown.good, shown.colour, shown.world_from_base.inverse()
     place = base_from_world @ shown.tips().translation
-    found = shown.residuals[:, -3:] @ base_from_world.rotation.T
-    length = np.linalg.norm(found, axis=1)
+    errors = shown.residuals[:, -3:] @ base_from_world.rotation.T
+    length = np.linalg.norm(errors, axis=1)
     side = float(np.ptp(place, axis=0).max()) or 1.0
     crowded = min(1.0, FEW_ARROWS / len(place)) ** (1 / 3)
     scale = round_below(ARROW_SHARE * crowded * side / max(float(np.sqrt((length[good] ** 2).mean())), 1e-12))
     cut = np.minimum(1, LONGEST_SHARE * side / np.maximum(scale * length, 1e-300))
-    ends = place + scale * found * cut[:, None]
+    ends = place + scale * errors * cut[:, None]
     bar = round_below(1.5 * ARROW_SHARE * crowded * side / scale)
     figure = new_figure(9, 4.4)
     for k, (i, j) in enumerate(((0, 1), (0, 2))):
         axes = figure.add_axes((0.075 + 0.5 * k, 0.12, 0.42, 0.85))
         every = np.concatenate([place, ends])[:, [i, j]]
         low = every.min(0) - 0.08 * side
-        axes.plot(*np.vstack([every, low]).T, " ")  # all of it is within the limits
-        for mask, own in ((good, colour), (~good, COLOURS[1] if colour != COLOURS[1] else COLOURS[0])):
-            start, way = place[mask][:, [i, j]], (ends - place)[mask][:, [i, j]]
+        axes.plot(*np.vstack([every, low]).T, " ")  # invisible points: the limits include everything
+        for mask, arrow_colour in ((good, colour), (~good, COLOURS[1] if colour != COLOURS[1] else COLOURS[0])):
+            start, arrow = place[mask][:, [i, j]], (ends - place)[mask][:, [i, j]]
             style = {
                 "angles": "xy",
                 "scale_units": "xy",
@@ -113,8 +113,8 @@ def space_picture(shown: Drawn) -> dict[str, str]:
                 "headwidth": 3.5,
                 "headlength": 4,
             }
-            axes.quiver(*start.T, *way.T, color=own, **style)
-            axes.plot(*start.T, ".", color=own, ms=3)
+            axes.quiver(*start.T, *arrow.T, color=arrow_colour, **style)
+            axes.plot(*start.T, ".", color=arrow_colour, ms=3)
         plane(axes, f"{'xyz'[i]} of the base, mm", f"{'xyz'[j]} of the base, mm", 0.04)
         axes.plot([low[0], low[0] + scale * bar], [low[1], low[1]], color=INK, lw=2, solid_capstyle="butt")
         axes.annotate(f"{bar:g} mm", low, (0, 4), textcoords="offset points", fontsize=SMALL, color=INK)

@@ -1,8 +1,8 @@
-"""Elasticity as unknowns: what is expected of arms, and with what doubt.
+"""Elasticity as unknowns: the values expected of an arm, and their σ.
 
-Compliance, moments and gears are too many numbers for few rows; each is held to what is usual by a σ, and those of
-compliance about the axes, across them, and of gears are estimated with the other variance components. Where an arm
-shows nothing of a kind, its σ becomes small and the kind is as good as absent.
+Compliance, moments and gears are too many numbers for few rows. Each number is held to its usual value by a σ. The σ of
+compliance about the axes, of compliance across them, and of gears are estimated with the other variance components.
+Where an arm shows nothing of a kind, the σ of this kind becomes small, and the kind is as good as absent.
 """
 
 from collections.abc import Mapping
@@ -17,25 +17,27 @@ from stcal.robot.kinematics.forward import GRAVITY_M_S2, elasticity_values
 from stcal.robot.kinematics.model import Chain, Elasticity, Robot
 
 AXIS, ACROSS, PERIODIC, HYSTERESIS, MOMENT = 3, 4, 5, 6, 7
-"""Groups of σ, after those of the dimensions; that of moments, and those after it, are not estimated."""
+"""Groups of σ, after those of the dimensions; the σ of moments, and of groups after it, are not estimated."""
 MASS_KG = 100.0
-"""Of an arm of one metre, growing with the square of its length, from the first link to the last falling to nothing:
-0.6 m 25 kg, 1.2 m 116, 2.1 m 550 are sold. Compliances make up for what it is wrong by, so that 3 times is no harm."""
+"""Usual mass of an arm of one metre. It grows with the square of the length, and falls to nothing from the first link
+to the last; arms on the market have 25 kg at 0.6 m, 116 kg at 1.2 m, 550 kg at 2.1 m. Compliances compensate its error,
+so that a factor of 3 does no harm."""
 BESIDE = 0.15
-"""Of the arm's length: a link's centre of mass is so far from the middle of its two joints, each way."""
+"""Typical distance of a link's centre of mass from the middle of its two joints, in each direction, as a share of the
+arm's length."""
 HEAVIER = 0.5
-"""σ of the factor by which an arm is heavier than usual. Without loads nothing shows it, and compliances make up for
-it; beside the torques of masses that are known compliances have a scale."""
+"""σ of the factor by which an arm is heavier than usual. Without loads nothing shows this factor, and compliances
+compensate it. The torques of known masses give compliances a scale."""
 DOWN = np.array([0.0, 0.0, -1.0])
 SOME = 0.1
-"""Share of a σ at which compliances start: at 0 moments would move nothing."""
+"""Share of a σ at which compliances start; at 0 moments would move nothing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UsualElasticity:
-    """``expected``, ``scale`` : (9 n,), or (10 n,) with hysteresis, what each of :func:`elasticity_values` is expected
-    to be, and what makes it rad at the joint's usual torque, or a share of the usual moment; ``group`` : of each, whose
-    σ; ``factor_sigma`` : of a factor that all moments have in common."""
+    """The prior of :func:`elasticity_values`, (9 n,), or (10 n,) with hysteresis. ``expected`` : expected values;
+    ``scale`` : factors that make a value rad at the joint's usual torque, or a share of the usual moment; ``group`` :
+    group of σ of each value; ``factor_sigma`` : σ of a factor that all moments have in common."""
 
     expected: np.ndarray
     scale: np.ndarray
@@ -43,18 +45,21 @@ class UsualElasticity:
     factor_sigma: float = 0.0
 
     def away(self, chain: Chain) -> np.ndarray:
-        """From what is expected, rad or shares."""
+        """Returns the deviations of the chain's elasticity from the expected values, in rad or shares."""
         assert chain.elasticity is not None
         values = elasticity_values(chain.elasticity, HYSTERESIS in self.group)
         return self._apart((values - self.expected) * self.scale)
 
     def jacobian(self) -> np.ndarray:
-        """Of :meth:`away` by the values."""
+        """Returns the derivative of :meth:`away` by the values."""
         return self._apart(np.diag(self.scale))
 
     def _apart(self, shares: np.ndarray) -> np.ndarray:
-        """Shares, independent with σ 1: moments err by these and, all together, by the factor. The inverse
-        root of their covariance 1 + σ² m mᵀ is shorter along m, the usual moments, and as it was across."""
+        """Returns the shares made independent, with σ 1.
+
+        Moments err by these shares and, all together, by the factor. The inverse root of their covariance 1 + σ² m mᵀ
+        shortens the component along m, the usual moments, and leaves the others.
+        """
         if not self.factor_sigma:
             return shares
         along = np.where(self.group == MOMENT, self.expected * self.scale, 0.0)
@@ -65,8 +70,10 @@ class UsualElasticity:
 
 
 def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> UsualElasticity:
-    """Of an arm with these dimensions; known loads are ``carried``, which show how heavy it is itself; with
-    ``hysteresis`` (10 n,)."""
+    """Returns the usual elasticity of an arm with these dimensions.
+
+    ``carried`` : known loads were carried, which show how heavy the arm itself is; ``hysteresis`` : values are (10 n,).
+    """
     n = len(chain)
     moment, beside = _moments(chain)
     torque = chain.gathered(np.linalg.norm(moment, axis=1) + beside)
@@ -80,20 +87,23 @@ def usual(chain: Chain, carried: bool = False, hysteresis: bool = False) -> Usua
 
 
 def carries(chain: Chain, conditions: Conditions) -> bool:
-    """Whether the masses that rows carried, or that of the chain where they say nothing, are any."""
+    """Returns True if any row carried a mass, or, where the rows do not say, if the chain has a payload."""
     if conditions.payload_kg is None:
         return chain.elasticity is not None and chain.elasticity.payload_kg > 0
     return conditions.loaded
 
 
 def bending(state: State, robot: Robot, deflection_rad: float, conditions: Conditions = USUAL) -> State:
-    """The state with elasticity to be adjusted: as the robot file has it, or hardly any, and gravity down from the
-    base; with the mass that all rows carried, if it was one, and with hysteresis if rows say from where joints came."""
+    """Returns the state with elasticity to be adjusted.
+
+    It starts as the robot file has it, or nearly rigid with gravity down from the base. The payload is the mass that
+    all rows carried, if it was one. Hysteresis is included if rows say from which side joints came.
+    """
     elasticity = state.chain.elasticity
     if elasticity is None or not elasticity.compliance.any():
-        n, known = len(state.chain), usual(state.chain)
-        compliance = SOME * deflection_rad / known.scale[: 2 * n].reshape(n, 2)
-        moment = known.expected[2 * n : 5 * n].reshape(n, 3)
+        n, prior = len(state.chain), usual(state.chain)
+        compliance = SOME * deflection_rad / prior.scale[: 2 * n].reshape(n, 2)
+        moment = prior.expected[2 * n : 5 * n].reshape(n, 3)
         stated = robot.elasticity or Elasticity(compliance, moment, np.zeros((n, 4)), DOWN)
         bent = replace(stated, compliance=compliance, moment=moment, periodic=np.zeros((n, 4)))
         elasticity = replace(robot, elasticity=bent).chain().elasticity
@@ -106,7 +116,8 @@ def bending(state: State, robot: Robot, deflection_rad: float, conditions: Condi
 
 
 def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
-    """(n, 3) N m of each link with what follows put at the next joint, and (n,) what they are known to."""
+    """Returns the usual moments (n, 3) of each link in N m, with what follows placed at the next joint, and their σ
+    (n,)."""
     n = len(chain)
     carrier = [chain.after(i) for i in range(n)]
     last = sorted(set(range(n)) - set(carrier))
@@ -125,8 +136,8 @@ def _moments(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _longest(chain: Chain, ends: Mapping[int, Rigid]) -> tuple[float, np.ndarray]:
-    """Length, mm, of the longest way from the first joint of a branch at the base to its end; and (n,) how many joints
-    follow one another from each to the farthest end, itself counted."""
+    """Returns the length, in mm, of the longest way from the first joint of a branch at the base to its end; and for
+    each joint (n,) the number of joints from it, itself included, to the farthest end."""
     length, above = np.zeros(len(chain)), np.ones(len(chain))
     for i, end in ends.items():
         length[i] = np.linalg.norm(end.translation)

@@ -1,4 +1,4 @@
-"""What ``identify`` writes with ``--json``."""
+"""The file that ``identify`` writes with ``--json``."""
 
 from typing import Literal
 
@@ -94,7 +94,7 @@ class FoundLeft(Part):
 
 
 class IdentifiedFile(ResultFile):
-    """Of ``identify``."""
+    """The result file of ``identify``."""
 
     format: Literal["stcal identified 1"] = Field(description="the file's form and its version")
     robot: str = Field(description="name")

@@ -1,5 +1,7 @@
-"""What the nominal D-H rows are worth: dimensions as made differ from the drawing by σ that the data show; and base and
-tools beside them."""
+"""The nominal D-H rows as observations of the parameters, and the poses of base and tools.
+
+Dimensions as made differ from the drawing by σ that the data show.
+"""
 
 from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass, replace
@@ -18,12 +20,13 @@ from stcal.robot.kinematics.forward import chain_parameters, moved_chain
 from stcal.robot.kinematics.model import Robot
 
 DIFFERENCE_MM = 1e-4
-"""Step of the derivatives by differences, in movement of the tool: linear to a millionth, and far above rounding."""
+"""Step of the derivatives by differences, in mm of movement of the tool: linear to a millionth, and far above
+rounding."""
 DOUBT = 1.0
-"""Of the logarithm of the deviations' σ: what makes of robots are known for is known within a factor of e or so."""
+"""σ of the logarithm of the deviations' σ: the deviations of makes of robots are known within a factor of about e."""
 COAXIAL_MM = 100.0
-"""Of parallel axes closer than this an error of length across them turns θ by more than zero positions err (0.5 mm over
-5 mrad)."""
+"""Distance of parallel axes below which an error of length across them turns θ by more than zero positions err (0.5 mm
+over 5 mrad)."""
 LENGTH, TWIST, ZERO = 0, 1, 2
 FIXED_LENGTH, FIXED_ANGLE = 8, 9
 FIXED_MM, FIXED_RAD = 1e-4, 1e-7
@@ -40,12 +43,12 @@ DIMENSIONS = ("a", "alpha", "d", "theta", "beta")
 
 
 def adjusted(text: str) -> Adjusted:
-    """Of names with commas between them: base and tool are always meant.
+    """Returns the option for ``text``, names with commas between them; base and tool are always included.
 
     Raises
     ------
     InputError
-        Another name.
+        An unknown name.
     """
     words = {word.strip() for word in text.split(",")}
     if not words <= {"base", "tool", "zeros", "geometry", "all"}:
@@ -57,10 +60,10 @@ def adjusted(text: str) -> Adjusted:
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """σ of a robot's dimensions about nominal: lengths (mm), twists, and zero positions of joints (rad, mm); and of
-    what its links give way by at the usual torque about the joints' axes and across them, of its gears, and of its
-    joints' hysteresis (rad). The values here are what is expected before the data are seen: some tenths of a millimetre
-    and of a degree."""
+    """σ of a robot's dimensions about nominal: lengths (mm), twists (rad), and zero positions of joints (rad, mm). Also
+    σ of what links give way by at the usual torque about the joints' axes and across them, of gears, and of hysteresis
+    of joints (rad). The defaults are the values expected before the data are seen: some tenths of a millimetre and of a
+    degree."""
 
     length_mm: float = 0.5
     twist_rad: float = 1e-3
@@ -71,13 +74,13 @@ class Deviations:
     hysteresis_rad: float = 1e-4
 
     def of(self, groups: np.ndarray) -> dict[str, float | None]:
-        """By name; None of groups that the robot has no dimensions of."""
+        """Returns the σ by name; None for groups in which the robot has no dimensions."""
         present = np.isin(np.arange(len(astuple(self))), groups)
         return {k: v if there else None for (k, v), there in zip(asdict(self).items(), present, strict=True)}
 
 
 def dh_values(robot: Robot) -> np.ndarray:
-    """(n, 5) of a, alpha, d, theta, beta."""
+    """Returns a, alpha, d, theta, beta of the rows, (n, 5)."""
     return np.array([[row.a, row.alpha, row.d, row.theta, row.beta] for row in robot.rows], float)
 
 
@@ -85,11 +88,11 @@ def dh_values(robot: Robot) -> np.ndarray:
 class NominalRows:
     """The nominal dimensions as observations of the parameters.
 
-    Dimensions are the rows' a, alpha, d, theta, beta, but of coaxial joints the offset along and across the nominal x
-    in place of a and theta (its polar form). ``coaxial`` : rows of theta, and of the a that follows it; ``jacobian`` :
-    (n, 5, k) by the parameters of the axes (tools move no row), taken once, as it hardly changes over what a factory
-    does; ``free`` : (n, 5) dimensions that parameters move at all; ``group`` : (n, 5) whose σ;
-    ``elasticity`` : where it is unknown.
+    Dimensions are the rows' a, alpha, d, theta, beta; for coaxial joints the offset along and across the nominal x
+    replaces a and theta, its polar form. ``coaxial`` : (row of theta, row of the a that follows it) of each pair of
+    coaxial joints; ``jacobian`` : (n, 5, k) by the parameters of the axes (tools move no row), taken once, as it hardly
+    changes over factory deviations; ``free`` : (n, 5) mask of the dimensions that any parameter moves; ``group`` : (n,
+    5) group of σ of each dimension; ``elasticity`` : the prior of the elasticity where it is unknown.
     """
 
     nominal: Robot
@@ -101,7 +104,7 @@ class NominalRows:
 
     @property
     def groups(self) -> np.ndarray:
-        """(p,) whose σ each of the observations that :meth:`held` makes has."""
+        """Group of σ (p,) of each observation that :meth:`held` makes."""
         own = self.group[self.free]
         return own if self.elasticity is None else np.append(own, self.elasticity.group)
 
@@ -109,49 +112,53 @@ class NominalRows:
     def about(
         cls, state: State, units: np.ndarray, nominal: Robot, adjust: Adjusted = "all", carried: bool = False
     ) -> "NominalRows":
-        """With the derivatives at ``state``, where ``units`` (k,) of the parameters move the tool by 1 mm; dimensions
-        that ``adjust`` or the robot file keep are conditions; known loads were ``carried``."""
+        """Returns the rows with their derivatives at ``state``.
+
+        ``units`` : (k,) steps of the parameters that move the tool by 1 mm; ``adjust`` : dimensions that this or the
+        robot file keeps are conditions; ``carried`` : known loads were carried.
+        """
         coaxial = _coaxial(nominal)
 
         def values(step: np.ndarray) -> np.ndarray:
-            found = robot_from_chain(moved_chain(state.chain, step), state.tools, nominal)
-            return _dimensions(found, nominal, coaxial)
+            robot = robot_from_chain(moved_chain(state.chain, step), state.tools, nominal)
+            return _dimensions(robot, nominal, coaxial)
 
         units = units[: len(chain_parameters(state.chain))]
-        jacobian, here = np.zeros((len(nominal.rows), 5, len(units))), values(np.zeros(len(units)))
+        jacobian, reference = np.zeros((len(nominal.rows), 5, len(units))), values(np.zeros(len(units)))
         for k in range(len(units)):
             step = np.zeros(len(units))
             step[k] = DIFFERENCE_MM * units[k]
-            jacobian[:, :, k] = (values(step) - here) / step[k]
+            jacobian[:, :, k] = (values(step) - reference) / step[k]
         group = np.tile([LENGTH, TWIST, LENGTH, ZERO, TWIST], (len(jacobian), 1))
-        group[nominal.prismatic, 3] = TWIST  # the zero of these is d
+        group[nominal.prismatic, 3] = TWIST  # the zero position of a prismatic joint is d
         group[[turn for turn, _ in coaxial], 3] = LENGTH
-        kept = np.isin(group, KEPT[adjust])
-        kept |= [[name in joint.fixed for name in DIMENSIONS] for joint in nominal.joints]
-        group[kept] = np.where(group[kept] == LENGTH, FIXED_LENGTH, FIXED_ANGLE)
+        fixed = np.isin(group, KEPT[adjust])
+        fixed |= [[name in joint.fixed for name in DIMENSIONS] for joint in nominal.joints]
+        group[fixed] = np.where(group[fixed] == LENGTH, FIXED_LENGTH, FIXED_ANGLE)
         elasticity = usual(nominal.chain(), carried, state.hysteresis) if state.elastic else None
         return cls(nominal, coaxial, jacobian, np.abs(jacobian * units).max(axis=2) > 1e-9, group, elasticity)
 
     def held(self, state: State, deviations: Deviations, kind: Kind) -> Held:
-        """Linear about ``state``, with the σ of ``deviations``, by all parameters of this kind of observation."""
+        """Returns the nominal dimensions as prior knowledge, linear about ``state``, with the σ of ``deviations``, by
+        all parameters of this kind of observation."""
         robot = robot_from_chain(state.chain, state.tools, self.nominal)
         away = _dimensions(robot, self.nominal, self.coaxial) - _dimensions(self.nominal, self.nominal, self.coaxial)
         jacobian = self.jacobian[self.free]
         others = len(parameter_names(state, kind)) - jacobian.shape[1]
-        by, value = np.pad(jacobian, ((0, 0), (0, others))), away[self.free]
+        derivative, value = np.pad(jacobian, ((0, 0), (0, others))), away[self.free]
         if self.elasticity is not None:
-            by = np.asarray(block_diag(by, self.elasticity.jacobian()))
+            derivative = np.asarray(block_diag(derivative, self.elasticity.jacobian()))
             value = np.append(value, self.elasticity.away(state.chain))
         sigma = np.array([*astuple(deviations), 1.0, FIXED_MM, FIXED_RAD])[self.groups]
-        return Held(value, by, sigma, self.groups >= FIXED_LENGTH)
+        return Held(value, derivative, sigma, self.groups >= FIXED_LENGTH)
 
     @property
     def fixed(self) -> np.ndarray:
-        """(n, 5) dimensions that could be adjusted, and are not."""
+        """Mask (n, 5) of the dimensions that could be adjusted but are not."""
         return (self.group >= FIXED_LENGTH) & self.free
 
     def notes(self, robot: Robot) -> tuple[str, ...]:
-        """What is to be known of the rows of ``robot``."""
+        """Returns notes on the rows of ``robot``."""
         reasons = [
             f"{name} of row {i} ({reason})"
             for i, joint in enumerate(self.nominal.joints, 1)
@@ -165,14 +172,15 @@ class NominalRows:
         )
 
     def sigma(self, robot: Robot, covariance: np.ndarray) -> np.ndarray:
-        """(n, 5) σ of the rows of ``robot`` (a, alpha, d, theta, beta) from the parameters' covariance (k, k)."""
+        """Returns σ (n, 5) of the rows of ``robot`` (a, alpha, d, theta, beta) from the parameters' covariance (k,
+        k)."""
         jacobian = self.by_parameters(robot)
         covariance = covariance[: jacobian.shape[2], : jacobian.shape[2]]
         sigma = np.sqrt(np.einsum("njk,kl,njl->nj", jacobian, covariance, jacobian).clip(0))
         return np.where(self.fixed, 0.0, sigma)
 
     def by_parameters(self, robot: Robot) -> np.ndarray:
-        """(n, 5, k) derivatives of the rows of ``robot``, of a, alpha, d, theta, beta."""
+        """Returns the derivatives (n, 5, k) of the rows of ``robot`` (a, alpha, d, theta, beta) by the parameters."""
         jacobian = self.jacobian.copy()
         for turn, reach in self.coaxial:
             angle = robot.rows[turn].theta - self.nominal.rows[turn].theta
@@ -184,7 +192,7 @@ class NominalRows:
 
 
 def _dimensions(robot: Robot, nominal: Robot, coaxial: tuple[tuple[int, int], ...]) -> np.ndarray:
-    """(n, 5) of a, alpha, d, theta, beta, or what stands in their place."""
+    """Returns a, alpha, d, theta, beta (n, 5), or the offsets along and across the nominal x for coaxial joints."""
     values = dh_values(robot)
     for turn, reach in coaxial:
         angle, offset = values[turn, 3] - nominal.rows[turn].theta, values[reach, 0]
@@ -193,58 +201,58 @@ def _dimensions(robot: Robot, nominal: Robot, coaxial: tuple[tuple[int, int], ..
 
 
 def _coaxial(nominal: Robot) -> tuple[tuple[int, int], ...]:
-    """(row of theta, row of a) of consecutive joints on nearly one line."""
-    found = []
+    """Returns (row of theta, row of a) of each pair of consecutive joints on nearly one line."""
+    pairs = []
     for i in range(1, len(nominal.rows)):
         reach = i - 1 if nominal.convention == "standard" else i
         row = nominal.rows[reach]
         parallel = abs(np.cos(row.alpha) * np.cos(row.beta)) > np.cos(PARALLEL_RAD)
         follows = nominal.tree is None or i not in nominal.tree.mounts
         if follows and parallel and abs(row.a) < COAXIAL_MM and not nominal.prismatic[i]:
-            found.append((i - 1, reach))
-    return tuple(found)
+            pairs.append((i - 1, reach))
+    return tuple(pairs)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
-    """Base in the instrument's frame, a tool in the flange's, a station in the first one's, or where a branch begins:
-    ``pose``, and σ (6,) of its rotation (rad, about the outer frame's axes) and translation (mm); nan of what was not
-    fitted."""
+    """The pose of the base in the instrument's frame, a tool in the flange's, a station in the first one's, or the
+    start of a branch. ``sigma`` : (6,) of its rotation (rad, about the outer frame's axes) and translation (mm); nan
+    where it was not fitted."""
 
     name: str
     pose: Rigid
     sigma: np.ndarray
 
     def sigma_or_none(self) -> list[float | None] | None:
-        """For programs."""
+        """Returns σ for result files; None where it is nan."""
         return None if np.isnan(self.sigma).all() else [None if np.isnan(s) else float(s) for s in self.sigma]
 
 
 def base_name() -> str:
-    """For tables."""
+    """Returns the name of the base in tables."""
     return "base in the instrument's frame"
 
 
 def tool_name(name: str) -> str:
-    """For tables."""
+    """Returns the name of a tool in tables."""
     return f"tool {name} in the flange's frame".replace("  ", " ")
 
 
 def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, nominal: Robot) -> tuple[Placed, ...]:
-    """Base and tools of the robot file that ``state`` makes, stations, and where branches of a tree begin.
+    """Returns base and tools of the robot file that ``state`` makes, stations, and the starts of branches of a tree.
 
     Parameters
     ----------
     state : State
-        As identified.
+        The identified state.
     kind : {"pose", "position", "distance"}
-        Of the observations: positions tell no orientation of a tool, distances no base.
+        Kind of the observations: positions tell no orientation of a tool, distances no base.
     covariance : (k, k) array
-        Of the parameters but elasticity.
+        Covariance of the parameters without elasticity.
     units : (k,) array
-        That make each parameter a movement of the tool of about 1 mm.
+        Factors that make each parameter a movement of the tool of about 1 mm.
     nominal : Robot
-        From which the file's form is.
+        The robot whose file form is used.
     """
 
     def poses(at: State) -> Poses:
@@ -254,8 +262,8 @@ def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, 
         return Poses.of([robot.world_from_base, *robot.tools.values(), *stations, *mounts])
 
     state = replace(state, elastic=False)
-    here = poses(state)
-    derivative = np.zeros((len(here), 6, len(units)))
+    current = poses(state)
+    derivative = np.zeros((len(current), 6, len(units)))
     for k, unit in enumerate(units):
         step = np.zeros(len(units))
         step[k] = DIFFERENCE_MM * unit
@@ -274,4 +282,4 @@ def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, 
             f"mount of joint {i + 1} behind {'the base' if after < 0 else f'joint {after + 1}'}"
             for i, (after, _) in nominal.tree.mounts.items()
         ]
-    return tuple(Placed(*each) for each in zip(names, here, sigma, strict=True))
+    return tuple(Placed(*each) for each in zip(names, current, sigma, strict=True))

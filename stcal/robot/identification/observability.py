@@ -1,4 +1,4 @@
-"""How well a set of poses shows a robot's parameters: the observability indices O1 … O5."""
+"""Observability indices O1 … O5: how well a set of poses shows a robot's parameters."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,10 +12,11 @@ from stcal.robot.kinematics.forward import chain_parameters
 from stcal.robot.kinematics.model import Robot
 
 SEEN = 1e-9
-"""Singular values below this share of the largest are rounding: the parameter is not seen by any pose."""
+"""Share of the largest singular value below which a singular value is rounding: no pose shows the parameter."""
 
 TOGETHER, MOST_BESIDE = 0.2, 2
-"""Share of a direction's largest motion from which on a parameter moves with it; so many are named beside the first."""
+"""Share of a direction's largest motion from which on a parameter is named with it, and largest number of parameters
+named beside the first."""
 
 MEANING = {
     "O1": "volume of the ellipsoid of uncertainty (D-optimality)",
@@ -24,18 +25,18 @@ MEANING = {
     "O4": "noise amplification",
     "O5": "harmonic mean, near to A-optimality",
 }
-"""Of the indices, in words."""
+"""The meaning of each index."""
 EXPLAINED = [f"  {name}: {words}" for name, words in MEANING.items()]
-"""A line of each, for the terminal."""
+"""Lines for the terminal, one for each index."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObservabilityIndices:
     """Indices of an identification Jacobian with singular values σ₁ ≥ … ≥ σ_L from ``count`` poses; larger is better.
 
-    They depend on the unit of the parameters but for the order that O1 gives to sets of poses. Everywhere here all
-    parameters are lengths in mm, an angle being the arc that it makes at the arm's whole reach
-    (:func:`parameter_scale`), and what is measured is counted in its σ. So singular values, O1, O3, O4 and O5 are in
+    The indices depend on the units of the parameters, except for the order that O1 gives to sets of poses. In this
+    module all parameters are lengths in mm, an angle being the arc that it makes at the arm's whole reach
+    (:func:`parameter_scale`), and measurements are counted in their σ. So singular values, O1, O3, O4 and O5 are in
     1/mm; O2 has no unit; and 1 / O3 is the σ in mm of the combination of parameters that is seen worst.
 
     Parameters
@@ -45,7 +46,7 @@ class ObservabilityIndices:
     o2 : float
         σ_L / σ₁: inverse condition number (Driels & Pathre 1990).
     o3 : float
-        σ_L: the parameter that is seen worst, E-optimality (Nahvi, Hollerbach & Hayward 1994).
+        σ_L: the combination of parameters that is seen worst, E-optimality (Nahvi, Hollerbach & Hayward 1994).
     o4 : float
         σ_L² / σ₁: noise amplification (Nahvi & Hollerbach 1996).
     o5 : float
@@ -60,7 +61,8 @@ class ObservabilityIndices:
 
     @classmethod
     def of(cls, singular_values: np.ndarray, count: int) -> "ObservabilityIndices":
-        """From the singular values (L,) of the Jacobian of ``count`` poses; all indices are 0 where one of them is 0.
+        """Returns the indices by the singular values (L,) of the Jacobian of ``count`` poses; all are 0 if one value is
+        0.
 
         Raises
         ------
@@ -83,12 +85,13 @@ class ObservabilityIndices:
 
     @classmethod
     def of_jacobian(cls, rows: np.ndarray, seen: int | None = None) -> "ObservabilityIndices":
-        """From the Jacobian (m, r, k) of m poses over σ, parameters in mm; of its ``seen`` largest singular values."""
+        """Returns the indices of the Jacobian (m, r, k) of m poses over σ, parameters in mm, by its ``seen`` largest
+        singular values."""
         sigma = np.linalg.svd(rows.reshape(-1, rows.shape[2]), compute_uv=False)[:seen]
         return cls.of(np.where(sigma > SEEN * sigma[0], sigma, 0.0), len(rows))
 
     def values(self) -> dict[str, float]:
-        """By name, O1 … O5."""
+        """Returns the indices by name, O1 … O5."""
         return {"O1": self.o1, "O2": self.o2, "O3": self.o3, "O4": self.o4, "O5": self.o5}
 
 
@@ -100,7 +103,7 @@ def identification_jacobian(
     sigma_rad: float = 1.0,
     tool: str = "",
 ) -> np.ndarray:
-    """Derivative of what is measured at joint vectors by all that is identified, over σ, (m, r, k).
+    """Returns the derivatives (m, r, k) of the measured values at joint vectors by all identified parameters, over σ.
 
     r is 6 (rotation over σ_rad, translation over σ_mm) or 3 (position over σ_mm), in the world's axes; the k parameters
     are those of :func:`~stcal.robot.identification.residuals.parameter_names`, rad and mm.
@@ -108,7 +111,7 @@ def identification_jacobian(
     Parameters
     ----------
     q : (m, n) array
-        Values of the controller, rad or mm.
+        Joint values of the controller, rad or mm.
     """
     state = State(robot.chain(), {tool: robot.tool(tool)})
     derivative = tip_jacobian(state, q, (tool,) * len(q), observe)[1]
@@ -117,9 +120,11 @@ def identification_jacobian(
 
 
 def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[str] = ("",)) -> np.ndarray:
-    """(k,) factors of the columns of an identification Jacobian after which all parameters are in mm: an angle counts
-    by the arc that it makes at the arm's whole reach (:func:`~stcal.robot.kinematics.damped.reach_mm`, of the longest
-    tool)."""
+    """Returns factors (k,) of the columns of an identification Jacobian that bring all parameters to mm.
+
+    An angle counts by the arc that it makes at the arm's whole reach (:func:`~stcal.robot.kinematics.damped.reach_mm`,
+    with the longest tool).
+    """
     tools = list(tools)
     turning = [c < 3 for _, c in chain_parameters(robot.chain())]
     turning += ([True] * (tool_width(observe) - 3) + [False] * 3) * len(tools)
@@ -127,8 +132,10 @@ def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[st
 
 
 def directions_named(directions: np.ndarray, names: list[str]) -> tuple[str, ...]:
-    """Names of directions (k, d) of k parameters, such as ``J2 y (with tool z)``: each led by a parameter that no other
-    one has, with those that move with it."""
+    """Returns names of directions (k, d) of k parameters, such as ``J2 y (with tool z)``.
+
+    A direction is led by a parameter that is in no other direction, followed by the parameters that move with it.
+    """
     lead, reduced = [], directions.copy()
     for column in range(reduced.shape[1]):
         free = np.abs(reduced)
@@ -139,9 +146,13 @@ def directions_named(directions: np.ndarray, names: list[str]) -> tuple[str, ...
         others = np.arange(reduced.shape[1]) != column
         reduced[:, others] -= np.outer(reduced[:, column], reduced[i, others])
         lead.append(int(i))
-    found = []
-    for i, own in zip(lead, reduced.T, strict=True):
-        strong = [k for k in np.argsort(-np.abs(own)) if k != i and abs(own[k]) > TOGETHER * np.abs(own).max()]
+    named = []
+    for i, direction in zip(lead, reduced.T, strict=True):
+        strong = [
+            k
+            for k in np.argsort(-np.abs(direction))
+            if k != i and abs(direction[k]) > TOGETHER * np.abs(direction).max()
+        ]
         beside = " and ".join(names[k] for k in strong[:MOST_BESIDE]) + (" …" if len(strong) > MOST_BESIDE else "")
-        found.append(f"{names[i]} (with {beside})" if beside else names[i])
-    return tuple(found)
+        named.append(f"{names[i]} (with {beside})" if beside else names[i])
+    return tuple(named)

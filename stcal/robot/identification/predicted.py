@@ -1,6 +1,6 @@
-"""What the identified robot is expected to err by, where it was measured and elsewhere.
+"""The error that an identified robot is expected to have, where it was measured and elsewhere.
 
-Few rows, or rows of a small part of the joints' ranges, fit well and tell little: the covariance knows by how much.
+Few rows, or rows of a small part of the joints' ranges, fit well but determine little; the covariance shows how little.
 """
 
 from collections.abc import Sequence
@@ -18,20 +18,20 @@ from stcal.robot.kinematics.model import Robot
 
 SAMPLES, SEED = 200, 0
 ELSEWHERE = 3.0
-"""Times the σ at the measured rows, from which on that elsewhere is a warning: 40 rows over the middle 60 % of all
-ranges have 1.6, over 30 % 3.5, eight rows 3."""
+"""Ratio of σ over the joints' ranges to σ at the measured rows, above which there is a warning: 40 rows over the middle
+60 % of all ranges have 1.6, over 30 % 3.5, eight rows 3."""
 FEW = 2.0
-"""Numbers measured, in those of the parameters, below which σ are hardly estimated: of 40 simulated sets of eight poses
-(1.6) two found a tenth of the true one."""
+"""Number of measured values per parameter below which σ are hardly estimated: of 40 simulated sets of eight poses (1.6)
+two gave a tenth of the true σ."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predicted:
     """σ of the tool's position, mm (root of the summed variances of x, y, z), by the covariance of the parameters.
 
-    ``here_mm`` : (m,) at the joint values that were measured; ``ranges_mm`` : (s,) at random ones over the joints'
-    ranges (± half a turn, or the reach, where unlimited), with ``left_mm`` in it, RMS of what residuals go with;
-    ``covariance`` : (k, k) of all parameters, those of elasticity too, rad and mm.
+    ``here_mm`` : (m,) at the measured joint values; ``ranges_mm`` : (s,) at random ones over the joints' ranges (± half
+    a turn, or the reach, where unlimited), including ``left_mm``, the RMS of the effects that residuals go with;
+    ``covariance`` : (k, k) of all parameters, including elasticity, rad and mm.
     """
 
     here_mm: np.ndarray
@@ -40,23 +40,23 @@ class Predicted:
     left_mm: float = 0.0
 
     def elsewhere(self) -> float:
-        """σ over the ranges in units of that at the measured rows (RMS)."""
+        """Returns σ over the ranges in units of σ at the measured rows (RMS)."""
         return _rms(self.ranges_mm) / max(_rms(self.here_mm), 1e-9)
 
 
 def predicted(state: State, robot: Robot, seen: Observed, covariance: np.ndarray) -> Predicted | None:
-    """Of the target that most rows have; None of distances, which say nothing of the place of all.
+    """Returns σ for the target of most rows; None for distances, which do not show where the whole arm is.
 
     Parameters
     ----------
     state : State
-        As identified.
+        The identified state.
     robot : Robot
-        With the joints' ranges.
+        The robot with the joints' ranges.
     seen : Observed
         The observations.
     covariance : (k, k) array
-        Of the parameters, rad and mm.
+        Covariance of the parameters, rad and mm.
     """
     if seen.kind == "distance":
         return None
@@ -76,21 +76,22 @@ def _sigma(
     covariance: np.ndarray,
     conditions: Conditions = USUAL,
 ) -> np.ndarray:
-    """(r,) at joint values (r, n), mm."""
+    """Returns σ (r,) of the position at joint values (r, n), mm."""
     place = tip_jacobian(state, q, targets, kind, conditions)[1][:, 3:]
     return np.sqrt(np.einsum("rik,kl,ril->r", place, covariance, place))
 
 
 def predicted_at(found: Predicted, state: State, kind: Kind, q: np.ndarray, targets: Sequence[str]) -> np.ndarray:
-    """(r,) σ of the tool's position at joint values (r, n) that were not measured, mm, with what residuals go with; nan
-    of tools that were not measured.
+    """Returns σ (r,) of the tool's position at joint values (r, n) that were not measured, mm.
+
+    It includes the effects that residuals go with, and is nan for tools that were not measured.
 
     Parameters
     ----------
     found : Predicted
-        Of the identification.
+        Prediction of the identification.
     state, kind
-        As identified, and from what.
+        The identified state, and the kind of observation that it was identified from.
     q : (r, n) array
         Joint values, rad and mm.
     targets : (r,) sequence of str
@@ -98,13 +99,13 @@ def predicted_at(found: Predicted, state: State, kind: Kind, q: np.ndarray, targ
     """
     sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
     if known.any():
-        own = [name for name in targets if name in state.tools]
-        sigma[known] = np.hypot(_sigma(state, q[known], own, kind, found.covariance), found.left_mm)
+        known_targets = [name for name in targets if name in state.tools]
+        sigma[known] = np.hypot(_sigma(state, q[known], known_targets, kind, found.covariance), found.left_mm)
     return sigma
 
 
 def _over_ranges(robot: Robot, count: int) -> np.ndarray:
-    """(count, n) random joint values, rad or mm."""
+    """Returns random joint values (count, n), rad or mm."""
     low, high = robot.limits().T
     half = np.where(robot.prismatic, reach_mm(replace(robot, tools={"": Rigid()})), np.pi)
     low, high = np.where(np.isfinite(low), low, -half), np.where(np.isfinite(high), high, half)
@@ -112,15 +113,15 @@ def _over_ranges(robot: Robot, count: int) -> np.ndarray:
 
 
 def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted | None, tuple[str, ...]]:
-    """With what residuals go with in the σ over the ranges, and what is to be said of it.
+    """Returns the prediction with the effects that residuals go with in the σ over the ranges, and notes on it.
 
-    The rows show by how much the model fails among them; the covariance, which takes the model as true, does not know
-    of it, and values identified from other rows differ by more than it says.
+    The rows show by how much the model fails among them. The covariance takes the model as true and does not include
+    this, so that values identified from other rows differ by more than it says.
     """
     if found is None or not left:
         return found, ()
-    each = np.array([finding.effect_mm / (np.sqrt(2) if finding.turns else 1.0) for finding in left])
-    size = float(np.sqrt((each**2).sum()))
+    effects = np.array([finding.effect_mm / (np.sqrt(2) if finding.turns else 1.0) for finding in left])
+    size = float(np.sqrt((effects**2).sum()))
     wider = replace(found, ranges_mm=np.hypot(found.ranges_mm, size), left_mm=size)
     return wider, (
         f"σ hold for these rows, and for places like theirs: the model leaves {size:.2g} mm RMS that goes with what is "
@@ -132,21 +133,22 @@ def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted
 def doubts(
     found: Predicted | None, seen: Observed, units: np.ndarray, covariance: np.ndarray, names: list[str], tested: bool
 ) -> tuple[str, ...]:
-    """What is to be said of rows that are few, or of a small part of the ranges.
+    """Returns notes on rows that are few, or that cover a small part of the ranges.
 
-    ``units`` : (k,) make each parameter a movement of the tool of about 1 mm; ``tested`` : rows were held out.
+    ``units`` : (k,) factors that make each parameter a movement of the tool of about 1 mm; ``tested`` : rows were held
+    out.
     """
     notes = []
     numbers = WIDTH[seen.kind] * len(seen)
-    said = f"{len(seen)} {seen.kind}s give {numbers} numbers for {len(names)} parameters"
+    count = f"{len(seen)} {seen.kind}s give {numbers} numbers for {len(names)} parameters"
     if not tested:
         notes.append(
-            f"{said}: none can be held out to test the result, and errors of the same rows say nothing; measure twice "
+            f"{count}: none can be held out to test the result, and errors of the same rows say nothing; measure twice "
             "as many"
         )
     elif numbers < FEW * len(names):
         notes.append(
-            f"{said}: σ estimated from so few may be several times too small; state --sigma-mm, or measure more"
+            f"{count}: σ estimated from so few may be several times too small; state --sigma-mm, or measure more"
         )
     if found is not None and found.elsewhere() > ELSEWHERE:
         sizes, directions = np.linalg.eigh(covariance / units[:, None] / units)

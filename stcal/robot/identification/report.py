@@ -1,4 +1,4 @@
-"""What an identification found, as text, JSON and page."""
+"""Reports of an identification as text, JSON and page."""
 
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -26,7 +26,7 @@ ELASTIC = ["<joint, mdeg", "gravity", "across axis", "once a turn", "twice a tur
 
 
 def identified_text(result: Identified, nominal: Robot) -> str:
-    """Tables for the terminal."""
+    """Returns tables for the terminal."""
     kinds = ", ".join(f"{k}s {v}" for k, v in result.ranks.items())
     lines = [
         f"robot {nominal.name}: {_observations(result)}, {result.rank} parameters determined "
@@ -61,9 +61,9 @@ def identified_text(result: Identified, nominal: Robot) -> str:
 
 
 def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
-    """Everything, for programs (keys: ``data_layout.md``)."""
+    """Returns the result for programs (keys: ``data_layout.md``)."""
     values, before = dh_values(result.robot), dh_values(nominal)
-    held = result.held_out
+    held_out = result.held_out
     content = {
         "format": "stcal identified 1",
         "robot": nominal.name,
@@ -111,23 +111,23 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
         ],
     }
     if result.predicted is not None:
-        both = {"same_rows": result.predicted.here_mm, "ranges": result.predicted.ranges_mm}
-        content["predicted"] = {name: _named(_statistics(each)) for name, each in both.items()}
-    if held is not None:
-        mean, rms, largest = _statistics(held.position_mm)
+        predictions = {"same_rows": result.predicted.here_mm, "ranges": result.predicted.ranges_mm}
+        content["predicted"] = {name: _named(_statistics(each)) for name, each in predictions.items()}
+    if held_out is not None:
+        mean, rms, largest = _statistics(held_out.position_mm)
         content["held_out"] = {
-            "folds": held.folds,
-            "repeats": len(held.position_mm),
+            "folds": held_out.folds,
+            "repeats": len(held_out.position_mm),
             "mean_mm": mean,
             "rms_mm": rms,
             "max_mm": largest,
-            "mean_deg": float(np.degrees(np.nanmean(held.rotation_rad))) if result.seen.kind == "pose" else None,
+            "mean_deg": float(np.degrees(np.nanmean(held_out.rotation_rad))) if result.seen.kind == "pose" else None,
         }
     return IdentifiedFile.model_validate(content)
 
 
 def identified_page(result: Identified, nominal: Robot) -> str:
-    """The report page."""
+    """Returns the report page."""
     good = result.weights >= OUTLIER_WEIGHT
     drawn = Drawn(result.state, result.robot.world_from_base, result.seen, result.residuals, good)
     return render(
@@ -160,19 +160,20 @@ def identified_page(result: Identified, nominal: Robot) -> str:
 
 
 def _price(result: Identified) -> list[str]:
-    """What is kept as it was, and what that costs."""
+    """Returns what was adjusted, and the held-out errors with and without the kept dimensions; empty if none are
+    kept."""
     rows = result.adjustment.rows
     if not rows.fixed.any():
         return []
-    said = f"adjusted: base, tools and {int((rows.free & ~rows.fixed).sum())} of {int(rows.free.sum())} dimensions"
+    message = f"adjusted: base, tools and {int((rows.free & ~rows.fixed).sum())} of {int(rows.free.sum())} dimensions"
     if result.held_out is None or result.all_held_out is None:
-        return [said]
+        return [message]
     own, every = (_statistics(each.position_mm)[1] for each in (result.held_out, result.all_held_out))
-    return [f"{said}; rows held out err by {own:.3g} mm RMS, by {every:.3g} were all dimensions adjusted"]
+    return [f"{message}; rows held out err by {own:.3g} mm RMS, by {every:.3g} were all dimensions adjusted"]
 
 
 def _model(result: Identified) -> list[str]:
-    """What was tried, and what it gains."""
+    """Returns which model was chosen, and its gain."""
     gain = result.gain
     if gain is None:
         return ["model: elastic"] if result.model == "elastic" else []
@@ -185,13 +186,13 @@ def _model(result: Identified) -> list[str]:
 
 
 def elastic_head(result: Identified) -> list[str]:
-    """Over :func:`elastic_rows`."""
+    """Returns the heads of :func:`elastic_rows`."""
     return [*ELASTIC, *(["hysteresis"] if result.state.hysteresis else [])]
 
 
 def elastic_rows(result: Identified) -> list[list[str]]:
-    """Of each joint, what its link gives way by at the torques of the measured rows (RMS), the amplitudes of its gear,
-    and where it was adjusted its hysteresis, with σ."""
+    """Returns a row of each joint, values with σ: what its link gives way by at the torques of the measured rows (RMS),
+    the amplitudes of its gear, and its hysteresis if it was adjusted."""
     elasticity, sigma = result.state.chain.elasticity, result.elasticity_sigma
     if elasticity is None or sigma is None:
         return []
@@ -207,8 +208,8 @@ def elastic_rows(result: Identified) -> list[list[str]]:
     for i in range(len(chain)):
         cells = [(c * t, s * t) for c, s, t in zip(elasticity.compliance[i], sigma.compliance[i], rms[i], strict=True)]
         for pair in (slice(0, 2), slice(2, 4)):
-            size, each = float(np.linalg.norm(elasticity.periodic[i, pair])), sigma.periodic[i, pair]
-            cells.append((size, float(np.sqrt((each**2).mean()))))
+            size, gear_sigma = float(np.linalg.norm(elasticity.periodic[i, pair])), sigma.periodic[i, pair]
+            cells.append((size, float(np.sqrt((gear_sigma**2).mean()))))
         if result.state.hysteresis:
             cells.append((elasticity.hysteresis[i], sigma.hysteresis[i]))
         rows.append([str(i + 1), *(f"{MDEG * value:.1f} ± {MDEG * s:.1f}" for value, s in cells)])
@@ -216,9 +217,9 @@ def elastic_rows(result: Identified) -> list[list[str]]:
 
 
 def _elasticity(result: Identified) -> dict | None:
-    """Of the robot file, with σ."""
-    found, sigma = result.robot.elasticity, result.elasticity_sigma
-    if found is None or sigma is None:
+    """Returns the elasticity of the robot file, with σ; None if it was not adjusted."""
+    elasticity, sigma = result.robot.elasticity, result.elasticity_sigma
+    if elasticity is None or sigma is None:
         return None
 
     def joints(each: Elasticity) -> list[dict]:
@@ -228,35 +229,37 @@ def _elasticity(result: Identified) -> dict | None:
             for (a, b), m, p, h in zip(*(part.tolist() for part in parts), strict=True)
         ]
 
-    return {"gravity": found.gravity.tolist(), "joints": joints(found), "sigma": joints(sigma)}
+    return {"gravity": elasticity.gravity.tolist(), "joints": joints(elasticity), "sigma": joints(sigma)}
 
 
 def _placed(each: Placed) -> list[list[str]]:
-    """Translation, mm, and rotation vector, deg; σ in a line of their own."""
+    """Returns a line of translation, mm, and rotation vector, deg; and a second line of their σ, if there are any."""
     values, sigma = _shown(each)
     lines = [[each.name, *(number(v, 4) for v in values)]]
     return lines if np.isnan(sigma).all() else [*lines, ["  σ", *(number(s, 4) for s in sigma)]]
 
 
 def _shown(each: Placed) -> tuple[np.ndarray, np.ndarray]:
-    """Translation, mm, and rotation vector, deg, (6,); and σ of shifts along, and turns about, the axes (6,)."""
+    """Returns translation, mm, and rotation vector, deg, (6,); and σ (6,) of shifts along, and turns about, the
+    axes."""
     values = np.append(each.pose.translation, np.degrees(each.pose.log()[:3]))
     return values, np.append(each.sigma[3:], np.degrees(each.sigma[:3]))
 
 
 def placed_cells(each: Placed) -> list[str]:
-    """Name, and value ± σ of translation, mm, and rotation vector, deg, for a page."""
-    found = [number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in zip(*_shown(each), strict=True)]
-    return [each.name.partition(" in the")[0], *found]
+    """Returns name, and value ± σ of translation, mm, and rotation vector, deg, for a page."""
+    cells = [number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in zip(*_shown(each), strict=True)]
+    return [each.name.partition(" in the")[0], *cells]
 
 
 def placed_parts(placed: Iterable[Placed]) -> list[dict]:
-    """For result files."""
+    """Returns poses with σ for result files."""
     return [{"name": each.name, "pose": each.pose.matrix(), "sigma": each.sigma_or_none()} for each in placed]
 
 
 def _rows(result: Identified, nominal: Robot) -> list[tuple[list, list]]:
-    """Of each unit: the values that have it, each with the columns that it spans, and rows of joints."""
+    """Returns a table for each unit: heads of the values in it, each with the number of columns it spans, and rows of
+    joints."""
     values, before, sigma = dh_values(result.robot) * SHOWN, dh_values(nominal) * SHOWN, result.dh_sigma * SHOWN
     tables = []
     for unit in dict.fromkeys(UNITS):
@@ -291,18 +294,18 @@ def _figure(result: Identified):
 
 
 def _by_row(values: np.ndarray) -> np.ndarray:
-    seen = np.isfinite(values)
-    return np.where(seen, values, 0).sum(0) / np.where(seen.any(0), seen.sum(0), np.nan)
+    finite = np.isfinite(values)
+    return np.where(finite, values, 0).sum(0) / np.where(finite.any(0), finite.sum(0), np.nan)
 
 
 def _errors(result: Identified) -> dict[str, np.ndarray]:
-    found = {"nominal axes, base and tool fitted": result.nominal_mm, "identified, the same rows": result.fitted_mm}
+    errors = {"nominal axes, base and tool fitted": result.nominal_mm, "identified, the same rows": result.fitted_mm}
     if result.held_out is not None:
-        found[f"held out, {result.held_out.folds} folds"] = result.held_out.position_mm
+        errors[f"held out, {result.held_out.folds} folds"] = result.held_out.position_mm
     if result.predicted is not None:
-        found["σ, the same rows"] = result.predicted.here_mm
-        found["σ, over the joints' ranges"] = result.predicted.ranges_mm
-    return found
+        errors["σ, the same rows"] = result.predicted.here_mm
+        errors["σ, over the joints' ranges"] = result.predicted.ranges_mm
+    return errors
 
 
 def _statistics(errors: np.ndarray) -> tuple[float, float, float]:
@@ -336,7 +339,7 @@ def _sigma(value: float) -> str:
 
 
 def _observations(result: Identified) -> str:
-    """How many of what."""
+    """Returns the number and kind of the observations."""
     seen = result.seen
     return f"{len(seen)} {seen.kind}s" + (" by their distances" if seen.frameless else "")
 

@@ -1,4 +1,4 @@
-"""What measurements say about a robot: residuals, and their derivatives by the minimal parameters."""
+"""Residuals of measurements about a robot, and their derivatives by the minimal parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -28,9 +28,9 @@ WIDTH = {"pose": 6, "position": 3, "distance": 1}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """What is identified: the chain, and flange_from_tool by target; where ``elastic`` the chain's elasticity too, the
-    parameters of which are the last ones, with ``hysteresis`` or without; and station_from_world by station, the first
-    of which is the world."""
+    """The unknowns of an identification. ``chain``; ``tools`` : flange_from_tool by target; ``elastic`` : whether the
+    chain's elasticity is among them, as the last parameters; ``stations`` : station_from_world by station, the first of
+    which is the world; ``hysteresis`` : whether elasticity includes hysteresis."""
 
     chain: Chain
     tools: dict[str, Rigid]
@@ -40,7 +40,7 @@ class State:
 
     @property
     def elastic_count(self) -> int:
-        """Parameters of the elasticity."""
+        """Number of parameters of the elasticity."""
         return (10 if self.hysteresis else 9) * len(self.chain) if self.elastic else 0
 
 
@@ -48,10 +48,10 @@ class State:
 class Observed:
     """Measurements as one kind of observation.
 
-    ``first``, ``second`` : (r,) rows of the measurements that each observation is about; equal but for distances.
-    ``values`` : (r,) distances, mm, else empty. ``frameless`` : positions of which only the distances are used. All
-    distances of m points hold what the points hold but a motion of all of them; so these are positions in a frame of
-    their own, whose place is identified with the rest, and not counted.
+    ``first``, ``second`` : (r,) rows of the measurements that each observation is about; they differ for distances
+    only. ``values`` : (r,) distances, mm, else empty. ``frameless`` : positions of which only the distances are used.
+    All distances of m points determine the points but for a motion of all of them. So such points are positions in a
+    frame of their own, whose pose is identified with the other parameters but not counted.
     """
 
     kind: Kind
@@ -66,31 +66,31 @@ class Observed:
 
     @property
     def used(self) -> Kind:
-        """What of the measurements is used."""
+        """Kind of observation for which the measurements are used."""
         return "distance" if self.frameless else self.kind
 
 
 def tool_width(kind: Kind) -> int:
-    """Parameters of each tool: orientation is seen in poses only."""
+    """Returns the number of parameters of each tool; orientation is seen in poses only."""
     return 6 if kind == "pose" else 3
 
 
 def observed(data: Measurements, kind: Kind | None = None) -> Observed:
-    """The measurements as ``kind``, or as the most that they hold.
+    """Returns the measurements as ``kind``, or as the richest kind that they hold.
 
     Raises
     ------
     InputError
-        They do not hold it.
+        The measurements do not hold ``kind``.
     """
-    held = "distance" if data.distances is not None else "position" if data.rotations is None else "pose"
-    kind = kind or held
-    if WIDTH[kind] > WIDTH[held]:
-        raise InputError("E-MEASURED-KIND", f"{data.where}: {held}s were measured, {kind}s cannot be had from them")
+    richest = "distance" if data.distances is not None else "position" if data.rotations is None else "pose"
+    kind = kind or richest
+    if WIDTH[kind] > WIDTH[richest]:
+        raise InputError("E-MEASURED-KIND", f"{data.where}: {richest}s were measured, {kind}s cannot be had from them")
     rows, none = np.arange(len(data)), np.zeros(0)
     if kind != "distance":
         return Observed(kind, data, rows, rows, none)
-    if held == "distance":
+    if richest == "distance":
         distances, from_row = data.lengths()
         real = rows[from_row != rows]
         return Observed(kind, data, real, from_row[real], distances[real])
@@ -98,8 +98,8 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
 
 
 def parameter_names(state: State, kind: Kind) -> list[str]:
-    """``J2 rx`` … of the axes, ``tool x`` … of the tools, and ``station B rx`` … of stations but the first; r in rad,
-    the others in mm; without elasticity."""
+    """Returns the names of the parameters without elasticity: ``J2 rx`` … of the axes, ``tool x`` … of the tools, and
+    ``station B rx`` … of stations but the first; r in rad, the others in mm."""
     component = ("rx", "ry", "rz", "x", "y", "z")
     tool = component if kind == "pose" else component[3:]
     names = [f"J{i + 1} {component[c]}" for i, c in chain_parameters(state.chain)]
@@ -108,29 +108,30 @@ def parameter_names(state: State, kind: Kind) -> list[str]:
 
 
 def tips(state: State, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:
-    """world_from_tool at joint vectors (m, n), with the tool and the load of each."""
+    """Returns world_from_tool at joint vectors (m, n), with the tool and the load of each."""
     place = {name: i for i, name in enumerate(state.tools)}
     tool = Poses.of(state.tools.values())
     return carried_poses(state.chain, q, targets, conditions) @ tool[[place[t] for t in targets]]
 
 
 def tips_of(state: State, data: Measurements) -> Poses:
-    """world_from_tool of m measurements."""
+    """Returns world_from_tool of m measurements."""
     return tips(state, data.q, data.targets, data.conditions)
 
 
 def residuals(state: State, seen: Observed) -> np.ndarray:
-    """Measured minus modelled, (r, 6), (r, 3) or (r, 1): rad and mm in the axes of the row's station."""
+    """Returns measured minus modelled values, (r, 6), (r, 3) or (r, 1): rad and mm in the axes of the row's station."""
     return _beside(state, tips_of(state, seen.data), seen)
 
 
 def jacobian(state: State, seen: Observed) -> np.ndarray:
-    """Derivative of what the model says by :func:`parameter_names` and the elasticity, (r, 6 or 3 or 1, k)."""
+    """Returns the derivative of the modelled values by :func:`parameter_names` and the elasticity, (r, 6 or 3 or 1,
+    k)."""
     return linear(state, seen)[1]
 
 
 def linear(state: State, seen: Observed) -> tuple[np.ndarray, np.ndarray]:
-    """:func:`residuals` and :func:`jacobian`."""
+    """Returns :func:`residuals` and :func:`jacobian`."""
     tip, full = tip_jacobian(state, seen.data.q, seen.data.targets, seen.kind, seen.data.conditions)
     if len(state.stations) > 1:
         full = _by_station(state, seen, tip, full)
@@ -138,8 +139,8 @@ def linear(state: State, seen: Observed) -> tuple[np.ndarray, np.ndarray]:
 
 
 def curvature(state: State, seen: Observed, pull: np.ndarray) -> np.ndarray:
-    """Second derivative, (9 n, 9 n), of the sum of ``pull`` (r, 6 or 3) times what the model says, by compliances and
-    moments."""
+    """Returns the second derivative (9 n, 9 n), by compliances and moments, of the sum of ``pull`` (r, 6 or 3) times
+    the modelled values."""
     tip, data = tips_of(state, seen.data), seen.data
     moves = as_seen(state, seen, tip, np.broadcast_to(np.eye(6), (len(tip), 6, 6)))
     pulls = np.einsum("rw,rwk->rk", pull, moves)
@@ -147,8 +148,10 @@ def curvature(state: State, seen: Observed, pull: np.ndarray) -> np.ndarray:
 
 
 def as_seen(state: State, seen: Observed, tip: Poses, moves: np.ndarray) -> np.ndarray:
-    """What observations see, (r, 6 or 3 or 1, k), of motions of the tools (m, 6, k) at ``tip``: rad over mm, in the
-    world's axes; seen in those of the row's station."""
+    """Returns the effect on observations, (r, 6 or 3 or 1, k), of motions ``moves`` (m, 6, k) of the tools at ``tip``.
+
+    Motions are rad over mm in the world's axes; their effects are in the axes of the row's station.
+    """
     if len(state.stations) > 1:
         turn = _stations(state, seen.data.stations).rotation[:, None]
         moves = (turn @ moves.reshape(len(moves), 2, 3, -1)).reshape(moves.shape)
@@ -162,17 +165,17 @@ def as_seen(state: State, seen: Observed, tip: Poses, moves: np.ndarray) -> np.n
 
 
 def _stations(state: State, names: Sequence[str]) -> Poses:
-    """station_from_world of each row."""
+    """Returns station_from_world of each row."""
     place = {name: i for i, name in enumerate(state.stations)}
     return Poses.of(state.stations.values())[[place[name] for name in names]]
 
 
 def _by_station(state: State, seen: Observed, tip: Poses, full: np.ndarray) -> np.ndarray:
-    """The derivative with columns of the stations, as small motions of the world."""
+    """Returns the derivative with the columns of the stations filled in, as small motions of the world."""
     full, names = full.copy(), np.array(seen.data.stations)
-    own = len(parameter_names(state, seen.kind)) - 6 * (len(state.stations) - 1)
+    offset = len(parameter_names(state, seen.kind)) - 6 * (len(state.stations) - 1)
     for s, name in enumerate(list(state.stations)[1:]):
-        rows, place = names == name, own + 6 * s
+        rows, place = names == name, offset + 6 * s
         full[rows, :3, place : place + 3] = np.eye(3)
         full[rows, 3:, place : place + 3] = -skew(tip.translation[rows])
         full[rows, 3:, place + 3 : place + 6] = np.eye(3)
@@ -180,7 +183,7 @@ def _by_station(state: State, seen: Observed, tip: Poses, full: np.ndarray) -> n
 
 
 def _beside(state: State, tip: Poses, seen: Observed) -> np.ndarray:
-    """Measured minus modelled (m,) poses of the tips."""
+    """Returns measured minus modelled values for the poses ``tip`` (m,) of the tools."""
     if len(state.stations) > 1:
         tip = _stations(state, seen.data.stations) @ tip
     if seen.kind == "pose":
@@ -194,8 +197,8 @@ def _beside(state: State, tip: Poses, seen: Observed) -> np.ndarray:
 def tip_jacobian(
     state: State, q: np.ndarray, targets: Sequence[str], kind: Kind, conditions: Conditions = USUAL
 ) -> tuple[Poses, np.ndarray]:
-    """world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by :func:`parameter_names` and the
-    elasticity: rotation (rad) over translation (mm), in the world's axes, where stations move nothing."""
+    """Returns world_from_tool at joint vectors (m, n), and its derivative (m, 6, k) by :func:`parameter_names` and the
+    elasticity: rotation (rad) over translation (mm), in the world's axes; stations move nothing."""
     tip = tips(state, q, targets, conditions)
     width = tool_width(kind)
     axes_part = chain_jacobian(state.chain, q, tip, conditions)
@@ -217,13 +220,13 @@ def tip_jacobian(
 
 
 def moved(state: State, step: np.ndarray, kind: Kind) -> State:
-    """The state after small motions along the parameters, (k,)."""
+    """Returns the state after small motions along the parameters, (k,)."""
     k = len(chain_parameters(state.chain))
     width = tool_width(kind)
     tools = {}
     for t, (name, tool) in enumerate(state.tools.items()):
-        own = step[k + width * t : k + width * (t + 1)]
-        tools[name] = tool @ Rigid.exp(own if width == 6 else [0, 0, 0, *own])
+        tool_step = step[k + width * t : k + width * (t + 1)]
+        tools[name] = tool @ Rigid.exp(tool_step if width == 6 else [0, 0, 0, *tool_step])
     stations, k = dict(state.stations), k + width * len(tools)
     for s, name in enumerate(list(stations)[1:]):
         stations[name] = stations[name] @ Rigid.exp(step[k + 6 * s : k + 6 * s + 6])
@@ -235,7 +238,7 @@ def moved(state: State, step: np.ndarray, kind: Kind) -> State:
 
 
 def only_of(seen: Observed, keep: np.ndarray) -> Observed:
-    """The observations at indices, or of a mask (r,)."""
+    """Returns the observations at the indices, or of the mask (r,), ``keep``."""
     if seen.kind == "distance":
         return replace(seen, first=seen.first[keep], second=seen.second[keep], values=seen.values[keep])
     data = seen.data[keep]

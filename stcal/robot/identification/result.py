@@ -1,4 +1,4 @@
-"""What an identification is asked for, and what it answers."""
+"""Options and result of an identification."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -26,43 +26,45 @@ from stcal.robot.kinematics.model import Elasticity, Robot
 Model = Literal["rigid", "elastic", "auto"]
 LEAST_FOLDS = 2
 BEYOND_CHANCE = 2.5
-"""Standard errors by which one model's errors of held-out rows are to be below the other's. Rows of one fold share what
-their solution errs by, so that a standard error of independent rows is too small: of rigid arms 2 would do for 95 %."""
+"""Number of standard errors by which the held-out errors of one model must be below those of the other. Rows of one
+fold share the error of their solution, so that a standard error of independent rows is too small: for rigid arms 2
+would do for 95 %."""
 OUTLIER_WEIGHT = 0.5
-"""Observations of less are named: their residual is over twice Huber's limit."""
+"""Weight below which an observation is named as an outlier: its residual is over twice Huber's limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class IdentifyOptions:
-    """How :func:`identify` works.
+    """Options of :func:`identify`.
 
     Parameters
     ----------
     observe : {"pose", "position", "distance"}, optional
-        What of the measurements to use; the most that was measured if not given.
+        Kind of observation to use of the measurements; the richest one that was measured if not given.
     sigma_mm, sigma_rad : float, optional
         σ of one coordinate of a position, mm, and of an orientation, rad; estimated where not given.
     robust : bool
-        Whether outliers weigh less (Huber), and what are errors and no noise nothing at all.
+        Whether outliers weigh less (Huber), and gross errors nothing at all.
     folds : int
-        Of the cross-validation; 0 for none.
+        Number of folds of the cross-validation; 0 for none.
     repeats : int, optional
-        Divisions into folds, in each of which every row is held out once; 5 of few rows, 1 of many, if not given.
+        Number of divisions into folds, in each of which every row is held out once; 5 for few rows, 1 for many, if not
+        given.
     seed : int
-        Of the divisions.
+        Seed of the divisions.
     partial : bool
-        Keep nominal what the data do not determine, in place of refusing them.
+        Keep nominal what the data do not determine, instead of refusing the data.
     adjust : {"all", "geometry", "zeros", "base,tool"}
-        Dimensions to adjust beside base and tools: all, all but the joints' zero positions, these alone, or none. What
-        the robot file calls fixed stays in any case.
+        Dimensions to adjust beside base and tools: all, all but the joints' zero positions, zero positions alone, or
+        none. Dimensions that are fixed in the robot file stay in any case.
     model : {"rigid", "elastic", "auto"}
-        Whether links give way to gravity and gears turn unevenly; ``auto`` takes what predicts held-out rows better by
-        more than chance, and rigid where neither does.
+        Whether links give way to gravity and gears turn unevenly; ``auto`` takes the elastic model if it predicts
+        held-out rows better by more than chance, else the rigid one.
 
     Raises
     ------
     InputError
-        A σ that is not positive, or beyond 1 m or 1 rad.
+        A σ that is not positive, or beyond 1 m or 1 rad; ``auto`` with fewer than two folds.
     """
 
     observe: Kind | None = None
@@ -89,8 +91,8 @@ class IdentifyOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOutRows:
-    """Errors of rows that a fit had not seen: ``position_mm``, ``rotation_rad`` : (repeats, r), nan where there is
-    none, as of rotations where positions were measured."""
+    """Errors of rows that were held out of a fit. ``position_mm``, ``rotation_rad`` : (repeats, r), nan where there is
+    no error, such as for rotations where positions were measured."""
 
     folds: int
     position_mm: np.ndarray
@@ -99,8 +101,8 @@ class HeldOutRows:
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """What ``elastic`` predicts rows better by than ``rigid``: RMS errors of held-out rows by both, and the mean of the
-    rows' differences with its standard error, mm."""
+    """Gain of the elastic model over the rigid one in prediction: RMS errors of held-out rows by both, and the mean of
+    the rows' differences with its standard error, mm."""
 
     rigid_mm: float
     elastic_mm: float
@@ -109,22 +111,22 @@ class Gain:
 
     @classmethod
     def between(cls, rigid: HeldOutRows, elastic: HeldOutRows) -> "Gain":
-        """Of the same rows by both."""
-        both = [np.nanmean(each.position_mm, axis=0) for each in (rigid, elastic)]
-        less = both[0] - both[1]
-        less = less[np.isfinite(less)]
+        """Returns the gain from errors of the same rows by both models."""
+        errors = [np.nanmean(each.position_mm, axis=0) for each in (rigid, elastic)]
+        differences = errors[0] - errors[1]
+        differences = differences[np.isfinite(differences)]
         before, after = (float(np.sqrt(np.nanmean(each.position_mm**2))) for each in (rigid, elastic))
-        return cls(before, after, float(less.mean()), float(less.std(ddof=1) / np.sqrt(len(less))))
+        return cls(before, after, float(differences.mean()), float(differences.std(ddof=1) / np.sqrt(len(differences))))
 
     @property
     def beyond_chance(self) -> bool:
-        """Whether it is one."""
+        """Whether the gain is beyond chance."""
         return self.gain_mm > BEYOND_CHANCE * self.sigma_mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjustment:
-    """A solution with the σ that go with it; ``notes`` : on what had not come to rest."""
+    """A solution with the σ that go with it. ``notes`` : on iterations that did not converge."""
 
     solution: Solution
     weighting: Weighting
@@ -141,47 +143,47 @@ class Identified:
     Parameters
     ----------
     robot : Robot
-        Base where the instrument stands, tools by target; mm, rad.
+        The robot with its base in the instrument's frame, tools by target; mm, rad.
     seen : Observed
         The r observations.
     adjustment : Adjustment
-        Solution, weights and σ; what is wanted of it is at hand as properties.
+        Solution, weights and σ; what is used often is a property, too.
     names : tuple of str
-        (k,) of the parameters, small motions of each joint's frame and of the tools (J2 ry: axis of joint 2 about its
-        y, rad; tool x: mm).
+        Names (k,) of the parameters, small motions of each joint's frame and of the tools (J2 ry: axis of joint 2 about
+        its y, rad; tool x: mm).
     covariance : (k, k) array
-        Of the parameters, rad and mm.
+        Covariance of the parameters, rad and mm.
     rank : int
-        Parameters that the data used determine.
+        Number of parameters that the data used determine.
     ranks : dict of str to int
-        Parameters that these joint values determine, by kind of observation.
+        Number of parameters that these joint values determine, by kind of observation.
     undetermined : tuple of str
-        Directions that were kept nominal, each by its parameters.
+        Directions that were kept nominal, each named by its parameters.
     nominal_mm : (r,) array
         Errors with nominal axes, base and tools fitted.
     held_out : HeldOutRows or None
         Errors of the cross-validation.
     predicted : Predicted or None
-        σ of the tool's position by the covariance; None of distances.
+        σ of the tool's position by the covariance; None for distances.
     placed : tuple of Placed
         Base and tools of the robot, with σ.
     left : tuple of Finding or None
-        What the residuals go with; None where observations are too few to tell.
+        Effects that the residuals go with; None if the observations are too few to tell.
     dh_sigma : (n, 5) array
         σ of a, alpha, d, theta, beta; mm, rad.
     observability : ObservabilityIndices
-        Of the parameters that are determined.
+        Indices of the determined parameters.
     deviations : dict of str to float or None
-        σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad. Of elasticity: of what
-        links give way by at the usual torque, and of gears, rad.
+        σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad. For elasticity: σ of what
+        links give way by at the usual torque, of gears and of hysteresis, rad.
     elasticity_sigma : Elasticity or None
         σ of the robot's elasticity where it was adjusted.
     gain : Gain or None
-        Where both models were tried.
+        Comparison of both models, where both were tried.
     all_held_out : HeldOutRows or None
         Errors of the cross-validation with all dimensions adjusted, where some are kept.
     notes : tuple of str
-        Rows left out, and what is to be known of the result.
+        Rows left out, and remarks on the result.
     """
 
     robot: Robot
@@ -211,7 +213,7 @@ class Identified:
 
     @property
     def model(self) -> Model:
-        """That was adjusted."""
+        """The model that was adjusted."""
         return "elastic" if self.state.elastic else "rigid"
 
     @property
@@ -226,29 +228,29 @@ class Identified:
 
     @property
     def sigma0(self) -> float:
-        """By how much the σ that were given have to be multiplied; 1 where they were estimated."""
+        """Factor by which the given σ have to be multiplied; 1 where they were estimated."""
         return self.weighting.factor
 
     @property
     def weights(self) -> np.ndarray:
-        """(r,) Huber's weights."""
+        """Huber weights (r,)."""
         return self.adjustment.solution.weights
 
     @property
     def residuals(self) -> np.ndarray:
-        """(r, 6), (r, 3) or (r, 1) measured minus modelled, rad and mm, in the instrument's axes."""
+        """Residuals (r, 6), (r, 3) or (r, 1), measured minus modelled, rad and mm, in the instrument's axes."""
         return self.adjustment.solution.residuals
 
     @property
     def fitted_mm(self) -> np.ndarray:
-        """(r,) errors with identified axes."""
+        """Errors (r,) with identified axes, mm."""
         return position_errors(self.residuals)
 
     def outliers(self) -> list[tuple[int, float]]:
-        """(row of the observations, error in mm) of those that weigh less than half."""
+        """Returns (row of the observations, error in mm) of each observation that weighs less than half."""
         return [(int(i), float(self.fitted_mm[i])) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
 
 
 def position_errors(found: np.ndarray) -> np.ndarray:
-    """(r,) position error, mm."""
+    """Returns the position errors (r,), mm."""
     return np.linalg.norm(found[:, -3:], axis=1) if found.shape[1] > 1 else np.abs(found[:, 0])

@@ -54,49 +54,52 @@ from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Elasticity, Robot
 
 LEAST_MM, LEAST_RAD = 1e-3, 1e-6
-"""σ where none is given begin at the misfit of the nominal robot, but not below this."""
+"""Lower limit of the σ at the start; σ that are not given start at the misfit of the nominal robot."""
 TYPICAL_MM, TYPICAL_RAD = 0.1, 5e-4
-"""Of instruments: what joint values determine is told for these."""
+"""σ of typical instruments; what joint values determine is told for these."""
 VARIANCE_ROUNDS = 10
-"""Two to four do for most data; a robot without noise needs the most."""
+"""Largest number of rounds of estimating σ. Two to four suffice for most data; a robot without noise needs the most."""
 VARIANCE_SETTLED, VARIANCE_UNSETTLED = 1e-3, 1e-2
-"""Of the logarithm of a σ: a thousandth of it is far below what any data tell of one; a hundredth is worth a note."""
+"""Changes of the logarithm of a σ: convergence below the first, a note above the second. A thousandth of a σ is far
+below what any data determine."""
 FOLD_ROUNDS = 3
-"""Of the σ without some of the rows, from those of all."""
+"""Number of rounds of estimating the σ without some of the rows, starting from those of all rows."""
 FALLS = 0.5
-"""Medians of residuals that fall by less are near enough for the estimates proper."""
+"""Ratio of successive medians of residuals above which they are near enough to start the actual estimation."""
 STILL_RAD, STILL_MM = 1e-5, 1e-2
-"""A joint that moves less than this did not move."""
+"""Motion, in rad or mm, below which a joint did not move."""
 OUTLIER_ROUNDS = 5
-"""Of leaving errors out; after 1 to 3 the same ones are left out again."""
+"""Largest number of rounds of leaving out gross errors; after 1 to 3 rounds the same ones are left out again."""
 MOSTLY_GOOD = 0.5
-"""Share of the observations below which nothing is called an error."""
+"""Smallest share of good observations; where fewer would be good, nothing is called an error."""
 TRY_ELASTIC = "gravity and gears may explain it: --model auto tries whether they predict rows held out better"
 REPEATS, FEW_ROWS = 5, 300
-"""Divisions of the cross-validation of few rows; one does for more."""
+"""Number of divisions of the cross-validation for few rows, and largest number of few rows; one division does for
+more."""
 
 
 @one_thread()
 def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None = None) -> Identified:
     """Identify the axes, base and tools of ``robot`` from ``data``.
 
-    Complete, minimal and continuous parameters (:func:`stcal.robot.kinematics.forward.chain_parameters`), trust region,
-    Huber weights, covariance, and the way back to D-H rows with Hayati's β for nearly parallel axes.
+    The parameters are complete, minimal and continuous (:func:`stcal.robot.kinematics.forward.chain_parameters`). They
+    are adjusted by a trust-region method with Huber weights, have a covariance, and are converted back to D-H rows,
+    with Hayati's β for nearly parallel axes.
 
     Parameters
     ----------
     robot : Robot
-        The nominal robot: mm, rad; it is where the search starts, and what dimensions are expected to be near to.
+        The nominal robot: mm, rad. The search starts at it, and dimensions are expected to be near it.
     data : Measurements
-        Joint values with what was measured there, in the instrument's frame.
+        Joint values with the measurements made at them, in the instrument's frame.
     options : IdentifyOptions, optional
         σ, robustness, cross-validation.
 
     Returns
     -------
     Identified
-        The robot with ``world_from_base`` in the instrument's frame, its covariance and errors. Iterations of the σ
-        that had not come to rest are among its notes.
+        The robot with ``world_from_base`` in the instrument's frame, its covariance and errors. Its notes name
+        iterations of the σ that did not converge.
 
     Raises
     ------
@@ -116,57 +119,57 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
     1996.
     """
     options = options or IdentifyOptions()
-    seen = observed(data, options.observe)
+    observations = observed(data, options.observe)
     _still_joints(robot, data, options.partial)
     first = start(robot, data)
-    rows = NominalRows.about(first, parameter_units(jacobian(first, seen)), robot, options.adjust)
-    _enough(seen, first, rows)
-    adjusted, held_out, gain = _modelled(robot, first, seen, options, rows)
+    rows = NominalRows.about(first, parameter_units(jacobian(first, observations)), robot, options.adjust)
+    _enough(observations, first, rows)
+    adjusted, held_out, gain = _modelled(robot, first, observations, options, rows)
     solution = adjusted.solution
-    names = parameter_names(solution.state, seen.kind)
-    undetermined = _undetermined(solution, names, seen, options.partial)
-    every, rank = _covariance(adjusted, seen), solution.rank() - _place(seen)
-    own = slice(len(names))
-    covariance = every[own, own]
+    names = parameter_names(solution.state, observations.kind)
+    undetermined = _undetermined(solution, names, observations, options.partial)
+    full_covariance, rank = _covariance(adjusted, observations), solution.rank() - _place(observations)
+    named = slice(len(names))
+    covariance = full_covariance[named, named]
     identified = robot_from_chain(solution.state.chain, solution.state.tools, robot)
-    sigma = predicted(solution.state, robot, seen, every)
-    found = left(
+    prediction = predicted(solution.state, robot, observations, full_covariance)
+    findings = left(
         solution.state,
         identified.world_from_base,
-        seen,
+        observations,
         adjusted.weighting,
-        jacobian(solution.state, seen),
+        jacobian(solution.state, observations),
         solution.weights,
     )
-    wider, hold = widened(sigma, found or ())
+    wider, remarks = widened(prediction, findings or ())
     tested = held_out is not None or options.folds < LEAST_FOLDS
     return Identified(
         robot=identified,
-        seen=seen,
+        seen=observations,
         adjustment=adjusted,
         names=tuple(names),
         covariance=covariance,
         rank=rank,
         ranks=_ranks(solution.state, data),
         undetermined=undetermined,
-        nominal_mm=position_errors(residuals(first, seen)),
+        nominal_mm=position_errors(residuals(first, observations)),
         held_out=held_out,
         predicted=wider,
-        placed=placed(solution.state, seen.kind, covariance, solution.units[own], robot),
-        left=found,
+        placed=placed(solution.state, observations.kind, covariance, solution.units[named], robot),
+        left=findings,
         dh_sigma=adjusted.rows.sigma(identified, covariance),
-        observability=_observability(identified, adjusted, seen, rank),
+        observability=_observability(identified, adjusted, observations, rank),
         deviations=adjusted.deviations.of(adjusted.rows.groups),
-        elasticity_sigma=_elasticity_sigma(solution.state, every),
+        elasticity_sigma=_elasticity_sigma(solution.state, full_covariance),
         gain=gain,
-        all_held_out=_with_all(robot, first, seen, options) if rows.fixed.any() else None,
+        all_held_out=_with_all(robot, first, observations, options) if rows.fixed.any() else None,
         notes=data.notes
         + adjusted.rows.notes(identified)
         + adjusted.notes
-        + doubts(sigma, seen, solution.units[own], covariance, names, tested)
-        + tuple(each.sentence() for each in found or ())
-        + hold
-        + ((TRY_ELASTIC,) if hold and not solution.state.elastic else ())
+        + doubts(prediction, observations, solution.units[named], covariance, names, tested)
+        + tuple(each.sentence() for each in findings or ())
+        + remarks
+        + ((TRY_ELASTIC,) if remarks and not solution.state.elastic else ())
         + (data.conditions.ignored("the arm as identified") if identified.elasticity is None else ()),
     )
 
@@ -174,7 +177,8 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
 def _modelled(
     robot: Robot, first: State, seen: Observed, options: IdentifyOptions, rows: NominalRows
 ) -> tuple[Adjustment, HeldOutRows | None, Gain | None]:
-    """Adjusted by the model that is asked for, or that predicts better by more than chance."""
+    """Returns the adjustment by the requested model, or by the one that predicts better by more than chance; with its
+    held-out errors, and the gain if both were tried."""
     rigid = _adjusted(first, seen, options, rows)
     if options.model == "rigid":
         return rigid, _cross_validated(robot, seen, rigid, options), None
@@ -186,21 +190,21 @@ def _modelled(
     good = rigid.solution.weights >= GROSS
     good |= good.mean() < MOSTLY_GOOD
     elastic = _without_errors(state, seen, good, options, (rows, rigid.weighting, rigid.deviations))
-    held = [_cross_validated(robot, seen, each, options) for each in (rigid, elastic)]
-    if held[0] is None or held[1] is None:
+    held_out = [_cross_validated(robot, seen, each, options) for each in (rigid, elastic)]
+    if held_out[0] is None or held_out[1] is None:
         return (elastic, None, None) if options.model == "elastic" else (rigid, None, None)
-    gain = Gain.between(held[0], held[1])
+    gain = Gain.between(held_out[0], held_out[1])
     if options.model == "elastic" or gain.beyond_chance:
-        return elastic, held[1], gain
-    return rigid, held[0], gain
+        return elastic, held_out[1], gain
+    return rigid, held_out[0], gain
 
 
 def _elasticity_sigma(state: State, covariance: np.ndarray) -> Elasticity | None:
-    """σ of the elasticity by the covariance (k, k) of all parameters."""
+    """Returns σ of the elasticity from the covariance (k, k) of all parameters; None for a rigid arm."""
     if not state.elastic or state.chain.elasticity is None:
         return None
-    none = replace(state.chain.elasticity, hysteresis=np.zeros(len(state.chain)))
-    return with_values(none, np.sqrt(np.diag(covariance))[-state.elastic_count :])
+    template = replace(state.chain.elasticity, hysteresis=np.zeros(len(state.chain)))
+    return with_values(template, np.sqrt(np.diag(covariance))[-state.elastic_count :])
 
 
 def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
@@ -228,39 +232,44 @@ def _enough(seen: Observed, state: State, rows: NominalRows) -> None:
 
 
 def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weighting:
-    """Where σ begin, and which the residuals tell. What is given for all coordinates are weights, times σ₀; one σ given
-    of two is taken as it is. The others begin at the misfit, so that no observation is an outlier of the start."""
+    """Returns the weighting at the start, and which σ are estimated from the residuals.
+
+    Where σ of all coordinates are given, they are weights, times σ₀. Where one of two σ is given, it is taken as it is.
+    The others start at the misfit, so that no observation is an outlier at the start.
+    """
     sigma = {"mm": options.sigma_mm, "rad": options.sigma_rad}
     needed = ("rad", "mm") if seen.kind == "pose" else ("mm",)
     missing = tuple(name for name in needed if sigma[name] is None)
-    own = seen.data.covariance is not None and seen.kind != "distance" and missing == needed
-    estimated = ("factor",) if own or not missing else missing
-    weighting = Weighting(options.sigma_mm or LEAST_MM, options.sigma_rad or LEAST_RAD, own, estimated=estimated)
+    with_covariances = seen.data.covariance is not None and seen.kind != "distance" and missing == needed
+    estimated = ("factor",) if with_covariances or not missing else missing
+    weighting = Weighting(
+        options.sigma_mm or LEAST_MM, options.sigma_rad or LEAST_RAD, with_covariances, estimated=estimated
+    )
     white = weighting.whiten(residuals(state, seen), seen)
     misfit = {name: float(np.median(np.abs(white[:, c]))) for name, c in weighting.columns(white.shape[1]).items()}
     return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
 
 
 def _with_all(robot: Robot, first: State, seen: Observed, options: IdentifyOptions) -> HeldOutRows | None:
-    """Held-out errors of a rigid arm of which all dimensions are adjusted."""
+    """Returns the held-out errors of a rigid arm with all dimensions adjusted."""
     free = replace(robot, joints=tuple(replace(joint, fixed={}) for joint in robot.joints))
     rows = NominalRows.about(first, parameter_units(jacobian(first, seen)), free)
     return _cross_validated(robot, seen, _adjusted(first, seen, options, rows), options)
 
 
 def _adjusted(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> Adjustment:
-    """Solve with the observations that agree, and estimate σ."""
+    """Solves with the observations that agree, and estimates σ."""
     good = np.ones(len(seen), bool)
     if options.robust:
         good = agreeing(state, seen, _weighting(state, seen, options))
         good |= good.mean() < MOSTLY_GOOD
-    own = seen if good.all() else only_of(seen, good)
-    state, weighting = _by_medians(state, own, options, rows)
+    consistent = seen if good.all() else only_of(seen, good)
+    state, weighting = _by_medians(state, consistent, options, rows)
     return _without_errors(state, seen, good, options, (rows, weighting, Deviations()))
 
 
 Known = tuple[NominalRows, Weighting, Deviations]
-"""The nominal dimensions; and where σ of measurements and dimensions start."""
+"""The nominal dimensions, and the values at which σ of measurements and dimensions start."""
 
 
 def _without_errors(
@@ -271,31 +280,35 @@ def _without_errors(
     known: Known,
     rounds: int = VARIANCE_ROUNDS,
 ) -> Adjustment:
-    """Solve, and once more without what are errors and no noise, (r,), and with what is none: Huber's weights bound
-    their pull, but let each pull as hard as the worst honest observation, which no covariance knows of."""
+    """Solves, removes gross errors, and solves again until the set of gross errors stays the same.
+
+    ``good`` : (r,) mask of the observations that are no gross errors at the start. Huber weights bound an outlier's
+    pull, but each outlier pulls as hard as the worst honest observation, and no covariance shows it.
+    """
     for _ in range(OUTLIER_ROUNDS + 1):
-        found = _settled(state, seen if good.all() else only_of(seen, good), options, known, rounds)
+        adjustment = _settled(state, seen if good.all() else only_of(seen, good), options, known, rounds)
         if not good.all():
-            left = residuals(found.solution.state, seen)
-            length = np.linalg.norm(found.weighting.whiten(left, seen), axis=1)
+            errors = residuals(adjustment.solution.state, seen)
+            length = np.linalg.norm(adjustment.weighting.whiten(errors, seen), axis=1)
             weights = huber_weights(length, huber_limit(seen.kind))
-            found = replace(found, solution=replace(found.solution, residuals=left, weights=weights))
-        if not _errors_change(found, good):
-            return found
-        good, state = found.solution.weights >= GROSS, found.solution.state
-        known = (found.rows, found.weighting, found.deviations)
+            adjustment = replace(adjustment, solution=replace(adjustment.solution, residuals=errors, weights=weights))
+        if not _errors_change(adjustment, good):
+            return adjustment
+        good, state = adjustment.solution.weights >= GROSS, adjustment.solution.state
+        known = (adjustment.rows, adjustment.weighting, adjustment.deviations)
     note = f"which observations are errors still changes after {OUTLIER_ROUNDS} rounds; look at the outliers"
-    return replace(found, notes=(*found.notes, note))
+    return replace(adjustment, notes=(*adjustment.notes, note))
 
 
 def _errors_change(found: Adjustment, good: np.ndarray) -> bool:
-    """Whether other observations than before, (r,), are errors; never where most would be."""
+    """Returns True if the set of gross errors is not that of ``good`` (r,); False if most observations would be
+    errors."""
     now = found.solution.weights >= GROSS
     return bool((now != good).any() and now.mean() >= MOSTLY_GOOD)
 
 
 def _by_medians(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> tuple[State, Weighting]:
-    """State, and σ by medians, which outliers do not move, until they stay."""
+    """Returns the state, and σ by medians, which outliers do not move, iterated until they stay."""
     weighting = _weighting(state, seen, options)
     for _ in range(VARIANCE_ROUNDS):
         state = solve(state, seen, weighting, options.robust, rows.held(state, Deviations(), seen.kind)).state
@@ -306,7 +319,7 @@ def _by_medians(state: State, seen: Observed, options: IdentifyOptions, rows: No
 
 
 def _settled(state: State, seen: Observed, options: IdentifyOptions, known: Known, rounds: int) -> Adjustment:
-    """Solve, and estimate σ, in turns."""
+    """Solves and estimates σ in turns."""
     rows, weighting, deviations = known
     relaxation = Relaxation()
     for _ in range(rounds):
@@ -323,14 +336,15 @@ def _settled(state: State, seen: Observed, options: IdentifyOptions, known: Know
 
 
 def _undetermined(solution: Solution, names: list[str], seen: Observed, partial: bool) -> tuple[str, ...]:
-    """Directions that the data leave open, by the parameters along each, beyond those that distances never see."""
-    _, directions, good = solution.spectrum()
+    """Returns the directions that the data leave open, named by their parameters, beyond those that distances never
+    show."""
+    _, directions, determined = solution.spectrum()
     expected = unseen(seen.kind)
-    if (~good).sum() <= expected:
+    if (~determined).sum() <= expected:
         return ()
-    found = directions_named(directions[:, ~good][:, expected:], names)
+    open_directions = directions_named(directions[:, ~determined][:, expected:], names)
     if not partial:
-        first = ", ".join(found[:4]) + (" …" if len(found) > 4 else "")
+        first = ", ".join(open_directions[:4]) + (" …" if len(open_directions) > 4 else "")
         raise DegenerateError(
             "E-IDENTIFY-UNDETERMINED",
             f"{seen.data.where}: the data determine {solution.rank()} of {len(names) - expected - solution.count} "
@@ -338,11 +352,12 @@ def _undetermined(solution: Solution, names: list[str], seen: Observed, partial:
             f"{first}; measure more varied poses (`stcal robot design`), or keep the nominal values of these with "
             "--partial",
         )
-    return found
+    return open_directions
 
 
 def _ranks(state: State, data: Measurements) -> dict[str, int]:
-    """Parameters that poses, positions and distances at these joint values determine, whichever were measured."""
+    """Returns how many parameters poses, positions and distances at these joint values determine, whichever were
+    measured."""
     tip = tips_of(state, data)
     exact = Measurements(
         data.where,
@@ -365,13 +380,13 @@ def _observability(robot: Robot, adjusted: Adjustment, seen: Observed, rank: int
     state, weighting = adjusted.solution.state, adjusted.weighting
     scale = parameter_scale(robot, seen.kind, state.tools)
     rows = weighting.whiten(jacobian(state, seen)[:, :, : len(scale)], seen) * scale
-    if seen.frameless:  # without what a motion of all points of a station makes
-        each = []
-        for own in seen.data.by_station().values():
-            at = (seen.data.points() - seen.data.points()[own].mean(0)) * own[:, None]
-            shift = np.eye(3) * own[:, None, None]
-            each.append(np.concatenate([-skew(at) / np.linalg.norm(at), shift], axis=2))
-        motions = np.concatenate(each, axis=2)
+    if seen.frameless:  # remove what a motion of all points of a station can produce
+        blocks = []
+        for rows_of_station in seen.data.by_station().values():
+            lever = (seen.data.points() - seen.data.points()[rows_of_station].mean(0)) * rows_of_station[:, None]
+            shift = np.eye(3) * rows_of_station[:, None, None]
+            blocks.append(np.concatenate([-skew(lever) / np.linalg.norm(lever), shift], axis=2))
+        motions = np.concatenate(blocks, axis=2)
         u, s, _ = np.linalg.svd(weighting.whiten(motions, seen).reshape(-1, motions.shape[2]), full_matrices=False)
         u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
         rows = (flat - u @ (u.T @ flat)).reshape(rows.shape)
@@ -379,7 +394,8 @@ def _observability(robot: Robot, adjusted: Adjustment, seen: Observed, rank: int
 
 
 def _place(seen: Observed) -> int:
-    """Directions in which positions that count by their distances can be moved together: 6 (5 of points on a line)."""
+    """Returns the number of directions in which positions that count by their distances can be moved together: 6 per
+    station (5 for points on a line)."""
     if not seen.frameless:
         return 0
     directions = 0
@@ -390,20 +406,24 @@ def _place(seen: Observed) -> int:
 
 
 def _covariance(adjusted: Adjustment, seen: Observed) -> np.ndarray:
-    """(k, k) of the parameters; none along the directions that distances never see, which stay where they were."""
+    """Returns the covariance (k, k) of the parameters; 0 along the directions that distances never show, which stay as
+    they were."""
     covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.least)))
     if seen.kind != "distance":
         return covariance
     units = adjusted.solution.units
     blind = adjusted.solution.spectrum()[1][:, : unseen(seen.kind)]
     blind = np.pad(blind, ((0, len(units) - len(blind)), (0, 0)))
-    kept = (np.eye(len(units)) - blind @ blind.T) * units[:, None] / units
-    return kept @ covariance @ kept.T
+    projector = (np.eye(len(units)) - blind @ blind.T) * units[:, None] / units
+    return projector @ covariance @ projector.T
 
 
 def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: IdentifyOptions) -> HeldOutRows | None:
-    """Errors of rows that took no part: of neither the parameters nor (where rows are few) the σ nor which are errors.
-    Descents start at the solution of all rows: the minimum is the same from everywhere, and near."""
+    """Returns errors of rows that took no part in the parameters; None if the rows are too few.
+
+    Where rows are few, held-out rows take no part in the σ and in the search for gross errors either. Descents start at
+    the solution of all rows: the minimum is the same from everywhere, and near.
+    """
     rows = len(seen)
     if min(options.folds, rows) < LEAST_FOLDS:
         return None
@@ -413,31 +433,31 @@ def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: I
     good, begin = whole.solution.weights >= GROSS, (whole.rows, whole.weighting, whole.deviations)
     good |= good.mean() < MOSTLY_GOOD
     for repeat in range(repeats):
-        for place in dealt(rows, options.folds, rng):
-            others = np.setdiff1d(np.arange(rows), place)
-            train, test = only_of(seen, others), only_of(seen, place)
+        for test_rows in dealt(rows, options.folds, rng):
+            train_rows = np.setdiff1d(np.arange(rows), test_rows)
+            train, test = only_of(seen, train_rows), only_of(seen, test_rows)
             state = _of_targets(whole.solution.state, train)
             seeks = len(parameter_names(state, seen.kind)) - unseen(seen.kind) - whole.solution.count
             if WIDTH[seen.kind] * len(train) <= seeks:
                 return None
             if rows <= FEW_ROWS:
-                state = _without_errors(state, train, good[others], options, begin, FOLD_ROUNDS).solution.state
+                state = _without_errors(state, train, good[train_rows], options, begin, FOLD_ROUNDS).solution.state
             else:
                 held = whole.rows.held(state, whole.deviations, seen.kind)
                 state = solve(state, train, whole.weighting, options.robust, held).state
             if seen.kind != "distance":
                 named = zip(test.data.targets, test.data.stations, strict=True)
                 known = np.array([target in state.tools and station in state.stations for target, station in named])
-                test, place = only_of(test, known), place[known]
-            found = residuals(state, test)
-            position[repeat, place] = position_errors(found)
+                test, test_rows = only_of(test, known), test_rows[known]
+            errors = residuals(state, test)
+            position[repeat, test_rows] = position_errors(errors)
             if seen.kind == "pose":
-                rotation[repeat, place] = np.linalg.norm(found[:, :3], axis=1)
+                rotation[repeat, test_rows] = np.linalg.norm(errors[:, :3], axis=1)
     return HeldOutRows(min(options.folds, rows), position, rotation)
 
 
 def _of_targets(state: State, seen: Observed) -> State:
-    """With the tools and stations that ``seen`` shows."""
+    """Returns the state with the tools and stations that ``seen`` shows, and the first station."""
     tools = {name: tool for name, tool in state.tools.items() if name in seen.data.targets}
     first = next(iter(state.stations))
     stations = {name: each for name, each in state.stations.items() if name in {first, *seen.data.stations}}

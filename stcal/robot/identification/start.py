@@ -1,4 +1,5 @@
-"""Where identification starts: base and tools by the nominal axes; and data that this robot cannot have made."""
+"""Start of an identification: base and tools by the nominal axes; and refusal of data that this robot cannot have
+made."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,31 +25,33 @@ Fit = frozenset[Literal["base", "tool"]]
 BOTH: Fit = frozenset(("base", "tool"))
 ROUNDS = 500
 REGULAR = 1e-10
-"""Damping that keeps what these positions leave open, as of a tool that never turned, where it is."""
+"""Smallest damping. It keeps parameters that these positions leave open at their start, such as the point of a tool
+that never turned."""
 NEARLY = 1e-3
-"""Share of the squared misfit that a start may still promise to lose: where the robot file is not that of the data the
-valley is flat, and the misfit says so."""
+"""Share of the squared misfit that the next step may still be predicted to remove. Where the robot file does not belong
+to the data, the valley is flat, and the misfit shows it."""
 STILL_MM = 0.01
 AROUND = 0.1
-"""Of the arm's reach: how far from the given point of the tool distances are tried too."""
+"""Distance from the given tool point at which distances are fitted from other starts too, as a share of the arm's
+reach."""
 
 
 def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
-    """The nominal chain where the instrument stands, with tools that fit the measurements best.
+    """Returns the nominal chain with its base in the instrument's frame, and the tools that fit the measurements best.
 
     Parameters
     ----------
     robot : Robot
-        Its axes are taken as they are; and base and tools, unless they are fitted.
+        The robot. Its axes are taken as they are, and so are base and tools unless they are fitted.
     data : Measurements
-        What the instrument saw.
+        The measurements of the instrument.
     fit : frozenset of {"base", "tool"}
-        What is fitted to it; all if not given.
+        What is fitted to the measurements; both if not given.
 
     Raises
     ------
     InputError
-        The nominal robot does not fit the data; the reason is named where one mends it.
+        The nominal robot does not fit the data; the message names a cause if its correction makes the robot fit.
     DegenerateError
         A target never moved, or only along a line.
     """
@@ -80,7 +83,7 @@ def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
 
 
 def _carried(robot: Robot, data: Measurements, named: list[str]) -> None:
-    """Every target of a tree is known to be on a branch."""
+    """Refuses targets that the robot file of a tree puts on no branch."""
     assert robot.tree is not None
     missing = [name for name in named if name not in robot.tree.carriers]
     if missing:
@@ -93,25 +96,26 @@ def _carried(robot: Robot, data: Measurements, named: list[str]) -> None:
 
 
 def _with_stations(robot: Robot, data: Measurements) -> State:
-    """By the rows of the station that has most; the others where these positions put them."""
+    """Returns the state by the rows of the station with most rows; the other stations stand where its positions put
+    them."""
     (first, most), *others = data.by_station().items()
     state = start(robot, data[most])
-    known = robot.tools.get("", Rigid())
-    tools = {name: state.tools.get(name, robot.tools.get(name, known)) for name in sorted(set(data.targets))}
+    default = robot.tools.get("", Rigid())
+    tools = {name: state.tools.get(name, robot.tools.get(name, default)) for name in sorted(set(data.targets))}
     state = replace(state, tools=tools)
     stations = dict(state.stations)
-    for name, own in others:
-        part = data[own]
+    for name, rows in others:
+        station_data = data[rows]
         try:
-            station = align_rigid(part.points(), tips_of(state, part).translation)
+            station = align_rigid(station_data.points(), tips_of(state, station_data).translation)
         except DegenerateError as error:
             raise DegenerateError(
                 "E-STATION-FEW",
-                f"{data.where}: station {name}: {own.sum()} positions do not show where it stands; 3 or more off one "
+                f"{data.where}: station {name}: {rows.sum()} positions do not show where it stands; 3 or more off one "
                 "line needed, or leave them out",
             ) from error
-        off = part.points() - (station @ tips_of(state, part)).translation
-        misfit, extent = float(np.sqrt((off**2).sum(1).mean())), _extent(part)
+        difference = station_data.points() - (station @ tips_of(state, station_data)).translation
+        misfit, extent = float(np.sqrt((difference**2).sum(1).mean())), _extent(station_data)
         if misfit > FITS * extent:
             raise InputError(
                 "E-IDENTIFY-STATION",
@@ -123,7 +127,7 @@ def _with_stations(robot: Robot, data: Measurements) -> State:
 
 
 def _extent(data: Measurements) -> float:
-    """RMS about the mean of what was measured, mm."""
+    """Returns the RMS of the measured positions about their mean, or of the measured distances, mm."""
     if data.positions is None:
         return float(np.sqrt((data.lengths()[0] ** 2).mean()))
     return float(np.sqrt(((data.positions - data.positions.mean(0)) ** 2).sum(1).mean()))
@@ -138,24 +142,25 @@ def _moves(data: Measurements) -> None:
             )
         return
     for name in sorted(set(data.targets)):
-        own = data.positions[[t == name for t in data.targets]]
-        moved = float(np.linalg.norm(np.ptp(own, axis=0)))
-        if moved < STILL_MM and len(own) > 1:
+        xyz = data.positions[[t == name for t in data.targets]]
+        moved = float(np.linalg.norm(np.ptp(xyz, axis=0)))
+        if moved < STILL_MM and len(xyz) > 1:
             raise DegenerateError(
                 "E-IDENTIFY-UNMOVED",
-                f"{data.where}: target {name or 'of all rows'} never moved ({moved:.2g} mm over {len(own)} rows, more "
+                f"{data.where}: target {name or 'of all rows'} never moved ({moved:.2g} mm over {len(xyz)} rows, more "
                 f"than {STILL_MM} mm needed); was it on the robot, were positions read anew?",
             )
 
 
 def _placed(robot: Robot, data: Measurements, tools: dict[str, Rigid], fit: Fit = BOTH) -> tuple[State, float]:
-    """Base and tool points by least squares, tool orientations after them; and the RMS misfit, mm."""
+    """Returns base and tool points by least squares and tool orientations after them, as a state; and the RMS misfit,
+    mm."""
     chain = replace(robot, world_from_base=Rigid()).chain()
     flange = carried_poses(chain, data.q, data.targets, data.conditions)
     names = list(tools)
     rows = np.array([names.index(t) for t in data.targets])
     points = np.array([tools[name].translation for name in names])
-    if data.positions is None:  # distances see neither base nor where the instrument stands
+    if data.positions is None:  # distances show neither the base nor the instrument's place
         points, misfit = _points_of_distances(robot, flange, data, rows, points, "tool" in fit)
         return State(chain, {name: Rigid(tools[name].rotation, points[k]) for k, name in enumerate(names)}), misfit
     if "base" in fit:
@@ -193,8 +198,8 @@ def _base_and_points(
     given: Rigid | None = None,
     fit_points: bool = True,
 ):
-    """Base, unless it is ``given``, and tool points by least squares, from the alignment with the points given; and RMS
-    misfit, mm."""
+    """Returns base (unless ``given``) and tool points by least squares, starting from the alignment with the points
+    given; and the RMS misfit, mm."""
     free = np.array([given is None] * 6 + [fit_points] * points.size)
     try:
         base = given or align_rigid(positions, flange @ points[rows])
@@ -206,28 +211,34 @@ def _base_and_points(
         ) from error
     moving = (rows[:, None] == np.arange(len(points)))[:, None, :, None]
     spread = np.linalg.norm(positions - positions.mean(0), axis=1).max()
-    held = 1 / np.array([*[USELESS_MM / spread] * 3, *[USELESS_MM] * (3 + points.size)]) ** 2
+    information = 1 / np.array([*[USELESS_MM / spread] * 3, *[USELESS_MM] * (3 + points.size)]) ** 2
 
     def linearise(at: tuple[Rigid, np.ndarray, np.ndarray]) -> NormalEquations:
-        seen = flange @ at[1][rows]
+        points_base = flange @ at[1][rows]
         turned = np.where(moving, (at[0].rotation @ flange.rotation)[:, :, None], 0.0).reshape(len(rows), 3, -1)
-        by = np.concatenate([-skew(seen @ at[0].rotation.T), np.tile(np.eye(3), (len(rows), 1, 1)), turned], axis=2)
-        own = NormalEquations.of((at[0] @ seen - positions).ravel(), free * by.reshape(-1, by.shape[2]))
-        return own + NormalEquations(float(at[2] @ (held * at[2])), np.diag(held), held * at[2])
+        derivative = np.concatenate(
+            [-skew(points_base @ at[0].rotation.T), np.tile(np.eye(3), (len(rows), 1, 1)), turned], axis=2
+        )
+        equations = NormalEquations.of(
+            (at[0] @ points_base - positions).ravel(), free * derivative.reshape(-1, derivative.shape[2])
+        )
+        return equations + NormalEquations(
+            float(at[2] @ (information * at[2])), np.diag(information), information * at[2]
+        )
 
     if not free.any():
         return base, points, float(np.sqrt(((base @ (flange @ points[rows]) - positions) ** 2).sum(1).mean()))
-    found = minimise(
-        (base, points, np.zeros(len(held))),
+    minimum = minimise(
+        (base, points, np.zeros(len(information))),
         linearise,
         lambda at, step: (perturbed(at[0], step[:6]), at[1] + step[6:].reshape(-1, 3), at[2] + step),
         least_damping=REGULAR,
         max_steps=ROUNDS,
     )
-    found.required(
-        f"{where}: base and tools", "check the D-H rows and the joint values", NEARLY * float(found.linear.cost)
+    minimum.required(
+        f"{where}: base and tools", "check the D-H rows and the joint values", NEARLY * float(minimum.linear.cost)
     )
-    base, points, _ = found.state
+    base, points, _ = minimum.state
     misfit = np.linalg.norm(base @ (flange @ points[rows]) - positions, axis=1)
     return base, points, float(np.sqrt((misfit**2).mean()))
 
@@ -235,7 +246,7 @@ def _base_and_points(
 def _points_of_distances(
     robot: Robot, flange: Poses, data: Measurements, rows: np.ndarray, points: np.ndarray, fit_points: bool
 ):
-    """Tool points by least squares, from those given and from others around the flange; and RMS misfit, mm."""
+    """Returns tool points by least squares, starting at those given and around them; and the RMS misfit, mm."""
 
     def errors(moved: np.ndarray) -> np.ndarray:
         tip = flange @ moved.reshape(-1, 3)[rows]
@@ -246,24 +257,24 @@ def _points_of_distances(
         return points, float(np.sqrt((errors(points.ravel()) ** 2).mean()))
     reach = max(reach_mm(robot, tool) for tool in robot.tools)
     around = AROUND * reach * np.vstack([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    # A start, settled or not: the adjustment goes on from here, and says when it does not converge.
+    # This is a start, converged or not: the adjustment goes on from here, and reports if it does not converge.
     fits = [least_squares(errors, (points + shift).ravel(), max_nfev=ROUNDS) for shift in around]
     best = min(fits, key=lambda fit: fit.cost)
     return best.x.reshape(-1, 3), float(np.sqrt(2 * best.cost / len(data)))
 
 
 def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: float, extent: float) -> None:
-    """Say what is wrong with the data, or with the robot file."""
-    found = {}
-    for reason, other, guess in _guesses(robot, data, tools):
+    """Raises an error that says what is wrong with the data, or with the robot file."""
+    misfits = {}
+    for reason, variant, guess in _guesses(robot, data, tools):
         try:
-            found[reason] = _placed(other, guess, tools)[1] / _extent(guess)
-        except (DegenerateError, ConvergenceError):  # a guess that leaves too little, or explains nothing
+            misfits[reason] = _placed(variant, guess, tools)[1] / _extent(guess)
+        except (DegenerateError, ConvergenceError):  # this guess leaves too few data, or explains nothing
             continue
     says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
     says += f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; "
-    reason = min(found, key=lambda guess: found[guess])
-    if found[reason] < min(EXPLAINS * misfit / extent, FITS):
+    reason = min(misfits, key=lambda guess: misfits[guess])
+    if misfits[reason] < min(EXPLAINS * misfit / extent, FITS):
         raise InputError("E-IDENTIFY-MISFIT", f"{says}it would fit if {reason}")
     raise InputError(
         "E-IDENTIFY-MISFIT", f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units"
@@ -271,7 +282,7 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
 
 
 def _guesses(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[tuple[str, Robot, Measurements]]:
-    """Frequent mistakes: what would be right, with robot and data as if it were."""
+    """Yields frequent mistakes: in words, with the robot and the data as they would be without the mistake."""
     turning, n = ~robot.prismatic, len(robot.rows)
     q, angle = data.q, np.where(turning, 180 / np.pi, 1.0)
     scaled = {"distances": data.distances, "positions": data.positions}
@@ -302,5 +313,5 @@ def _guesses(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Itera
     if data.rotations is not None:
         inverse = data.poses().inverse()
         reason = "poses are inverse (instrument seen from the tool); give the tool in the instrument's frame"
-        there = {"positions": inverse.translation, "rotations": inverse.rotation, "covariance": None}
-        yield reason, robot, replace(data, **there)
+        inverted = {"positions": inverse.translation, "rotations": inverse.rotation, "covariance": None}
+        yield reason, robot, replace(data, **inverted)

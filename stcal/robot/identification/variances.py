@@ -1,10 +1,11 @@
-"""Variance components of an identification, and a covariance that knows that they are estimates themselves.
+"""Variance components of an identification, and a covariance of the parameters that allows for their uncertainty.
 
-Estimated are the σ of the measurements and of the robot's dimensions about nominal. About the solution everything is
+Components are the σ of the measurements and of the robot's dimensions about nominal. About the solution everything is
 linear, so that for any σ the parameters and the likelihood of the σ (restricted maximum likelihood, Patterson &
-Thompson 1971) are closed forms of a few k × k matrices. The covariance of the parameters is the mean over the posterior
-of the σ of their covariance there and of the square of their shift (Kass & Steffey 1989), by Gauss-Hermite quadrature
-about the maximum: in place of σ taken as known it is wider by what a t distribution is wider than a normal one.
+Thompson 1971) are closed forms of a few k × k matrices. The covariance of the parameters is the mean, over the
+posterior of the σ, of their covariance at these σ and of the square of their shift (Kass & Steffey 1989), by
+Gauss-Hermite quadrature about the maximum. It exceeds the covariance with σ taken as known as a t distribution exceeds
+a normal one.
 """
 
 from dataclasses import astuple, dataclass, replace
@@ -20,29 +21,31 @@ from stcal.robot.identification.nominal import DOUBT, Deviations, NominalRows
 from stcal.robot.identification.residuals import WIDTH, Kind, Observed, jacobian
 
 LEAST = 1e-9
-"""mm, rad: σ of data without noise."""
+"""Smallest σ, in mm or rad: that of data without noise."""
 FARTHEST = 3.0
-"""log σ is looked for within this of where it was, a factor of 20, each round: beyond, rounding spoils the squares."""
+"""Largest change of log σ in a round, a factor of 20; beyond it rounding spoils the squares."""
 NEAREST = 0.7
-"""Of what products bend, a factor of two: what is farther the tangent says wrongly, and may call best."""
+"""The same for σ of compliances, a factor of two: their products with moments are nonlinear, so that farther away the
+tangent is wrong, and may call a wrong value best."""
 QUIETER = -2.5
-"""log σ of the data is looked for from here too: few data may be explained by noise alone, or by dimensions."""
+"""Second start of the search for log σ of the data: few data may be explained by noise alone, or by dimensions."""
 GROSS = 0.5
-"""Observations of less weight are errors, not noise (normal ones never are so far out), and say nothing of σ."""
+"""Weight below which an observation is a gross error, not noise (normal errors are never so large), and does not count
+for σ."""
 NODES, NODE_WEIGHTS = np.sqrt(3.0) * np.array([0.0, -1.0, 1.0]), np.array([4.0, 1.0, 1.0]) / 6
-"""Gauss-Hermite of three points for a standard normal distribution."""
+"""Points and weights of three-point Gauss-Hermite quadrature for a standard normal distribution."""
 MOST_PRODUCT = 5
-"""Dimensions: 243 points; of rigid arms there are no more."""
+"""Largest number of dimensions for the product rule: 243 points; rigid arms have no more."""
 SHORTEST = 0.1
-"""Share of a step of the σ: two that lead back and forth by chance stop nothing."""
+"""Smallest share of a step of the σ: two steps that lead back and forth by chance must not stop the iteration."""
 STEP = 1e-4
-"""Of the second derivatives, in log σ."""
+"""Step of the second derivatives, in log σ."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Components:
-    """Parts of an adjustment, linear about its solution, in ``units`` (k,) of its parameters; those of the data first,
-    then the groups of the robot's dimensions. ``least``, ``most`` : (p,) of log (σ / present σ)."""
+    """Parts of an adjustment, linear about its solution, in ``units`` (k,) of its parameters. Parts of the data come
+    first, then the groups of the robot's dimensions. ``least``, ``most`` : (p,) limits of log (σ / present σ)."""
 
     parts: Parts
     least: np.ndarray
@@ -50,13 +53,13 @@ class Components:
     units: np.ndarray
 
     def best(self) -> np.ndarray:
-        """(p,) log (σ / present σ) of highest density."""
+        """Returns log (σ / present σ) (p,) of highest posterior density."""
         data = np.isinf(self.parts.doubt)
         starts = (np.zeros(len(data)), np.where(data, QUIETER, self.parts.expected))
         return self.parts.best(self.least, self.most, starts)
 
     def covariance(self, best: np.ndarray) -> np.ndarray:
-        """(k, k) covariance of the parameters about the estimate at ``best`` (p,)."""
+        """Returns the covariance (k, k) of the parameters about the estimate at ``best`` (p,)."""
         root = self._root(best)
         z, rule = _rule(root.shape[1])
         log_density, _, step, inverse = self.parts.at(best + z @ root.T)
@@ -69,13 +72,14 @@ class Components:
         return mean * self.units[:, None] * self.units
 
     def _root(self, best: np.ndarray) -> np.ndarray:
-        """(p, f) square root of the covariance of log σ, of the f that are not at their least value."""
+        """Returns a square root (p, f) of the covariance of log σ, for the f components that are not at their lower
+        limit."""
         free = np.flatnonzero(best > self.least + STEP)
         moves = STEP * np.eye(len(best))[free]
         gradient = self.parts.at(np.concatenate([best + moves, best - moves]))[1]
         hessian = (gradient[: len(free)] - gradient[len(free) :])[:, free] / (2 * STEP)
         values, directions = np.linalg.eigh(-(hessian + hessian.T) / 2)
-        # a flat or rising direction: as wide as what is known beforehand, at the most
+        # a flat or rising direction is at most as wide as the prior
         least = np.full(len(free), np.min(self.parts.doubt, initial=1.0) ** -2.0)
         values = np.maximum(values, least)
         root = np.zeros((len(best), len(free)))
@@ -84,8 +88,11 @@ class Components:
 
 
 def _rule(width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (m, width) and weights (m,) of a standard normal distribution; of many dimensions those of the cubature of
-    degree three alone (Arasaratnam & Haykin, IEEE Trans. Automatic Control 54, 2009)."""
+    """Returns points (m, width) and weights (m,) for a standard normal distribution.
+
+    In many dimensions they are those of the cubature of degree three (Arasaratnam & Haykin, IEEE Trans. Automatic
+    Control 54, 2009), else of the product rule.
+    """
     if width > MOST_PRODUCT:
         away = np.sqrt(width) * np.eye(width)
         return np.vstack([away, -away]), np.full(2 * width, 0.5 / width)
@@ -96,21 +103,24 @@ def _rule(width: int) -> tuple[np.ndarray, np.ndarray]:
 def components(
     solution: Solution, seen: Observed, weighting: Weighting, robust: bool, rows: NominalRows, deviations: Deviations
 ) -> Components:
-    """The parts of an adjustment: of the data those whose σ is estimated, then the groups of the robot's dimensions."""
+    """Returns the parts of an adjustment: those of the data whose σ is estimated, then the groups of the robot's
+    dimensions."""
     units = solution.units
     white = weighting.whiten(solution.residuals, seen)
     derivative = weighting.whiten(jacobian(solution.state, seen), seen) * units
-    kept = _kept(seen.kind) if robust else 1.0
+    huber_share = _kept(seen.kind) if robust else 1.0
     honest = solution.weights >= GROSS
     honest |= honest.mean() < 0.5
-    # What σ scales is the square of the residual cut off at Huber's limit, (w e)²; the rest of w e² stays as it is.
+    # σ scales the square of the residual cut off at Huber's limit, (w e)²; the rest of w e² does not depend on σ.
     weight = solution.weights[:, None, None]
     scaled = weight**2 * honest[:, None, None]
     parts, fixed = [], NormalEquations(0.0, np.eye(len(units)) / USELESS_MM**2, np.zeros(len(units)))
     for name, columns in weighting.columns(white.shape[1]).items():
         if name in weighting.estimated:
-            own, count = _linear(white, derivative, columns, scaled), kept * white[honest, columns].size
-            parts.append((own, count, 0.0, np.inf, max(np.log(LEAST / weighting.value(name)), -FARTHEST), FARTHEST))
+            equations, count = _linear(white, derivative, columns, scaled), huber_share * white[honest, columns].size
+            parts.append(
+                (equations, count, 0.0, np.inf, max(np.log(LEAST / weighting.value(name)), -FARTHEST), FARTHEST)
+            )
             fixed = fixed + _linear(white, derivative, columns, weight - scaled)
         else:
             fixed = fixed + _linear(white, derivative, columns, weight)
@@ -118,14 +128,14 @@ def components(
     e, j = held.value / held.sigma, held.jacobian * units / held.sigma[:, None]
     fixed = fixed + NormalEquations.of(e[group >= MOMENT], j[group >= MOMENT])
     for g, (sigma, expected) in enumerate(zip(astuple(deviations), astuple(Deviations()), strict=True)):
-        mine = group == g
-        if mine.any():
+        in_group = group == g
+        if in_group.any():
             far = NEAREST if g in (AXIS, ACROSS) else FARTHEST
-            own = NormalEquations.of(e[mine], j[mine])
-            parts.append((own, mine.sum(), np.log(expected / sigma), DOUBT, -far, far))
-    each, *known = zip(*parts, strict=True)
-    count, expected, doubt, least, most = (np.array(values, float) for values in known)
-    together, curved = NormalEquations.stacked(each), curvature_of(solution, seen, weighting)
+            equations = NormalEquations.of(e[in_group], j[in_group])
+            parts.append((equations, in_group.sum(), np.log(expected / sigma), DOUBT, -far, far))
+    equations_of_parts, *numbers = zip(*parts, strict=True)
+    count, expected, doubt, least, most = (np.array(values, float) for values in numbers)
+    together, curved = NormalEquations.stacked(equations_of_parts), curvature_of(solution, seen, weighting)
     if curved is not None:
         together, fixed = _bent(together, fixed, np.isfinite(doubt), curved * units[:, None] * units)
     return Components(Parts(together, count, fixed, expected, doubt), least, most, units)
@@ -134,16 +144,19 @@ def components(
 def _bent(
     each: NormalEquations, fixed: NormalEquations, held: np.ndarray, curved: np.ndarray
 ) -> tuple[NormalEquations, NormalEquations]:
-    """With what second derivatives take, ``curved`` (k, k), gone from the parts that are ``held`` (p,) and from what is
-    fixed: at the minimum the data pull as much as these hold, which changes with the σ of these, not of the data."""
+    """Returns the parts after second derivatives have taken ``curved`` (k, k) from the ``held`` (p,) and fixed ones.
+
+    At the minimum the data pull as much as these parts hold. This pull changes with the σ of these parts, not of the
+    data.
+    """
     normal = fixed.normal + each.normal[held].sum(0)
     bends = Bent.of(normal, curved).bends()
-    own = np.where(held[:, None, None], bends.T @ each.normal @ bends, each.normal)
-    return replace(each, normal=own), replace(fixed, normal=bends.T @ fixed.normal @ bends)
+    bent = np.where(held[:, None, None], bends.T @ each.normal @ bends, each.normal)
+    return replace(each, normal=bent), replace(fixed, normal=bends.T @ fixed.normal @ bends)
 
 
 def _linear(white: np.ndarray, derivative: np.ndarray, columns: slice, weight: np.ndarray) -> NormalEquations:
-    """Of some coordinates e - J δ, with weights (r, 1, 1)."""
+    """Returns the normal equations of the residuals e - J δ of some coordinates, with weights (r, 1, 1)."""
     k = derivative.shape[2]
     e, j = white[:, columns].ravel(), derivative[:, columns]
     weighted = (weight * j).reshape(-1, k).T
@@ -152,17 +165,17 @@ def _linear(white: np.ndarray, derivative: np.ndarray, columns: slice, weight: n
 
 
 class Relaxation:
-    """Shares of the steps of an iteration that may overshoot, by how the last two steps agree (Aitken's Δ² of vectors,
-    Irons & Tuck, Int. J. Numerical Methods in Engineering 1, 1969)."""
+    """Shares to take of the steps of an iteration that may overshoot, by how the last two steps agree (Aitken's Δ² of
+    vectors, Irons & Tuck, Int. J. Numerical Methods in Engineering 1, 1969)."""
 
     def __init__(self) -> None:
         self._share, self._last = 1.0, None
 
     def step(self, wanted: np.ndarray) -> np.ndarray:
-        """What to go of a step (p,) that is ``wanted``."""
+        """Returns the part of a ``wanted`` step (p,) to take."""
         if self._last is not None:
             turned = wanted - self._last
-            falls = -float(self._last @ turned)  # where it does not, there is no sign of overshooting
+            falls = -float(self._last @ turned)  # if this is not positive, there is no sign of overshooting
             share = self._share * falls / max(float(turned @ turned), 1e-300) if falls > 0 else 1.0
             self._share = float(np.clip(share, SHORTEST, 1.0))
         self._last = wanted
@@ -172,7 +185,7 @@ class Relaxation:
 def estimated(
     change: np.ndarray, rows: NominalRows, weighting: Weighting, deviations: Deviations
 ) -> tuple[Weighting, Deviations]:
-    """σ of the measurements and of the dimensions, changed by ``change`` (p,) of their logarithms."""
+    """Returns σ of the measurements and of the dimensions, after a ``change`` (p,) of their logarithms."""
     names = [name for name in ("factor", "rad", "mm") if name in weighting.estimated]
     new = {name: weighting.value(name) * np.exp(x) for name, x in zip(names, change, strict=False)}
     sigma = np.array(astuple(deviations))
@@ -181,7 +194,9 @@ def estimated(
 
 
 def _kept(kind: Kind) -> float:
-    """Of the square of normal residuals, the share that is left when they are cut off at Huber's limit (Huber's
-    Proposal 2), so that outliers hardly move σ, and σ of honest ones comes out as it is."""
+    """Returns the share of the square of normal residuals that is left when they are cut off at Huber's limit.
+
+    With this share (Huber's Proposal 2) outliers hardly move σ, and σ of honest observations is not too small.
+    """
     width, limit = WIDTH[kind], huber_limit(kind) ** 2
     return float(chdtr(width + 2, limit) + limit / width * chdtrc(width, limit))

@@ -1,1 +1,1 @@
-"""Robots: what they are, their file, forward and inverse kinematics, and what was measured on them."""
+"""Robots: model, robot file, forward and inverse kinematics, and measured data."""

@@ -1,4 +1,4 @@
-"""Columns of robots' tables: orientations in any convention, and which columns a command passes over."""
+"""Columns of robot tables: orientations in any convention, and the columns that a command does not read."""
 
 import re
 from collections.abc import Iterable
@@ -14,18 +14,19 @@ _KNOWN = re.compile(
     "target|status|from_row|pose|image|name|scene|set|line|station|faces|circles|rms_px|chi2_per_dof|error_mm|"
     "error_deg|(commanded|nominal)_.*"
 )
-"""What the commands of robots and ``stcal-sfm measure`` write: not every command reads it, and all know it."""
+"""Columns that the robot commands and ``stcal-sfm measure`` write. Not every command reads them; none reports them."""
 
 
 def oriented(table: Table, rotation: str | None = None) -> tuple[Poses | None, tuple[str, ...], tuple[str, ...]]:
-    """m poses where there are orientations beside the positions; the columns of these; and what is to be said of them.
+    """Returns m poses (None without orientations), the columns of their angles, and a note that names the convention.
 
-    ``rotation`` : the convention, as of ``--rotation``, of angles whose columns do not say it.
+    ``rotation`` : convention of angles whose column names do not state it, as for ``--rotation``.
 
     Raises
     ------
     InputError
-        Some columns of a rotation only, none that is one, or a convention that must be said, or is and need not be.
+        The columns of a rotation are incomplete, ``rotation`` is given without such columns, or the convention is
+        missing or given although the columns state it.
     """
     turned = None if table.has_rotation() else read_rotations(table, rotation=rotation)
     if rotation is not None and (turned is None or turned.stated):
@@ -40,6 +41,6 @@ def oriented(table: Table, rotation: str | None = None) -> tuple[Poses | None, t
 
 
 def unread(table: Table, read: Iterable[str] = ()) -> tuple[str, ...]:
-    """A note with the columns that neither belong to a table of robots nor were ``read`` beyond these; none if all."""
-    passed = [name for name in table.columns if name not in {*read} and not _KNOWN.fullmatch(name)]
-    return (f"column{'s' * (len(passed) > 1)} not read: {', '.join(passed)}",) if passed else ()
+    """Returns one note that lists the columns neither known nor in ``read``; no note if there are none."""
+    ignored = [name for name in table.columns if name not in {*read} and not _KNOWN.fullmatch(name)]
+    return (f"column{'s' * (len(ignored) > 1)} not read: {', '.join(ignored)}",) if ignored else ()

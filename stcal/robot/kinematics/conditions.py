@@ -1,4 +1,4 @@
-"""Under which conditions joint vectors were reached: what the flange carried, and from where joints came."""
+"""Conditions under which joint vectors were reached: payload at the flange, and approach direction of each joint."""
 
 from dataclasses import dataclass, replace
 
@@ -18,19 +18,19 @@ MOST_KG = 1e4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Conditions:
-    """Of m joint vectors.
+    """Payload and approach directions of m joint vectors.
 
     Parameters
     ----------
     payload_kg : (m,) array, optional
-        Mass at the flange; that of the robot file where not given.
+        Mass at the flange; that of the robot file if not given.
     approach : (m, n) array, optional
-        Direction in which each joint moved last: 1 upwards, −1 downwards, 0 where that is not known.
+        Direction in which each joint moved last: 1 upwards, −1 downwards, 0 unknown.
 
     Raises
     ------
     InputError
-        A mass that is not finite, below 0, or beyond all that arms carry; other directions.
+        A mass that is not finite, below 0 or above ``MOST_KG``; a direction other than 1, −1 and 0.
     """
 
     payload_kg: np.ndarray | None = None
@@ -47,39 +47,39 @@ class Conditions:
                 raise InputError("E-PAYLOAD-VALUE", f"payload is {value:g} kg; 0 … {MOST_KG:g} needed")
 
     def __getitem__(self, index) -> "Conditions":
-        """Of the joint vectors at a mask, slice or list."""
+        """Returns the conditions of the joint vectors selected by a mask, slice or list."""
         if self.payload_kg is None and self.approach is None:
             return self
         return Conditions(*(None if each is None else each[index] for each in (self.payload_kg, self.approach)))
 
     @property
     def approached(self) -> bool:
-        """Whether it is known of any joint from where it came."""
+        """True if the approach direction of any joint is known."""
         return self.approach is not None and bool(self.approach.any())
 
     @property
     def loaded(self) -> bool:
-        """Whether anything is known to have been carried."""
+        """True if a payload above 0 is known for any joint vector."""
         return self.payload_kg is not None and bool(self.payload_kg.any())
 
     def ignored(self, who: str) -> tuple[str, ...]:
-        """A note that a rigid arm gives way to no load, where there is one."""
+        """Returns a note that the rigid arm ``who`` does not deflect under its payload; no note without payload."""
         if not self.loaded:
             return ()
         return (f"{who} is rigid, {PAYLOAD} moves nothing (`identify --model elastic` tells what links give way by)",)
 
 
 USUAL = Conditions()
-"""What the robot file says."""
+"""Default conditions: payload of the robot file, approach directions unknown."""
 
 
 def loaded(payload_kg: ArrayLike | None, count: int) -> Conditions:
-    """With a mass for all ``count`` joint vectors, or one for each.
+    """Returns conditions with one mass for all ``count`` joint vectors, or one mass for each.
 
     Raises
     ------
     InputError
-        As :class:`Conditions`, and masses of another number.
+        As :class:`Conditions`; or the number of masses is neither 1 nor ``count``.
     """
     if payload_kg is None:
         return USUAL
@@ -90,27 +90,29 @@ def loaded(payload_kg: ArrayLike | None, count: int) -> Conditions:
 
 
 def read_conditions(table: Table, payload_kg: float | None = None, joints: int = 0) -> Conditions:
-    """Of a table's rows: column ``payload_kg``, or one mass for all; and columns ``approach1`` … of so many joints.
+    """Reads the conditions of a table's rows: payload, and columns ``approach1`` … of ``joints`` joints.
+
+    The payload is column ``payload_kg``, or ``payload_kg`` for all rows.
 
     Raises
     ------
     InputError
-        Both, or a mass or direction that cannot be; the message names the line.
+        Both a column and an argument ``payload_kg``, or an invalid mass or direction; the message names the line.
     """
     return replace(_carried(table, payload_kg), approach=_approach(table, joints))
 
 
 def approach_columns(joints: int) -> tuple[str, ...]:
-    """``approach1`` … of so many joints."""
+    """Returns the column names ``approach1`` … of ``joints`` joints."""
     return tuple(f"{APPROACH}{i + 1}" for i in range(joints))
 
 
 def _approach(table: Table, joints: int) -> np.ndarray | None:
-    named = approach_columns(joints)
-    if not any(name in table for name in named):
+    columns = approach_columns(joints)
+    if not any(name in table for name in columns):
         return None
     values = np.zeros((len(table), joints))
-    for i, name in enumerate(named):
+    for i, name in enumerate(columns):
         if name in table:
             values[:, i] = table.numbers(name)
             for row in np.flatnonzero(~np.isin(values[:, i], DIRECTIONS)).tolist():

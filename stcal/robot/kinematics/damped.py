@@ -1,8 +1,8 @@
-"""Damped least squares for joint vectors, many poses at once; without unit, lengths in shares of the arm's reach.
+"""Least squares, damped, for the joint vectors of many poses at once; unitless, lengths as fractions of the reach.
 
-This descent stands apart from :func:`stcal.geometry.least_squares.minimise`: thousands of starts, most of which end
-early, are followed in shrinking arrays, joints stop at their limits, and the damping is a share of the squared error,
-which keeps steps short where the arm folds. Callers look at what was reached, so that none passes for a solution.
+This solver is separate from :func:`stcal.geometry.least_squares.minimise`. It follows thousands of starts, most of
+which end early, in shrinking arrays; joints stop at their limits; and the damping is proportional to the squared error,
+which keeps steps short where the arm folds. Callers must check whether the result reaches the pose.
 """
 
 from dataclasses import dataclass
@@ -14,23 +14,24 @@ from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.model import Robot
 
 ROUNDS = 60
-"""At a fold every step halves the distance: 40 to come from 1 to 1e-12."""
+"""Largest number of iterations. At a fold every step halves the distance, so that 1 to 1e-12 takes 40."""
 DONE_MM, DONE_RAD = 1e-10, 1e-13
-"""Iteration ends here, a digit below what counts as reached."""
+"""Errors at which iteration ends, one digit below the tolerance of a reached pose."""
 LONGEST = 1.0
-"""Longest step of a joint, rad or share of the reach: beyond it the linear model says nothing."""
+"""Longest step of a joint, rad or fraction of the reach; the linear model does not hold beyond it."""
 LEAST_DAMPING = 1e-14
-"""Keeps the normal equations regular where the Jacobian is not."""
+"""Smallest damping; it keeps the normal equations regular where the Jacobian is singular."""
 ORIENTATION_WEIGHT = 0.03
-"""Of arms that cannot choose the orientation: position first. What this leaves of the position is taken away after."""
+"""Weight of the orientation for arms of fewer than six joints, whose position has priority. The position error that
+remains is removed by :func:`_position_exact`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InverseProblem:
-    """An arm with a tool, without unit.
+    """An arm with a tool, in unitless joint values.
 
-    ``unit`` : (n,) rad or mm of a joint's value 1; ``reach`` : mm; ``bounds`` : (n, 2); ``middle`` : (n,) of the
-    bounds, 0 where there are none; ``turns`` : (n,) whether 2π more is the same place.
+    ``unit`` : (n,) rad or mm that a unitless value of 1 stands for; ``reach`` : mm; ``bounds`` : (n, 2) joint limits;
+    ``middle`` : (n,) centre of the bounds, 0 if unlimited; ``turns`` : (n,) true if adding 2π gives the same position.
     """
 
     robot: Robot
@@ -50,7 +51,7 @@ class InverseProblem:
         finite = np.isfinite(bounds)
         middle = np.where(finite.all(axis=1), np.where(finite, bounds, 0.0).mean(axis=1), 0.0)
         middle = np.clip(middle, *bounds.T)
-        # A turn of the controller's value is one of the arm only if coupling makes whole turns of it.
+        # A whole turn of the controller's value leaves the arm in place only if the coupling maps it to whole turns.
         whole = np.isclose(robot.coupling, np.round(robot.coupling)) & ~(sliding[:, None] & (robot.coupling != 0))
         return cls(robot, tool, unit, reach, bounds, middle, ~sliding & whole.all(axis=0))
 
@@ -63,18 +64,18 @@ class InverseProblem:
         return np.clip(q, *self.bounds.T)
 
     def errors(self, poses: Poses, q: np.ndarray) -> np.ndarray:
-        """(m, 6) from what q reaches to ``poses``: rad, mm."""
+        """Returns (m, 6) differences from the poses that q reaches to ``poses``: rad, mm."""
         return poses.difference(forward(self.robot, q * self.unit, self.tool))
 
     def jacobian(self, q: np.ndarray) -> np.ndarray:
-        """(m, 6, n) without unit."""
-        found = jacobian(self.robot, q * self.unit, self.tool) * self.unit
-        found[:, 3:] /= self.reach
-        return found
+        """Returns the unitless Jacobian, (m, 6, n)."""
+        derivative = jacobian(self.robot, q * self.unit, self.tool) * self.unit
+        derivative[:, 3:] /= self.reach
+        return derivative
 
 
 def reach_mm(robot: Robot, tool: str = "") -> float:
-    """No point of the tool's origin is further from the first joint: the lengths of all links, and travels, added."""
+    """Returns an upper bound of the distance from first joint to tool origin, mm: the sum of all links and travels."""
     whole = robot.chain()
     chain = whole.branch(whole.carrier(tool))
     end = chain.last_from_flange @ robot.tool(tool)
@@ -84,9 +85,9 @@ def reach_mm(robot: Robot, tool: str = "") -> float:
 
 
 def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
-    """Joint vectors (m, n), without unit, from starts q to least error; within ``bounds`` (n, 2) where given.
+    """Returns unitless joint vectors (m, n) of least error, found from starts q; within ``bounds`` (n, 2) if given.
 
-    Nothing is raised where a pose cannot be reached: the result is then a local minimum of the error.
+    A pose that cannot be reached raises no error: the result is then a local minimum of the error.
     """
     q = q.copy()
     if not len(q):
@@ -95,26 +96,26 @@ def solve(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarr
     weight[3:] = 1 / problem.reach
     if problem.under_actuated:
         weight[:3] = ORIENTATION_WEIGHT
-    at, goal = np.arange(len(q)), poses
-    off = problem.errors(goal, q)
+    rows, goal = np.arange(len(q)), poses
+    error = problem.errors(goal, q)
     damping = np.full(len(q), 1e-2)
     for _ in range(ROUNDS):
-        going = ~_done(off)
-        at, goal, off, damping = at[going], goal[going], off[going], damping[going]
-        if not len(at):
+        going = ~_done(error)
+        rows, goal, error, damping = rows[going], goal[going], error[going], damping[going]
+        if not len(rows):
             break
-        step, gain = _step(problem, q[at], off, weight, damping, bounds)
-        trial = q[at] + step
+        step, gain = _step(problem, q[rows], error, weight, damping, bounds)
+        trial = q[rows] + step
         if bounds is not None:
             trial = np.clip(trial, *bounds.T)
         new = problem.errors(goal, trial)
-        better = np.linalg.norm(new * weight, axis=1) < np.linalg.norm(off * weight, axis=1)
-        q[at[better]] = trial[better]
-        off = np.where(better[:, None], new, off)
+        better = np.linalg.norm(new * weight, axis=1) < np.linalg.norm(error * weight, axis=1)
+        q[rows[better]] = trial[better]
+        error = np.where(better[:, None], new, error)
         damping = np.clip(np.where(better, damping / 5, damping * 5), 1e-12, 1e12)
-        stuck = (np.abs(trial - q[at]).max(axis=1) < 1e-15) & ~better | (gain < 1e-15)
+        stuck = (np.abs(trial - q[rows]).max(axis=1) < 1e-15) & ~better | (gain < 1e-15)
         keep = ~stuck
-        at, goal, off, damping = at[keep], goal[keep], off[keep], damping[keep]
+        rows, goal, error, damping = rows[keep], goal[keep], error[keep], damping[keep]
     return _position_exact(problem, poses, q, bounds) if problem.under_actuated else q
 
 
@@ -130,12 +131,12 @@ def _step(
     damping: np.ndarray,
     bounds: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Damped step (m, n), and (m,) how much of the error the joints can act on."""
+    """Returns the damped step (m, n) and the norm (m,) of the gradient, the error that the joints can act on."""
     weighted = off * weight
     row = np.where(weight == 1 / problem.reach, 1.0, weight)  # the Jacobian's translation is in shares of the reach
     derivative = problem.jacobian(q) * row[:, None]
     pull = np.einsum("mij,mi->mj", derivative, weighted)
-    if bounds is not None:  # a joint at its limit that would go beyond stays
+    if bounds is not None:  # a joint at its limit does not move beyond it
         low, high = bounds.T
         held = ((q <= low) & (pull < 0)) | ((q >= high) & (pull > 0))
         derivative = np.where(held[:, None], 0.0, derivative)
@@ -151,11 +152,11 @@ def _step(
 
 
 def _position_exact(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
-    """Shortest steps that take the rest of the position error away; of joints within bounds only, as far as it goes."""
+    """Removes the remaining position error by minimum-norm steps of the joints that are not at their limits."""
     for _ in range(4):
         off = problem.errors(poses, q)[:, 3:] / problem.reach
         derivative = problem.jacobian(q)[:, 3:]
-        near = np.linalg.norm(off, axis=1) < ORIENTATION_WEIGHT  # farther ones are out of reach, and stay as they are
+        near = np.linalg.norm(off, axis=1) < ORIENTATION_WEIGHT  # poses farther off are out of reach and stay unchanged
         if bounds is not None:
             low, high = bounds.T
             derivative = np.where(((q <= low) | (q >= high))[:, None], 0.0, derivative)

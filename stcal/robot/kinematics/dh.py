@@ -1,4 +1,4 @@
-"""From a chain of axes back to Denavit–Hartenberg rows, with Hayati's β where two axes are nearly parallel."""
+"""Conversion of a chain of axes to Denavit–Hartenberg rows, with Hayati's β where two axes are nearly parallel."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,22 +20,24 @@ from stcal.robot.kinematics.model import (
 )
 
 PARALLEL_RAD = np.radians(1.0)
-"""Below this the foot of the common normal is far away and moves by metres with micro-radians: Hayati's β instead."""
+"""Angle between axes below which Hayati's β is used. There the foot of the common normal is far away, and moves by
+metres if an axis turns by micro-radians."""
 SAME_AXIS_MM = 1e-10
-"""Parallel axes closer than this are one line, as of a SCARA's spindle: any θ does, the nominal one is kept."""
+"""Distance below which parallel axes count as one line, as in a SCARA's spindle. Then θ is free; the nominal θ is
+kept."""
 
 ROUNDING, ROUNDING_MM = 1e-12, 1e-9
-"""What products of a dozen transforms leave of an equality."""
+"""Tolerances for the rounding error of a product of a dozen transforms."""
 NOTHING_MM, NOTHING_RAD = 1e-12, 1e-14
-"""By which no tool is moved by 1e-10 mm."""
+"""Length and angle rounded to zero; they move a tool by less than 1e-10 mm."""
 
 
 def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robot:
-    """The robot whose rows, base and tools make the same poses as ``chain`` with ``tools`` (flange_from_tool).
+    """Returns the robot whose rows, base and tools give the same poses as ``chain`` with ``tools`` (flange_from_tool).
 
-    What a chain does not determine is kept from ``nominal``: θ and d of the first row (the base may turn and slide
-    along the first axis) and the whole part of the last row after its joint (the tools may do so along the last), a and
-    d of a prismatic joint, d of a row with β.
+    Values that a chain does not determine are kept from ``nominal``: θ and d of the first row (the base may turn about
+    and slide along the first axis), the part of the last row after its joint (the tools may turn about and slide along
+    the last axis), a and d of a prismatic joint, and d of a row with β.
     """
     n = len(chain)
     rows = list(nominal.rows)
@@ -43,7 +45,9 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
     mounts = {} if nominal.tree is None else nominal.tree.mounts
     begins = {0, *mounts}
     first = dict.fromkeys(begins, Rigid())
-    passed = [Rigid()] * n  # what a joint lets through: a turn and a slide about its axis (any, if prismatic)
+    passed = [
+        Rigid()
+    ] * n  # free motion of a joint: a turn about its axis and a slide along it (any slide, if prismatic)
     for i in sorted(set(range(n)) - begins):
         gap = passed[i - 1] @ chain.gap(i)
         before = rows[i - 1]
@@ -51,7 +55,7 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         wanted = DHRow(after.a, after.alpha, before.d, before.theta, after.beta)
         found = _row_between(gap, wanted, bool(chain.prismatic[i]))
         passed[i] = (along(found) @ across(found)).inverse() @ gap
-        if i - 1 in begins:  # base or mount takes what differs from the nominal first row
+        if i - 1 in begins:  # base or mount absorbs the difference from the nominal first row
             first[i - 1] = Rigid(about_z(found.theta - before.theta), [0.0, 0.0, found.d - before.d])
             passed[i - 1] = first[i - 1].inverse()
             found = replace(found, theta=before.theta, d=before.d)
@@ -62,12 +66,12 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
             rows[i] = replace(after, a=found.a, alpha=found.alpha, beta=found.beta)
 
     def begin(i: int) -> Rigid:
-        """Where the first row of a branch begins in the frame that its carrier's row ends in."""
+        """Returns the start of a branch's first row in the frame at the end of its carrier's row."""
         place = chain.gap(i) @ first[i]
         return place if standard else place @ across(rows[i]).inverse()
 
     def end(i: int) -> Rigid:
-        """Joint i as in ``chain`` in the frame that its row ends in."""
+        """Returns the frame of joint i of ``chain`` in the frame at the end of its row."""
         nominal_end = along(rows[i]) @ across(rows[i]) if standard else along(rows[i])
         return nominal_end.inverse() @ passed[i]
 
@@ -88,8 +92,10 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
 
 
 def _elasticity(robot: Robot, chain: Chain, nominal: Robot) -> Elasticity | None:
-    """That of ``chain`` in the frames of ``robot``, which are turned about the joints' axes, and slid along them: by so
-    little, or of so stiff an arm, that what it gives way by stays; loads are where ``nominal`` says."""
+    """Returns the elasticity of ``chain`` in the joint frames of ``robot``.
+
+    Those frames are turned about the joints' axes and slid along them. The motions are so small, or the arm so stiff,
+    that deflections do not change. The payload centre is that of ``nominal``."""
     elasticity = chain.elasticity
     if elasticity is None:
         return None
@@ -103,7 +109,9 @@ def _elasticity(robot: Robot, chain: Chain, nominal: Robot) -> Elasticity | None
 
 
 def _row_between(gap: Rigid, nominal: DHRow, to_prismatic: bool) -> DHRow:
-    """θ, d of the joint before and a, α, β up to the next axis, ``gap`` being known up to what that lets through."""
+    """Returns the row with θ, d of the previous joint and a, α, β to the next axis.
+
+    ``gap`` is determined up to the free motion of the next joint."""
     z, place = gap.rotation[:, 2], gap.translation
     sine = float(np.hypot(z[0], z[1]))
     parallel = sine < np.sin(PARALLEL_RAD)
@@ -118,60 +126,64 @@ def _row_between(gap: Rigid, nominal: DHRow, to_prismatic: bool) -> DHRow:
                 theta = _near(float(np.arctan2(sign * y, sign * x)), nominal.theta)
         else:
             a = nominal.a
-        seen = about_z(-theta) @ z  # (sin β, −sin α cos β, cos α cos β)
-        alpha = _near(float(np.arctan2(-seen[1], seen[2])), nominal.alpha)
-        return DHRow(a, alpha, nominal.d, theta, float(np.arcsin(seen[0])))
+        rotated = about_z(-theta) @ z  # (sin β, −sin α cos β, cos α cos β)
+        alpha = _near(float(np.arctan2(-rotated[1], rotated[2])), nominal.alpha)
+        return DHRow(a, alpha, nominal.d, theta, float(np.arcsin(rotated[0])))
     sign = -1.0 if np.sin(nominal.alpha) < 0 else 1.0
     alpha = _near(float(np.arctan2(sign * sine, z[2])), nominal.alpha)
     theta = _near(float(np.arctan2(sign * z[0], -sign * z[1])), nominal.theta)
     if to_prismatic:
         return DHRow(nominal.a, alpha, nominal.d, theta)
-    seen = about_z(-theta) @ place  # (a, −ψ sin α, d + ψ cos α), ψ along the next axis
-    slide = -seen[1] / np.sin(alpha)
-    return DHRow(float(seen[0]), alpha, float(seen[2] - slide * np.cos(alpha)), theta)
+    rotated = about_z(-theta) @ place  # (a, −ψ sin α, d + ψ cos α), ψ along the next axis
+    slide = -rotated[1] / np.sin(alpha)
+    return DHRow(float(rotated[0]), alpha, float(rotated[2] - slide * np.cos(alpha)), theta)
 
 
 def _near(angle: float, nominal: float) -> float:
-    """The same angle in the turn around the nominal one."""
+    """Returns ``angle`` plus the multiple of 2π that brings it nearest to ``nominal``."""
     return angle + 2 * np.pi * round((nominal - angle) / (2 * np.pi))
 
 
 def robot_between(
     chain: Chain, tools: Mapping[str, Rigid], name: str, convention: Convention, joints: tuple[Joint, ...]
 ) -> Robot:
-    """A robot of these axes and tools (flange_from_tool) that has no nominal one.
+    """Returns a robot with these axes and tools (flange_from_tool), without a nominal robot.
 
-    Its first row begins at the chain's base, and its last ends at the chain's flange, where a row can; else the base,
-    and the tools, take what is left.
+    Its first row begins at the chain's base, and its last row ends at the chain's flange, where a row without β can;
+    otherwise the base and the tools absorb the remaining transform.
     """
     bare = Robot(name, convention, (DHRow(0.0, 0.0, 0.0, 0.0),) * len(chain), joints, chain.coupling)
     hints = list(bare.rows)
-    found = _with_ends(chain, tools, bare)
-    for i in range(len(hints) - 1):  # of the two x axes along each common normal the one within 90° of the last
-        if abs(found.rows[i].theta) > np.pi / 2 + ROUNDING:
+    robot = _with_ends(chain, tools, bare)
+    for i in range(
+        len(hints) - 1
+    ):  # choose the x axis along each common normal that is within 90° of the previous x axis
+        if abs(robot.rows[i].theta) > np.pi / 2 + ROUNDING:
             k = i if convention == "standard" else i + 1
-            hints[k] = DHRow(-found.rows[k].a, -found.rows[k].alpha, 0.0, 0.0)
-            found = _with_ends(chain, tools, replace(bare, rows=tuple(hints)))
-    rows = [DHRow(_length(r.a), _angle(r.alpha), _length(r.d), _angle(r.theta), _angle(r.beta)) for r in found.rows]
-    return replace(found, rows=tuple(rows))
+            hints[k] = DHRow(-robot.rows[k].a, -robot.rows[k].alpha, 0.0, 0.0)
+            robot = _with_ends(chain, tools, replace(bare, rows=tuple(hints)))
+    rows = [DHRow(_length(r.a), _angle(r.alpha), _length(r.d), _angle(r.theta), _angle(r.beta)) for r in robot.rows]
+    return replace(robot, rows=tuple(rows))
 
 
 def _with_ends(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -> Robot:
-    """With a first row from the chain's base and a last one to its flange, where there are such."""
+    """Returns the robot with a first row from the chain's base and a last row to its flange, where such rows exist."""
     rows, modified = list(nominal.rows), nominal.convention == "modified"
     bare = robot_from_chain(chain, {"": Rigid()}, nominal)
     if (end := _row_of(bare.tool(), modified=False, across_too=not modified)) is not None:
         rows[-1] = end if not modified else replace(rows[-1], d=end.d, theta=end.theta)
     if len(rows) > 1 and (begin := _row_of(bare.world_from_base, modified, across_too=modified)) is not None:
         rows[0] = begin if modified else replace(rows[0], d=begin.d, theta=begin.theta)
-    found = robot_from_chain(chain, tools, replace(nominal, rows=tuple(rows)))
-    base = found.world_from_base
+    robot = robot_from_chain(chain, tools, replace(nominal, rows=tuple(rows)))
+    base = robot.world_from_base
     at_base = np.abs(base.translation).max() < ROUNDING_MM and np.abs(base.rotation - np.eye(3)).max() < ROUNDING
-    return replace(found, world_from_base=Rigid()) if at_base else found
+    return replace(robot, world_from_base=Rigid()) if at_base else robot
 
 
 def _row_of(pose: Rigid, modified: bool, across_too: bool) -> DHRow | None:
-    """The row without β that makes this pose, alone or as its part along the axis; None where none does."""
+    """Returns the row without β that gives this pose, or None.
+
+    Without ``across_too`` only d and θ of the row are used."""
     r, p = pose.rotation, pose.translation
     if not across_too:
         row = DHRow(0.0, 0.0, float(p[2]), float(np.arctan2(r[1, 0], r[0, 0])))
@@ -183,17 +195,17 @@ def _row_of(pose: Rigid, modified: bool, across_too: bool) -> DHRow | None:
         theta = float(np.arctan2(r[1, 0], r[0, 0]))
         a = float(np.cos(theta) * p[0] + np.sin(theta) * p[1])
         row = DHRow(a, float(np.arctan2(r[2, 1], r[2, 2])), float(p[2]), theta)
-    made = across(row) @ along(row) if modified else along(row) @ across(row)
-    fits = np.abs(made.rotation - r).max() < ROUNDING and np.abs(made.translation - p).max() < ROUNDING_MM
+    pose_of_row = across(row) @ along(row) if modified else along(row) @ across(row)
+    fits = np.abs(pose_of_row.rotation - r).max() < ROUNDING and np.abs(pose_of_row.translation - p).max() < ROUNDING_MM
     return row if fits else None
 
 
 def _length(value: float) -> float:
-    """0 where rounding left something."""
+    """Returns ``value``, or 0 if it is only rounding error."""
     return 0.0 if abs(value) < NOTHING_MM else value
 
 
 def _angle(value: float) -> float:
-    """Whole right angles where rounding left something."""
+    """Returns ``value``, or the nearest multiple of 90° if the difference is only rounding error."""
     right = np.pi / 2 * round(value / (np.pi / 2))
     return right if abs(value - right) < NOTHING_RAD else value

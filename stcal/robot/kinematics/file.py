@@ -1,4 +1,4 @@
-"""``robot.toml``: read with every mistake named, and written so that it reads back the same."""
+"""Reading and writing of ``robot.toml``; every mistake is named, and a written file reads back as the same robot."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ WHAT = "robot file"
 REMEDY = "`stcal robot init FILE` writes one to edit"
 POSE_KEYS = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
 MOST_JOINTS = 60
-"""Of a humanoid with hands."""
+"""Largest number of joints, that of a humanoid with hands."""
 LIMIT_DIGITS = 9
 """Decimals of joint limits, degrees or mm: 125°, not 125.00000000000001."""
 
@@ -58,7 +58,7 @@ class _ElasticityFile(Strict):
     payload_centre_mm: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
 
     def elasticity(self, count: int, where: str) -> Elasticity:
-        """Of ``count`` joints."""
+        """Returns the elasticity of ``count`` joints."""
         for key, values in self:
             if isinstance(values, list) and len(values) != count:
                 raise InputError(
@@ -131,7 +131,7 @@ def load_robot(path: str | Path) -> Robot:
 
 
 def _tree(data: _RobotFile, where: str) -> Tree | None:
-    """What keys ``after``, ``mount`` and ``joint`` say; None where there are none."""
+    """Returns the tree that keys ``after``, ``mount`` and ``joint`` describe; None without such keys."""
     n = len(data.joint)
     mounts = {}
     for i, joint in enumerate(data.joint):
@@ -181,7 +181,7 @@ def _joint(j: _JointFile, where: str) -> Joint:
 
 
 def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
-    """The text of a robot file; every number reads back to the same double but for the last bit of the angles.
+    """Returns the text of a robot file; every number reads back as the same double, but for the last bit of angles.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Whether poses and joint values can be of one robot, or only in another convention of quaternions."""
+"""Test whether measured orientations fit the robot, or would fit only in another quaternion convention."""
 
 from collections.abc import Sequence
 
@@ -16,23 +16,25 @@ and the base as positions have it, are off by less than half of that (:data:`FIT
 
 
 def require_convention(where: str, targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> None:
-    """Refuse orientations that fit in another convention only; where none of them can be told apart, all fit.
+    """Refuse orientations that fit the robot only in another quaternion convention.
+
+    Orientations that do not fit in any convention are accepted.
 
     Parameters
     ----------
     where : str
-        Their file, for messages.
+        Name of the file, for messages.
     targets : sequence of str
-        (m,) names of what was seen or commanded.
+        (m,) names of the targets seen or commanded.
     flange : (m, 3, 3) array
-        Rotations of the flange by the robot.
+        Rotations of the flange according to the robot model.
     seen : (m, 3, 3) array
-        Of the targets as they were read.
+        Rotations of the targets as read from the file.
 
     Raises
     ------
     InputError
-        Names the convention that fits.
+        Only another convention fits; the message names it.
     """
     own = turned_rad(targets, flange, seen)
     if own < TURNED_RAD:
@@ -48,8 +50,8 @@ def require_convention(where: str, targets: Sequence[str], flange: np.ndarray, s
 
 
 def turned_rad(targets: Sequence[str], flange: np.ndarray, seen: np.ndarray) -> float:
-    """RMS angle between orientations (m, 3, 3) and those of the flange with the tool, each target's own, that fits
-    best."""
+    """Returns the RMS angle between orientations ``seen`` (m, 3, 3) and those of the flange with the best-fitting tool
+    of each target, rad."""
     between = np.swapaxes(flange, 1, 2) @ seen
     square = 0.0
     for name in set(targets):

@@ -149,7 +149,7 @@ def torques(
 
 
 def _loaded(chain: Chain) -> int:
-    """The joint behind which a load hangs."""
+    """Returns the joint that carries the payload."""
     if chain.grown is not None and "" not in chain.grown.tree.carriers:
         raise InputError(
             "E-ROBOT-TREE",
@@ -159,7 +159,7 @@ def _loaded(chain: Chain) -> int:
 
 
 def waves(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """(4, n, m) of sin, cos of the joints' angles and of their doubles; 0 of prismatic joints."""
+    """Returns (4, n, m): sin and cos of joint angles, then sin and cos of twice the angles; 0 for prismatic joints."""
     angle = (q @ chain.coupling.T).T
     found = np.array([np.sin(angle), np.cos(angle), np.sin(2 * angle), np.cos(2 * angle)])
     return np.where(chain.prismatic[:, None], 0.0, found)
@@ -171,8 +171,8 @@ def _turning(chain: Chain) -> np.ndarray:
 
 
 def deflections(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> np.ndarray:
-    """(n, m, 3) rad by which each link gives way, in its own frame: by the torques on the arm as if it were rigid,
-    which differ from those on the bent one by as little as it bends."""
+    """Returns the deflection of each link, (n, m, 3) rad, in the link's frame. Torques are those on the rigid arm; they
+    differ from the torques on the deflected arm only as little as it deflects."""
     elasticity = _elasticity(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
     torque = np.einsum("imkc,imk->imc", rotation, torques(chain, q, rotation, origin, conditions))
@@ -311,7 +311,7 @@ def elasticity_values(elasticity: Elasticity, hysteresis: bool = False) -> np.nd
 
 
 def with_values(elasticity: Elasticity, values: np.ndarray) -> Elasticity:
-    """With other :func:`elasticity_values`, (9 n,) or (10 n,)."""
+    """Returns the elasticity with other :func:`elasticity_values`, (9 n,) or (10 n,)."""
     n = len(elasticity.moment)
     compliance, moment, periodic, hysteresis = np.split(values, [2 * n, 5 * n, 9 * n])
     return replace(
@@ -339,7 +339,7 @@ def _orthogonal(rotation: np.ndarray) -> np.ndarray:
 
 
 def _from_base_to_tool(robot: Robot, tool: str) -> Chain:
-    """The chain without the world, with the tool in the flange's place."""
+    """Returns the chain from the base, with the tool as its flange."""
     chain = replace(robot, world_from_base=Rigid()).chain()
     chain = chain.branch(chain.carrier(tool))
     return replace(chain, last_from_flange=chain.last_from_flange @ robot.tool(tool))

@@ -173,11 +173,13 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     poses = Poses.of([pose])
     solutions, inside = _turned(problem, _every_solution(problem, poses)[0], problem.middle)
     solutions = _distinct(solutions[inside])
-    many = Poses(np.repeat(poses.rotation, len(solutions), 0), np.repeat(poses.translation, len(solutions), 0))
-    found = _judge(problem, many, solutions)
-    keep = np.flatnonzero(found.usable & _as_good(found.error_rad))
+    repeated = Poses(np.repeat(poses.rotation, len(solutions), 0), np.repeat(poses.translation, len(solutions), 0))
+    judged = _judge(problem, repeated, solutions)
+    keep = np.flatnonzero(judged.usable & _as_good(judged.error_rad))
     order = keep[np.argsort(np.linalg.norm(solutions[keep] - problem.middle, axis=1), kind="stable")]
-    return Inverse(found.q[order], tuple(found.status[i] for i in order), found.error_mm[order], found.error_rad[order])
+    return Inverse(
+        judged.q[order], tuple(judged.status[i] for i in order), judged.error_mm[order], judged.error_rad[order]
+    )
 
 
 def _from_near(problem: InverseProblem, poses: Poses, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -195,7 +197,7 @@ def _from_near(problem: InverseProblem, poses: Poses, near: np.ndarray) -> tuple
 
 
 def _in_sequence(problem: InverseProblem, poses: Poses) -> Inverse:
-    """Without reference: each pose in the branch nearest to that of the one before."""
+    """Solves poses without reference: each in the branch nearest to the solution of the previous pose."""
     _refuse_redundant(problem)
     m, n = len(poses), len(problem.unit)
     q, ok, beyond = np.zeros((m, n)), np.zeros(m, bool), np.zeros(m, bool)
@@ -220,9 +222,9 @@ def _refuse_redundant(problem: InverseProblem) -> None:
 
 
 def _every_solution(problem: InverseProblem, poses: Poses, more: np.ndarray | None = None) -> list[np.ndarray]:
-    """For each pose, joint vectors (k, n) from many starts, limits not regarded, converged or not.
+    """Returns for each pose joint vectors (k, n) from many starts, ignoring limits, converged or not.
 
-    ``more`` : (m, n) one more joint vector to look at for each pose.
+    ``more`` : (m, n) one additional joint vector for each pose.
     """
     n, m = len(problem.unit), len(poses)
     low, high = problem.bounds.T
@@ -247,7 +249,9 @@ def _embedded(poses: Poses, reach: float) -> np.ndarray:
 def _nearest(
     problem: InverseProblem, pose: Poses, solutions: np.ndarray, near: np.ndarray
 ) -> tuple[np.ndarray | None, bool]:
-    """Of the solutions of one pose the one within the limits nearest to ``near``; and whether some are beyond them."""
+    """Returns the solution of one pose nearest to ``near`` within the limits, or None.
+
+    The second value is true if the pose is reached only by solutions beyond the limits."""
     turned, inside = _turned(problem, solutions, near)
     count = len(turned)
     many = Poses(np.repeat(pose.rotation, count, 0), np.repeat(pose.translation, count, 0))
@@ -263,18 +267,18 @@ def _nearest(
 
 
 def _as_good(error_rad: np.ndarray) -> np.ndarray:
-    """Which orientations are about as near as the nearest; of six joints all that are reached."""
+    """Returns which orientation errors are at most ``AS_GOOD`` times the least; with six joints all reached poses."""
     return error_rad <= AS_GOOD * error_rad.min(initial=np.inf) + WITHIN_RAD
 
 
 def _is_reached(problem: InverseProblem, off: np.ndarray) -> np.ndarray:
-    """(m,) of errors (m, 6), rad and mm; of fewer than six joints only the position has to be."""
+    """Returns (m,) true if errors (m, 6), rad and mm, are within tolerance; fewer than six joints: position only."""
     position = np.linalg.norm(off[:, 3:], axis=1) <= WITHIN_MM
     return position & ((np.linalg.norm(off[:, :3], axis=1) <= WITHIN_RAD) | problem.under_actuated)
 
 
 def _distinct(solutions: np.ndarray) -> np.ndarray:
-    """Each solution once."""
+    """Returns the solutions without duplicates."""
     kept: list[np.ndarray] = []
     for q in solutions:
         if all(np.abs(q - other).max() > SAME_BRANCH for other in kept):
@@ -307,46 +311,46 @@ def _is_nearest(problem: InverseProblem, q: np.ndarray, near: np.ndarray) -> np.
 
 
 def _nearest_around(problem: InverseProblem, poses: Poses, q: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Of solutions q (m, n) and those beside them the nearest to ``near``: branches meet along the motion that the
-    Jacobian sees least, so that another one near by is found from either side along it."""
+    """Returns the solutions nearest to ``near`` among q (m, n) and neighbouring branches. Branches meet along the
+    right singular vector of the smallest singular value, so starts on either side along it find a neighbour."""
     if not len(q):
         return q
     weakest = np.linalg.svd(problem.jacobian(q))[2][:, q.shape[1] - 1]
     best, distance = q.copy(), np.linalg.norm(q - near, axis=1)
     for side in (-2, -1, 1, 2):
         start = q + side * distance[:, None] * weakest
-        other, inside = _turned(problem, solve(problem, poses, start), near)
-        away = np.linalg.norm(other - near, axis=1)
-        nearer = inside & _is_reached(problem, problem.errors(poses, other))
+        neighbour, inside = _turned(problem, solve(problem, poses, start), near)
+        away = np.linalg.norm(neighbour - near, axis=1)
+        nearer = inside & _is_reached(problem, problem.errors(poses, neighbour))
         nearer &= away < np.linalg.norm(best - near, axis=1)
-        best[nearer] = other[nearer]
+        best[nearer] = neighbour[nearer]
     return best
 
 
 def _smallest(problem: InverseProblem, q: np.ndarray) -> np.ndarray:
-    """(m,) smallest singular value of the Jacobian, without unit."""
+    """Returns the smallest singular value (m,) of the unitless Jacobian."""
     if not len(q):
         return np.zeros(0)
     return np.linalg.svd(problem.jacobian(q), compute_uv=False)[:, -1]
 
 
 def _judge(problem: InverseProblem, poses: Poses, q: np.ndarray) -> Inverse:
-    """Status of joint vectors, limits not regarded."""
+    """Returns the status of joint vectors, ignoring limits."""
     off = problem.errors(poses, q)
     error_mm, error_rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
-    there, loose = _is_reached(problem, off), _smallest(problem, q) < SINGULAR
-    status = np.where(~there, UNREACHABLE, np.where(loose, SINGULAR_POSE, REACHED)).astype(object)
-    status[there & (error_rad > WITHIN_RAD)] = ORIENTATION
+    reached, singular = _is_reached(problem, off), _smallest(problem, q) < SINGULAR
+    status = np.where(~reached, UNREACHABLE, np.where(singular, SINGULAR_POSE, REACHED)).astype(object)
+    status[reached & (error_rad > WITHIN_RAD)] = ORIENTATION
     return Inverse(q * problem.unit, tuple(status), error_mm, error_rad)
 
 
 def _finished(problem: InverseProblem, poses: Poses, q: np.ndarray, ok: np.ndarray, beyond: np.ndarray) -> Inverse:
-    """Where nothing reaches the pose, what comes nearest within the limits; and the status of all."""
+    """Returns all joint vectors with status; for a pose not reached, the local minimum of error within the limits."""
     q = q.copy()
-    rest = np.flatnonzero(~ok)
-    if len(rest):
-        q[rest] = solve(problem, poses[rest], problem.clipped(q[rest]), problem.bounds)
-    found = _judge(problem, poses, q)
+    missing = np.flatnonzero(~ok)
+    if len(missing):
+        q[missing] = solve(problem, poses[missing], problem.clipped(q[missing]), problem.bounds)
+    judged = _judge(problem, poses, q)
     # An arm of more than six joints may get there on the second way, within the limits.
-    status = [s if ok[i] or s != UNREACHABLE else (LIMIT if beyond[i] else s) for i, s in enumerate(found.status)]
-    return Inverse(found.q, tuple(status), found.error_mm, found.error_rad)
+    status = [s if ok[i] or s != UNREACHABLE else (LIMIT if beyond[i] else s) for i, s in enumerate(judged.status)]
+    return Inverse(judged.q, tuple(status), judged.error_mm, judged.error_rad)

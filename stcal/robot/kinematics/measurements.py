@@ -1,4 +1,4 @@
-"""Measured data of robots: joint values with the positions, poses or distances that an instrument saw."""
+"""Robot data: joint values with the positions, poses or distances that an instrument measured."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -253,7 +253,7 @@ def _in_reach(data: Measurements, robot: Robot) -> None:
 
 
 def _usable(data: Measurements, table: Table) -> Measurements:
-    """Without the poses that are as likely wrong, and without copies of rows, which would count as measurements."""
+    """Removes ambiguous poses and copies of rows; a copy would count as an independent measurement."""
     undecided = np.zeros(len(data), bool)
     if STATUS in table:
         undecided = np.array([status == AMBIGUOUS for status in table.text(STATUS)])

@@ -309,7 +309,7 @@ class Grown:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """Fixed transforms of an arm: everything that calibration changes.
+    """The fixed transforms of an arm, which are all that calibration changes.
 
     ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in that of the joint that carries it (the
     first: in the world); ``last_from_flange`` : flange in the frame of the joint that carries it; ``prismatic`` : (n,);

@@ -6,7 +6,7 @@ WHAT = "URDF"
 WORLD, BASE, FLANGE, TOOL, TOOL0 = "world", "base_link", "flange", "tool", "tool0"
 """Names of links; other tools are ``tool_NAME``."""
 UNLIMITED = 1e6
-"""rad or m: a limit beyond is none; URDF has no half of one."""
+"""Value in rad or m beyond which a limit counts as unlimited; URDF cannot state only one of two limits."""
 MOVING: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 
 
@@ -16,5 +16,5 @@ def link_of(tool: str) -> str:
 
 
 def joint_name(i: int) -> str:
-    """Of a joint, from 0."""
+    """Returns the name of joint ``i``, counted from 0."""
     return f"joint_{i + 1}"

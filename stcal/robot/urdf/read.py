@@ -1,4 +1,4 @@
-"""A robot of a URDF: the joints between a link and another, or several others; all else in a file is passed over."""
+"""Reading of a robot from a URDF: the joints from one link to one or several others. The rest of a file is ignored."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from stcal.robot.urdf.names import (
 )
 
 SAME_MM, SAME_RAD = 1e-9, 1e-12
-"""By less the rows lead where the joints do."""
+"""Largest difference between the poses of the Denavit–Hartenberg rows and those of the URDF's joints."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,11 +37,11 @@ class UrdfRobot:
     robot : Robot
         mm, rad; joint values are those of the URDF's joints.
     joints : tuple of str
-        Their names.
+        Names of the moving joints.
     from_link, to_link : str
-        Between which it was read.
+        Links between which the robot was read.
     notes : tuple of str
-        What was not said there, or passed over.
+        Missing limits of joints.
     """
 
     robot: Robot
@@ -109,7 +109,7 @@ def read_urdf(
     to_link: str | Sequence[str] = "",
     convention: Convention = "standard",
 ) -> UrdfRobot:
-    """As :func:`load_urdf`, of a file's content."""
+    """Reads a robot from the content of a file, as :func:`load_urdf`."""
     root = _parsed(content, where)
     elements = root.findall("joint")
     joints = {joint.child: joint for joint in (_read_joint(each, where) for each in elements)}
@@ -139,7 +139,7 @@ def read_urdf(
 
 
 def fixed_values(n: int) -> np.ndarray:
-    """(8, n) joint values, rad or mm, fixed."""
+    """Returns (8, n) pseudo-random joint values, rad or mm, the same every time."""
     return np.random.default_rng(0).uniform(-3, 3, (8, n))
 
 
@@ -172,7 +172,8 @@ def _require_chain(path: list[_UrdfJoint], start: str, end: str, where: str) -> 
 
 
 def _robot_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convention) -> Robot:
-    """Of the paths from one link to each tool, ``""`` among them; they part behind the last joint that moves."""
+    """Returns the robot of the paths from one link to each tool, ``""`` among them; they part behind the last moving
+    joint."""
     moving = [joint for joint in paths[""] if joint.kind != "fixed"]
     gaps, passed = [], Rigid()
     for joint in paths[""]:
@@ -200,7 +201,7 @@ def _robot_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convent
 
 
 def _tree_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convention) -> Robot:
-    """Of the paths from one link to tools on several branches."""
+    """Returns the robot of the paths from one link to tools on several branches."""
     place: dict[str, int] = {}
     moving, gaps, mounts, carriers, tools = [], [], {}, {}, {}
     for tool, path in paths.items():
@@ -230,11 +231,11 @@ def _tree_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Conventi
 
 
 def _along(path: list[_UrdfJoint]) -> Rigid:
-    """Of fixed joints in a row."""
-    found = Rigid()
+    """Returns the product of the transforms of successive fixed joints."""
+    product = Rigid()
     for joint in path:
-        found = found @ joint.parent_from_child
-    return found
+        product = product @ joint.parent_from_child
+    return product
 
 
 def _limited(joint: _UrdfJoint) -> Joint:
@@ -296,7 +297,7 @@ def _three(text: str, where: str) -> np.ndarray:
 
 
 def _z_to(axis: np.ndarray) -> Rigid:
-    """A turn that brings z to the axis; none, or half a turn about x, where it is z or −z."""
+    """Returns a rotation that brings z to the axis: the identity for z, half a turn about x for −z."""
     x, y, z = axis
     across = float(np.hypot(x, y))
     if across == 0.0:

@@ -22,7 +22,7 @@ FAR_RAD = np.radians(1.0)
 AMPLIFIED = 10.0
 """A joint that moves by so many times what the pose is off, in rad, does so because the arm is near a singular pose."""
 SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)
-"""By more no tool is off what its drawing says."""
+"""Largest plausible deviation of a tool from its drawing, mm and rad."""
 MEANING = {
     LIMIT: "only joint values beyond the limits reach it",
     UNREACHABLE: "no joint values reach it",
@@ -33,7 +33,7 @@ MEANING = {
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Compensated:
-    """Commanded poses with what the controller must be told.
+    """The commanded poses with the corrected values for the controller.
 
     Parameters
     ----------
@@ -207,14 +207,14 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
 def _stayed(
     robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, found: Inverse, known: np.ndarray
 ) -> Stayed:
-    """Without changes of configuration in the rows whose joint values ``near`` (m, n) are ``known`` to command them."""
+    """Removes changes of configuration in the rows whose commanding joint values ``near`` (m, n) are ``known``."""
     away = (np.abs(found.q - near)[:, ~robot.prismatic] > FAR_RAD).any(axis=1)
     rows = np.flatnonzero(known & (away | np.array([status == LIMIT for status in found.status])))
     return stayed(robot, targets, poses, near, found, rows)
 
 
 def _built(robot: Robot) -> list[tuple[str, int]]:
-    """Of each joint its type and the joint that carries it."""
+    """Returns for each joint its type and the joint that carries it."""
     return [(joint.type, robot.carrier(i)[0]) for i, joint in enumerate(robot.joints)]
 
 
@@ -291,7 +291,7 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
 
 
 def compensation_file(result: Compensated, robot: Robot) -> CompensationFile:
-    """Everything, for programs."""
+    """Returns the complete result in machine-readable form."""
     columns = joint_columns(robot)
     unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
 

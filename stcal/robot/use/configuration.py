@@ -54,7 +54,7 @@ def stayed(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, found
 
 
 def _between(robot: Robot, limits: np.ndarray) -> Robot:
-    """With other limits (n, 2)."""
+    """Returns the robot with other limits (n, 2)."""
     joints = (Joint(own.type, low, high) for own, (low, high) in zip(robot.joints, limits.tolist(), strict=True))
     return replace(robot, joints=tuple(joints))
 

@@ -29,7 +29,7 @@ from stcal.robot.use.compensation import joint_cells, joint_columns
 from stcal.robot.use.files import DesignFile
 
 RANDOM_SETS = 20
-"""To compare with: their median is known to a quarter of their standard deviation."""
+"""Number of random sets for comparison; their median is known to a quarter of their standard deviation."""
 DRAWS = 200
 """So many joint vectors are drawn for each candidate that is wanted in the box before it counts as out of reach."""
 SWEEPS = 20
@@ -42,7 +42,7 @@ TEST_POSES = 200
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PoseDesign:
-    """Chosen poses beside random ones.
+    """The chosen poses, compared with random sets of poses.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class PoseDesign:
         freeze(self, "q", (len(self.poses), None), "joint values")
 
     def median(self) -> dict[str, float]:
-        """Of the random sets' indices."""
+        """Returns the median of each index over the random sets."""
         names = self.chosen.values()
         return {name: float(np.median([each.values()[name] for each in self.random])) for name in names}
 
@@ -313,7 +313,7 @@ def design_csv(result: PoseDesign, robot: Robot) -> str:
 
 
 def design_file(result: PoseDesign) -> DesignFile:
-    """Everything but the poses themselves, for programs."""
+    """Returns the result without the poses in machine-readable form."""
     return DesignFile.model_validate(
         {
             "format": "stcal pose design 1",

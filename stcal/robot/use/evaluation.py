@@ -37,7 +37,7 @@ certain: what a model leaves has longer tails than noise. 8 σ of 50 positions."
 LEAST_MM = 1e-3
 """Shorter errors are never wrong: no instrument tells them."""
 ROUNDS = 5
-"""Of fitting without wrong rows; one or two do."""
+"""Largest number of rounds of fitting without gross errors; one or two are usually enough."""
 UNSEEN = 1e-12
 """Share of what each parameter is seen by alone; of a direction that is seen less, σ is huge."""
 CHANCE = 0.05
@@ -46,7 +46,7 @@ CHANCE = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Of the errors of so many rows; mm, or rad of orientations."""
+    """Summary of the errors of a number of rows; mm, or rad for orientations."""
 
     rows: int
     mean: float
@@ -143,7 +143,7 @@ class Evaluation:
         return self.differences[0].better if self.differences and all(d.real for d in self.differences) else ""
 
     def line(self, row: int) -> int:
-        """Of the file."""
+        """Returns the line of the file of ``row``."""
         return int(self.seen.data.lines[self.seen.first[row]])
 
 
@@ -268,7 +268,7 @@ def _derivatives(state: State, base: Rigid, seen: Observed, fit: Fit) -> np.ndar
 def _placed(
     state: State, base: Rigid, found: np.ndarray, fitted: np.ndarray, fit: Fit, with_base: bool
 ) -> tuple[Placed, ...]:
-    """With σ by the residuals ``found`` (r, w) and the derivatives ``fitted`` (r, w, k)."""
+    """Returns the placements with σ from the residuals ``found`` (r, w) and the derivatives ``fitted`` (r, w, k)."""
     flat, k = fitted.reshape(found.size, -1), fitted.shape[2]
     size = np.maximum(np.linalg.norm(flat, axis=0), 1e-300)
     seen, directions = np.linalg.eigh((flat / size).T @ (flat / size))
@@ -290,7 +290,7 @@ def _placed(
 
 
 def _differences(robots: tuple[Evaluated, ...], good: np.ndarray) -> tuple[Difference, ...]:
-    """Paired: rows that are hard for one are hard for the others, which their differences do not feel."""
+    """Returns paired differences between robots; errors of rows that are hard for all robots cancel in them."""
     order = sorted(robots, key=lambda each: each.errors_mm[good].mean())
     better, found = order[0], []
     for worse in order[1:]:

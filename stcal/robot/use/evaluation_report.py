@@ -175,7 +175,7 @@ def _cells(values) -> list[str]:
 
 
 def evaluation_file(result: Evaluation) -> EvaluationFile:
-    """Everything, for programs (keys: ``data_layout.md``)."""
+    """Returns the complete result in machine-readable form (keys: ``data_layout.md``)."""
     robots = []
     for each in result.robots:
         robots.append(

@@ -50,7 +50,7 @@ class RobotDifference(Part):
 
 
 class EvaluationFile(ResultFile):
-    """Of ``evaluate``."""
+    """Result file of ``evaluate``."""
 
     format: Literal["stcal evaluation 1"] = Field(description="the file's form and its version")
     refit: str = Field(description="what was fitted: `none`, `base`, `tool` or `base-tool`")
@@ -87,7 +87,7 @@ class CompensatedPose(Part):
 
 
 class CompensationFile(ResultFile):
-    """Of ``compensate``."""
+    """Result file of ``compensate``."""
 
     format: Literal["stcal compensation 1"] = Field(description="the file's form and its version")
     robot: str = Field(description="name")
@@ -126,7 +126,7 @@ class MeasuredSet(Part):
 
 
 class VerificationFile(ResultFile):
-    """Of ``verify``."""
+    """Result file of ``verify``."""
 
     format: Literal["stcal verification 1"] = Field(description="the file's form and its version")
     poses: list[str] = Field(description="names, the first being the one that distances start from")
@@ -142,7 +142,7 @@ class VerificationFile(ResultFile):
 
 
 class DesignFile(ResultFile):
-    """Of ``design``."""
+    """Result file of ``design``."""
 
     format: Literal["stcal pose design 1"] = Field(description="the file's form and its version")
     count: int = Field(description="number of poses")

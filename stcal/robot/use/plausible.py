@@ -23,7 +23,7 @@ from stcal.robot.use.targets import Targets, joints_of, poses_of, rows_by_tool
 UNITS = ("m", "in")
 """What columns of mm may hold; of micrometres no arm would reach anything, and a tenth, of cm, may be meant."""
 USUAL = 0.01
-"""Of the reach: ten times what arms are made to, or all zeros off by half a degree."""
+"""Usual error as a fraction of the reach: ten times the manufacturing tolerance, or all zeros off by half a degree."""
 SAMPLE = 50
 """Joint vectors at which two robots are compared."""
 DOUBTED, LEAST, TRIED = 0.25, 4, 8
@@ -102,14 +102,14 @@ def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
 
 
 def position_misfit_mm(robot: Robot, targets: Targets) -> float:
-    """By how much (RMS) joint values miss the positions of the poses beside them."""
+    """Returns the RMS distance between the positions that joint values reach and those of the poses of their rows."""
     if targets.poses is None:
         raise InputError("E-TARGETS-NO-POSES", f"{targets.where}: joint values without poses; columns x_mm … qz needed")
     return _rms(poses_of(robot, targets, targets.joints()).translation - targets.poses.translation)
 
 
 def _rms(shift: np.ndarray) -> float:
-    """Of vectors (m, 3)."""
+    """Returns the RMS length of vectors (m, 3)."""
     return float(np.sqrt((shift**2).sum(axis=1).mean()))
 
 
@@ -148,8 +148,8 @@ def _guesses(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray) -> Ite
 
 
 def _paired(targets: Targets, poses: Poses, reached: Poses, reach: float) -> Poses | None:
-    """For each pose the nearest of those ``reached`` with its tool, whichever row it is of; None where that is not one
-    to one, and very near: rough joint values that choose a branch are often nearer to another row's pose."""
+    """Returns for each pose the nearest pose ``reached`` with its tool, of any row. Returns None if the assignment is
+    not one to one and very near: rough joint values that choose a branch are often nearer to another row's pose."""
     rows = np.arange(len(poses))
     for _, own in rows_by_tool(targets):
         tree, asked = (
@@ -192,7 +192,7 @@ def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
 
 
 def _base_mm(robot: Robot) -> float:
-    """From the base's origin to the first joint."""
+    """Returns the distance from the base's origin to the first joint, mm."""
     return float(np.linalg.norm(replace(robot, world_from_base=Rigid()).chain().translation[0]))
 
 

@@ -125,6 +125,6 @@ def _joint_rows(result: Compensated, robot: Robot) -> list[list[str]]:
 
 
 def _colours(count: int) -> list[str]:
-    """Before in the colour of warmth, after in that of calm; then the palette."""
+    """Returns the colours: warm for before, cool for after, then the rest of the palette."""
     order = [COLOURS[1], COLOURS[0], *COLOURS[2:]]
     return [order[i % len(order)] for i in range(count)]

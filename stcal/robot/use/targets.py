@@ -1,4 +1,4 @@
-"""Commanded poses as a file has them, and what a robot makes of them, each row with its own tool."""
+"""Target poses commanded by a file, and the robot's poses and joint values for them, each row with its own tool."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ NAMES = ("pose", "image", "name", "scene", PAYLOAD)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Targets:
-    """Commanded poses, one for each row of a file; by joint values where no poses are given.
+    """Target poses, one for each row of a file; given by joint values if the file has no poses.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Whether a calibration helped: distances between measured positions against those between the commanded ones.
+"""Verification of a calibration: distances between measured positions are compared with the commanded distances.
 
-The test of the stereo-target paper: distances from the first position, which need no common frame of robot and
-instrument. They all carry the error of the first position; the distances of all pairs depend less on any one.
+This is the test of the stereo-target paper. Distances from the first position need no common frame of robot and
+instrument. They all carry the error of the first position; the distances of all pairs depend less on any one position.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from stcal.robot.use.files import VerificationFile
 
 WHAT = "measured positions"
 SAME_MM = 1e-6
-"""Commanded positions nearer than this are the same command: what printing makes of a number."""
+"""Distance below which two commanded positions count as the same command; it covers the rounding of printed numbers."""
 MISSES, MISSES_MM = 0.05, 20.0
 """Share of the commanded distances, and mm, RMS of all pairs, by which measured ones miss them: arms err by under 1 %
 of their 2 m, and a robot model that is not the arm's, or rows in another order, by more."""
@@ -67,7 +67,7 @@ class SetResult:
     scale: float
 
     def doubt(self) -> str:
-        """Why this may not be an arm at its commands; empty where it may."""
+        """Returns why the measured positions may not belong to the commands; empty if they may."""
         if abs(self.scale - 1) > SCALE_WITHIN:
             return (
                 f"set {self.name}: measured distances are {self.scale:.4f} times the commanded ones; "
@@ -82,7 +82,7 @@ class SetResult:
         )
 
     def figures(self) -> dict[str, float]:
-        """What is compared between sets, mm."""
+        """Returns the figures that are compared between sets, mm."""
         return {"mean": self.mean_mm, "std": self.std_mm, "max": self.max_mm, "all pairs RMS": self.pairs_rms_mm}
 
 
@@ -102,12 +102,12 @@ class Verification:
     notes: tuple[str, ...] = ()
 
     def reduction(self, index: int) -> dict[str, float]:
-        """By how many per cent each figure of set ``index`` is below the first set's."""
-        first, own = self.sets[0].figures(), self.sets[index].figures()
-        return {key: 100 * (1 - own[key] / first[key]) if first[key] > 0 else float("nan") for key in first}
+        """Returns the reduction of each figure of set ``index`` relative to the first set, per cent."""
+        first, figures = self.sets[0].figures(), self.sets[index].figures()
+        return {key: 100 * (1 - figures[key] / first[key]) if first[key] > 0 else float("nan") for key in first}
 
     def warnings(self) -> list[str]:
-        """What to look at."""
+        """Returns warnings of missing poses and of doubtful sets."""
         found = [
             f"set {name}: missing poses, left out of all sets ({len(poses)}): {_few(poses)}"
             for name, poses in self.missing.items()
@@ -181,7 +181,7 @@ def verify(data: MeasuredPoses) -> Verification:
     Returns
     -------
     Verification
-        Of each set mean, standard deviation and maximum of the errors of distances, mm.
+        Mean, standard deviation and maximum of each set's distance errors, mm.
 
     Raises
     ------
@@ -192,26 +192,26 @@ def verify(data: MeasuredPoses) -> Verification:
     for i, (group, name) in enumerate(zip(data.sets, data.names, strict=True)):
         rows.setdefault(group, {})[name] = i
     every = list(dict.fromkeys(data.names))
-    common = [name for name in every if all(name in own for own in rows.values())]
-    missing = {group: tuple(name for name in every if name not in own) for group, own in rows.items()}
+    common = [name for name in every if all(name in rows_of_set for rows_of_set in rows.values())]
+    missing = {group: tuple(name for name in every if name not in rows_of_set) for group, rows_of_set in rows.items()}
     if len(common) < 3:
         raise InputError(
             "E-VERIFY-FEW",
             f"{data.where}: {len(common)} poses in {'all of the sets ' if len(rows) > 1 else ''}{', '.join(rows)}; "
             "at least 3 needed; are the commanded positions of the sets the same?",
         )
-    index = {group: np.array([own[name] for name in common]) for group, own in rows.items()}
+    index = {group: np.array([rows_of_set[name] for name in common]) for group, rows_of_set in rows.items()}
     first = next(iter(index.values()))
-    for group, own in index.items():
-        off = np.abs(data.commanded[own] - data.commanded[first]).max(axis=1)
-        if off.max() > SAME_MM:
-            k = int(off.argmax())
+    for group, rows_of_set in index.items():
+        apart = np.abs(data.commanded[rows_of_set] - data.commanded[first]).max(axis=1)
+        if apart.max() > SAME_MM:
+            k = int(apart.argmax())
             raise InputError(
                 "E-VERIFY-COMMANDED",
-                f"{data.where}: pose {common[k]} is commanded {off[k]:.4g} mm apart in sets {next(iter(index))} and "
-                f"{group} (line {data.lines[own[k]]}); the same commands needed",
+                f"{data.where}: pose {common[k]} is commanded {apart[k]:.4g} mm apart in sets {next(iter(index))} and "
+                f"{group} (line {data.lines[rows_of_set[k]]}); the same commands needed",
             )
-    sets = tuple(_set_result(data, group, own) for group, own in index.items())
+    sets = tuple(_set_result(data, group, rows_of_set) for group, rows_of_set in index.items())
     at = data.commanded[first]
     distances = np.linalg.norm(at[1:] - at[0], axis=1)
     return Verification(data.where, tuple(common), distances, sets, missing, data.notes)
@@ -221,15 +221,15 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray) -> SetResult:
     commanded, measured = data.commanded[rows], data.measured[rows]
     error = np.linalg.norm(measured[1:] - measured[0], axis=1) - np.linalg.norm(commanded[1:] - commanded[0], axis=1)
     size = np.abs(error)
-    squares = pairs = product = wanted_squares = 0.0
+    squares = pairs = product = commanded_squares = 0.0
     for i in range(1, len(measured)):  # row by row: all pairs of thousands at once are gigabytes
-        found = np.linalg.norm(measured[:i] - measured[i], axis=1)
-        wanted = np.linalg.norm(commanded[:i] - commanded[i], axis=1)
-        squares += float(((found - wanted) ** 2).sum())
-        product += float(found @ wanted)
-        wanted_squares += float(wanted @ wanted)
+        measured_distance = np.linalg.norm(measured[:i] - measured[i], axis=1)
+        commanded_distance = np.linalg.norm(commanded[:i] - commanded[i], axis=1)
+        squares += float(((measured_distance - commanded_distance) ** 2).sum())
+        product += float(measured_distance @ commanded_distance)
+        commanded_squares += float(commanded_distance @ commanded_distance)
         pairs += i
-    if wanted_squares == 0:
+    if commanded_squares == 0:
         raise InputError(
             "E-VERIFY-ALIKE", f"{data.where}: set {name}: all commanded positions are the same; different ones needed"
         )
@@ -240,16 +240,16 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray) -> SetResult:
         std_mm=float(size.std(ddof=1)),
         max_mm=float(size.max()),
         pairs_rms_mm=float(np.sqrt(squares / pairs)),
-        pairs_mm=float(np.sqrt(wanted_squares / pairs)),
-        scale=product / wanted_squares,
+        pairs_mm=float(np.sqrt(commanded_squares / pairs)),
+        scale=product / commanded_squares,
     )
 
 
 def verified_text(result: Verification) -> str:
     """The table for the terminal."""
     rows = [["<", "mean mm", "std mm", "max mm", "all pairs RMS mm"]]
-    for k, each in enumerate(result.sets):
-        rows.append([each.name, *(number(v, 4) for v in each.figures().values())])
+    for k, result_of_set in enumerate(result.sets):
+        rows.append([result_of_set.name, *(number(v, 4) for v in result_of_set.figures().values())])
         if k:
             rows.append(["  reduced", *(f"{v:.1f} %" for v in result.reduction(k).values())])
     lines = [
@@ -262,15 +262,25 @@ def verified_text(result: Verification) -> str:
 
 
 def verification_file(result: Verification) -> VerificationFile:
-    """Everything, for programs."""
+    """Returns the complete result in machine-readable form."""
     sets = []
-    for k, each in enumerate(result.sets):
-        figures = dict(zip(("mean_mm", "std_mm", "max_mm", "all_pairs_rms_mm"), each.figures().values(), strict=True))
+    for k, result_of_set in enumerate(result.sets):
+        figures = dict(
+            zip(("mean_mm", "std_mm", "max_mm", "all_pairs_rms_mm"), result_of_set.figures().values(), strict=True)
+        )
         reduced = dict(zip(figures, result.reduction(k).values(), strict=True)) if k else None
         reduced = reduced and {
             key.replace("_mm", "_percent"): v if np.isfinite(v) else None for key, v in reduced.items()
         }
-        sets.append({"set": each.name, **figures, "scale": each.scale, "reduced": reduced, "error_mm": each.error_mm})
+        sets.append(
+            {
+                "set": result_of_set.name,
+                **figures,
+                "scale": result_of_set.scale,
+                "reduced": reduced,
+                "error_mm": result_of_set.error_mm,
+            }
+        )
     return VerificationFile.model_validate(
         {
             "format": "stcal verification 1",

@@ -1,4 +1,4 @@
-"""From the sources to combined and expanded uncertainties of faces and of the target's largest distances."""
+"""Combination of the sources to combined and expanded uncertainties of faces and of the target's largest distances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,19 +22,20 @@ from stcal.sfm.runs.saved import SavedRun
 
 COVERAGE_FACTOR = 2.0
 LONGEST = 5
-"""Distances that a budget has."""
+"""Number of distances in a budget."""
 DRAWS = 100_000
-"""Of the coverage (JCGM 101:2008)."""
+"""Number of random draws for the coverage (JCGM 101:2008)."""
 Kind = Literal["position", "rotation", "distance"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurand:
-    """What the budget is of: a face's position or rotation in the target frame (3 numbers, of which the uncertainty is
-    the root of the summed variances), or a distance between two circles.
+    """A quantity whose uncertainty the budget states.
 
-    ``name`` : the face, or ``a – b``; ``length_mm`` of distances; ``jacobian`` : (r, 3c) by the circles, mm or rad;
-    ``designed`` : (r, d) by the frame circles that were not mapped.
+    It is a face's position or rotation in the target frame (3 numbers, whose uncertainty is the root of the summed
+    variances), or a distance between two circles. ``name`` : the face, or ``a – b``; ``length_mm`` : length of a
+    distance, else None; ``jacobian`` : (r, 3c) with respect to the circles, mm or rad; ``designed`` : (r, d) with
+    respect to the frame circles that were not mapped.
     """
 
     kind: Kind
@@ -49,7 +50,8 @@ class Measurand:
         object.__setattr__(self, "designed", frozen(self.designed, (None, None), f"{self.name}: designed"))
 
     def covariance(self, source: Source, designed_sigma_mm: float) -> np.ndarray:
-        """(r, r) by one source; ``designed_sigma_mm`` counts for that of the placed circles alone."""
+        """Returns the covariance (r, r) from one source. ``designed_sigma_mm`` matters only for the source of placed
+        circles."""
         if source.key == PLACED:
             return designed_sigma_mm**2 * self.designed @ self.designed.T
         return self.jacobian @ source.covariance_mm2 @ self.jacobian.T
@@ -60,9 +62,12 @@ PLACED = "placed_circles"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Row:
-    """The uncertainty of one measurand, mm or rad: ``contributions`` by key of the source, ``standard`` combined,
-    ``expanded`` with k = 2, ``coverage`` of that, simulated; ``freedom`` : effective degrees of freedom
-    (Welch–Satterthwaite, JCGM 100 G.4)."""
+    """The uncertainty of one measurand, mm or rad.
+
+    ``contributions`` : by key of the source; ``standard`` : combined standard uncertainty; ``expanded`` : with k = 2;
+    ``coverage`` : simulated coverage of ``expanded``; ``freedom`` : effective degrees of freedom (Welch–Satterthwaite,
+    JCGM 100 G.4).
+    """
 
     measurand: Measurand
     contributions: dict[str, float]
@@ -73,13 +78,13 @@ class Row:
     freedom: float
 
     def share(self, key: str) -> float:
-        """Of the variance."""
+        """Returns the share of one source in the variance."""
         return (self.contributions[key] / self.standard) ** 2 if self.standard else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Photographs of a group: how many, and the largest angle between two of their axes, rad."""
+    """Number of photographs of a group, and the largest angle between two of their axes, rad."""
 
     group: str
     images: int
@@ -88,7 +93,10 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Budget:
-    """``correction`` : relative, of lengths, for stated expansion; it is not applied to the run's result."""
+    """The uncertainty budget of a run.
+
+    ``correction`` : relative correction of lengths for the stated expansion. It is not applied to the run's result.
+    """
 
     joint: JointResult
     reference_face: str
@@ -99,36 +107,45 @@ class Budget:
     correction: float
 
     def of_kind(self, kind: Kind) -> list[Row]:
-        """Rows of one kind."""
+        """Returns the rows of one kind."""
         return [row for row in self.rows if row.measurand.kind == kind]
 
 
 def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
-    """The budget of a finished run.
+    """Returns the budget of a finished run.
 
     Parameters
     ----------
     run : SavedRun
-        Solved jointly: a chain states no covariance.
+        The run. It must be solved jointly, since a chain states no covariance.
     statement : Statement, optional
-        Of sizes, temperatures and fields; what ``board.toml`` states where None.
+        Stated sizes, temperatures and fields. If None, those that ``board.toml`` states.
 
     Raises
     ------
     InputError
-        Another solve, or a folder that lacks files.
+        If the run was solved otherwise, or its folder lacks files.
     """
     if run.faces.solve != "joint" or not run.faces.eccentricity:
         raise InputError(
             "E-BUDGET-NO-COVARIANCE",
             f"run {run.folder}: solved by {run.faces.solve}, which states no covariance; run again with --solve joint",
         )
-    again = adjusted_run(run)
-    found = contributions_of(again.state)
-    own = derivatives(found.joint, again.start, run.target, run.faces.frame)
+    adjusted = adjusted_run(run)
+    contributions = contributions_of(adjusted.state)
+    derivatives_of_run = derivatives(contributions.joint, adjusted.start, run.target, run.faces.frame)
     rows = statement or statement_of(run.board.stated)
     camera, refined = run.camera, run.options.refine_camera
-    return budget(found, own, camera, run.board, run.options.flatness_mm, refined, rows, run.faces.reference_face)
+    return budget(
+        contributions,
+        derivatives_of_run,
+        camera,
+        run.board,
+        run.options.flatness_mm,
+        refined,
+        rows,
+        run.faces.reference_face,
+    )
 
 
 def budget(
@@ -141,14 +158,14 @@ def budget(
     statement: Statement,
     reference_face: str,
 ) -> Budget:
-    """Of an adjustment; arguments as of :func:`stcal.sfm.budget.sources.sources_of`."""
+    """Returns the budget of an adjustment. Arguments are as in :func:`stcal.sfm.budget.sources.sources_of`."""
     sources = sources_of(found, camera, board, flatness_mm, refined, statement)
     if own.circles_designed.shape[2]:
         sources += (_placed(own),)
     rng = np.random.default_rng(0)
     rows = [
-        _row(each, sources, own.designed_sigma_mm, found.joint.redundancy, rng)
-        for each in measurands(found.joint, own, reference_face)
+        _row(measurand, sources, own.designed_sigma_mm, found.joint.redundancy, rng)
+        for measurand in measurands(found.joint, own, reference_face)
     ]
     views = tuple(_view(model) for model in found.joint.models)
     return Budget(found.joint, reference_face, sources, tuple(rows), views, statement, correction(statement))
@@ -164,19 +181,21 @@ def _placed(own: Derivatives) -> Source:
 
 
 def measurands(joint: JointResult, own: Derivatives, reference_face: str) -> list[Measurand]:
-    """Positions and rotations of all faces but the reference, and the longest distances."""
-    others = [face for face in own.target_from_face if face != reference_face]
-    found = []
+    """Returns positions and rotations of all faces except the reference face, and the longest distances."""
+    other_faces = [face for face in own.target_from_face if face != reference_face]
+    quantities = []
     kinds: tuple[tuple[Kind, slice], ...] = (("position", slice(3, 6)), ("rotation", slice(0, 3)))
     for kind, rows in kinds:
-        found += [
-            Measurand(kind, face, (), None, own.faces[face][rows], own.face_designed[face][rows]) for face in others
+        quantities += [
+            Measurand(kind, face, (), None, own.faces[face][rows], own.face_designed[face][rows])
+            for face in other_faces
         ]
-    return found + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST]]
+    return quantities + [distance(joint, a, b) for a, b in longest_of(joint.labels, joint.xyz_model)[:LONGEST]]
 
 
 def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int, int]]:
-    """The two circles farthest apart of every two faces, and of each face that has two; the longest first."""
+    """Returns, for every two faces and within each face, the two circles farthest apart. The longest distance comes
+    first."""
     faces: dict[str, list[int]] = {}
     for i, label in enumerate(labels):
         faces.setdefault(label.face, []).append(i)
@@ -188,12 +207,12 @@ def longest_of(labels: Sequence[CircleLabel], xyz: np.ndarray) -> list[tuple[int
 
 
 def distance(joint: JointResult, i: int, j: int) -> Measurand:
-    """Between two circles."""
-    way = joint.xyz_model[j] - joint.xyz_model[i]
-    length = float(np.linalg.norm(way))
+    """Returns the measurand of the distance between two circles."""
+    difference = joint.xyz_model[j] - joint.xyz_model[i]
+    length = float(np.linalg.norm(difference))
     jacobian = np.zeros((1, joint.xyz_model.size))
-    jacobian[0, 3 * j : 3 * j + 3] = way / length
-    jacobian[0, 3 * i : 3 * i + 3] = -way / length
+    jacobian[0, 3 * j : 3 * j + 3] = difference / length
+    jacobian[0, 3 * i : 3 * i + 3] = -difference / length
     ends = joint.labels[i], joint.labels[j]
     return Measurand("distance", f"{ends[0]} – {ends[1]}", ends, length, jacobian, np.zeros((1, 0)))
 
@@ -201,14 +220,14 @@ def distance(joint: JointResult, i: int, j: int) -> Measurand:
 def _row(
     measurand: Measurand, sources: Sequence[Source], designed_sigma_mm: float, redundancy: int, rng: np.random.Generator
 ) -> Row:
-    parts = {each.key: measurand.covariance(each, designed_sigma_mm) for each in sources}
-    covariance = np.sum(list(parts.values()), axis=0)
+    covariances = {source.key: measurand.covariance(source, designed_sigma_mm) for source in sources}
+    covariance = np.sum(list(covariances.values()), axis=0)
     variance = float(np.trace(covariance))
-    estimated = sum(float(np.trace(parts[each.key])) for each in sources if each.evaluation == "A")
+    estimated = sum(float(np.trace(covariances[source.key])) for source in sources if source.evaluation == "A")
     standard = float(np.sqrt(variance))
     return Row(
         measurand,
-        {key: float(np.sqrt(max(np.trace(each), 0.0))) for key, each in parts.items()},
+        {key: float(np.sqrt(max(np.trace(source), 0.0))) for key, source in covariances.items()},
         covariance,
         standard,
         COVERAGE_FACTOR * standard,
@@ -218,7 +237,7 @@ def _row(
 
 
 def _coverage(covariance: np.ndarray, expanded: float, rng: np.random.Generator) -> float:
-    """Share of simulated errors that are not longer than the expanded uncertainty."""
+    """Returns the share of simulated errors that are not longer than the expanded uncertainty."""
     values, vectors = np.linalg.eigh(covariance)
     errors = rng.standard_normal((DRAWS, len(values))) * np.sqrt(np.maximum(values, 0.0)) @ vectors.T
     return float((np.linalg.norm(errors, axis=1) <= expanded).mean())

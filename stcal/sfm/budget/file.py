@@ -1,4 +1,4 @@
-"""What ``budget`` writes with ``--json``, and what its page and PDF show."""
+"""Form of the JSON file of ``budget``, which its page and PDF show too."""
 
 import math
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ class ViewsRow(Part):
 
 
 class Uncertainty(Part):
-    """Of one measurand."""
+    """Uncertainty of one measurand."""
 
     contributions: dict[str, float]
     sensitivities: dict[str, float]
@@ -90,7 +90,7 @@ class LengthRow(Part):
 
 
 class LengthTestPart(Part):
-    """Against one reference."""
+    """Length test against one reference."""
 
     reference: str
     lengths: list[LengthRow]
@@ -101,17 +101,17 @@ class LengthTestPart(Part):
 
     @classmethod
     def of(cls, test: LengthTest) -> "LengthTestPart":
-        """The part of a test."""
+        """Returns the part of the file for a test."""
         rows = [
             LengthRow(
-                circles=list(each.circles),
-                measured_mm=each.measured_mm,
-                reference_mm=each.reference_mm,
-                error_um=MICRO * each.error_mm,
-                expanded_um=MICRO * each.expanded_mm,
-                e_n=each.e_n,
+                circles=list(length.circles),
+                measured_mm=length.measured_mm,
+                reference_mm=length.reference_mm,
+                error_um=MICRO * length.error_mm,
+                expanded_um=MICRO * length.expanded_mm,
+                e_n=length.e_n,
             )
-            for each in test.lengths
+            for length in test.lengths
         ]
         return cls(
             reference=test.reference,
@@ -124,7 +124,7 @@ class LengthTestPart(Part):
 
 
 class BudgetFile(ResultFile):
-    """Of ``budget``."""
+    """The JSON file of ``budget``."""
 
     format: Literal["stcal budget 1"] = Field(description="the file's form and its version")
     version: str = Field(description="of stcal")
@@ -176,8 +176,8 @@ class BudgetFile(ResultFile):
 
     @classmethod
     def of(cls, budget: Budget, run: SavedRun, verified: VerifyFile, tests: Sequence[LengthTest] = ()) -> "BudgetFile":
-        """The file of a run's budget; ``verified`` : what became of its files."""
-        parts = [LengthTestPart.of(each) for each in tests]
+        """Returns the file of a run's budget. ``verified`` : state of the run's files."""
+        parts = [LengthTestPart.of(test) for test in tests]
         return cls.model_validate(_content(budget, run, verified) | {"length_tests": parts})
 
 
@@ -224,16 +224,16 @@ def _source(source: Source) -> SourceRow:
 
 def _faces(budget: Budget) -> dict[str, dict]:
     rotations = {row.measurand.name: row for row in budget.of_kind("rotation")}
-    found = {}
+    faces = {}
     for row in budget.of_kind("position"):
-        other = rotations[row.measurand.name]
-        found[row.measurand.name] = {
+        rotation = rotations[row.measurand.name]
+        faces[row.measurand.name] = {
             "position_um": _uncertainty(row, budget, MICRO),
             "position_xyz_um": (MICRO * np.sqrt(np.diag(row.covariance))).tolist(),
-            "rotation_mdeg": _uncertainty(other, budget, MILLIDEGREES),
-            "rotation_xyz_mdeg": (MILLIDEGREES * np.sqrt(np.diag(other.covariance))).tolist(),
+            "rotation_mdeg": _uncertainty(rotation, budget, MILLIDEGREES),
+            "rotation_xyz_mdeg": (MILLIDEGREES * np.sqrt(np.diag(rotation.covariance))).tolist(),
         }
-    return found
+    return faces
 
 
 def _distance(row: Row, budget: Budget) -> dict:
@@ -248,10 +248,14 @@ def _distance(row: Row, budget: Budget) -> dict:
 
 
 def _uncertainty(row: Row, budget: Budget, unit: float) -> dict:
-    parts = {key: unit * each for key, each in row.contributions.items()}
+    contributions = {key: unit * contribution for key, contribution in row.contributions.items()}
     return {
-        "contributions": parts,
-        "sensitivities": {each.key: parts[each.key] / each.sigma for each in budget.sources if each.sigma},
+        "contributions": contributions,
+        "sensitivities": {
+            contribution.key: contributions[contribution.key] / contribution.sigma
+            for contribution in budget.sources
+            if contribution.sigma
+        },
         "standard": unit * row.standard,
         "expanded": unit * row.expanded,
         "coverage": row.coverage,
@@ -260,29 +264,29 @@ def _uncertainty(row: Row, budget: Budget, unit: float) -> dict:
 
 
 def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
-    """What a reader must know that no number says."""
-    unknown = [each.title for each in budget.sources if each.origin == "not stated"]
-    found = []
+    """Returns notes on what a reader must know that no number shows."""
+    unknown = [source.title for source in budget.sources if source.origin == "not stated"]
+    notes = []
     if unknown:
-        found.append(
+        notes.append(
             f"taken as exact, since nothing is stated of them: {', '.join(unknown)}; the uncertainties hold as far as "
             "these are"
         )
     if budget.correction:
-        found.append(
+        notes.append(
             f"for the stated expansion lengths of the run are to be changed by {PPM * budget.correction:+.1f} ppm; "
             "this is not done in faces.json, and the expanded uncertainties hold for corrected lengths"
         )
     failed = [check["title"] for check in run.report.get("checks", ()) if check["verdict"] == "failed"]
     if failed:
-        found.append(
+        notes.append(
             f"failed checks of the run: {len(failed)}, first {failed[0]}; what they found is not among the inputs, and "
             "this budget does not hold before it is put right"
         )
     if faults := verified.faults():
-        found.append(f"the run's folder is not as the run left it: {'; '.join(faults)}")
-    found.append(
+        notes.append(f"the run's folder is not as the run left it: {'; '.join(faults)}")
+    notes.append(
         "the reference face's frame is the target frame and carries no uncertainty; what its own circles do not know "
         "is in the other faces"
     )
-    return found
+    return notes

@@ -9,13 +9,13 @@ from stcal.sfm.budget.file import BudgetFile, SourceRow, Uncertainty
 from stcal.sfm.budget.text import name_of, verdict_of
 
 LEAST_SHARE = 1e-3
-"""Of a variance, that is drawn."""
+"""Least share of a variance that is drawn."""
 ROUNDING = 1e-6
-"""Of u: a contribution below it is none."""
+"""Ratio to u below which a contribution is rounding error alone."""
 
 
 def budget_page(file: BudgetFile) -> str:
-    """HTML with all that it shows inside."""
+    """Returns a self-contained HTML page of the budget."""
     faces, k = file.faces, file.coverage_factor
     kinds = [
         ("Positions of faces", "µm", {f"face {f}": each.position_um for f, each in faces.items()}),
@@ -55,16 +55,16 @@ def budget_page(file: BudgetFile) -> str:
 def _headline(file: BudgetFile, worst: str | None) -> list[tuple[str, str, str]]:
     tiles = []
     if worst is not None:
-        own = file.faces[worst]
+        worst_face = file.faces[worst]
         tiles = [
-            (number(own.position_um.expanded, 1), "µm", f"U of the position of face {worst}, the worst"),
-            (number(own.rotation_mdeg.expanded, 1), "mdeg", f"U of the rotation of face {worst}"),
+            (number(worst_face.position_um.expanded, 1), "µm", f"U of the position of face {worst}, the worst"),
+            (number(worst_face.rotation_mdeg.expanded, 1), "mdeg", f"U of the rotation of face {worst}"),
         ]
     if file.distances:
         longest = file.distances[0]
-        what = f"U of the longest distance, {number(longest.corrected_mm, 3)} mm"
-        tiles.append((number(longest.distance_um.expanded, 1), "µm", what))
-    unknown = sum(each.origin == "not stated" for each in file.sources)
+        caption = f"U of the longest distance, {number(longest.corrected_mm, 3)} mm"
+        tiles.append((number(longest.distance_um.expanded, 1), "µm", caption))
+    unknown = sum(source.origin == "not stated" for source in file.sources)
     return [*tiles, (str(unknown), "", f"of {len(file.sources)} inputs not stated, taken as exact")]
 
 
@@ -74,14 +74,16 @@ def _input(each: SourceRow) -> list[str]:
 
 
 def _table(columns: dict[str, Uncertainty], file: BudgetFile, unit: str) -> tuple[list[str], list[list[str]]]:
-    """Heads and rows: contribution by input, with the sensitivity for the first measurand; then the sums."""
+    """Returns heads and rows: contributions by input, with the sensitivity of the first measurand, then the sums."""
     heads = ["<Contribution to u", f"sensitivity, {next(iter(columns))}", *columns]
     rows = []
     first = next(iter(columns.values()))
-    for each in file.sources:
-        slope = f"{_slope(first, each):.3g} {unit}/{each.unit}" if each.key in first.sensitivities else "–"
-        parts = [number(u.contributions[each.key], 2) for u in columns.values()]
-        rows.append([each.title, slope, *("–" if each.origin == "not stated" else part for part in parts)])
+    for source in file.sources:
+        slope = f"{_slope(first, source):.3g} {unit}/{source.unit}" if source.key in first.sensitivities else "–"
+        parts = [number(u.contributions[source.key], 2) for u in columns.values()]
+        rows.append(
+            [source.title, slope, *("–" if source.origin == "not stated" else contribution for contribution in parts)]
+        )
     for title, values in (
         ("combined standard uncertainty u", [number(u.standard, 2) for u in columns.values()]),
         (f"expanded uncertainty U, k = {file.coverage_factor:g}", [number(u.expanded, 2) for u in columns.values()]),
@@ -96,30 +98,30 @@ def _table(columns: dict[str, Uncertainty], file: BudgetFile, unit: str) -> tupl
 
 
 def _slope(of: Uncertainty, source: SourceRow) -> float:
-    """Sensitivity; 0 where it is rounding alone."""
+    """Returns the sensitivity, or 0 if it is rounding error alone."""
     share = of.contributions[source.key] / of.standard if of.standard else 0.0
     return of.sensitivities[source.key] if share > ROUNDING else 0.0
 
 
 def _shares(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> tuple[str, list]:
-    """Stacked shares of the variances, and the legend."""
+    """Returns a figure with stacked shares of the variances, and its legend."""
     shares = {
-        each.key: np.array([(u.contributions[each.key] / u.standard) ** 2 if u.standard else 0 for _, u in measurands])
-        for each in file.sources
+        row.key: np.array([(u.contributions[row.key] / u.standard) ** 2 if u.standard else 0 for _, u in measurands])
+        for row in file.sources
     }
-    drawn = [each for each in file.sources if shares[each.key].max(initial=0) > LEAST_SHARE]
+    drawn = [row for row in file.sources if shares[row.key].max(initial=0) > LEAST_SHARE]
     figure = new_figure(9.0, 0.6 + 0.24 * len(measurands))
     axes = figure.subplots()
-    left, place = np.zeros(len(measurands)), np.arange(len(measurands))[::-1]
+    drawn_so_far, place = np.zeros(len(measurands)), np.arange(len(measurands))[::-1]
     legend = []
-    for i, each in enumerate(drawn):
+    for i, row in enumerate(drawn):
         colour = COLOURS[i % len(COLOURS)]
-        axes.barh(place, 100 * shares[each.key], left=100 * left, height=0.7, color=colour)
-        left += shares[each.key]
-        legend.append(swatch(each.title, colour))
+        axes.barh(place, 100 * shares[row.key], left=100 * drawn_so_far, height=0.7, color=colour)
+        drawn_so_far += shares[row.key]
+        legend.append(swatch(row.title, colour))
     names = [name for name, _ in measurands]
-    turned = {i for i, (_, u) in enumerate(measurands) if any(u is each.rotation_mdeg for each in file.faces.values())}
-    axes.set_yticks(place, [f"{name}, rotation" if i in turned else name for i, name in enumerate(names)])
+    rotations = {i for i, (_, u) in enumerate(measurands) if any(u is row.rotation_mdeg for row in file.faces.values())}
+    axes.set_yticks(place, [f"{name}, rotation" if i in rotations else name for i, name in enumerate(names)])
     axes.set_xlim(0, 100)
     axes.set_xlabel("share of the variance, %", fontsize=SMALL + 0.5, color=INK)
     calm(axes)
@@ -129,12 +131,12 @@ def _shares(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> tupl
 def _lengths(test) -> list[list[str]]:
     return [
         [
-            name_of(each.circles),
-            number(each.measured_mm, 4),
-            number(each.reference_mm, 4),
-            number(each.error_um, 2),
-            number(each.expanded_um, 2),
-            number(each.e_n, 2),
+            name_of(length.circles),
+            number(length.measured_mm, 4),
+            number(length.reference_mm, 4),
+            number(length.error_um, 2),
+            number(length.expanded_um, 2),
+            number(length.e_n, 2),
         ]
-        for each in test.lengths
+        for length in test.lengths
     ]

@@ -1,4 +1,4 @@
-"""Inputs of the measurement, what is known of each, and what its uncertainty does to the circles."""
+"""Inputs of the measurement: what is known of each, and the effect of its uncertainty on the circles."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,16 +15,16 @@ from stcal.sfm.budget.statement import Statement
 Origin = Literal["estimated", "stated", "assumed", "not stated"]
 PPM = 1e-6
 REFERENCE_C = 20.0
-"""ISO 1:2022, where nothing else is stated."""
+"""Reference temperature of ISO 1:2022, used unless another one is stated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
     """A row of the budget.
 
-    ``key`` in files; ``title`` in tables; ``evaluation`` : type A (statistics of this run) or B (other knowledge);
-    ``origin`` of the input's σ, and ``words`` on it; ``sigma`` in ``unit``, None where it is not one number;
-    ``covariance_mm2`` : (3c, 3c) of the circles by this input alone.
+    ``key`` : name in files; ``title`` : name in tables; ``evaluation`` : type A (statistics of this run) or B (other
+    knowledge); ``origin`` : where the input's σ comes from, explained in ``words``; ``sigma`` : the σ in ``unit``, None
+    if it is not one number; ``covariance_mm2`` : covariance (3c, 3c) of the circles due to this input alone.
     """
 
     key: str
@@ -48,12 +48,13 @@ def sources_of(
     refined: bool,
     statement: Statement,
 ) -> tuple[Source, ...]:
-    """All rows, those with nothing known too: what is left out is to be seen.
+    """Returns all rows of the budget, also of inputs of which nothing is known, so that the reader sees what is left
+    out.
 
-    ``camera`` : as given to the run, with the covariance that its file states; ``refined`` : whether its intrinsics
-    were adjusted.
+    ``camera`` : the camera as given to the run, with the covariance that its file states; ``refined`` : True if its
+    intrinsics were adjusted.
     """
-    none = np.zeros_like(found.joint.covariance_mm2)
+    zero = np.zeros_like(found.joint.covariance_mm2)
     common = found.joint.board_common
     shape = f"{100 * common:.0f} % of it common to all groups" if common else "each group its own"
     by_dots = f"sigma_mm of board.toml × σ₀ {found.joint.sigma0:.3f}; {shape}"
@@ -90,14 +91,14 @@ def sources_of(
         ),
         _flatness(found, flatness_mm),
         _intrinsics(found, camera, refined),
-        _scale(found.by_scale, none, statement),
+        _scale(found.by_scale, zero, statement),
     ]
     grown = found.joint.xyz_model - found.joint.xyz_model.mean(0)
-    for what, stated, effect in (
+    for body, stated, effect in (
         ("board", statement.board, found.by_scale),
         ("target", statement.target, grown.ravel()),
     ):
-        rows += _temperature(what, stated, effect, statement)
+        rows += _temperature(body, stated, effect, statement)
     return tuple(rows)
 
 
@@ -137,25 +138,26 @@ def _scale(by_scale: np.ndarray, none: np.ndarray, statement: Statement) -> Sour
 
 
 def _temperature(what: str, stated: StatedSize, effect: np.ndarray, statement: Statement) -> Iterator[Source]:
-    """Two rows: of the temperature, and of the coefficient; ``effect`` : (3c,) by a relative change of size."""
-    none = np.zeros((len(effect), len(effect)))
-    away = warmer_k(stated)
-    for key, title, sigma, by, unit in (
+    """Yields two rows: the temperature and the expansion coefficient. ``effect`` : (3c,) effect of a relative change of
+    size."""
+    zero = np.zeros((len(effect), len(effect)))
+    warmer = warmer_k(stated)
+    for key, title, sigma, factor, unit in (
         ("temperature", f"{what}'s temperature", stated.temperature_sigma_k, stated.expansion_ppm_per_k, "K"),
-        ("expansion", f"{what}'s expansion", stated.expansion_sigma_ppm_per_k, away, "ppm/K"),
+        ("expansion", f"{what}'s expansion", stated.expansion_sigma_ppm_per_k, warmer, "ppm/K"),
     ):
         name = "temperature_sigma_k" if key == "temperature" else "expansion_sigma_ppm_per_k"
-        if by is None or sigma is None:
-            needed = ("expansion_ppm_per_k" if key == "temperature" else "temperature_c") if by is None else name
-            yield Source(f"{what}_{key}", title, "B", "not stated", f"no {needed}", None, unit, none)
+        if factor is None or sigma is None:
+            needed = ("expansion_ppm_per_k" if key == "temperature" else "temperature_c") if factor is None else name
+            yield Source(f"{what}_{key}", title, "B", "not stated", f"no {needed}", None, unit, zero)
         else:
             words = f"{name} of {statement.origin[what, name]}"
-            covariance = (sigma * by * PPM) ** 2 * np.outer(effect, effect)
+            covariance = (sigma * factor * PPM) ** 2 * np.outer(effect, effect)
             yield Source(f"{what}_{key}", title, "B", "stated", words, sigma, unit, covariance)
 
 
 def warmer_k(stated: StatedSize) -> float | None:
-    """Temperature in the photographs less the reference temperature."""
+    """Returns the temperature in the photographs minus the reference temperature, or None if it is not stated."""
     if stated.temperature_c is None:
         return None
     reference = stated.reference_temperature_c
@@ -163,11 +165,14 @@ def warmer_k(stated: StatedSize) -> float | None:
 
 
 def correction(statement: Statement) -> float:
-    """By which lengths are to be multiplied, less 1, for the expansion that is stated: the board's grid is that much
-    larger than its file says, and the target that much larger than at its own reference temperature."""
+    """Returns the relative correction of lengths for the stated expansion.
+
+    The board's grid is larger than its file says by its expansion. The target is larger than at its own reference
+    temperature by its own expansion.
+    """
     total = 0.0
     for sign, stated in ((1, statement.board), (-1, statement.target)):
-        away = warmer_k(stated)
-        if away is not None and stated.expansion_ppm_per_k is not None:
-            total += sign * stated.expansion_ppm_per_k * PPM * away
+        warmer = warmer_k(stated)
+        if warmer is not None and stated.expansion_ppm_per_k is not None:
+            total += sign * stated.expansion_ppm_per_k * PPM * warmer
     return total

@@ -1,4 +1,4 @@
-"""What a user states for a budget: sizes and temperatures of board and target, and the fields of its head."""
+"""Statements of a user for a budget: sizes and temperatures of board and target, and the fields of its head."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -13,14 +13,14 @@ from stcal.io.design import BoardSizeEntry, SizeEntry
 from stcal.io.toml import Strict, load_toml
 
 FIELDS = ("instrument", "operator", "date", "traceability")
-"""Of the head of every budget, empty where nothing is given; others come after them."""
+"""Fields in the head of every budget, empty if not given. Other fields follow them."""
 LONGEST = 500
 Text = Annotated[str, Field(max_length=LONGEST)]
 FieldName = Annotated[str, Field(min_length=1, max_length=60)]
 
 
 class StatementFile(Strict):
-    """``--statement``."""
+    """The file of ``--statement``."""
 
     fields: dict[FieldName, Text] = Field(default_factory=dict)
     board: BoardSizeEntry = BoardSizeEntry()
@@ -29,8 +29,11 @@ class StatementFile(Strict):
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """``board``, ``target`` : of their sizes; ``origin`` by ``board`` or ``target`` and key: the file that states it;
-    ``fields`` of the head by name."""
+    """What the user states.
+
+    ``board``, ``target`` : their sizes; ``origin`` : the file that states a value, by ``board`` or ``target`` and key;
+    ``fields`` : fields of the head by name.
+    """
 
     board: StatedSize
     target: StatedSize
@@ -39,49 +42,49 @@ class Statement:
 
 
 def statement_of(own: StatedSize, path: Path | None = None, given: Sequence[str] = ()) -> Statement:
-    """The statement of a run: of ``board.toml``, over that of the file, over that the fields NAME=VALUE.
+    """Returns the statement of a run. The file overrides ``board.toml``, and NAME=VALUE overrides fields of the file.
 
     Parameters
     ----------
     own : StatedSize
-        What the run's ``board.toml`` states.
+        Sizes that the run's ``board.toml`` states.
     path : Path, optional
-        ``--statement``.
+        File of ``--statement``.
     given : sequence of str
-        ``--field``.
+        Fields of ``--field``, NAME=VALUE.
 
     Raises
     ------
     InputError
-        A file that is none, a field without ``=``, or a field twice.
+        If the file is not a statement, or a field has no ``=`` or is given twice.
     """
     file = load_toml(path, StatementFile, "statement", "give a TOML file") if path else StatementFile()
-    parts, origin = {}, {}
-    for what, first, second in (("board", own, file.board.stated()), ("target", StatedSize(), file.target.stated())):
+    sizes, origin = {}, {}
+    for body, first, second in (("board", own, file.board.stated()), ("target", StatedSize(), file.target.stated())):
         values = {}
-        for key in (each.name for each in fields(StatedSize)):
+        for key in (field.name for field in fields(StatedSize)):
             values[key] = getattr(second, key)
-            origin[what, key] = str(path)
+            origin[body, key] = str(path)
             if values[key] is None:
-                values[key], origin[what, key] = getattr(first, key), "board.toml"
-        parts[what] = StatedSize(**values)
+                values[key], origin[body, key] = getattr(first, key), "board.toml"
+        sizes[body] = StatedSize(**values)
     named = dict.fromkeys(FIELDS, "") | file.fields | fields_of(given)
-    return Statement(parts["board"], parts["target"], origin, named)
+    return Statement(sizes["board"], sizes["target"], origin, named)
 
 
 def fields_of(given: Sequence[str]) -> dict[str, str]:
-    """``NAME=VALUE`` as a dictionary; errors as of :func:`statement_of`."""
-    found: dict[str, str] = {}
+    """Parses ``NAME=VALUE`` into a dictionary. Errors are those of :func:`statement_of`."""
+    values: dict[str, str] = {}
     for text in given:
-        name, sign, value = (part.strip() for part in text.partition("="))
+        name, sign, value = (word.strip() for word in text.partition("="))
         if not sign or not name:
             raise InputError("E-OPTION-VALUE", f"--field {text!r}: NAME=VALUE needed, such as operator='A. Smith'")
-        if name in found:
+        if name in values:
             raise InputError("E-OPTION-REPEATED", f"--field {name}: given twice; give it once")
         if len(name) > 60 or len(value) > LONGEST:
             raise InputError(
                 "E-OPTION-VALUE",
                 f"--field {name[:20]}: {len(text)} characters; up to 60 for a name, {LONGEST} for a value",
             )
-        found[name] = value
-    return found
+        values[name] = value
+    return values

@@ -9,7 +9,7 @@ from stcal.sfm.budget.file import BudgetFile, LengthTestPart, SourceRow, Uncerta
 
 
 def budget_text(file: BudgetFile) -> str:
-    """Inputs, then a table each for positions, rotations and distances, then notes."""
+    """Returns the inputs, a table each for positions, rotations and distances, and the notes."""
     images = sum(each.images for each in file.views)
     groups = ", ".join(f"{each.group}: {each.images} over {each.spread_deg:.0f}°" for each in file.views)
     lines = [
@@ -32,26 +32,26 @@ def budget_text(file: BudgetFile) -> str:
 
 
 def _length_test(test: LengthTestPart) -> list[str]:
-    """Lengths, and the verdict."""
+    """Returns a table of the lengths, and the verdict."""
     rows = [("<length", "measured mm", "reference mm", "error µm", "U µm", "E_n")]
-    for each in test.lengths:
+    for length in test.lengths:
         values = (
-            f"{each.measured_mm:.4f}",
-            f"{each.reference_mm:.4f}",
-            f"{each.error_um:.2f}",
-            f"{each.expanded_um:.2f}",
+            f"{length.measured_mm:.4f}",
+            f"{length.reference_mm:.4f}",
+            f"{length.error_um:.2f}",
+            f"{length.expanded_um:.2f}",
         )
-        rows.append((name_of(each.circles), *values, number(each.e_n, 2)))
+        rows.append((name_of(length.circles), *values, number(length.e_n, 2)))
     return [
         f"length test against {test.reference}:",
         *text_table(rows),
         verdict_of(test),
-        *(f"note: {each}" for each in test.notes),
+        *(f"note: {length}" for length in test.notes),
     ]
 
 
 def verdict_of(test: LengthTestPart) -> str:
-    """In words."""
+    """Returns the verdict of a length test in words."""
     count = len(test.lengths)
     return (
         f"{'agrees' if test.agrees else 'differs'}: {test.beyond} of {count} lengths beyond U, by chance 1 in 22 is; "
@@ -64,7 +64,7 @@ def _known(test: LengthTestPart) -> list[float]:
 
 
 def name_of(circles: Sequence[str]) -> str:
-    """Of a length, by its ends."""
+    """Returns the name of a length, made from its ends."""
     return "–".join(circles)
 
 
@@ -75,19 +75,19 @@ def _length(row, file: BudgetFile) -> str:
 
 def _inputs(sources: Sequence[SourceRow]) -> list[str]:
     rows = [("<input", "u", "<", "<type", "<σ is", "<from")]
-    for each in sources:
-        sigma = "–" if each.sigma is None else f"{each.sigma:.3g}"
-        unit = "" if each.sigma is None else each.unit
-        rows.append((each.title, sigma, unit, each.evaluation, each.origin, each.words))
+    for source in sources:
+        sigma = "–" if source.sigma is None else f"{source.sigma:.3g}"
+        unit = "" if source.sigma is None else source.unit
+        rows.append((source.title, sigma, unit, source.evaluation, source.origin, source.words))
     return text_table(rows)
 
 
 def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> list[str]:
-    """Contributions by input, combined and expanded uncertainty; a column for each measurand."""
+    """Returns contributions by input, and combined and expanded uncertainty, with a column for each measurand."""
     rows = [(f"<{title}", *columns)]
-    for each in file.sources:
-        if each.origin != "not stated" or any(u.contributions[each.key] for u in columns.values()):
-            rows.append((each.title, *(f"{u.contributions[each.key]:.2f}" for u in columns.values())))
+    for source in file.sources:
+        if source.origin != "not stated" or any(u.contributions[source.key] for u in columns.values()):
+            rows.append((source.title, *(f"{u.contributions[source.key]:.2f}" for u in columns.values())))
     k = file.coverage_factor
     rows += [
         ("combined standard uncertainty u", *(f"{u.standard:.2f}" for u in columns.values())),

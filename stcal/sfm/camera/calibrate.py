@@ -1,4 +1,4 @@
-"""Calibrate a camera from photographs of the dot board, nothing known: the calls in order, and what they found."""
+"""Calibration of an unknown camera from photographs of the dot board: the calls in order, and their result."""
 
 import tempfile
 from collections.abc import Callable, Sequence
@@ -34,11 +34,11 @@ MIN_VIEWS = 3
 PERSPECTIVE, WIDE = "OPENCV", "OPENCV_FISHEYE"
 MAX_ROUNDS = 5
 SETTLED_SIGMAS = 0.1
-"""Detection rounds end when the next one would move no parameter by more than this, in its σ."""
+"""Largest move of a parameter by the next detection round, in its σ, at which the rounds end."""
 MAX_FOCAL_SIGMA = 0.01
-"""Relative; beyond it the boards do not determine the focal length."""
+"""Largest relative σ of the focal length. Beyond it the boards do not determine the focal length."""
 MAX_RESIDUAL_PX = 1.0
-"""RMS; beyond it the camera model, or the board file, is not that of the images."""
+"""Largest RMS residual. Beyond it the camera model or the board file does not fit the images."""
 SUSPICIOUS_FACTOR = 3.0
 OUTLIER_WEIGHT = 0.5
 CORNERS = ("top left", "top right", "bottom left", "bottom right")
@@ -46,10 +46,13 @@ CORNERS = ("top left", "top right", "bottom left", "bottom right")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
-    """``intrinsics`` with covariance; ``views`` that it rests on; ``skipped`` files and images without a board, and
-    why; ``rounds`` of detection; ``projection`` σ over the image; ``split`` None with fewer than six views;
-    ``held_out`` None with fewer than four; ``candidates`` : lens models that were tried, empty where one was given;
-    ``warnings`` : what makes the result worse than its σ may say, and what to do."""
+    """Result of calibrating one camera.
+
+    ``intrinsics`` : with covariance; ``views`` : views used; ``skipped`` : files and images without a board, and why;
+    ``rounds`` : number of detection rounds; ``projection`` : σ over the image; ``split`` : None with fewer than six
+    views; ``held_out`` : None with fewer than four; ``candidates`` : lens models that were tried, empty if a model was
+    given; ``warnings`` : problems that the σ may not show, and what to do about them.
+    """
 
     intrinsics: Intrinsics
     views: tuple[ImageObservations, ...]
@@ -72,40 +75,39 @@ def calibrate_camera(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> CameraCalibration:
-    """Intrinsics from a folder of photographs that show the board.
+    """Calibrates the intrinsics from a folder of photographs that show the board.
 
-    The start needs no knowledge of the lens: labels do not depend on the focal length, and the closed form finds it.
-    Ellipses are fitted in undistorted coordinates, so detection is repeated with the camera found. Closed form: Zhang
-    (2000).
+    The start needs no knowledge of the lens: labels do not depend on the focal length, and a closed form estimates it.
+    Ellipses are fitted in undistorted coordinates, so detection is repeated with the calibrated camera. Closed form:
+    Zhang (2000).
 
     Parameters
     ----------
     images : path
         Folder of photographs, or of folders of them.
     target : TargetDesign
-        What else may be in view, so that its circles are not taken for dots.
+        Target that may also be in view; its circles are then not taken for dots.
     board : BoardDesign
         The dot board, mm, with the σ of its dots.
     colmap_model : str
-        COLMAP's camera model to adjust, such as ``OPENCV``; or ``auto``, the simplest that foretells held-out views as
-        well as the best of all.
+        COLMAP's camera model to adjust, such as ``OPENCV``; or ``auto``, the simplest model that predicts held-out
+        views as well as the best one.
     ellipses : EllipseOptions, optional
-        Of detection; the defaults where None.
+        Options of detection; the defaults if None.
     workers : int, optional
-        Processes; one per core where None.
+        Number of processes; one per core if None.
     progress : callable, optional
         Called with (stage, done, total).
 
     Returns
     -------
     CameraCalibration
-        Intrinsics with the covariance of their parameters, px and OpenCV's pixel origin; what they rest on, and what to
-        look at.
+        Intrinsics with the covariance of their parameters, px and OpenCV's pixel origin; the views used, and warnings.
 
     Raises
     ------
     StcalError
-        One of its kinds, with a one-line message that says what to do.
+        A stage failed. The one-line message says what to do.
     """
     if colmap_model == AUTO:
         return of_chosen_model(
@@ -113,7 +115,7 @@ def calibrate_camera(
         )
     require_model(colmap_model)
     progress = progress or (lambda *_: None)
-    files, other = find_images(images)
+    files, not_images = find_images(images)
     camera = start_camera(*first_size(files), colmap_model)
     before: Intrinsics | None = None
     settled = False
@@ -123,7 +125,7 @@ def calibrate_camera(
                 files, camera, colmap_model, target, board, ellipses, Path(cache), workers, progress, rounds
             )
             views = board_views(detection.images, board, camera)
-            skipped = (*other, *detection.skipped, *_without_board(detection, views))
+            skipped = (*not_images, *detection.skipped, *_without_board(detection, views))
             require_views(views, len(files), skipped)
             start = camera if before else closed_form(views, board, camera)
             result = adjust_intrinsics(views, board, start, colmap_model)
@@ -137,12 +139,12 @@ def calibrate_camera(
 
 
 def require_model(colmap_model: str) -> None:
-    """Refuse a lens model that is none of ours.
+    """Checks that a lens model is supported.
 
     Raises
     ------
     InputError
-        With those there are.
+        It is not. The message lists the supported models.
     """
     if colmap_model not in COLMAP_MODELS:
         raise InputError(
@@ -154,9 +156,10 @@ def require_model(colmap_model: str) -> None:
 def of_chosen_model(
     calibrate: Callable[[str], CameraCalibration], board: BoardDesign, workers: int | None
 ) -> CameraCalibration:
-    """A calibration with the model that held-out views choose; ``calibrate`` : with a model's name.
+    """Returns a calibration with the lens model selected by held-out views.
 
-    Views are found with the usual perspective lens, or where that does not fit, with the usual wide one.
+    ``calibrate`` : calibrates with the model of the given name. Views are found with the usual perspective model, or,
+    if that does not fit, with the usual wide-angle model.
     """
     try:
         first = calibrate(PERSPECTIVE)
@@ -178,30 +181,35 @@ def judged(
     settled: bool,
     board: BoardDesign,
 ) -> CameraCalibration:
-    """A calibration with σ over the image, split-half check and warnings; ``settled`` : whether detection was."""
+    """Returns a calibration with σ over the image, split-half check, held-out views and warnings.
+
+    ``settled`` : whether the detection rounds converged.
+    """
     projection = projection_sigma(result)
     split = split_half(result, views, board)
     warnings = [*_of_rounds(result, settled), *_warnings(result, projection, split, board)]
     try:
-        foretold = held_out(views, board, result.camera, result.colmap_model)
+        of_held_out = held_out(views, board, result.camera, result.colmap_model)
     except StcalError as error:
-        foretold = None
+        of_held_out = None
         warnings.append(f"no views could be held out, as the others alone are too few: {error}")
-    return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, foretold, tuple(warnings))
+    return CameraCalibration(result, tuple(views), skipped, rounds, projection, split, of_held_out, tuple(warnings))
 
 
 def rejudged(before: CameraCalibration, result: Intrinsics, board: BoardDesign) -> CameraCalibration:
-    """A calibration whose camera others have helped to determine: σ over the image and warnings are those of
-    ``result``, checks by halves and views held out those of the camera alone."""
+    """Returns a camera's calibration with the intrinsics ``result`` of a joint adjustment.
+
+    σ over the image and warnings are those of ``result``; both checks are those of the camera alone.
+    """
     projection = projection_sigma(result)
     stale = _warnings(before.intrinsics, before.projection, before.split, board)
-    kept = [each for each in before.warnings if each not in stale]
-    warnings = (*kept, *_warnings(result, projection, before.split, board))
+    still_true = [each for each in before.warnings if each not in stale]
+    warnings = (*still_true, *_warnings(result, projection, before.split, board))
     return replace(before, intrinsics=result, projection=projection, warnings=warnings)
 
 
 def first_size(files: list[ImageFile]) -> tuple[int, int]:
-    """Width and height of the first readable image."""
+    """Returns width and height of the first readable image."""
     for file in files:
         try:
             height, width = decode(read_bytes(file.path, IMAGE_BYTES), file.name).shape
@@ -216,33 +224,33 @@ def first_size(files: list[ImageFile]) -> tuple[int, int]:
 def _detect(
     files, camera: Camera, colmap_model: str, target, board, ellipses, cache: Path, workers, progress, rounds: int
 ) -> DetectionResult:
-    # No size: the first readable image has it, and messages should say so.
+    # No size is given: it comes from the first readable image, and messages should say so.
     model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
     step = counted(progress, f"detect {rounds}", len(files))
     return detect_files(files, model, target, board, ellipses or EllipseOptions(), cache, workers, step)
 
 
 def _without_board(detection: DetectionResult, views: Sequence[ImageObservations]) -> list[Skipped]:
-    seen = {view.name for view in views}
+    names_with_board = {view.name for view in views}
     return [
         Skipped(
             image.file.name,
             "the board is in view more than once" if "board" in image.detection.repeated else "no board recognised",
         )
         for image in detection.images
-        if image.file.name not in seen
+        if image.file.name not in names_with_board
     ]
 
 
 def require_views(views: Sequence[ImageObservations], files: int, skipped: Sequence[Skipped]) -> None:
-    """Refuse too few views of the board.
+    """Checks that there are enough views of the board.
 
     Raises
     ------
     DetectionError
-        None at all.
+        There are none.
     DegenerateError
-        Fewer than three.
+        There are fewer than three.
     """
     if len(views) >= MIN_VIEWS:
         return
@@ -261,11 +269,12 @@ def require_views(views: Sequence[ImageObservations], files: int, skipped: Seque
 
 
 def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -> None:
-    """Refuse what the views do not determine, or the model does not describe.
+    """Checks that the views determine the focal length and that the lens model fits them.
 
     Raises
     ------
     DegenerateError
+        One of them is not so.
     """
     relative = float((result.sigma()[0] / result.camera.focal[0]).max())
     if relative > MAX_FOCAL_SIGMA:
@@ -285,20 +294,20 @@ def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -
 
 
 def residual_rms_px(result: Intrinsics) -> float:
-    """RMS per coordinate."""
+    """Returns the RMS of the residuals per coordinate, px."""
     return float(np.sqrt((result.residuals_px() ** 2).mean()))
 
 
 def _spread_deg(result: Intrinsics) -> float:
-    """Largest angle between the normals of two boards as the camera sees them."""
+    """Returns the largest angle between the normals of two boards in the camera frame."""
     normals = np.array([pose.rotation[:, 2] for model in result.models for pose in model.camera_from_model])
     return float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1, 1))))
 
 
 def _next_move(before: Intrinsics, after: Intrinsics) -> float:
-    """What another round of detection would move, in σ.
+    """Returns the predicted largest move of a parameter by another round of detection, in σ.
 
-    Less than the last round did, in the ratio in which that moved the camera less than the first round, which began
+    It is the last move, reduced by the ratio of the last move of projections to that of the first round, which began
     without distortion.
     """
     moved = model_parameters(after.camera, after.colmap_model) - model_parameters(before.camera, before.colmap_model)
@@ -309,21 +318,21 @@ def _next_move(before: Intrinsics, after: Intrinsics) -> float:
 
 
 def _of_rounds(result: Intrinsics, settled: bool) -> list[str]:
-    """What had not come to rest when the rounds were used up."""
-    found = []
+    """Returns warnings about iterations that had not converged after the last round."""
+    warnings = []
     if not settled:
-        found.append(
+        warnings.append(
             f"the camera still moves after {MAX_ROUNDS} rounds of detection; add views, or choose a simpler --model"
         )
     if not result.settled:
-        found.append("the σ of centres and dots still change when the rounds end; look at the outliers")
-    return found
+        warnings.append("the σ of centres and dots still change when the rounds end; look at the outliers")
+    return warnings
 
 
 def _warnings(
     result: Intrinsics, projection: ProjectionSigma, split: SplitHalf | None, board: BoardDesign
 ) -> list[str]:
-    """What a user should look at, and do."""
+    """Returns warnings, and what the user should do about them."""
     warnings = [
         f"no dots near the corner {corner}: they reach {100 * reach:.0f} %, {100 * MIN_REACH:.0f} % advised, "
         f"the distortion is extrapolated there, σ of a projection {sigma:.3f} px; add views with the board in it"

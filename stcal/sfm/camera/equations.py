@@ -1,8 +1,8 @@
-"""The equations of a camera calibration: of one camera, of several on the same boards, or of a rig of cameras.
+"""The normal equations of a camera calibration: one camera, several on the same boards, or a rig of cameras.
 
-A view of camera k at an instant t has the pose ``camera_k_from_first @ first_from_board[t]``; cameras that are no rig
-have instants of their own, and none sits anywhere on another. Poses are reduced away instant by instant, then the dots
-of each board; what is kept are the intrinsics of all cameras and, of a rig, where they sit (Helmert blocking).
+A view of camera k at an instant t has the pose ``camera_k_from_first @ first_from_board[t]``. Cameras that are not on a
+rig have separate instants and no relative poses. Poses are eliminated instant by instant, then the dots of each board.
+The remaining unknowns are the intrinsics of all cameras and, for a rig, their poses on it (Helmert blocking).
 """
 
 from dataclasses import dataclass, replace
@@ -21,24 +21,23 @@ from stcal.sfm.data.model import MetricModel
 
 MAX_STEPS = 200
 EXACTLY = 1e-15
-"""Share of χ² that the last step may promise …"""
+"""Largest relative decrease of χ² predicted for a step at convergence …"""
 SETTLED_PX = 1e-6
-"""… or by less than this it moves every projection: along a valley there is always more to gain, and nothing to see."""
+"""… or largest move of a projection. Along a valley χ² may decrease forever without a visible change."""
 TINY_PX = 1e-3
-"""Focal length of no lens."""
+"""Focal length that stands for invalid parameters."""
 CREEPING_PX = 1e-3
-"""Moves below this after all steps are along a direction that hardly changes the images: its σ says so."""
+"""Largest move of a projection accepted after all steps: a direction that hardly changes the images has a large σ."""
 START_DAMPING = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Unknowns.
+    """Unknowns of a calibration.
 
-    ``models`` : what one camera saw of one folder's board; ``folder``, ``camera_of`` : of each model, those of one
-    folder share their points; ``instant_of`` : (m,) of each model's images, place among its folder's poses;
-    ``first_from_board`` : these poses, by folder; ``cameras`` ; ``camera_from_first`` : where each sits on a rig,
-    empty where they are none.
+    ``models`` : views of one folder's board by one camera each; ``folder``, ``camera_of`` : of each model; models of
+    one folder share their points; ``instant_of`` : (m,) index of each image of a model among the poses of its folder;
+    ``first_from_board`` : these poses, by folder; ``camera_from_first`` : poses on the rig, empty without a rig.
     """
 
     models: tuple[MetricModel, ...]
@@ -50,14 +49,14 @@ class State:
     camera_from_first: tuple[Rigid, ...] = ()
 
     def boards(self) -> dict[str, list[int]]:
-        """Models by folder."""
+        """Returns the indices of the models by folder."""
         members: dict[str, list[int]] = {}
         for i, folder in enumerate(self.folder):
             members.setdefault(folder, []).append(i)
         return members
 
     def seen(self) -> "State":
-        """With the views' poses as those of instants and cameras are."""
+        """Returns the state with the views' poses computed from those of instants and cameras."""
         return replace(
             self, models=tuple(replace(m, camera_from_model=self._poses(i)) for i, m in enumerate(self.models))
         )
@@ -71,25 +70,30 @@ class State:
         return bool(self.camera_from_first) and k > 0
 
     def cost(self, huber: float) -> float:
-        """χ² of the images, Huber's beyond ``huber``."""
+        """Returns the χ² of the images, with Huber's loss beyond ``huber``."""
         return sum(image_cost(m, self.cameras[k], huber) for m, k in zip(self.models, self.camera_of, strict=True))
 
     def normalised(self) -> np.ndarray:
-        """Residuals of all observations over σ, (n, 2)."""
+        """Returns the normalised residuals of all observations, (n, 2)."""
         each = zip(self.models, self.camera_of, strict=True)
         return np.concatenate([normalised(m, self.cameras[k]) for m, k in each])
 
     def redundancy(self, kept: int) -> int:
-        """Observed coordinates less poses and the ``kept`` unknowns: the dots bring as many observations as
-        unknowns."""
+        """Returns the redundancy: observed coordinates minus unknowns of poses minus the ``kept`` unknowns.
+
+        The dots add as many observations as unknowns.
+        """
         poses = sum(len(each) for each in self.first_from_board.values())
         return sum(2 * len(m.image_index) for m in self.models) - 6 * poses - kept
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """What stays the same in one minimisation; by camera ``basis`` : (16, q) and ``weight`` : (q, q) of the vague prior
-    about ``start``. ``rig`` : whether the cameras sit on one."""
+    """Constants of one minimisation.
+
+    By camera, ``basis`` : (16, q) and ``weight`` : (q, q) of the vague prior about ``start``; ``rig`` : whether the
+    cameras are on one rig.
+    """
 
     basis: tuple[np.ndarray, ...]
     weight: tuple[np.ndarray, ...]
@@ -100,32 +104,32 @@ class Setting:
     rig: bool = False
 
     def away(self, k: int, camera: Camera) -> np.ndarray:
-        """Parameters of the COLMAP model minus those at the start, (q,)."""
+        """Returns the parameters of the COLMAP model minus those at the start, (q,)."""
         return np.linalg.pinv(self.basis[k]) @ (camera.parameters() - self.start[k].parameters())
 
     def intrinsics(self, k: int) -> slice:
-        """Place of a camera's intrinsics among the kept unknowns."""
+        """Returns the place of a camera's intrinsics among the kept unknowns."""
         ends = np.cumsum([0, *(b.shape[1] for b in self.basis)])
         return slice(int(ends[k]), int(ends[k + 1]))
 
     def sits(self, k: int) -> slice:
-        """Place of where a camera sits on the rig, (6,) or of nothing."""
+        """Returns the place of a camera's pose on the rig among the kept unknowns, 6 or empty."""
         begin = self.intrinsics(len(self.basis) - 1).stop
         return slice(begin + 6 * (k - 1), begin + 6 * k) if self.rig and k else slice(begin, begin)
 
     def of_camera(self, k: int) -> np.ndarray:
-        """Places of all that a camera's views depend on, among the kept unknowns."""
+        """Returns the indices of the kept unknowns that a camera's views depend on."""
         intrinsics, sits = self.intrinsics(k), self.sits(k)
         return np.concatenate([np.arange(intrinsics.start, intrinsics.stop), np.arange(sits.start, sits.stop)])
 
     @property
     def kept(self) -> int:
-        """How many unknowns are kept."""
+        """Number of kept unknowns."""
         return max(self.sits(len(self.basis) - 1).stop, self.intrinsics(len(self.basis) - 1).stop)
 
 
 def dots_costs(state: State, setting: Setting) -> np.ndarray:
-    """χ² of the dots' places: of the board's σ, and of its bends."""
+    """Returns the χ² of the dots' places: without the bends of boards, and of the bends."""
     each = [
         setting.shape[folder].costs(state.models[rows[0]].xyz_model, setting.sigma_mm)
         for folder, rows in state.boards().items()
@@ -142,11 +146,13 @@ def _cost(state: State, setting: Setting) -> float:
 
 
 def derivatives(state: State, setting: Setting, i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives of a model's projections, px: by its instants' poses, (n, 2, 6), by its points, (n, 2, 3), and by
-    what :meth:`Setting.of_camera` places, (n, 2, k).
+    """Returns the derivatives of a model's projections, px.
 
-    All motions are left perturbations. Of camera_k_from_first = (R, t) and first_from_board = (S, s), a turn w and a
-    shift d of the latter turn the view's pose by R w and shift it by R d; of the former, by w and by w × R s + d.
+    By the poses of its instants, (n, 2, 6), by its points, (n, 2, 3), and by the unknowns of
+    :meth:`Setting.of_camera`, (n, 2, k).
+
+    All motions are left perturbations. With camera_k_from_first = (R, t) and first_from_board = (S, s), a rotation w
+    and a shift d of the latter rotate the view's pose by R w and shift it by R d; of the former, by w and w × R s + d.
     """
     model, k = state.models[i], state.camera_of[i]
     camera = state.cameras[k]
@@ -165,7 +171,7 @@ def derivatives(state: State, setting: Setting, i: int) -> tuple[np.ndarray, np.
 
 
 def _of_board(state: State, setting: Setting, folder: str, rows: list[int]):
-    """Normal equations over a board's dots and the kept unknowns, poses reduced away, and the way back to these."""
+    """Returns the normal equations of a board's dots and the kept unknowns, and the reduction of the poses."""
     p, t = setting.shape[folder].places.size, len(state.first_from_board[folder])
     size = p + setting.kept
     full, full_right = np.zeros((size, size)), np.zeros(size)
@@ -174,21 +180,23 @@ def _of_board(state: State, setting: Setting, folder: str, rows: list[int]):
         model, k, instant = state.models[i], state.camera_of[i], state.instant_of[i]
         root = np.sqrt(robust_weights(model, state.cameras[k], setting.huber))[:, None]
         a, c, e = (model.whiten(d) * root[..., None] for d in derivatives(state, setting, i))
-        own = equations_of_poses(model, a, c, e, normalised(model, state.cameras[k]) * root)
+        equations = equations_of_poses(model, a, c, e, normalised(model, state.cameras[k]) * root)
         place = np.concatenate([np.arange(p), p + setting.of_camera(k)])
-        full[np.ix_(place, place)] += own.normal
-        full_right[place] += own.right
-        block[instant] += own.block
-        block_right[instant] += own.block_right
-        cross[np.ix_(instant, np.arange(6), place)] += own.cross
+        full[np.ix_(place, place)] += equations.normal
+        full_right[place] += equations.right
+        block[instant] += equations.block
+        block_right[instant] += equations.block_right
+        cross[np.ix_(instant, np.arange(6), place)] += equations.cross
     poses = reduce(block, block_right, cross)
     return full - poses.normal, full_right - poses.right, poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normal:
-    """Normal equations over the kept unknowns; the dots of each board are reduced away, the poses before them.
-    ``dots_left`` : redundancy of the observations of the dots."""
+    """Normal equations of the kept unknowns, after elimination of the poses and then of each board's dots.
+
+    ``dots_left`` : redundancy of the observations of the dots.
+    """
 
     cost: float
     state: State
@@ -227,7 +235,7 @@ class Normal:
         return cls(_cost(state, setting), state, setting, normal, right, tuple(boards), tuple(poses), float(dots_left))
 
     def with_flat_boards(self) -> dict[str, BoardShape]:
-        """The shapes, without bends of the boards whose bends may be chance."""
+        """Returns the shapes of the boards, without bends if these are insignificant."""
         covariance, setting = np.linalg.inv(self.normal), self.setting
         return {
             folder: setting.shape[folder].flat_by_chance(
@@ -237,17 +245,20 @@ class Normal:
         }
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Of the kept unknowns, then of the dots of each board, then of its poses."""
-        own = np.linalg.solve(self.normal + damping * np.diag(np.diag(self.normal)), self.right)
-        gain = 2 * float(own @ self.right) - float(own @ self.normal @ own)
+        """Returns the step of the kept unknowns, then of the boards' dots, then of their poses; and the predicted
+        gain."""
+        kept_step = np.linalg.solve(self.normal + damping * np.diag(np.diag(self.normal)), self.right)
+        gain = 2 * float(kept_step @ self.right) - float(kept_step @ self.normal @ kept_step)
         gain += sum(each.gain for each in (*self.boards, *self.poses))
-        dots = [board.back(own).ravel() for board in self.boards]
-        poses = [each.back(np.concatenate([moved, own])).ravel() for each, moved in zip(self.poses, dots, strict=True)]
-        step = np.concatenate([own, *dots, *poses])
+        dots = [board.back(kept_step).ravel() for board in self.boards]
+        poses = [
+            each.back(np.concatenate([moved, kept_step])).ravel() for each, moved in zip(self.poses, dots, strict=True)
+        ]
+        step = np.concatenate([kept_step, *dots, *poses])
         return step, gain if self.largest_move(step) > SETTLED_PX else 0.0
 
     def largest_move(self, step: np.ndarray) -> float:
-        """By which a step moves any projection, px."""
+        """Returns the largest move of a projection by a step, px."""
         new = moved(self.state, self.setting, step)
         moves = [
             np.abs(b.residuals_px(new.cameras[k]) - a.residuals_px(self.state.cameras[k])).max()
@@ -257,14 +268,14 @@ class Normal:
 
 
 def minimum(state: State, setting: Setting) -> State:
-    """The state of least cost: what is kept is damped, dots and poses at their best for each step of it.
+    """Returns the state of least cost. Only the kept unknowns are damped; dots and poses are optimal for each step.
 
     Raises
     ------
     ConvergenceError
-        None is reached.
+        No minimum is reached.
     """
-    found = minimise(
+    solution = minimise(
         state,
         lambda at: Normal.of(at, setting),
         lambda at, step: moved(at, setting, step),
@@ -273,39 +284,39 @@ def minimum(state: State, setting: Setting) -> State:
         settled=EXACTLY,
         max_steps=MAX_STEPS,
     )
-    if not found.converged:  # along a direction that hardly changes the images: its σ says so
-        move = found.linear.largest_move(found.linear.step(START_DAMPING)[0])
+    if not solution.converged:  # a direction that hardly changes the images has a large σ
+        move = solution.linear.largest_move(solution.linear.step(START_DAMPING)[0])
         if not move < CREEPING_PX:
             raise ConvergenceError(
                 "E-NO-MINIMUM",
-                f"camera: projections still move by {move:.1g} px after {found.steps} steps, {CREEPING_PX:g} px "
+                f"camera: projections still move by {move:.1g} px after {solution.steps} steps, {CREEPING_PX:g} px "
                 "needed; look at the images, add views that fill the image and are tilted, or choose a simpler --model",
             )
-    return found.state
+    return solution.state
 
 
 def moved(state: State, setting: Setting, step: np.ndarray) -> State:
-    """The state after a step of :meth:`Normal.step`."""
+    """Returns the state after a step of :meth:`Normal.step`."""
     boards, models = state.boards(), list(state.models)
-    own, rest = np.split(step, [setting.kept])
+    kept_step, remaining = np.split(step, [setting.kept])
     sizes = [setting.shape[folder].places.size for folder in boards]
-    *dots, rest = np.split(rest, np.cumsum(sizes))
+    *dots, remaining = np.split(remaining, np.cumsum(sizes))
     instants = np.cumsum([6 * len(state.first_from_board[folder]) for folder in boards])[:-1]
     first_from_board = {
         folder: moved_poses(state.first_from_board[folder], each.reshape(-1, 6))
-        for folder, each in zip(boards, np.split(rest, instants), strict=True)
+        for folder, each in zip(boards, np.split(remaining, instants), strict=True)
     }
     for rows, shift in zip(boards.values(), dots, strict=True):
         for i in rows:
             models[i] = replace(models[i], xyz_model=models[i].xyz_model + shift.reshape(-1, 3))
     cameras = tuple(
-        camera.with_parameters(_positive(camera.parameters() + setting.basis[k] @ own[setting.intrinsics(k)]))
+        camera.with_parameters(_positive(camera.parameters() + setting.basis[k] @ kept_step[setting.intrinsics(k)]))
         for k, camera in enumerate(state.cameras)
     )
     camera_from_first = state.camera_from_first
     if setting.rig:
-        turned = moved_poses(camera_from_first[1:], own[setting.sits(1).start :].reshape(-1, 6))
-        camera_from_first = (camera_from_first[0], *turned)
+        moved_cameras = moved_poses(camera_from_first[1:], kept_step[setting.sits(1).start :].reshape(-1, 6))
+        camera_from_first = (camera_from_first[0], *moved_cameras)
     return replace(
         state,
         models=tuple(models),
@@ -316,7 +327,7 @@ def moved(state: State, setting: Setting, step: np.ndarray) -> State:
 
 
 def _positive(parameters: np.ndarray) -> np.ndarray:
-    """Parameters of a camera; where a step leaves none, such as no image agrees with."""
+    """Returns the parameters if they are those of a camera, else parameters that no image agrees with."""
     if (parameters[:2] > 0).all() and np.isfinite(parameters).all():
         return parameters
     return np.concatenate([[TINY_PX, TINY_PX], np.zeros(len(parameters) - 2)])

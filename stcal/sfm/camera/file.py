@@ -1,4 +1,4 @@
-"""What ``calibrate-camera`` writes beside the camera file."""
+"""The JSON file that ``calibrate-camera`` writes beside the camera file."""
 
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -71,7 +71,7 @@ class OutlierRow(Part):
 
 
 class CalibrationFile(ResultFile):
-    """Of ``calibrate-camera``; pixels from the centre of the top-left pixel."""
+    """Result file of ``calibrate-camera``. Pixels count from the centre of the top-left pixel."""
 
     format: Literal["stcal camera 1"] = Field(description="the file's form and its version")
     model: str = Field(description="COLMAP model")
@@ -121,7 +121,7 @@ class CalibrationFile(ResultFile):
 
     @classmethod
     def of(cls, calibration: CameraCalibration) -> "CalibrationFile":
-        """The file of a calibrated camera."""
+        """Returns the file of a calibrated camera."""
         result, projection, split = calibration.intrinsics, calibration.projection, calibration.split
         camera, sigma, names = result.camera, result.sigma(), parameter_names(result.colmap_model)
         values = zip(names, model_parameters(camera, result.colmap_model), sigma, strict=True)
@@ -163,12 +163,12 @@ class CalibrationFile(ResultFile):
 def _views(result: Intrinsics) -> Iterator[BoardViewRow]:
     for model in result.models:
         residual = model.residuals_px(result.camera)
-        for image, pose, own in zip(model.images, model.camera_from_model, model.rows_by_image(), strict=True):
+        for image, pose, rows in zip(model.images, model.camera_from_model, model.rows_by_image(), strict=True):
             yield BoardViewRow(
                 image=image,
-                dots=len(own),
+                dots=len(rows),
                 tilt_deg=float(np.degrees(np.arccos(abs(pose.rotation[2, 2])))),
-                rms_px=float(np.sqrt((residual[own] ** 2).mean())),
+                rms_px=float(np.sqrt((residual[rows] ** 2).mean())),
             )
 
 

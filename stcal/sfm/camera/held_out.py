@@ -1,4 +1,4 @@
-"""Cross-validation of intrinsics: views that were held out, and the lens model that foretells them best."""
+"""Cross-validation of intrinsics: residuals of held-out views, and the lens model that predicts them best."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,31 +22,31 @@ from stcal.sfm.data.observations import ImageObservations, by_group
 
 FOLDS = 5
 MIN_TRAINING = 3
-"""Views to calibrate with."""
+"""Smallest number of views to calibrate with."""
 CANDIDATES = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"),
 )
 AUTO = "auto"
-"""In place of a model: the one that :func:`choose_model` takes."""
+"""Name that stands for the model selected by :func:`choose_model`."""
 LIKELY = 2.0
-"""Standard errors by which a model with fewer parameters may be worse than the best in the mean and still be taken;
-after the rule of one, Hastie, Tibshirani & Friedman 2009, The Elements of Statistical Learning, 7.10."""
+"""Number of standard errors by which a model with fewer parameters may be worse than the best and still be selected;
+after the one-standard-error rule, Hastie, Tibshirani & Friedman 2009, The Elements of Statistical Learning, 7.10."""
 HOPELESS = 3.0
-"""Times the residuals of the model that fits best; what fits worse is not tried further."""
+"""Largest ratio of a model's residuals to those of the model that fits best. Models beyond it are not tried further."""
 T = TypeVar("T")
 POSE_PASSES = 2
-"""Eccentricity of circles hardly changes with the pose."""
+"""Number of passes of pose and eccentricity. Few suffice, as eccentricity hardly changes with the pose."""
 CLIP_SIGMAS = 5.0
-"""A dot that is measured wrongly tells nothing of the lens."""
+"""Limit of residuals in σ. Gross errors of dots carry no information about the lens."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOut:
-    """Residuals of views that the calibration did not have: their poses alone were fitted to them.
+    """Residuals of views that were not used by the calibration; only the poses of these views were fitted.
 
-    ``residuals_px`` and ``in_sigma`` : by view, (n, 2), px and in the centres' own σ; ``factor`` : by which residuals
-    of the calibrations exceed those, as a median; ``folds`` .
+    ``residuals_px`` and ``in_sigma`` : by view, (n, 2), px and in the detected centres' σ; ``factor`` : median factor
+    by which residuals of the calibrations exceed these σ; ``folds`` : number of parts.
     """
 
     residuals_px: tuple[np.ndarray, ...]
@@ -55,20 +55,23 @@ class HeldOut:
     folds: int
 
     def rms_px(self, factor: float | None = None) -> float:
-        """Per coordinate, without dots that are wrong; ``factor`` : in place of the own one."""
+        """Returns the RMS per coordinate without gross errors; ``factor`` replaces the factor of this object."""
         most = CLIP_SIGMAS * (factor or self.factor)
         kept = [px[np.abs(own).max(axis=1) < most] for px, own in zip(self.residuals_px, self.in_sigma, strict=True)]
         return float(np.sqrt((np.concatenate(kept) ** 2).mean()))
 
     def squares(self, factor: float) -> np.ndarray:
-        """Mean square of each view in σ times that factor, (v,); what is beyond five counts as five."""
+        """Returns the mean square of each view in σ times ``factor``, (v,). Residuals beyond 5 count as 5."""
         return np.array([(np.minimum(np.abs(own) / factor, CLIP_SIGMAS) ** 2).mean() for own in self.in_sigma])
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A lens model: how many parameters it has, RMS of held-out views, by how much worse than the best model their mean
-    square is, in σ, and the standard error of that; ``why`` it could not be tried, or ``""``."""
+    """A lens model that was compared with others.
+
+    ``parameters`` : their number; ``rms_px`` : RMS of held-out views; ``worse`` : their mean square minus that of the
+    best model, in σ², and ``worse_sigma`` its standard error; ``why`` : why it could not be tried, or ``""``.
+    """
 
     model: str
     parameters: int
@@ -81,9 +84,9 @@ class Candidate:
 def held_out(
     views: Sequence[ImageObservations], board: BoardDesign, start: Camera, colmap_model: str, folds: int = FOLDS
 ) -> HeldOut | None:
-    """Every view held out once; None with too few views.
+    """Returns the residuals of all views, each held out once; None with too few views.
 
-    The places of the dots are those that the other views of its folder gave, with the design where there are none.
+    The places of the dots are those estimated from the other views of the folder, or design places if there are none.
 
     Raises
     ------
@@ -93,22 +96,22 @@ def held_out(
     folds = min(folds, len(views))
     if len(views) - -(-len(views) // folds) < MIN_TRAINING:
         return None
-    found: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    residuals_of_view: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     factors = []
     for fold in range(folds):
-        own = [view for i, view in enumerate(views) if i % folds == fold]
-        others = [view for i, view in enumerate(views) if i % folds != fold]
-        result = adjust_intrinsics(others, board, start, colmap_model)
+        excluded = [view for i, view in enumerate(views) if i % folds == fold]
+        training = [view for i, view in enumerate(views) if i % folds != fold]
+        result = adjust_intrinsics(training, board, start, colmap_model)
         factors.append(result.factors.centres)
-        found |= {view.name: foretold(view, board, result) for view in own}
-    residuals_px, in_sigma = zip(*(found[view.name] for view in views), strict=True)
+        residuals_of_view |= {view.name: foretold(view, board, result) for view in excluded}
+    residuals_px, in_sigma = zip(*(residuals_of_view[view.name] for view in views), strict=True)
     return HeldOut(residuals_px, in_sigma, float(np.median(factors)), folds)
 
 
 def choose_model(
     views: Sequence[ImageObservations], board: BoardDesign, known: Intrinsics, workers: int | None = None
 ) -> tuple[str, tuple[Candidate, ...]]:
-    """The simplest lens model that foretells held-out views as well as the best one, and how all of them fare.
+    """Returns the simplest lens model that predicts held-out views as well as the best one, and all candidates.
 
     Parameters
     ----------
@@ -116,26 +119,28 @@ def choose_model(
         Dots of the board, found with about the right camera.
     board : BoardDesign
     known : Intrinsics
-        Of any model that fits; where each begins, if of the same projection.
+        Intrinsics of any model that fits; start of all models of the same projection.
     workers : int, optional
-        Processes; one per core where None.
+        Number of processes; one per core if None.
 
     Raises
     ------
     StcalError
-        None can be calibrated with four fifths of the views.
+        No model can be calibrated with four fifths of the views.
     """
     fitted = dict(
         zip(CANDIDATES, _all(_fitted, [(views, board, known.camera, m) for m in CANDIDATES], workers), strict=True)
     )
-    factors = {m: each.factors.centres for m, each in fitted.items() if isinstance(each, Intrinsics)}
-    why = {m: str(each) for m, each in fitted.items() if isinstance(each, StcalError)}
+    factors = {m: entry.factors.centres for m, entry in fitted.items() if isinstance(entry, Intrinsics)}
+    why = {m: str(entry) for m, entry in fitted.items() if isinstance(entry, StcalError)}
     least = min(factors, key=factors.__getitem__, default="")
     for model, factor in factors.items():
         if factor > HOPELESS * factors[least]:
             why[model] = f"residuals {factor / factors[least]:.3g} times those of {least}"
     jobs = {
-        m: (views, board, each.camera, m) for m, each in fitted.items() if isinstance(each, Intrinsics) and m not in why
+        m: (views, board, entry.camera, m)
+        for m, entry in fitted.items()
+        if isinstance(entry, Intrinsics) and m not in why
     }
     fared: dict[str, HeldOut] = {}
     for model, outcome in zip(jobs, _all(_tried, list(jobs.values()), workers), strict=True):
@@ -144,10 +149,10 @@ def choose_model(
         else:
             why[model] = str(outcome or "too few views")
     if not fared:
-        failed = next((each for each in fitted.values() if isinstance(each, StcalError)), None)
+        failed = next((entry for entry in fitted.values() if isinstance(entry, StcalError)), None)
         raise failed if failed and not jobs else _too_few(len(views))
-    factor = min(each.factor for each in fared.values())  # one measure for all: that of the model that fits best
-    squares = {model: each.squares(factor) for model, each in fared.items()}
+    factor = min(entry.factor for entry in fared.values())  # one σ for all models: that of the model that fits best
+    squares = {model: entry.squares(factor) for model, entry in fared.items()}
     best = min(squares, key=lambda model: squares[model].mean())
     rows = [_row(model, fared.get(model), squares, best, why.get(model, "")) for model in CANDIDATES]
     as_good = [row for row in rows if row.worse is not None and row.worse <= LIKELY * (row.worse_sigma or 0.0)]
@@ -172,7 +177,7 @@ def _row(model: str, outcome: HeldOut | None, squares: dict[str, np.ndarray], be
 
 
 def _all(function: Callable[..., T], jobs: list[tuple], workers: int | None) -> list[T]:
-    """Results in the order of the jobs."""
+    """Returns the results in the order of the jobs."""
     return [result for _, result in sorted(run_parallel(function, jobs, workers), key=itemgetter(0))]
 
 
@@ -194,11 +199,13 @@ def _tried(views, board: BoardDesign, start: Camera, model: str) -> HeldOut | St
 
 
 def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (n, 2) of a view, px and in the centres' own σ, after its pose is fitted to it."""
+    """Returns the residuals (n, 2) of a view, px and in the detected centres' σ, after its pose is fitted."""
     camera = result.camera
     ((group, members),) = by_group([view]).items()
     model = model_of_views(group, view.labels, members, board, camera)
-    places = {label: xyz for own in result.models if own.group == group for label, xyz in _places(own)}
+    places = {
+        label: xyz for of_folder in result.models if of_folder.group == group for label, xyz in _places(of_folder)
+    }
     xyz = np.array([places.get(label, at) for label, at in zip(model.labels, model.xyz_model, strict=True)])
     model = replace(model, xyz_model=xyz)
     factor = result.factors.centres
@@ -212,8 +219,8 @@ def foretold(view: ImageObservations, board: BoardDesign, result: Intrinsics) ->
             return moved.whiten(moved.residuals_px(camera)).ravel() / factor
 
         depth = float(np.linalg.norm(begin.camera_from_model[0].translation))
-        found = least_squares(left, np.zeros(6), loss="huber", f_scale=2.0, x_scale=[1, 1, 1, depth, depth, depth])
-        model = replace(model, camera_from_model=moved_poses(begin.camera_from_model, found.x[None]))
+        solution = least_squares(left, np.zeros(6), loss="huber", f_scale=2.0, x_scale=[1, 1, 1, depth, depth, depth])
+        model = replace(model, camera_from_model=moved_poses(begin.camera_from_model, solution.x[None]))
     residual = model.residuals_px(camera)
     return residual, model.whiten(residual)
 

@@ -1,9 +1,9 @@
 """Intrinsics from views of the dot board: one adjustment over intrinsics, board poses and the board's own shape.
 
-Every image has its own pose of the board. The dots of a folder's images are those of one board in one state: their
-places are unknowns, and the design is an observation of them with the board's σ; scale does not matter here. That the
-board is bowed or twisted as a whole, by far more than its dots are off, is left free where the images show it. The
-image of a *circle* is the model. σ of the centres and of the dots are estimated too (variance components).
+Every image has its own pose of the board. All images of a folder show one board in one state: the places of its dots
+are unknowns, and the design observes them with the board's σ; scale does not matter here. Bending and twisting of
+the whole board, which is far larger than deviations of single dots, is free if the images show it. The model is the
+image of a *circle*. σ of the centres and of the dots are estimated too (variance components).
 """
 
 from collections.abc import Sequence
@@ -28,23 +28,22 @@ from stcal.sfm.data.observations import ImageObservations, by_group
 
 MAX_ROUNDS = 20
 FLAT_AFTER = 2
-"""Rounds after which σ are known well enough to tell which boards are flat."""
+"""Number of rounds after which σ are known well enough to test which boards are flat."""
 SETTLED_FACTOR = 0.005
 """Rounds end when no variance component moves by more than this …"""
 SETTLED_SHIFT_PX = 1e-5
 """… and no eccentricity by more than this."""
 LEAST_ROBUST = 1e-6
-"""Robust σ of residuals over σ: exact data have none."""
+"""Smallest robust σ of normalised residuals, for exact data."""
 LEAST_DOTS = 0.1
-"""Dots may be nearer to the grid than the board file says, but none is exact."""
+"""Smallest factor of the dots' σ: dots may be more accurate than the board file states, but never exact."""
 MIN_BOARD_REDUNDANCY = 20.0
-"""Below that the dots' residuals do not tell their σ, and the stated one stands."""
+"""Smallest redundancy of the dots for estimating their σ. Below it the σ of the board file is kept."""
 
 
 @dataclass(frozen=True, slots=True)
 class SigmaFactors:
-    """By how much residuals exceed the σ that the centres came with (``centres``) and that the board file states
-    for the dots (``dots``)."""
+    """Ratios of residuals to the detected centres' σ (``centres``), and to the board file's σ of dots (``dots``)."""
 
     centres: float = 1.0
     dots: float = 1.0
@@ -52,10 +51,13 @@ class SigmaFactors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Intrinsics:
-    """``cameras`` adjusted, c of them; ``covariance`` : (cq, cq) of the parameters of ``colmap_model``, camera by
-    camera; ``models`` : the boards as seen by each camera, one for each folder, mm, board frame; ``camera_of`` each;
-    ``factors`` ; ``huber`` : the length of a normalised residual beyond which it weighs less; ``redundancy`` ;
-    ``settled`` : whether σ and eccentricities did within :data:`MAX_ROUNDS`."""
+    """Intrinsics of c cameras after the adjustment.
+
+    ``covariance`` : (cq, cq) of the parameters of ``colmap_model``, camera by camera; ``models`` : views of one
+    folder's board by one camera, mm, board frame; ``camera_of`` : camera of each model; ``huber`` : length of a
+    normalised residual beyond which its weight decreases; ``settled`` : whether σ and eccentricities converged within
+    :data:`MAX_ROUNDS`.
+    """
 
     cameras: tuple[Camera, ...]
     colmap_model: str
@@ -69,35 +71,35 @@ class Intrinsics:
 
     @property
     def camera(self) -> Camera:
-        """The first camera, the only one but for a comparison."""
+        """The first camera. There are others only in a comparison of cameras."""
         return self.cameras[0]
 
     def sigma(self) -> np.ndarray:
-        """Standard deviations of the parameters, (cq,)."""
+        """Returns the standard deviations of the parameters, (cq,)."""
         return np.sqrt(np.diag(self.covariance))
 
     def residuals_px(self) -> np.ndarray:
-        """Of all observations, (n, 2)."""
+        """Returns the residuals of all observations, (n, 2)."""
         parts = [m.residuals_px(self.cameras[k]) for m, k in zip(self.models, self.camera_of, strict=True)]
         return np.concatenate(parts)
 
     def weights(self) -> list[np.ndarray]:
-        """Huber's, for each model."""
+        """Returns the Huber weights of each model."""
         return [
             robust_weights(m, self.cameras[k], self.huber) for m, k in zip(self.models, self.camera_of, strict=True)
         ]
 
 
 def model_parameters(camera: Camera, colmap_model: str) -> np.ndarray:
-    """Parameters of a COLMAP model, (q,), with OpenCV's pixel origin."""
+    """Returns the parameters of a COLMAP model, (q,), with OpenCV's pixel origin."""
     return np.linalg.pinv(intrinsic_basis(colmap_model)) @ camera.parameters()
 
 
 def vague_prior(camera: Camera, colmap_model: str) -> np.ndarray:
-    """Covariance (q, q) of what any lens fulfils: it only keeps the normal matrix regular.
+    """Returns the covariance (q, q) of a prior that any lens fulfils. It only keeps the normal matrix regular.
 
-    σ: focal length 100 %, centre a quarter of the longer side, each distortion coefficient what moves the corner of
-    the image by its own distance from the middle (tangential: a tenth of it).
+    σ: focal length 100 %; principal point a quarter of the longer side; each distortion coefficient the value that
+    moves the image's corner by its distance from the middle (tangential: by a tenth of it).
     """
     side = max(camera.width, camera.height)
     reach = float(np.hypot(camera.width, camera.height) / 2 / camera.focal.mean())
@@ -117,14 +119,14 @@ def adjust_intrinsics(
     factors: SigmaFactors | None = None,
     held: bool = False,
 ) -> Intrinsics:
-    """Adjust the intrinsics from ``start``.
+    """Adjusts the intrinsics from ``start``.
 
     Parameters
     ----------
-    views : board dots alone, at least three views
-    camera_of_view : which camera took each view, for a comparison of cameras 0, 1, … on the same boards
-    factors : taken as known; estimated where None
-    held : the intrinsics stay at ``start``, poses and board alone are adjusted; ``covariance`` is (0, 0) then
+    views : at least three views, with dots of the board only
+    camera_of_view : camera of each view, for a comparison of cameras 0, 1, … on the same boards
+    factors : known factors of σ; estimated if None
+    held : if True, intrinsics stay at ``start``, only poses and boards are adjusted, and ``covariance`` is (0, 0)
 
     Raises
     ------
@@ -144,30 +146,30 @@ def adjust_intrinsics(
         sigma_mm=board.sigma_mm,
         huber=np.inf,
     )
-    found = adjusted(state, setting, board, factors)
-    covariance = np.linalg.inv(found.last.normal)
+    adjustment = adjusted(state, setting, board, factors)
+    covariance = np.linalg.inv(adjustment.last.normal)
     return Intrinsics(
-        cameras=found.state.cameras,
+        cameras=adjustment.state.cameras,
         colmap_model=colmap_model,
         covariance=(covariance + covariance.T) / 2,
-        models=found.state.models,
-        camera_of=found.state.camera_of,
-        factors=found.factors,
-        huber=found.setting.huber,
-        redundancy=found.state.redundancy(setting.kept),
-        settled=found.settled,
+        models=adjustment.state.models,
+        camera_of=adjustment.state.camera_of,
+        factors=adjustment.factors,
+        huber=adjustment.setting.huber,
+        redundancy=adjustment.state.redundancy(setting.kept),
+        settled=adjustment.settled,
     )
 
 
 def design_shapes(state: State, board: BoardDesign) -> dict[str, BoardShape]:
-    """By folder, of the dots that it shows."""
+    """Returns the design shape of the visible dots by folder."""
     labels = {folder: state.models[rows[0]].labels for folder, rows in state.boards().items()}
     return {folder: BoardShape.of(board.places_mm(own)) for folder, own in labels.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
-    """Where the rounds of an adjustment ended; ``last`` : its normal equations; ``settled`` : whether they settled."""
+    """Result of an adjustment; ``last`` : its normal equations; ``settled`` : whether the rounds converged."""
 
     state: State
     setting: Setting
@@ -177,26 +179,26 @@ class Adjusted:
 
 
 def adjusted(state: State, setting: Setting, board: BoardDesign, known: SigmaFactors | None = None) -> Adjusted:
-    """Minimise, estimate σ and eccentricity, and again, until these settle.
+    """Alternates minimisation and estimation of σ and eccentricity until these converge.
 
     Parameters
     ----------
-    state, setting : where it begins; its models have the centres' own σ
-    known : factors of σ; estimated where None
+    state, setting : start; the models of the state have the detected centres' σ
+    known : factors of σ; estimated if None
 
     Raises
     ------
     ConvergenceError
         No minimum is reached.
     """
-    own, factors = [m.covariance_px2 for m in state.models], known or SigmaFactors()
+    detected_covariance, factors = [m.covariance_px2 for m in state.models], known or SigmaFactors()
     last: Normal | None = None
     settled = False
-    for done in range(MAX_ROUNDS):
-        if last is not None and done == FLAT_AFTER:
+    for round_index in range(MAX_ROUNDS):
+        if last is not None and round_index == FLAT_AFTER:
             setting = replace(setting, shape=last.with_flat_boards())
         before = state
-        state = _weighted(state, own, factors, board)
+        state = _weighted(state, detected_covariance, factors, board)
         shifted = max(np.abs(a.shift_px - b.shift_px).max() for a, b in zip(state.models, before.models, strict=True))
         setting = replace(setting, sigma_mm=factors.dots * board.sigma_mm)
         state = minimum(state, setting)
@@ -206,7 +208,7 @@ def adjusted(state: State, setting: Setting, board: BoardDesign, known: SigmaFac
         updated = known or _updated_factors(last, factors)
         change = max(abs(updated.centres / factors.centres - 1), abs(updated.dots / factors.dots - 1))
         factors = updated
-        settled = bool(done >= FLAT_AFTER and change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
+        settled = bool(round_index >= FLAT_AFTER and change < SETTLED_FACTOR and shifted < SETTLED_SHIFT_PX)
         if settled:
             break
     assert last is not None
@@ -214,25 +216,25 @@ def adjusted(state: State, setting: Setting, board: BoardDesign, known: SigmaFac
 
 
 def _start_state(views, camera_of_view, board: BoardDesign, start: Camera) -> State:
-    models, folders, which, instants = [], [], [], []
+    models, folders, camera_numbers, instants = [], [], [], []
     camera_of = {v.name: k for v, k in zip(views, camera_of_view, strict=True)}
     poses: dict[str, tuple[Rigid, ...]] = {}
     for folder, members in by_group(views).items():
         labels = tuple(sorted({label for v in members for label in v.labels}))
         for k in sorted({camera_of[v.name] for v in members}):
-            own = [v for v in members if camera_of[v.name] == k]
-            models.append(model_of_views(folder, labels, own, board, start))
+            of_camera = [v for v in members if camera_of[v.name] == k]
+            models.append(model_of_views(folder, labels, of_camera, board, start))
             folders.append(folder)
-            which.append(k)
-            known = poses.get(folder, ())
-            instants.append(len(known) + np.arange(len(own)))
-            poses[folder] = known + models[-1].camera_from_model
-    cameras = (start,) * (max(which) + 1)
-    return State(tuple(models), tuple(folders), tuple(which), tuple(instants), poses, cameras)
+            camera_numbers.append(k)
+            poses_so_far = poses.get(folder, ())
+            instants.append(len(poses_so_far) + np.arange(len(of_camera)))
+            poses[folder] = poses_so_far + models[-1].camera_from_model
+    cameras = (start,) * (max(camera_numbers) + 1)
+    return State(tuple(models), tuple(folders), tuple(camera_numbers), tuple(instants), poses, cameras)
 
 
 def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDesign, camera: Camera) -> MetricModel:
-    """The views of a folder around its board, which stands still, at its design's places."""
+    """Returns the model of a folder's views of its board, with the dots at their design places."""
     place = {label: i for i, label in enumerate(labels)}
     rows = [(i, place[label], k) for i, v in enumerate(views) for k, label in enumerate(v.labels)]
     image_index, point_index, keypoint = np.array(rows).T
@@ -252,7 +254,7 @@ def model_of_views(folder: str, labels: tuple[Label, ...], views, board: BoardDe
 
 
 def _weighted(state: State, own: list[np.ndarray], factors: SigmaFactors, board: BoardDesign) -> State:
-    """The state with the centres' σ scaled, and the eccentricity as it is now."""
+    """Returns the state with scaled σ of the centres and updated eccentricity."""
     radius: dict[Label, float] = {**board.radius_of()}
     models = tuple(
         replace(
@@ -266,10 +268,10 @@ def _weighted(state: State, own: list[np.ndarray], factors: SigmaFactors, board:
 
 
 def _updated_factors(last: Normal, factors: SigmaFactors) -> SigmaFactors:
-    """Variance components of centres and dots (Förstner 1979), each from its own residuals and redundancy."""
+    """Returns variance components of centres and dots (Förstner 1979), each from its own residuals and redundancy."""
     state, setting = last.state, last.setting
-    image_left = state.redundancy(setting.kept) - last.dots_left
+    image_redundancy = state.redundancy(setting.kept) - last.dots_left
     dots = factors.dots
     if last.dots_left > MIN_BOARD_REDUNDANCY:
         dots = max(LEAST_DOTS, dots * sigma_factor(dots_costs(state, setting)[0], last.dots_left))
-    return SigmaFactors(factors.centres * sigma_factor(state.cost(setting.huber), image_left), dots)
+    return SigmaFactors(factors.centres * sigma_factor(state.cost(setting.huber), image_redundancy), dots)

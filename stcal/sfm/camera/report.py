@@ -1,4 +1,4 @@
-"""The page of ``calibrate-camera``: how well every place of the image is known, and what the lens model leaves."""
+"""The page of ``calibrate-camera``: σ of projections over the image, and residuals of the lens model."""
 
 import numpy as np
 
@@ -12,15 +12,15 @@ from stcal.sfm.camera.file import CalibrationFile
 from stcal.sfm.camera.trust import GRID, projection_jacobian
 
 CELLS = (12, 8)
-"""Of the picture of residuals."""
+"""Number of cells of the figure of residuals, in x and y."""
 MIN_IN_CELL = 3
 ARROW_SHARE = 0.7
-"""Of a cell: how long the longest mean residual is drawn."""
+"""Largest length of a drawn mean residual, as a share of the cell."""
 MOST_ROWS = 500
 
 
 def calibration_page(result: CameraCalibration, summary: CalibrationFile, where: str) -> str:
-    """The report of ``calibrate-camera``."""
+    """Returns the report of ``calibrate-camera``."""
     intrinsics = result.intrinsics
     return render(
         "sfm/camera/page.html.jinja",
@@ -69,14 +69,14 @@ def _image_axes(result: CameraCalibration):
 
 
 def _map(result: CameraCalibration, values: np.ndarray, label: str):
-    """Values (n,) over the grid of the image, as colours and lines; dots where they were seen."""
+    """Returns a figure of values (n,) over the image's grid as filled contours, with the measured dots."""
     figure, axes = _image_axes(result)
     grid = result.projection.xy_px.reshape(*GRID[::-1], 2)
     shown = values.reshape(GRID[::-1])
-    drawn = axes.contourf(grid[..., 0], grid[..., 1], shown, levels=12, cmap="viridis")
+    contours = axes.contourf(grid[..., 0], grid[..., 1], shown, levels=12, cmap="viridis")
     for model in result.intrinsics.models:
         axes.plot(*model.measured_px.T, ".", color="white", markersize=1.0, alpha=0.5)
-    bar = figure.colorbar(drawn, ax=axes, shrink=0.85, pad=0.02)
+    bar = figure.colorbar(contours, ax=axes, shrink=0.85, pad=0.02)
     bar.set_label(label, fontsize=SMALL + 0.5, color=INK)
     bar.ax.tick_params(labelsize=SMALL)
     return uri(figure)
@@ -94,20 +94,20 @@ def _halves(result: CameraCalibration) -> str | None:
 
 
 def residual_map(result: CameraCalibration) -> str:
-    """Means over cells of the image: what the model leaves is alike in neighbours, noise is not."""
+    """Returns a figure of mean residuals over cells of the image. Model errors are alike in neighbouring cells."""
     figure, axes = _image_axes(result)
     camera = result.intrinsics.camera
     xy = np.concatenate([model.measured_px for model in result.intrinsics.models])
     weight = np.concatenate(result.intrinsics.weights())
-    left = result.intrinsics.residuals_px()
+    residuals = result.intrinsics.residuals_px()
     size = np.array([camera.width, camera.height]) / CELLS
     cell = np.clip((xy / size).astype(int), 0, np.array(CELLS) - 1)
     index = cell[:, 0] * CELLS[1] + cell[:, 1]
     count = np.bincount(index, weight, CELLS[0] * CELLS[1])
-    seen = count >= MIN_IN_CELL
-    mean = np.stack([np.bincount(index, weight * left[:, i], len(count)) for i in range(2)], axis=1)
-    mean = mean[seen] / count[seen, None]
-    middle = (np.stack(np.divmod(np.flatnonzero(seen), CELLS[1]), axis=1) + 0.5) * size
+    enough = count >= MIN_IN_CELL
+    mean = np.stack([np.bincount(index, weight * residuals[:, i], len(count)) for i in range(2)], axis=1)
+    mean = mean[enough] / count[enough, None]
+    middle = (np.stack(np.divmod(np.flatnonzero(enough), CELLS[1]), axis=1) + 0.5) * size
     longest = float(np.linalg.norm(mean, axis=1).max()) if len(mean) else 0.0
     times = round_below(ARROW_SHARE * size.min() / longest) if longest else 1.0
     axes.quiver(

@@ -1,7 +1,7 @@
-"""Several cameras that sit on one rig, from views of one board at the same instants: one adjustment of all.
+"""Joint calibration of several cameras on one rig, from views of one board at the same instants.
 
-Each camera is calibrated by itself first; then intrinsics, where the cameras sit, the board's poses and its shape are
-adjusted together. Cameras and boards are those of Furgale, Rehder & Siegwart (2013), Kalibr, but for the shape.
+Each camera is calibrated by itself first. Then intrinsics, poses of the cameras on the rig, poses of the board and its
+shape are adjusted together. The model is that of Furgale, Rehder & Siegwart (2013), Kalibr, plus the board's shape.
 """
 
 from collections.abc import Mapping
@@ -28,18 +28,21 @@ from stcal.sfm.camera.intrinsics import (
 )
 
 FEW_INSTANTS = 5
-"""Shared by a camera and the rest; fewer are advised against."""
+"""Smallest advised number of instants that a camera shares with the others."""
 LOOSE = 1.3
-"""Times by which residuals may grow when the cameras are held to one rig."""
+"""Largest factor by which residuals may grow in the joint adjustment without a warning."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigCalibration:
-    """``names`` ; ``cameras`` : each as if calibrated alone, but with the intrinsics of all together;
-    ``camera_from_first`` : (c,) poses and ``covariance`` : (c, 6, 6) of them, mm and rad, zero for the first;
-    ``shared`` : (c,) instants that it has in common with others; ``alone_rms_px`` : (c,) residuals before;
-    ``instants`` : images by camera, for each; ``rms_px`` : of each; ``apart`` ; ``factor`` : by which residuals exceed
-    those of the cameras alone; ``dots`` : factor of the board's σ; ``redundancy`` ; ``warnings`` ."""
+    """Result of calibrating c cameras of one rig.
+
+    ``cameras`` : calibration of each camera, with the intrinsics of the joint adjustment; ``camera_from_first`` : (c,)
+    poses and ``covariance`` : (c, 6, 6) their covariances, rad and mm, zero for the first; ``shared`` : (c,) number of
+    instants in common with others; ``alone_rms_px`` : (c,) RMS of residuals before the joint adjustment; ``instants`` :
+    image by camera, for each instant; ``rms_px`` : RMS of each instant; ``apart`` : views that do not belong to their
+    instant; ``factor`` : ratio of residuals to those of the cameras alone; ``dots`` : factor of the board's σ.
+    """
 
     names: tuple[str, ...]
     cameras: tuple[CameraCalibration, ...]
@@ -56,22 +59,22 @@ class RigCalibration:
     warnings: tuple[str, ...]
 
     def rms_of_cameras(self) -> list[float]:
-        """Of the residuals of each, per coordinate, px."""
+        """Returns the RMS of the residuals of each camera, per coordinate, px."""
         return [residual_rms_px(each.intrinsics) for each in self.cameras]
 
 
 @one_thread()
 def calibrate_rig(cameras: Mapping[str, CameraCalibration], board: BoardDesign, unique: bool = False) -> RigCalibration:
-    """Adjust cameras of one rig together.
+    """Adjusts the cameras of one rig together.
 
     Parameters
     ----------
     cameras : mapping
-        By name, each calibrated alone; views of one instant have the same name, but for the suffix.
+        Calibrations of the single cameras by name. Views of one instant have the same name except for the suffix.
     board : BoardDesign
-        That all of them saw.
+        Board that all cameras saw.
     unique : bool
-        Its points cannot be taken for each other, as those of a ChArUco board.
+        Whether the board's points are identified uniquely, as on a ChArUco board.
 
     Returns
     -------
@@ -81,15 +84,15 @@ def calibrate_rig(cameras: Mapping[str, CameraCalibration], board: BoardDesign, 
     Raises
     ------
     StcalError
-        A camera shares no instant with the rest, or no minimum is reached.
+        A camera shares no instant with the others, or no minimum is reached.
     """
     if len(cameras) < 2:
         raise InputError("E-RIG-CAMERAS", f"rig: {len(cameras)} camera, 2 needed; calibrate one without --rig")
     names, alone = tuple(cameras), tuple(cameras.values())
     sightings = [each for k, camera in enumerate(alone) for each in _sightings(k, camera)]
     together = gathered(names, [each.intrinsics.camera for each in alone], sightings, board, unique)
-    found = adjust_rig(alone, together, board)
-    return _result(names, alone, together, found, board)
+    joint = adjust_rig(alone, together, board)
+    return _result(names, alone, together, joint, board)
 
 
 def _sightings(k: int, camera: CameraCalibration) -> list[Sighting]:
@@ -102,7 +105,7 @@ def _sightings(k: int, camera: CameraCalibration) -> list[Sighting]:
 
 
 def adjust_rig(alone: tuple[CameraCalibration, ...], together: Together, board: BoardDesign) -> Adjusted:
-    """All unknowns from where the cameras alone have them; σ of each camera's centres are those found for it.
+    """Adjusts all unknowns, starting from the calibrations of the single cameras and with their σ of centres.
 
     Raises
     ------
@@ -125,26 +128,34 @@ def adjust_rig(alone: tuple[CameraCalibration, ...], together: Together, board: 
 
 
 def _start(alone: tuple[CameraCalibration, ...], together: Together, board: BoardDesign) -> State:
-    models, folders, which, instants = [], [], [], []
+    models, folders, camera_numbers, instants = [], [], [], []
     poses: dict[str, tuple[Rigid, ...]] = {}
     for folder in dict.fromkeys(each.view.group for each in together.sightings):
         members = [each for each in together.sightings if each.view.group == folder]
         labels = tuple(sorted({label for each in members for label in each.view.labels}))
-        known = {}
+        pose_of_instant = {}
         for each in members:
-            known.setdefault(each.instant, together.camera_from_first[each.camera].inverse() @ each.camera_from_board)
-        place = {instant: i for i, instant in enumerate(known)}
-        poses[folder] = tuple(known.values())
+            pose_of_instant.setdefault(
+                each.instant, together.camera_from_first[each.camera].inverse() @ each.camera_from_board
+            )
+        place = {instant: i for i, instant in enumerate(pose_of_instant)}
+        poses[folder] = tuple(pose_of_instant.values())
         for k in sorted({each.camera for each in members}):
-            own, scale = [each for each in members if each.camera == k], alone[k].intrinsics.factors.centres ** 2
-            views = [replace(each.view, covariance_px2=scale * each.view.covariance_px2) for each in own]
+            of_camera, scale = [each for each in members if each.camera == k], alone[k].intrinsics.factors.centres ** 2
+            views = [replace(each.view, covariance_px2=scale * each.view.covariance_px2) for each in of_camera]
             models.append(model_of_views(folder, labels, views, board, alone[k].intrinsics.camera))
             folders.append(folder)
-            which.append(k)
-            instants.append(np.array([place[each.instant] for each in own]))
+            camera_numbers.append(k)
+            instants.append(np.array([place[each.instant] for each in of_camera]))
     cameras = tuple(each.intrinsics.camera for each in alone)
     state = State(
-        tuple(models), tuple(folders), tuple(which), tuple(instants), poses, cameras, together.camera_from_first
+        tuple(models),
+        tuple(folders),
+        tuple(camera_numbers),
+        tuple(instants),
+        poses,
+        cameras,
+        together.camera_from_first,
     )
     return state.seen()
 
@@ -159,9 +170,9 @@ def _result(
     state, setting = found.state, found.setting
     covariance = np.linalg.inv(found.last.normal)
     covariance = (covariance + covariance.T) / 2
-    sits = np.zeros((len(names), 6, 6))
+    pose_covariance = np.zeros((len(names), 6, 6))
     for k in range(1, len(names)):
-        sits[k] = covariance[setting.sits(k), setting.sits(k)]
+        pose_covariance[k] = covariance[setting.sits(k), setting.sits(k)]
     members: dict[str, dict[str, str]] = {}
     for each in together.sightings:
         members.setdefault(each.instant, {})[names[each.camera]] = each.view.name
@@ -171,7 +182,7 @@ def _result(
         names=names,
         cameras=tuple(rejudged(a, own, board) for a, own in zip(alone, intrinsics, strict=True)),
         camera_from_first=state.camera_from_first,
-        covariance=sits,
+        covariance=pose_covariance,
         shared=shared,
         alone_rms_px=tuple(residual_rms_px(each.intrinsics) for each in alone),
         instants=dict(sorted(members.items())),
@@ -185,7 +196,7 @@ def _result(
 
 
 def _of_camera(k: int, alone: Intrinsics, found: Adjusted, covariance: np.ndarray) -> Intrinsics:
-    """The part of one camera."""
+    """Returns the intrinsics of one camera from the joint adjustment."""
     state, place = found.state, found.setting.intrinsics(k)
     models = tuple(m for m, camera in zip(state.models, state.camera_of, strict=True) if camera == k)
     return Intrinsics(
@@ -202,7 +213,7 @@ def _of_camera(k: int, alone: Intrinsics, found: Adjusted, covariance: np.ndarra
 
 
 def _rms_by_instant(state: State, together: Together) -> dict[str, float]:
-    """Of all coordinates, px."""
+    """Returns the RMS of all residuals of each instant, per coordinate, px."""
     instant = {(each.camera, each.view.name): each.instant for each in together.sightings}
     squares: dict[str, list[np.ndarray]] = {}
     for model, k in zip(state.models, state.camera_of, strict=True):

@@ -1,4 +1,4 @@
-"""``rig.json``: what ``calibrate-camera --rig`` found of several cameras together."""
+"""``rig.json``: the result of ``calibrate-camera --rig``."""
 
 from typing import Annotated, Literal
 
@@ -34,7 +34,7 @@ class ApartRow(Part):
 
 
 class RigCalibrationFile(ResultFile):
-    """Of ``calibrate-camera --rig``; beside it stands a camera file with its own JSON for each camera."""
+    """Result file of ``calibrate-camera --rig``. Each camera has its own camera file and JSON file beside it."""
 
     format: Literal["stcal camera rig 1"] = Field(description="the file's form and its version")
     cameras: list[RigCamera] = Field(
@@ -57,7 +57,7 @@ class RigCalibrationFile(ResultFile):
 
     @classmethod
     def of(cls, rig: RigCalibration) -> "RigCalibrationFile":
-        """The file of a calibrated rig."""
+        """Returns the file of a calibrated rig."""
         rows = zip(
             rig.names,
             rig.cameras,

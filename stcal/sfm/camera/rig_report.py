@@ -1,4 +1,4 @@
-"""What a rig's calibration found, for the terminal and as a page."""
+"""The result of a rig's calibration, as text for the terminal and as a page."""
 
 import numpy as np
 
@@ -21,15 +21,15 @@ CAMERA_HEADS = (
 )
 MOST_ROWS = 500
 FRUSTUM_SHARE = 0.15
-"""Of the rig's extent: how long the drawn views are."""
+"""Length of the drawn fields of view, as a share of the rig's extent."""
 
 
 def rig_text(rig: RigCalibration) -> str:
-    """Cameras, and where they sit."""
+    """Returns the cameras and their poses on the rig as text."""
     lines = [
         f"skipped {name}/{each.name}: {each.reason}"
-        for name, own in zip(rig.names, rig.cameras, strict=True)
-        for each in own.skipped
+        for name, camera in zip(rig.names, rig.cameras, strict=True)
+        for each in camera.skipped
     ]
     lines += [f"apart {each.camera}/{each.image}: {each.reason}" for each in rig.apart]
     lines += [_headline(rig), "", *text_table([list(CAMERA_HEADS), *_camera_rows(rig)])]
@@ -56,15 +56,15 @@ def _camera_rows(rig: RigCalibration) -> list[list[str]]:
     return [
         [
             name,
-            own.intrinsics.colmap_model,
-            str(len(own.views)),
+            camera.intrinsics.colmap_model,
+            str(len(camera.views)),
             str(shared),
             number(rms, 4),
             number(alone, 4),
-            number(float(np.median(own.projection.sigma_px)), 4),
-            number(own.held_out.rms_px() if own.held_out else None, 4),
+            number(float(np.median(camera.projection.sigma_px)), 4),
+            number(camera.held_out.rms_px() if camera.held_out else None, 4),
         ]
-        for name, own, shared, rms, alone in zip(
+        for name, camera, shared, rms, alone in zip(
             rig.names, rig.cameras, rig.shared, rig.rms_of_cameras(), rig.alone_rms_px, strict=True
         )
     ]
@@ -76,7 +76,7 @@ def _poses(rig: RigCalibration) -> list[tuple[str, list[list[str]]]]:
 
 
 def rig_page(rig: RigCalibration, where: str) -> str:
-    """The report of ``calibrate-camera --rig``."""
+    """Returns the report of ``calibrate-camera --rig``."""
     return render(
         "sfm/camera/rig.html.jinja",
         where=where,
@@ -108,7 +108,10 @@ def rig_page(rig: RigCalibration, where: str) -> str:
 
 
 def _arrangement(rig: RigCalibration):
-    """Cameras with their fields of view from above (x, z) and from the side (z, y), in the first camera."""
+    """Returns a figure of the cameras and their fields of view from above (x, z) and from the side (z, y).
+
+    Coordinates are in the frame of the first camera.
+    """
     inverse = [pose.inverse() for pose in rig.camera_from_first]
     places = np.array([pose.translation for pose in inverse])
     length = FRUSTUM_SHARE * max(float(np.ptp(places, axis=0).max()), 1.0) * 3
@@ -118,8 +121,8 @@ def _arrangement(rig: RigCalibration):
         figure.subplots(1, 2), ((0, 2), (2, 1)), (("x, mm", "z, mm"), ("z, mm", "y, mm")), strict=True
     ):
         calm(axes)
-        for k, (name, pose, own) in enumerate(zip(rig.names, inverse, rig.cameras, strict=True)):
-            camera, colour = own.intrinsics.camera, COLOURS[k % len(COLOURS)]
+        for k, (name, pose, calibration) in enumerate(zip(rig.names, inverse, rig.cameras, strict=True)):
+            camera, colour = calibration.intrinsics.camera, COLOURS[k % len(COLOURS)]
             across = 0 if a == 0 else 1
             half = 0.5 * (camera.width, camera.height)[across] / camera.focal[across]
             edge = np.zeros((2, 3))
@@ -136,7 +139,7 @@ def _arrangement(rig: RigCalibration):
 
 
 def _by_instant(rig: RigCalibration):
-    """Residuals of instants that several cameras saw, and of the rest."""
+    """Returns a figure of the residuals by instant. Instants that several cameras saw have their own colour."""
     figure = new_figure(7.2, 2.2)
     figure.set_layout_engine("constrained")
     axes = figure.add_subplot()

@@ -1,4 +1,4 @@
-"""What a camera calibration found, in a few lines for the terminal."""
+"""The result of a camera calibration as text for the terminal."""
 
 import numpy as np
 
@@ -10,17 +10,17 @@ from stcal.sfm.camera.trust import FAILED_P, SUSPICIOUS_P
 
 
 def models_table(summary: CalibrationFile) -> list[str]:
-    """How lens models foretell held-out views; the chosen one has a star."""
+    """Returns a table of how well lens models predict held-out views. The chosen model has a star."""
     rows = [["<", "<lens model", "parameters", "held out px", "worse σ²", "±", "<"]]
-    for each in summary.models:
-        star = "*" if each.model == summary.model else ""
-        numbers = [number(each.rms_px, 4), number(each.worse, 4), number(each.worse_sigma, 4)]
-        rows.append([star, each.model, str(each.parameters), *numbers, each.why])
+    for model in summary.models:
+        star = "*" if model.model == summary.model else ""
+        numbers = [number(model.rms_px, 4), number(model.worse, 4), number(model.worse_sigma, 4)]
+        rows.append([star, model.model, str(model.parameters), *numbers, model.why])
     return text_table(rows)
 
 
 def calibration_text(result: CameraCalibration, summary: CalibrationFile) -> str:
-    """Parameters with σ, and what to look at."""
+    """Returns the parameters with σ, checks, outliers and warnings as text."""
     lines = [f"skipped {each.name}: {each.reason}" for each in result.skipped]
     lines += [f"outlier {each.image} {each.label}: residual {each.residual_px:.3f} px" for each in summary.outliers]
     width, height = summary.size_px

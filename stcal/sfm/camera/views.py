@@ -1,4 +1,4 @@
-"""Board views for a camera that is not known yet: which dot is which, a focal length and poses to start from."""
+"""Board views of an unknown camera: numbering of the dots, and approximate focal length and poses."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,37 +15,39 @@ from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.files import DetectedImage
 
 START_FOCAL, FISHEYE_FOCAL = 1.2, 0.45
-"""In longer image sides: between a wide-angle and a portrait lens; and of equidistant lenses 127° across."""
+"""Approximate focal lengths over the longer image side: between wide-angle and portrait; equidistant lens of 127°."""
 FOCAL_LIMITS = (0.2, 50.0)
-"""In longer image sides; what the closed form gives outside of them is noise."""
+"""Limits of the focal length over the longer image side. Results of the closed form outside of them are noise."""
 SETTLING_PASSES = 3
 
 
 def start_camera(width: int, height: int, colmap_model: str) -> Camera:
-    """A lens of middling focal length without distortion, principal point in the middle."""
+    """Returns a camera of medium focal length without distortion, with the principal point in the middle."""
     fisheye = FISHEYE in colmap_model
     focal = (FISHEYE_FOCAL if fisheye else START_FOCAL) * max(width, height)
     return Camera(width, height, [focal, focal], [(width - 1) / 2, (height - 1) / 2], np.zeros(8), fisheye)
 
 
 def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, camera: Camera) -> Camera:
-    """``camera`` with the focal length that the boards' homographies ask for; unchanged where they ask for none, and of
-    equidistant lenses, whose rays turn with the focal length.
+    """Returns ``camera`` with the focal length estimated from the homographies of the boards.
+
+    The camera is unchanged if the homographies give no plausible focal length, and for equidistant lenses, as their
+    rays depend on the focal length.
 
     Zhang (2000), sec. 3.1, with square pixels and known principal point: the two axes of each board are orthogonal
     and equally long, which is linear in 1/f². Lens distortion of ``camera`` is removed first.
     """
     if camera.fisheye:
         return camera
-    along, known = [], []
+    coefficients, constants = [], []
     for image in observations:
         h = _homography(image, board, camera)
         first, second = h[:, 0], h[:, 1]
         first, second = np.array([first, second]) / np.sqrt(np.linalg.norm(first[:2]) * np.linalg.norm(second[:2]))
-        along += [first[:2] @ second[:2], first[:2] @ first[:2] - second[:2] @ second[:2]]
-        known += [-first[2] * second[2], second[2] ** 2 - first[2] ** 2]
-    square = float(np.dot(along, along))
-    inverse = float(np.dot(along, known)) / square if square else 0.0  # (assumed focal / focal)²
+        coefficients += [first[:2] @ second[:2], first[:2] @ first[:2] - second[:2] @ second[:2]]
+        constants += [-first[2] * second[2], second[2] ** 2 - first[2] ** 2]
+    square = float(np.dot(coefficients, coefficients))
+    inverse = float(np.dot(coefficients, constants)) / square if square else 0.0  # (assumed focal / focal)²
     low, high = FOCAL_LIMITS * np.array(max(camera.width, camera.height)) / camera.focal[0]
     if not high**-2 < inverse < low**-2:
         return camera
@@ -53,12 +55,12 @@ def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, c
 
 
 def start_pose(image: ImageObservations, board: BoardDesign, camera: Camera) -> Rigid:
-    """camera_from_board of one view.
+    """Returns camera_from_board of one view.
 
     Raises
     ------
     DegenerateError
-        The dots do not determine it.
+        The dots do not determine the pose.
     """
     pose = camera_from_plane(_homography(image, board, camera))
     return refine_planar_pose(pose, board.places_mm(image.labels)[:, :2], camera.normalised_from_pixel(image.centre_px))
@@ -69,17 +71,17 @@ def _homography(image: ImageObservations, board: BoardDesign, camera: Camera) ->
 
 
 def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Camera) -> list[ImageObservations]:
-    """The dots of every image that shows the board, numbered alike in all images of a folder.
+    """Returns the dots of every image that shows the board, numbered consistently in all images of a folder.
 
-    A plain board looks the same after half a turn, and where a strip is hidden the rows may be off by one. A wrong
-    numbering costs nothing but the match between the dots and their own deviations from the grid; so these, seen
-    best with a good ``camera``, decide.
+    A plain board looks the same after half a turn, and if a strip is hidden, rows may be numbered off by one. A wrong
+    numbering only breaks the match between the dots and their individual deviations from the grid. The numbering is
+    therefore selected by these deviations, which a good ``camera`` shows best.
     """
     views = []
     for image in images:
-        seen = image.detection.board
-        if seen is not None and len(seen.rows):
-            dots = image.detection.centres.select(seen.rows)
+        sighting = image.detection.board
+        if sighting is not None and len(sighting.rows):
+            dots = image.detection.centres.select(sighting.rows)
             labels = tuple(DotLabel(0, i) for i in range(len(dots)))
             views.append(
                 ImageObservations(
@@ -103,7 +105,7 @@ def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Cam
 
 
 def _deviations(numberings: np.ndarray, xy_normalised: np.ndarray, board: BoardDesign) -> np.ndarray:
-    """Dots as seen minus as designed, in the board's plane, (k, rows·columns, 2) mm for k numberings; 0 unseen."""
+    """Returns measured minus designed dots in the board's plane, (k, rows·columns, 2) mm for k numberings, else 0."""
     fields = np.zeros((len(numberings), board.rows * board.columns, 2))
     for field, cells in zip(fields, numberings, strict=True):
         xy_mm = board.pitch_mm * cells[:, ::-1].astype(float)
@@ -113,7 +115,7 @@ def _deviations(numberings: np.ndarray, xy_normalised: np.ndarray, board: BoardD
 
 
 def _choose_alike(fields: Sequence[np.ndarray]) -> list[int]:
-    """For each image the field of deviations that agrees best with those of the others."""
+    """Selects for each image the field of deviations that agrees best with those of the other images."""
     chosen = [0] * len(fields)
     order = sorted(range(len(fields)), key=lambda i: -np.count_nonzero(fields[i][0]))
     total = np.zeros_like(fields[0][0])

@@ -1,1 +1,1 @@
-"""What the stages hand to each other: labelled observations, and models of groups."""
+"""Data that the stages hand to each other: labelled observations, and models of groups."""

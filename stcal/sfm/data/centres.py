@@ -9,14 +9,15 @@ from stcal.geometry.arrays import frozen
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Centres:
-    """Measured ellipses, n of them.
+    """n measured ellipses.
 
-    ``centre_px`` : (n, 2) centre of the ideal ellipse, put into the image as it is (OpenCV pixel origin);
-    ``centre`` : (n, 2) the same in normalised ideal coordinates; ``shape`` : (n, 2, 2) its shape there, rim = centre +
-    shape @ unit circle; ``covariance_px2`` : (n, 2, 2) of ``centre_px``; ``blur_px`` : (n,); ``contrast`` : (n,) grey
-    values, inside minus outside; ``noise`` : (n,) robust σ of a pixel about the model, grey values; ``rim`` : (n,)
-    share of the rim that follows the model; ``uneven_px`` : (n, 2) how far uneven brightness would have moved the
-    centre, zero where none is seen; ``ok`` : (n,) usable.
+    ``centre_px`` : (n, 2) centre of the ideal ellipse, distorted into the original image (OpenCV pixel origin);
+    ``centre`` : (n, 2) the same in normalised ideal coordinates; ``shape`` : (n, 2, 2) shape of the ellipse in these
+    coordinates, rim = centre + shape @ unit circle; ``covariance_px2`` : (n, 2, 2) covariance of ``centre_px``;
+    ``blur_px`` : (n,); ``contrast`` : (n,) grey values, inside minus outside; ``noise`` : (n,) robust σ of a pixel
+    about the model, grey values; ``rim`` : (n,) share of the rim that follows the model; ``uneven_px`` : (n, 2) shift
+    of the centre that uneven brightness would have caused, zero if no uneven brightness was detected; ``ok`` : (n,)
+    True if the ellipse is usable.
     """
 
     centre_px: np.ndarray
@@ -50,14 +51,14 @@ class Centres:
         return len(self.centre_px)
 
     def select(self, keep: np.ndarray) -> "Centres":
-        """Those of the indices or mask ``keep``."""
+        """Returns the ellipses of the indices or mask ``keep``."""
         return Centres(*(getattr(self, f.name)[keep] for f in fields(self)))
 
     @classmethod
     def concatenate(cls, parts: list["Centres"]) -> "Centres":
-        """All parts, one after the other."""
+        """Returns the ellipses of all parts, one part after the other."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def sigma_px(self) -> np.ndarray:
-        """Standard deviation per axis (RMS of the two), (n,)."""
+        """Returns the standard deviation of each centre per axis (RMS over both axes), (n,)."""
         return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)

@@ -1,5 +1,7 @@
-"""The model of one group: cameras and labelled points, and the observations they explain. The mapper's world has no
-unit, so that its models and those in millimetres are two types: whoever forgets the scale passes the wrong one."""
+"""The model of one group: camera poses, labelled points, and their observations.
+
+The mapper's world has no unit. Models in this world and models in mm are therefore two types, so that a forgotten scale
+is a type error."""
 
 from dataclasses import dataclass, fields, replace
 from typing import TypeVar
@@ -14,12 +16,12 @@ from stcal.sfm.data.observations import ImageObservations
 
 _PER_OBSERVATION = ("image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 MIN_POINTS = 6
-"""Labelled points that hold an image; thousands are what COLMAP's own defaults expect."""
+"""Smallest number of labelled points that an image must observe. COLMAP's defaults expect thousands."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outlier:
-    """An observation that is left out: it contradicts all others."""
+    """An observation that is excluded because it contradicts all others."""
 
     image: str
     label: Label
@@ -29,13 +31,13 @@ class Outlier:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupModel:
-    """m images, p points, n observations of one group; what models with and without unit have in common.
+    """m images, p points and n observations of one group: the common base of models with and without a unit.
 
-    ``images`` : (m,) names; ``camera_from_model`` : (m,) poses; ``labels`` : (p,); ``xyz_model`` : (p, 3): the model's
-    frame, and its unit, are what :class:`WorldModel` and :class:`MetricModel` say;
-    ``image_index``, ``point_index`` : (n,); ``keypoint`` : (n,) place among the image's observations;
-    ``measured_px`` : (n, 2) ellipse centres; ``shift_px`` : (n, 2) what eccentricity adds to the image of a circle's
-    centre, zero until it is known; ``covariance_px2`` : (n, 2, 2) of the measured centres.
+    ``images`` : (m,) names; ``camera_from_model`` : (m,) poses; ``labels`` : (p,); ``xyz_model`` : (p, 3),
+    frame and unit are defined by :class:`WorldModel` and :class:`MetricModel`;
+    ``image_index``, ``point_index`` : (n,); ``keypoint`` : (n,) index among the image's observations;
+    ``measured_px`` : (n, 2) ellipse centres; ``shift_px`` : (n, 2) eccentricity, measured ellipse centre minus image of
+    the circle's centre, zero until it is known; ``covariance_px2`` : (n, 2, 2) covariances of the measured centres.
     """
 
     group: str
@@ -60,15 +62,15 @@ class GroupModel:
             object.__setattr__(self, name, frozen(getattr(self, name), (n,), name, dtype=int))
 
     def corrected_px(self) -> np.ndarray:
-        """Images of the circles' centres, (n, 2): the measured ellipse centres less their eccentricity."""
+        """Returns the images of the circles' centres, (n, 2): measured ellipse centres minus eccentricity."""
         return self.measured_px - self.shift_px
 
     def sigma_px(self) -> np.ndarray:
-        """Standard deviation per axis (RMS of the two), (n,)."""
+        """Returns the standard deviation of each measurement per axis (RMS over both axes), (n,)."""
         return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
 
     def whiten(self, values_px: np.ndarray) -> np.ndarray:
-        """Values (n, 2) or (n, 2, k) in pixels, in units of σ along axes that are independent."""
+        """Whitens values (n, 2) or (n, 2, k), px, by the covariances of their observations."""
         (xx, xy), (_, yy) = np.moveaxis(self.covariance_px2, (1, 2), (0, 1))
         across = np.sqrt(np.maximum(yy - xy * xy / xx, 1e-12 * yy))
         first, second = values_px[:, 0], values_px[:, 1]
@@ -77,29 +79,29 @@ class GroupModel:
         return np.stack([first / along, (second - slope * first) / across], axis=1)
 
     def rows_by_image(self) -> list[np.ndarray]:
-        """Observations of every image, in the order of ``images``."""
+        """Returns the indices of the observations of each image, in the order of ``images``."""
         order = np.argsort(self.image_index, kind="stable")
         return np.split(order, np.searchsorted(self.image_index[order], np.arange(1, len(self.images))))
 
     def keypoints_px(self, image: ImageObservations, rows: np.ndarray) -> np.ndarray:
-        """All keypoints of one image, (k, 2): corrected where the model has them (``rows``), measured elsewhere."""
+        """Returns all keypoints of one image, (k, 2): corrected if in the model (``rows``), else measured."""
         xy = image.centre_px.copy()
         xy[self.keypoint[rows]] = self.measured_px[rows] - self.shift_px[rows]
         return xy
 
     def xyz_camera(self) -> np.ndarray:
-        """The observed points in the frames of the cameras that observe them, (n, 3)."""
+        """Returns the observed points in the frames of the cameras that observe them, (n, 3)."""
         rotation = np.stack([pose.rotation for pose in self.camera_from_model])
         translation = np.stack([pose.translation for pose in self.camera_from_model])
         xyz = self.xyz_model[self.point_index]
         return np.einsum("nij,nj->ni", rotation[self.image_index], xyz) + translation[self.image_index]
 
     def residuals_px(self, camera: Camera) -> np.ndarray:
-        """Corrected minus projected, (n, 2)."""
+        """Returns the residuals, corrected minus projected, (n, 2)."""
         return self.corrected_px() - camera.project(self.xyz_camera())
 
     def _placed(self, kind: type["M"], a_from_model: Similarity) -> "M":
-        """The same model in another frame, its unit included."""
+        """Returns the model transformed to another frame and unit, as a model of the given kind."""
         rotation, scale = a_from_model.rigid.rotation, a_from_model.scale
         poses = tuple(
             Rigid(
@@ -112,27 +114,29 @@ class GroupModel:
         return kind(**same | {"camera_from_model": poses, "xyz_model": a_from_model @ self.xyz_model})
 
     def observed(self: "M", rows: np.ndarray) -> "M":
-        """The model with these of its observations, and all of its images and points."""
+        """Returns the model with the given observations only, but with all of its images and points."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _PER_OBSERVATION})
 
     def points_by_face(self) -> dict[str, np.ndarray]:
-        """Indices of the points of every face, and of the board under ``board``."""
+        """Returns the indices of the points by face; the points of the board have the key ``board``."""
         members: dict[str, list[int]] = {}
         for i, label in enumerate(self.labels):
             members.setdefault(label.plane, []).append(i)
         return {key: np.array(indices) for key, indices in members.items()}
 
     def without(self: "M", drop: np.ndarray) -> "M":
-        """The model without the observations of mask ``drop``, and then without points that fewer than two images
-        see and images that see fewer than six points."""
+        """Returns the model without the observations of mask ``drop``.
+
+        Points that fewer than two images then observe, and images that observe fewer than six points, are removed too.
+        """
         keep = ~drop
         while True:
             points = np.bincount(self.point_index[keep], minlength=len(self.labels))
             images = np.bincount(self.image_index[keep], minlength=len(self.images))
-            again = keep & (points[self.point_index] >= 2) & (images[self.image_index] >= MIN_POINTS)
-            if (again == keep).all():
+            still_kept = keep & (points[self.point_index] >= 2) & (images[self.image_index] >= MIN_POINTS)
+            if (still_kept == keep).all():
                 break
-            keep = again
+            keep = still_kept
         kept_points, kept_images = np.flatnonzero(points), np.flatnonzero(images)
         arrays = {name: getattr(self, name)[keep] for name in _PER_OBSERVATION}
         arrays["point_index"] = np.searchsorted(kept_points, arrays["point_index"])
@@ -148,30 +152,30 @@ class GroupModel:
 
 
 M = TypeVar("M", bound=GroupModel)
-"""Models of either kind: what keeps the unit keeps the type."""
+"""Type of a model of either kind. Functions that keep the unit of a model keep its type."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorldModel(GroupModel):
-    """A model as the mapper makes it: its frame is a world without unit, and lies by chance."""
+    """A model from the mapper. Its frame is a world of arbitrary origin, orientation and unit."""
 
     def moved(self, a_from_world: Similarity) -> "WorldModel":
-        """The same model in another world, its unit included."""
+        """Returns the model transformed to another world and unit."""
         return self._placed(WorldModel, a_from_world)
 
     def metric(self, a_from_world: Similarity) -> "MetricModel":
-        """The model in mm, in frame a."""
+        """Returns the model in mm, in frame a."""
         return self._placed(MetricModel, a_from_world)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MetricModel(GroupModel):
-    """A model in mm. Its frame is the target's where the group is chained to it, else the group's or the board's."""
+    """A model in mm. Its frame is the target's if the group is chained to it, else the group's or the board's."""
 
     def moved(self, a_from_model: Rigid) -> "MetricModel":
-        """The same model in another frame."""
+        """Returns the model in another frame."""
         return self._placed(MetricModel, Similarity(1.0, a_from_model))
 
     def in_world(self, world_from_model: Similarity) -> "WorldModel":
-        """The model as the mapper might have made it, for simulations."""
+        """Returns the model in a world without unit, as the mapper would have made it; for simulations."""
         return self._placed(WorldModel, world_from_model)

@@ -1,4 +1,4 @@
-"""Labelled circle centres: what detection hands to everything after it, and ``detections.csv``."""
+"""Circle centres with labels, the output of detection, and ``detections.csv``."""
 
 import csv
 import io
@@ -13,11 +13,12 @@ from stcal.labels import CircleLabel, Label, parse_labels
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageObservations:
-    """The labelled circles of one image, n of them.
+    """n labelled circles of one image.
 
-    ``centre_px`` : (n, 2) ellipse centres in the image as it is, OpenCV pixel origin; ``centre`` : (n, 2) and
-    ``shape`` : (n, 2, 2) the ideal ellipse in normalised coordinates; ``covariance_px2`` : (n, 2, 2); ``uneven_px`` :
-    (n, 2) by how much uneven brightness would have moved the centres, zero where none was seen, and by default.
+    ``centre_px`` : (n, 2) ellipse centres in the original image, OpenCV pixel origin; ``centre`` : (n, 2) and
+    ``shape`` : (n, 2, 2) the ideal ellipse in normalised coordinates; ``covariance_px2`` : (n, 2, 2) covariances
+    of ``centre_px``; ``uneven_px`` : (n, 2) shift of the centres that uneven brightness would have caused, zero by
+    default and if no uneven brightness was detected.
     """
 
     name: str
@@ -42,26 +43,26 @@ class ImageObservations:
         return len(self.labels)
 
     def sigma_px(self) -> np.ndarray:
-        """Standard deviation per axis (RMS of the two), (n,)."""
+        """Returns the standard deviation of each centre per axis (RMS over both axes), (n,)."""
         return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
 
     def face_ids(self) -> list[str]:
-        """Faces of the target that the labels name, in order."""
+        """Returns the ids of the target's faces that the labels name, in order of appearance."""
         return list(dict.fromkeys(label.face for label in self.labels if isinstance(label, CircleLabel)))
 
     def plus(self, other: "ImageObservations") -> "ImageObservations":
-        """These, and the other's circles of the same image after them."""
+        """Returns these circles followed by the circles of ``other``, observations of the same image."""
         arrays = [np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)[3:]]
         return ImageObservations(self.name, self.group, self.labels + other.labels, *arrays)
 
     def select(self, keep) -> "ImageObservations":
-        """Those of the indices ``keep``."""
+        """Returns the circles of the indices ``keep``."""
         arrays = [getattr(self, f.name)[keep] for f in fields(self)[3:]]
         return ImageObservations(self.name, self.group, tuple(self.labels[i] for i in keep), *arrays)
 
 
 def by_group(observations: Sequence[ImageObservations]) -> dict[str, list[ImageObservations]]:
-    """Observations by group, in order."""
+    """Returns the observations by group, in order."""
     groups: dict[str, list[ImageObservations]] = {}
     for image in observations:
         groups.setdefault(image.group, []).append(image)
@@ -69,7 +70,7 @@ def by_group(observations: Sequence[ImageObservations]) -> dict[str, list[ImageO
 
 
 def detections_csv(observations: list[ImageObservations]) -> str:
-    """Text of ``detections.csv``."""
+    """Returns the text of ``detections.csv``."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["image", "label", "x_px", "y_px", "sigma_px"])

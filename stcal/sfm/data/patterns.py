@@ -1,4 +1,4 @@
-"""Circles of the faces and the board, plane by plane, and which of them an image shows, by the plane's pose."""
+"""Circles of the faces and the board by plane, and their visibility in an image for a given pose of the plane."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,17 +15,17 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, Label
 
 MAX_TILT_RAD = np.radians(70.0)
-"""Between a circle's normal and the line of sight; what is seen more obliquely need not be found."""
+"""Largest angle between a circle's normal and the line of sight. Circles seen more obliquely need not be found."""
 RIM = np.stack([np.cos(np.arange(24) * np.pi / 12), np.sin(np.arange(24) * np.pi / 12)], axis=1)
 BORDER_POINTS = 33
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pattern:
-    """The n circles of one plane by design.
+    """The n circles of one plane according to the design.
 
     ``plane`` : face id or ``board``; ``labels``; ``xy_mm`` : (n, 2); ``radius_mm`` : (n,); ``polarity``; ``side`` : 1
-    where the plane's Z is the side that the circles are seen from, −1 where it is the other.
+    if the circles are seen from the side that the plane's Z points to, −1 if they are seen from the other side.
     """
 
     plane: str
@@ -36,16 +36,16 @@ class Pattern:
     side: Literal[1, -1]
 
     def xyz_mm(self) -> np.ndarray:
-        """Centres, (n, 3), plane's frame."""
+        """Returns the centres, (n, 3), in the plane's frame."""
         return np.column_stack([self.xy_mm, np.zeros(len(self.xy_mm))])
 
 
 def patterns_of(target: TargetDesign, board: BoardDesign | None) -> dict[str, Pattern]:
-    """The faces and the board by name."""
-    found = {f.id: Pattern(f.id, f.labels(), f.xy_mm, f.radius_mm, target.polarity, 1) for f in target.faces}
+    """Returns the patterns of the faces and the board by name."""
+    patterns = {f.id: Pattern(f.id, f.labels(), f.xy_mm, f.radius_mm, target.polarity, 1) for f in target.faces}
     if board is not None:  # its Z points into it
-        found[BOARD] = Pattern(BOARD, board.labels(), board.xy_mm(), board.radii_mm(), board.polarity, -1)
-    return found
+        patterns[BOARD] = Pattern(BOARD, board.labels(), board.xy_mm(), board.radii_mm(), board.polarity, -1)
+    return patterns
 
 
 def in_view(
@@ -55,9 +55,9 @@ def in_view(
     border: np.ndarray,
     max_tilt_rad: float = MAX_TILT_RAD,
 ) -> np.ndarray:
-    """Mask of the circles that face the camera and lie in the image with their whole rim.
+    """Returns the mask of the circles that face the camera and lie in the image with their whole rim.
 
-    ``border`` : of :func:`ideal_border`; beyond it a lens model may fold back.
+    ``border`` : result of :func:`ideal_border`; beyond this border a lens model may fold back.
     """
     axes = camera_from_plane.rotation
     xyz = camera_from_plane @ pattern.xyz_mm()
@@ -77,18 +77,18 @@ def in_view(
 def images_px(
     pattern: Pattern, camera_from_plane: Rigid, camera: Camera, circles: np.ndarray | slice = slice(None)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ellipses that the circles project to, in the image as it is: centres (n, 2) and symmetric shapes (n, 2, 2), px;
-    lens distortion to first order."""
+    """Returns the ellipses that the circles project to in the original image, px: centres (n, 2) and symmetric shapes
+    (n, 2, 2). Lens distortion of the shapes is of first order."""
     xyz = camera_from_plane @ pattern.xyz_mm()[circles]
     centre, shape = circle_images(xyz, camera_from_plane.rotation[:, :2], pattern.radius_mm[circles])
     distorted, by_ideal = camera.distort_jacobian(centre)
-    turned = camera.focal[:, None] * (by_ideal @ shape)
-    return distorted * camera.focal + camera.centre, shape_of_square(turned @ np.swapaxes(turned, 1, 2))
+    shape_px = camera.focal[:, None] * (by_ideal @ shape)
+    return distorted * camera.focal + camera.centre, shape_of_square(shape_px @ np.swapaxes(shape_px, 1, 2))
 
 
 @lru_cache(maxsize=8)
 def ideal_border(camera: Camera) -> np.ndarray:
-    """Least and largest ideal coordinates, (2, 2), along the image's border."""
+    """Returns the smallest and largest ideal coordinates along the image's border, (2, 2)."""
     t = np.linspace(0, 1, BORDER_POINTS)
     x, y = t * (camera.width - 1), t * (camera.height - 1)
     zero = np.zeros(BORDER_POINTS)

@@ -1,4 +1,4 @@
-"""Images of the circles of a target in many poses at once: centres of the ellipses, and what moves them."""
+"""Images of a target's circles in many poses at once: centres of the ellipses and their derivatives."""
 
 from dataclasses import dataclass
 
@@ -8,17 +8,17 @@ from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.rigid import skew
 
 NEAREST_MM = 1e-6
-"""Depth that stands for any that is smaller: behind the camera the numbers only have to be finite."""
+"""Lower bound of the depth. Behind the camera the numbers only have to be finite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CircleImages:
     """n circles in h poses, seen by an ideal camera of focal length 1.
 
-    ``centre`` : (h, n, 2) of their ellipses, normalised coordinates; ``depth`` : (h, n) of the circles' centres, mm,
-    not positive behind the camera, where nothing else means anything; ``by_pose`` : (h, n, 2, 6) by the left
-    perturbation of camera_from_target (rad, mm); ``by_circle`` : (h, n, 2, 3) by the circles' centres in the target,
-    per mm, normals held.
+    ``centre`` : (h, n, 2) centres of the ellipses, normalised coordinates; ``depth`` : (h, n) depth of the circles'
+    centres, mm, zero or negative behind the camera, where all other values are meaningless; ``by_pose`` : (h, n, 2, 6)
+    derivative of ``centre`` by the left perturbation of camera_from_target (rad, mm); ``by_circle`` : (h, n, 2, 3)
+    derivative by the circles' centres in the target frame, per mm, normals fixed.
     """
 
     centre: np.ndarray
@@ -27,20 +27,21 @@ class CircleImages:
     by_circle: np.ndarray
 
     def of(self, rows) -> "CircleImages":
-        """In those of the poses."""
+        """Returns the images in the poses of the indices or mask ``rows``."""
         return CircleImages(*(getattr(self, name)[rows] for name in self.__slots__))
 
 
 def project_circles(
     xyz: np.ndarray, normal: np.ndarray, radius_mm: np.ndarray, rotation: np.ndarray, translation: np.ndarray
 ) -> CircleImages:
-    """Project circles (n, 3), (n, 3), (n,) of the target frame, mm, by h poses camera_from_target (h, 3, 3), (h, 3).
+    """Project circles, centres (n, 3), normals (n, 3), radii (n,), target frame, mm, by h poses camera_from_target.
 
-    The eccentricity is that of :func:`stcal.geometry.conic.circle_image_offset`, and is differentiated too.
+    ``rotation`` : (h, 3, 3); ``translation`` : (h, 3). The derivatives include the eccentricity of
+    :func:`stcal.geometry.conic.circle_image_offset`.
     """
     back = np.swapaxes(rotation, 1, 2)
-    turned, axis = xyz @ back, normal @ back
-    centre = turned + translation[:, None]
+    rotated, axis = xyz @ back, normal @ back
+    centre = rotated + translation[:, None]
     depth = centre[..., 2].copy()
     np.maximum(centre[..., 2], NEAREST_MM, out=centre[..., 2])
     point = circle_image_offset(centre, axis, radius_mm)
@@ -58,6 +59,6 @@ def project_circles(
     by_axis = (q * axis[..., 2:])[..., None] * by_point
     by_axis[..., 2] += q * (by_point @ axis[..., None])[..., 0]
     by_pose = np.empty((*depth.shape, 2, 6))
-    by_pose[..., :3] = -(by_centre @ skew(turned) + by_axis @ skew(axis))
+    by_pose[..., :3] = -(by_centre @ skew(rotated) + by_axis @ skew(axis))
     by_pose[..., 3:] = by_centre
     return CircleImages(image, depth, by_pose, by_centre @ rotation[:, None])

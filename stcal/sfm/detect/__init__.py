@@ -1,1 +1,1 @@
-"""From pixels to labelled circle centres: candidates, centring, faces, board."""
+"""Detection of labelled circle centres in images: candidates, centring, faces, board."""

@@ -1,4 +1,4 @@
-"""Which circles of a face also fit another face, or the same face turned: they cannot tell the two apart."""
+"""Sets of circles of a face that also fit another face, or the same face turned, and so cannot identify it."""
 
 from functools import lru_cache
 
@@ -9,9 +9,9 @@ from stcal.likeness import common_circles, whole_likeness
 
 
 def confusable(target: TargetDesign) -> dict[str, tuple[frozenset[int], ...]]:
-    """For every face the sets of its circles (places in the design) that another reading explains as well.
+    """Returns by face the sets of its circles (indices in the design) that another reading explains as well.
 
-    A face is only named by circles that are not all in one of these sets.
+    Circles name a face only if no such set contains all of them.
     """
     key = tuple((f.id, f.xy_mm.tobytes(), f.radius_mm.tobytes()) for f in target.faces)
     return _confusable(key)
@@ -31,8 +31,11 @@ def _confusable(key) -> dict[str, tuple[frozenset[int], ...]]:
 
 
 def in_common(face: FaceDesign, other: FaceDesign, mirrored: bool = False) -> int:
-    """How many circles of a face at most coincide with circles of another, or with its own after a turn, moved as a
-    whole or, ``mirrored``, turned over; 0 where fewer than ``MIN_COMMON``."""
+    """Returns the largest number of circles of a face that coincide with circles of another, or with its own after a
+    turn.
+
+    The face is moved rigidly or, if ``mirrored``, turned over. 0 if fewer than ``MIN_COMMON`` coincide.
+    """
     xy = np.asarray(face.xy_mm) * [-1 if mirrored else 1, 1]
     same = face.id == other.id and not mirrored
     found = common_circles(xy, face.radius_mm, other.xy_mm, other.radius_mm, same)
@@ -40,13 +43,13 @@ def in_common(face: FaceDesign, other: FaceDesign, mirrored: bool = False) -> in
 
 
 def is_named(face: FaceDesign, found: np.ndarray, target: TargetDesign) -> bool:
-    """Whether the circles found (mask) name the face: no other reading explains them all."""
+    """Returns whether the circles found (mask) name the face, as no other reading explains them all."""
     circles = frozenset(np.flatnonzero(found).tolist())
     return not any(circles <= rival for rival in confusable(target)[face.id])
 
 
 def likeness_notes(target: TargetDesign) -> list[str]:
-    """What is nearly alike among the faces, a sentence each: those that one circle tells apart, and mirror images."""
+    """Returns notes about faces that only one circle distinguishes, and about mirror images among the faces."""
     near = [telling for face in target.faces for other in target.faces for telling in _telling(face, other)]
     notes = []
     if near:
@@ -65,7 +68,7 @@ def likeness_notes(target: TargetDesign) -> list[str]:
 
 
 def _telling(face: FaceDesign, other: FaceDesign) -> list[tuple[float, str, str, str]]:
-    """Single circles that tell a face from another one: by how many mm, both faces, and the circle."""
+    """Returns single circles that distinguish a face from another one: distance in mm, both faces, and the circle."""
     rival = other.xy_mm, other.radius_mm
     found = []
     for common in common_circles(face.xy_mm, face.radius_mm, *rival, same=face is other):
@@ -81,7 +84,7 @@ def _telling(face: FaceDesign, other: FaceDesign) -> list[tuple[float, str, str,
 
 
 def mirror_images(target: TargetDesign) -> dict[str, str]:
-    """For every face whose image in a mirror passes for a face, that face."""
+    """Returns the faces whose mirror image looks like a face, and that face."""
     key = tuple((f.id, f.xy_mm.tobytes(), f.radius_mm.tobytes()) for f in target.faces)
     return _mirror_images(key)
 

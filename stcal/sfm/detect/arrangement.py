@@ -1,4 +1,4 @@
-"""How the planes of one group stand to one another, and where its images were taken from.
+"""The arrangement of one group: relative poses of its planes, and poses of its images.
 
 Within a group nothing moves but the camera. So what the images read as faces and boards must fit one rigid
 arrangement; a reading that does not (a wrong numbering of the board, a second board, a printed grid, a reflection) is
@@ -21,14 +21,14 @@ from stcal.sfm.detect.plane_bundle import PlaneBundle
 from stcal.sfm.detect.sightings import PlaneView, Readings, flipped_pose
 
 MAX_SHIFT_PITCHES = 0.3
-"""By how much a plane may be off its place in an image's first pose, in steps of the pattern; a wrong numbering of the
-board is one off."""
+"""Largest deviation of a plane from its place in an image's first pose, in steps of the pattern; a wrong numbering
+of the board is one off."""
 MAX_SEEDS = 8
-"""Images that the arrangement is started from, until one explains everything."""
+"""Largest number of start images, until one explains everything."""
 MIN_MIRRORED = 0.5
 """Share of an image's circles that are where the group has one when the image is turned back."""
 MAX_OFF_PITCHES = 0.12
-"""By how much the circles of a reading may be off after the adjustment, in steps of the pattern (median): of the
+"""Largest deviation of a reading's circles after the adjustment, in steps of the pattern (median): of the
 reference target 3 mm, where a design is off by tenths and a wrong numbering by a whole step."""
 
 
@@ -57,14 +57,14 @@ class Arrangement:
         return rest, {i: views for i, views in gone.items() if views}
 
     def explained(self) -> int:
-        """Circles of the readings that fit."""
+        """Returns the number of circles of the readings that fit."""
         return sum(len(view.rows) for views in self.views.values() for view in views)
 
 
 def arrange(
     images: Sequence[list[Readings]], patterns: dict[str, Pattern], step_mm: float, focal_px: float
 ) -> Arrangement:
-    """The arrangement that explains most circles of one group.
+    """Returns the arrangement that explains most circles of one group.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def _seeds(images: Sequence[list[Readings]]) -> list[tuple[int, PlaneView]]:
 
 
 def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_mm: float) -> Arrangement:
-    """From one image to all that share planes with those that are placed."""
+    """Grows the arrangement from one image to all images that share planes with placed ones."""
     known = {view.plane: Rigid()}
     # Where the first image's numbering is a convention, another image alone cannot say which it is.
     by_convention = view.plane == BOARD and len(_same_circles(images[seed], view)) > 1
@@ -210,14 +210,13 @@ def _placed(readings: list[Readings], known: dict[str, Rigid], reach_mm: float, 
 
 
 def _alike(pose: Rigid, other: Rigid, view: PlaneView, reach_mm: float) -> bool:
-    """Whether two poses put a plane to one place, turned by less than a step at its rim."""
+    """Returns whether two poses put a plane at the same place, to less than a step at its rim."""
     difference = pose.inverse() @ other
     return bool(np.abs(difference @ view.span_mm() - view.span_mm()).max() < reach_mm)
 
 
 def _agreeing(readings: list[Readings], camera_from_group: Rigid, known, reach_mm: float, taken: set[str]):
-    """Of each circles' readings the one that is where the arrangement has its plane, each plane once; and those of
-    which several are."""
+    """Returns the readings that agree with the arrangement, each plane once, and circles with several such readings."""
     agreed, ambiguous = [], []
     ranked = []
     for views in readings:
@@ -238,7 +237,7 @@ def _agreeing(readings: list[Readings], camera_from_group: Rigid, known, reach_m
 
 
 def _shift_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]) -> float:
-    """How far circles are seen from where the arrangement has them (median)."""
+    """Returns the median distance of circles from their places in the arrangement."""
     difference = camera_from_group @ known[view.plane]
     shift = view.camera_from_plane @ view.xyz_mm() - difference @ view.xyz_mm()
     return float(np.median(np.linalg.norm(shift, axis=1)))
@@ -271,8 +270,8 @@ def _agreed_plane(images: Sequence[list[Readings]], placed, known: dict[str, Rig
 
 
 def _unknown_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], named: bool):
-    """By plane that is not known yet: (image, view, group_from_plane) of the placed images' readings that are named, or
-    of those that are not and agree with no known plane."""
+    """Returns (image, view, group_from_plane) by unknown plane, of the placed images' readings that are named, or of
+    those that are not named and agree with no known plane."""
     seen: dict[str, list[tuple[int, PlaneView, Rigid]]] = {}
     for i, (pose, agreed) in placed.items():
         for views in images[i]:
@@ -286,14 +285,14 @@ def _unknown_planes(images: Sequence[list[Readings]], placed, known: dict[str, R
 
 
 def _together(found: list[tuple[int, PlaneView, Rigid]], reach_mm: float) -> np.ndarray:
-    """Mask (n, n) of the views that put their plane to one place."""
+    """Returns the mask (n, n) of pairs of views that put their plane at the same place."""
     span = found[0][1].span_mm()
     corners = np.array([pose @ span for _, _, pose in found])
     return np.linalg.norm(corners[:, None] - corners, axis=3).max(2) < reach_mm
 
 
 def _adjusted(found: Arrangement, focal_px: float) -> Arrangement:
-    """Poses of images and planes of least reprojection error over the accepted views."""
+    """Adjusts the poses of images and planes to least reprojection error over the accepted views."""
     images, planes = list(found.camera_from_group), list(found.group_from_plane)
     rows = [(a, planes.index(v.plane), v) for a, i in enumerate(images) for v in found.views[i]]
     if not rows:
@@ -317,7 +316,7 @@ def _adjusted(found: Arrangement, focal_px: float) -> Arrangement:
 
 
 def _checked(images: Sequence[list[Readings]], found: Arrangement, step_mm: float) -> Arrangement:
-    """The arrangement with all readings judged by it, after its adjustment."""
+    """Returns the arrangement with all readings compared with it, after its adjustment."""
     views, contradicted, unsettled = {}, {}, {}
     for i, pose in found.camera_from_group.items():
         agreed, ambiguous = _agreeing(images[i], pose, found.group_from_plane, MAX_SHIFT_PITCHES * step_mm, set())

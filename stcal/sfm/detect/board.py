@@ -16,24 +16,24 @@ from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, matc
 
 NEIGHBOURS = 20
 STEP_TOLERANCE = 0.3
-"""How far a dot may be from where the step between its neighbours puts it, in steps."""
+"""Largest distance of a dot from its place predicted by its neighbours, in steps."""
 DIAGONAL = 1.22
-"""Between one, a step along a row, and √2, a step along a diagonal."""
+"""Limit between the lengths of a step along a row, 1, and along a diagonal, √2."""
 MIN_SHARE = 0.35
 """Smallest share of the board's dots that makes a board."""
 MAX_BOARDS = 3
 MAX_COSINE = 0.35
-"""Of the angle between the two first steps, mapped to the board plane; 45° has 0.7."""
+"""Largest cosine of the angle between the two first steps in the board plane; 45° has 0.7."""
 MIN_LINKS = 3
-"""Neighbours that a dot needs to start a grid."""
+"""Smallest number of neighbours of a dot that starts a grid."""
 NEARLY_ALL = 0.9
 """Share of the board that ends the search for a larger grid."""
 MIN_SIDE = 3
-"""Fewest rows and columns."""
+"""Smallest number of rows and columns."""
 CORNER_MARGIN = 0.4
 """A dot is the larger one when its radius is past this fraction of the way from the normal to the larger one."""
 MAX_UNEXPLAINED = 2
-"""Dots that a numbering may expect inside the image and not find, more than the best numbering does."""
+"""Largest number of missing dots inside the image of a numbering, beyond those of the best numbering."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,7 @@ class BoardReading:
 
 
 def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.ndarray) -> list[BoardReading]:
-    """Boards in the image, the one with the most dots first.
+    """Finds the boards in the image and returns the one with the most dots first.
 
     ``image_corners`` : (4, 2) corners of the image in normalised ideal coordinates, in order around it.
     """
@@ -76,7 +76,7 @@ def find_boards(candidates: Candidates, board: BoardDesign, image_corners: np.nd
 
 
 def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: BoardDesign) -> dict[int, tuple[int, int]]:
-    """The largest grid grown from any of the seeds; a complete one ends the search."""
+    """Returns the largest grid grown from any of the seeds; a complete one ends the search."""
     best: dict[int, tuple[int, int]] = {}
     inside, nearly_all = np.zeros(len(candidates), int), NEARLY_ALL * len(board.cells())
     for seed in seeds:
@@ -93,8 +93,9 @@ def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: Boar
 
 
 def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:
-    """For every candidate, mapped to a circle of the board's radius: the dot one pitch away in the four directions
-    that most neighbours agree on. Returns (n, 4) indices or −1, and (n, 2, 2) whose columns are the two steps."""
+    """Finds for each candidate, mapped to a circle of the board's radius, the dots one pitch away in the four
+    directions that most neighbours agree on. Returns (n, 4) indices or −1, and (n, 2, 2) whose columns are the two
+    steps."""
     n = len(candidates)
     k = min(NEIGHBOURS + 1, n)
     near = candidates.tree.query(candidates.xy, k=k)[1][:, 1:]
@@ -123,7 +124,7 @@ def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.n
 
 
 def _grow(candidates: Candidates, links, steps, seed: int, free) -> dict[int, tuple[int, int]]:
-    """Cells (u, v) by candidate, from neighbour to neighbour; the steps are carried along and renewed."""
+    """Returns cells (u, v) by candidate, grown from neighbour to neighbour; the steps are updated on the way."""
     start = np.array(steps[seed])
     for axis, (ahead, behind) in enumerate(((0, 2), (1, 3))):
         found = [
@@ -163,7 +164,7 @@ def _grow(candidates: Candidates, links, steps, seed: int, free) -> dict[int, tu
 
 
 def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) -> BoardReading | None:
-    """Fit the homography over the grown cells, match all dots by it, and list the numberings that fit."""
+    """Fits the homography of the grown cells, matches all dots with it, and lists the numberings that fit."""
     index = np.array(list(cells))
     uv = np.array(list(cells.values()))
     homography = _robust_homography(uv, candidates, index)
@@ -193,12 +194,12 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
 
 
 def needed_dots(board: BoardDesign) -> float:
-    """Fewest dots that make a reading of the board."""
+    """Returns the smallest number of dots for a reading of the board."""
     return max(MIN_SHARE * len(board.cells()), MIN_SIDE**2)
 
 
 def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:
-    """Homography over the cells that agree with it; None where they do not span the plane."""
+    """Returns the homography of the consistent cells; None if they do not span the plane."""
     keep = np.ones(len(uv), bool)
     for _ in range(5):
         if keep.sum() < MIN_SIDE**2 or min(np.ptp(uv[keep], axis=0)) < MIN_SIDE - 1:
@@ -219,7 +220,7 @@ def _robust_homography(uv, candidates: Candidates, index) -> np.ndarray | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Placement:
-    """One way to lay the board over n dots: ``unexplained`` dots, seen outside of it or expected and not seen;
+    """One placement of the board over n dots: ``unexplained`` : number of dots outside of it, or expected and missing;
     ``inside`` : (n,) those on it; ``cells`` : (n, 2) their row and column; ``index`` : (n,) of the candidates."""
 
     unexplained: int
@@ -231,7 +232,7 @@ class _Placement:
 def _place(
     candidates: Candidates, uv, index, turn: int, board: BoardDesign, homography, image_corners
 ) -> list[_Placement]:
-    """Placements of the grid turned by ``turn`` quarters."""
+    """Returns the placements of the grid turned by ``turn`` quarters."""
     rotation = np.array([[1, 0], [0, 1]])
     for _ in range(turn):
         rotation = rotation @ np.array([[0, -1], [1, 0]])
@@ -274,7 +275,7 @@ def _offsets(cells: np.ndarray, size: np.ndarray) -> np.ndarray:
 
 
 def _large_dots(candidates: Candidates, uv, index, board: BoardDesign, homography) -> np.ndarray:
-    """Mask of the dots that are larger than the others, as the larger corner dot is."""
+    """Returns the mask of the dots that are as large as the larger corner dot."""
     if board.corner is None or board.corner_radius_mm is None:
         return np.zeros(len(uv), bool)
     local = np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, uv))))
@@ -283,7 +284,7 @@ def _large_dots(candidates: Candidates, uv, index, board: BoardDesign, homograph
 
 
 def _inside_image(xy: np.ndarray, homography, uv, image_corners) -> np.ndarray:
-    """Mask of the predicted dots that lie in the image with their whole rim and some margin."""
+    """Returns the mask of the predicted dots that lie in the image with their whole rim and some margin."""
     margin = 0.35 * np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, uv))))
     edge = np.roll(image_corners, -1, axis=0) - image_corners
     normal = np.column_stack([-edge[:, 1], edge[:, 0]]) / np.linalg.norm(edge, axis=1)[:, None]
@@ -293,7 +294,7 @@ def _inside_image(xy: np.ndarray, homography, uv, image_corners) -> np.ndarray:
 
 
 def _reading(placements: list[_Placement], candidates: Candidates, board: BoardDesign) -> BoardReading:
-    """The dots that all likely placements number, with their numberings and homographies, and what else they may be."""
+    """Returns the dots that all likely placements number, their numberings, homographies and unlikely numberings."""
     most = placements[0].unexplained + MAX_UNEXPLAINED
     likely = [p for p in placements if p.unexplained <= most]
     common = np.logical_and.reduce([p.inside for p in likely])

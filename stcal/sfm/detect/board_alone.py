@@ -14,9 +14,9 @@ from stcal.sfm.detect.labels import MIN_EXPECTED, LabelledImage, labelled_image
 from stcal.sfm.detect.sightings import PlaneView, likely_views, readings_of
 
 MAX_SHIFT_PITCHES = 0.3
-"""A pose that a symmetry of the board explains puts its corners on one another to within this."""
+"""Largest distance of corners from one another under a symmetry of the board."""
 CLEAR_RAD = np.radians(20.0)
-"""By which a numbering must turn the camera less than the next one does."""
+"""Smallest difference of the camera's rotation between the best numbering and the next one."""
 UNNUMBERED = "left out, show the whole board, or a face with it"
 
 
@@ -31,7 +31,7 @@ def is_board_alone(detection: DetectionResult) -> bool:
 
 
 def label_boards(detection: DetectionResult, target: TargetDesign, board: BoardDesign) -> list[LabelledImage]:
-    """Labelled dots of all images, in the order of their groups."""
+    """Returns the labelled dots of all images, in the order of their groups."""
     groups: dict[str, list[DetectedImage]] = {}
     for image in detection.images:
         groups.setdefault(image.file.group, []).append(image)
@@ -54,7 +54,7 @@ def _label_group(images: list[DetectedImage], target: TargetDesign, board: Board
 
 
 def _views(image: DetectedImage, target: TargetDesign, board: BoardDesign) -> list[PlaneView] | str:
-    """The ways to number the one board of an image, all by its symmetry; or why there are none."""
+    """Returns the symmetric numberings of the only board of an image, or why there are none."""
     if not image.detection.boards:
         return ""
     if image.detection.board is None:

@@ -1,9 +1,9 @@
 """Faces of the target: the pattern is found in the face plane, after a homography, and the face named there.
 
 Document 000 walks along image directions and decides by dot products, which perspective breaks. Here two
-neighbouring candidates that could be two neighbouring circles of a design fix a map of the plane; it is grown to
-all circles of a face and every reading of the same candidates competes with it. A face is named only when one
-reading explains more circles than every other.
+neighbouring candidates that may be two neighbouring circles of a design determine a map of the plane. The map is grown
+to all circles of a face, and all readings of the same candidates compete. A face is named only if one reading explains
+more circles than every other.
 """
 
 from dataclasses import dataclass
@@ -22,49 +22,49 @@ NEIGHBOURS_IN_IMAGE = 12
 PAIR_TOLERANCE = 0.3
 """Relative tolerance of distance and size of a pair after the map of one ellipse to a circle."""
 SUPPORT = 5
-"""So many nearest circles are predicted from a pair …"""
+"""Number of nearest circles that are predicted from a pair …"""
 MIN_SUPPORT = 2
-"""… and so many of them must be there before the hypothesis is grown."""
+"""… and the number of them that must be present before the hypothesis is grown."""
 FIRST_HYPOTHESES = 300
-"""The best supported ones in an image are all grown, so that rivals meet; of the others …"""
+"""Number of the best supported hypotheses of an image that are all grown, so that rivals compete; of the others …"""
 MAX_TRIES = 8
-"""… at most so many from each outline that is in no reading yet: a dim face comes after all clutter."""
+"""… this many are grown from each outline without a reading, as a dim face ranks behind all clutter."""
 AT_ONCE = 32
-"""Hypotheses that are grown side by side, ahead of their turn."""
+"""Number of hypotheses that are grown side by side, ahead of their turn."""
 MAX_CONTRAST_RATIO = 4.0
-"""Between neighbouring circles of one face, which a shadow or a glare may cross."""
+"""Largest ratio of contrasts of neighbouring circles of one face, which a shadow or a glare may cross."""
 MIN_CIRCLES = 6
-"""A homography takes four circles; two more confirm it."""
+"""Smallest number of circles of a face. Four determine a homography; two more confirm it."""
 MAX_SIZE_RATIO = 1.25
-"""Between the sizes of two circles of a face, each over its design's, on top of a pixel of their diameters: the equal
-discs of a printed grid are no large and small circles."""
+"""Largest ratio of measured to designed size between two circles of a face, in addition to one pixel of diameter. It
+rejects printed grids of equal discs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceReading:
-    """One face in one image: ``index`` (n circles,) into the candidates, −1 where missing; ``homography`` from the
-    face plane (mm) into normalised coordinates."""
+    """One face in one image: ``index`` : (n circles,) into the candidates, −1 if missing; ``homography`` : from the
+    face plane (mm) to normalised coordinates."""
 
     face: FaceDesign
     index: np.ndarray
     homography: np.ndarray
 
     def count(self) -> int:
-        """Circles found."""
+        """Returns the number of circles found."""
         return int((self.index >= 0).sum())
 
     def used(self) -> np.ndarray:
-        """Candidates that it uses."""
+        """Returns the indices of the candidates of the face."""
         return self.index[self.index >= 0]
 
     def labels(self) -> list[CircleLabel]:
-        """Of these."""
+        """Returns the labels of the circles found."""
         return [label for label, i in zip(self.face.labels(), self.index, strict=True) if i >= 0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefusedReading:
-    """Candidates that were not named: ``readings`` that fit them, the ``value`` that did not pass the ``limit`` of
+    """Candidates that were not named: ``readings`` that fit them, and the ``value`` that failed the ``limit`` of
     ``gate``."""
 
     readings: tuple[FaceReading, ...]
@@ -73,14 +73,14 @@ class RefusedReading:
     limit: float
 
     def used(self) -> np.ndarray:
-        """Candidates that any of the readings uses."""
+        """Returns the indices of the candidates of any reading."""
         return np.unique(np.concatenate([each.used() for each in self.readings]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceFinding:
-    """``faces`` : named with certainty, a face in view twice with two readings; ``refused`` : what was seen and not
-    named, and why."""
+    """Faces in one image: ``faces`` : unambiguously named; a face in view twice has two readings; ``refused`` :
+    patterns without a name, and why."""
 
     faces: tuple[FaceReading, ...]
     refused: tuple[RefusedReading, ...]
@@ -88,13 +88,13 @@ class FaceFinding:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pairs:
-    """p pairs of neighbouring circles of a design, alike ones of several faces once, each with the s circles around the
-    first, and the u places on the faces where they are.
+    """p distinct pairs of neighbouring circles of a design, each with the s circles nearest to the first, and the u
+    occurrences of the pairs on faces.
 
-    ``offset`` : (p, s, 2) places of the circles around, from the first; ``radius`` : (p, s), the first's own in front;
-    ``there`` : (p, s), as faces of few circles have fewer; ``second`` : (p,) which of them is the neighbour;
-    ``uses`` : (p + 1,) where each pair's rows of the next two begin; ``face`` : (u,) number of the face; ``circles`` :
-    (u, s) their numbers in it, −1 where there is none.
+    ``offset`` : (p, s, 2) places of these circles relative to the first; ``radius`` : (p, s), beginning with the first
+    circle; ``there`` : (p, s) mask, as small faces have fewer circles; ``second`` : (p,) index of the pair's second
+    circle; ``uses`` : (p + 1,) start of each pair's rows in the next two; ``face`` : (u,) number of the face;
+    ``circles`` : (u, s) numbers of the circles in it, −1 if there is none.
     """
 
     offset: np.ndarray
@@ -108,8 +108,8 @@ class _Pairs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Starts:
-    """n hypotheses, the best supported first: ``origin`` (n,) the first outline, ``face`` (n,) its number,
-    ``circles`` (n, s) of it, and the ``candidates`` (n, s) that may be them, −1 where there is none."""
+    """n hypotheses, the best supported first: ``origin`` : (n,) first outline; ``face`` : (n,) number of the face;
+    ``circles`` : (n, s) of this face; ``candidates`` : (n, s) that match these circles, −1 if there is none."""
 
     origin: np.ndarray
     face: np.ndarray
@@ -117,20 +117,21 @@ class _Starts:
     candidates: np.ndarray
 
     def agree(self, face: int, index: np.ndarray) -> np.ndarray:
-        """Those of a face of which a reading, ``index`` by circle, has two circles or more; (n,)."""
+        """Returns the hypotheses of a face that agree with a reading, ``index`` by circle, in two circles or more."""
         own = np.flatnonzero(self.face == face)
         same = (index[self.circles[own]] == self.candidates[own]) & (self.candidates[own] >= 0)
         return own[same.sum(1) >= 2]
 
     def index(self, rank: int, width: int | None = None) -> np.ndarray:
-        """Candidate of each circle of the hypothesis's face, −1 where there is none; ``width`` : so long."""
+        """Returns the candidate of each circle of the hypothesis's face, −1 if there is none; ``width`` : length."""
         index = np.full(int(self.circles.max(initial=0)) + 1 if width is None else width, -1)
         matched = self.candidates[rank] >= 0
         index[self.circles[rank][matched]] = self.candidates[rank][matched]
         return index
 
     def unlike(self, rank: int, wanted: np.ndarray) -> list[int]:
-        """A hypothesis, and ``wanted`` ones behind it of which no two are likely to become the same reading."""
+        """Returns a hypothesis and ``wanted`` ones behind it, no two of which are likely to grow to the same
+        reading."""
         left, chosen = wanted.copy(), []
         left[:rank], left[rank] = False, True
         while len(chosen) < AT_ONCE and left.any():
@@ -143,7 +144,7 @@ class _Starts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Circles:
-    """All faces of a design: ``xy`` (f, m, 2), mm, and ``radius`` (f, m), 0 behind the last circle of a face."""
+    """All faces of a design: ``xy`` : (f, m, 2), mm, and ``radius`` : (f, m), 0 behind the last circle of a face."""
 
     xy: np.ndarray
     radius: np.ndarray
@@ -190,14 +191,16 @@ def _pairs(target: TargetDesign) -> _Pairs:
 
 
 class FaceFinder:
-    """Finds the faces of one design."""
+    """Finder of the faces of one design."""
 
     def __init__(self, target: TargetDesign):
         self.target = target
 
     def find(self, candidates: Candidates) -> FaceFinding:
-        """All faces among the candidates. The image of a face in a mirror can pass for another face, which only the
-        group can tell."""
+        """Finds all faces among the candidates.
+
+        The mirror image of a face may look like another face; only the group can tell.
+        """
         readings: list[FaceReading] = []
         if len(candidates) < MIN_CIRCLES or not self.target.faces:
             return _decide(readings, self.target)
@@ -225,7 +228,7 @@ class FaceFinder:
         return _decide(readings, self.target)
 
     def _grown(self, candidates: Candidates, starts: "_Starts", ranks: list[int]):
-        """Circles and homography that each of some hypotheses grows to, side by side; None where none hold together."""
+        """Grows hypotheses side by side: returns circles and homography by rank, None if too few circles agree."""
         circles = _circles(self.target)
         index = np.stack([starts.index(rank, circles.radius.shape[1]) for rank in ranks])
         face = starts.face[ranks]
@@ -237,14 +240,14 @@ class FaceFinder:
         }
 
     def find_mirrored(self, candidates: Candidates, named: tuple[FaceReading, ...]) -> tuple[FaceReading, ...]:
-        """Faces that the image shows as a mirror does, if none of those ``named`` in it says that it does not."""
+        """Returns faces that appear mirrored in the image; none if a ``named`` face shows that it is not mirrored."""
         if any(reading.face.id not in mirror_images(self.target) for reading in named):
             return ()
         found = self.find(candidates.mirrored()).faces
         return tuple(reading for reading in found if reading.face.id not in mirror_images(self.target))
 
     def _hypotheses(self, candidates: Candidates) -> _Starts:
-        """All pairs of neighbouring outlines that may be a pair of the design, with their support."""
+        """Returns all pairs of neighbouring outlines that may be a pair of the design, with their support."""
         pairs = _pairs(self.target)
         first, step, ratio = _candidate_pairs(candidates)
         every = np.arange(len(pairs.second))
@@ -268,7 +271,8 @@ class FaceFinder:
 
 
 def _candidate_pairs(candidates: Candidates):
-    """Neighbours of like shape: the first, the step to the second where the first is a unit circle, size ratio."""
+    """Returns pairs of neighbours of similar shape: first, step to the second if the first is a unit circle, size
+    ratio."""
     k = min(NEIGHBOURS_IN_IMAGE + 1, len(candidates))
     second = candidates.tree.query(candidates.xy, k=k)[1][:, 1:].ravel()
     first = np.repeat(np.arange(len(candidates)), k - 1)
@@ -284,7 +288,7 @@ def _candidate_pairs(candidates: Candidates):
 
 
 def _turn(step_plane: np.ndarray, step_image: np.ndarray) -> np.ndarray:
-    """Turn and scale, (n, 2, 2), that takes each plane vector (n, 2) to its image vector (n, 2)."""
+    """Returns the rotations with scale, (n, 2, 2), that map plane vectors (n, 2) to image vectors (n, 2)."""
     (a, b), (x, y) = step_plane.T, step_image.T
     square = a * a + b * b
     c, s = (a * x + b * y) / square, (a * y - b * x) / square
@@ -292,9 +296,9 @@ def _turn(step_plane: np.ndarray, step_image: np.ndarray) -> np.ndarray:
 
 
 def _support(candidates: Candidates, pairs: _Pairs, pair: np.ndarray, xy: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """Candidates near the affine prediction of the circles around the first: (h, s), −1 where there is none.
+    """Returns the candidates near the affine prediction of the circles around the first: (h, s), −1 if there is none.
 
-    ``pair`` : (h,) of the design; ``xy`` : (h, 2) of the first candidate; ``linear`` : (h, 2, 2) map of the plane
+    ``pair`` : (h,) pairs of the design; ``xy`` : (h, 2) first candidate; ``linear`` : (h, 2, 2) map of the plane
     """
     offset, radius = pairs.offset[pair], pairs.radius[pair]
     predicted = xy[:, None] + offset @ np.swapaxes(linear, 1, 2)
@@ -307,13 +311,13 @@ def _support(candidates: Candidates, pairs: _Pairs, pair: np.ndarray, xy: np.nda
 
 
 def _seen_from_outside(homography: np.ndarray, face: FaceDesign) -> bool:
-    """Whether the face's Z points to the camera; the mirror image of a face has it point away."""
+    """Returns whether the face's Z points to the camera. On the mirror image of a face it points away."""
     depth = face.xy_mm[0] @ homography[2, :2] + homography[2, 2]
     return np.linalg.det(homography) * depth < 0
 
 
 def _of_one_size(candidates: Candidates, face: FaceDesign, index: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """``index`` without the circles that are larger or smaller against their design than most others."""
+    """Returns ``index`` without circles whose ratio of size to design deviates from the median."""
     local = homography_jacobian(homography, face.xy_mm)
     expected = face.radius_mm * np.sqrt(np.abs(np.linalg.det(local)))
     ratio = candidates.radius[index] / expected
@@ -323,12 +327,12 @@ def _of_one_size(candidates: Candidates, face: FaceDesign, index: np.ndarray, ho
 
 
 def needed_circles(face: FaceDesign) -> int:
-    """Fewest circles that make a reading of the face."""
+    """Returns the smallest number of circles for a reading of the face."""
     return min(MIN_CIRCLES, len(face.ids))
 
 
 def _decide(readings: list[FaceReading], target: TargetDesign) -> FaceFinding:
-    """Keep the readings that explain more than every other reading of the same candidates."""
+    """Keeps the readings that explain more circles than every other reading of the same candidates."""
     readings = [r for r in readings if r.count() >= needed_circles(r.face)]
     readings.sort(key=lambda r: -r.count())
     named: list[FaceReading] = []

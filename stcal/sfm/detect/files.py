@@ -1,4 +1,4 @@
-"""Detection over all files: in parallel, each result kept by the content of its image and the options."""
+"""Detection in all files, in parallel. Results are cached by content of the image and options."""
 
 import hashlib
 import json
@@ -28,18 +28,18 @@ from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predi
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
 CACHE_VERSION = 7
-"""Raised whenever detection gives other results for the same image: what was kept is then not used again."""
+"""Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
 LOSSY = (".jpg", ".jpeg")
 COPY = re.compile(r"\b(copy|kopie|copie|copia|cópia)\b|\(\d+\)|~", re.IGNORECASE)
-"""What file managers add to the name of a second copy."""
+"""Additions of file managers to the name of a second copy."""
 SAME_PLACE_PX = 4.0
 SAME_SHARE = 0.6
 """Share of an image's circles that lie within the same squares of that side in another form of it; at a square's edge
 some change over."""
 
 Detector = Callable[[np.ndarray, Camera, TargetDesign, BoardDesign | None, EllipseOptions], ImageDetection]
-"""Reads one grey image."""
+"""Type of functions that detect circles in one grey image."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +76,7 @@ def detect_files(
     detector: Detector | None = None,
     forms: bool = True,
 ) -> DetectionResult:
-    """Detect in all files; what cannot be used is skipped and listed.
+    """Detects circles in all files; unusable files are skipped and listed.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera,
 def _fingerprint(
     detector: Detector | None, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> str:
-    """Hash of everything but the image that detection depends on."""
+    """Returns a hash of everything that detection depends on except the image."""
 
     def plain(value):
         return value.tolist() if isinstance(value, np.ndarray) else str(value)
@@ -152,7 +152,7 @@ def _key(data: bytes, settings: str) -> tuple[str, str]:
 
 
 def _kept(file: ImageFile, settings: str, cache: Path) -> DetectedImage | None:
-    """The result of an earlier run for this content and these settings."""
+    """Returns the cached result for this content and these settings."""
     try:
         path = cache / f"{_key(file.read(), settings)[1]}.npz"
     except OSError:
@@ -170,7 +170,7 @@ def _detect_file(
     settings: str,
     detector: Detector | None,
 ) -> tuple[str, bytes] | Skipped:
-    """Detect in one file: the key of the result, and what is to be kept of it."""
+    """Detects circles in one file; returns the key of the result and its content for the cache."""
     loaded = load_image(file, camera, size_from)
     if isinstance(loaded, Skipped):
         return loaded
@@ -184,7 +184,7 @@ def _detect_file(
 
 
 def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedImage:
-    """Keep a result, and take it as it is kept."""
+    """Saves a result in the cache and loads it from there."""
     path = cache / f"{key}.npz"
     save(path, content)
     found = _load(file, path, reused=False)
@@ -240,7 +240,7 @@ def _packed(detection: ImageDetection, digest: str, image: np.ndarray) -> bytes:
 
 
 def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
-    """Read what was kept; None where the file is damaged."""
+    """Loads a cached result; None if the file is damaged."""
 
     def make(stored, meta) -> DetectedImage:
         faces = [
@@ -287,7 +287,7 @@ def look_again(
     cache: Path,
     workers: int | None = None,
 ) -> dict[str, SecondLook]:
-    """Measure the circles that are predicted in images; by name. What an earlier run measured is kept.
+    """Measures the circles that are predicted in images; returns results by name, cached ones included.
 
     An image that can no longer be read is left as it was after the first look.
     """
@@ -332,7 +332,7 @@ def _stored_look(stored, meta) -> SecondLook:
 
 
 def copy_of(file: ImageFile, first: str, what: str = "") -> Skipped:
-    """Why a second file of the same content is left out."""
+    """Returns the reason why a second file of the same content is skipped."""
     return Skipped(file.name, f"the same image as {first}{what}", "copy")
 
 
@@ -356,7 +356,7 @@ def _without_copies(found: list[DetectedImage | Skipped], forms: bool) -> tuple[
 
 
 def _plainness(file: ImageFile) -> tuple[bool, bool, int]:
-    """Less is plainer: a form without losses, no word of a copy in the name, a short name."""
+    """Returns a sort key: lossless files first, then names without a word for copy, then short names."""
     return file.path.suffix.lower() in LOSSY, bool(COPY.search(file.path.stem)), len(file.path.stem)
 
 
@@ -388,7 +388,7 @@ def _same_pixels(one: ImageFile, two: ImageFile) -> bool:
 
 
 def require_upright(images: tuple[DetectedImage, ...]) -> None:
-    """Refuse a set of images that is mirrored.
+    """Raises an error for a set of mirrored images.
 
     Raises
     ------

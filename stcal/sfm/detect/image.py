@@ -1,4 +1,4 @@
-"""One image: candidates → board → faces → centres. What only the group can decide stays open."""
+"""Detection in one image: candidates → board → faces → centres. Decisions that need the group stay open."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,19 +20,19 @@ from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetecti
 
 NAMELESS, DOT = "a circle of a face without a name", "a board dot"
 FAINT = 0.25
-"""Of the contrast asked for, where an image shows too little with that."""
+"""Share of the required contrast that is used if an image shows too little with the full one."""
 MAX_FREE = 400
-"""Outlines beside the boards that are tried for faces, the largest: photographs have up to 130, and time and memory
-grow with each; a fine checkerboard has tens of thousands."""
+"""Largest number of outlines outside of boards that are tried for faces; the largest outlines are used. Photographs
+have up to 130. A fine checkerboard has tens of thousands, and time and memory grow with each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageReading:
-    """What the outlines in one image were read as, before their centres are measured.
+    """Interpretation of the outlines in one image, before their centres are measured.
 
-    ``found`` : all outlines by polarity; ``boards`` : the one with the most dots first; ``free`` : the target's
-    outlines that are no board's, the largest ``MAX_FREE``; ``faces`` : what they were read as; ``mirrored`` : faces
-    seen as in a mirror; ``untried`` : outlines that are too many.
+    ``found`` : all outlines by polarity; ``boards`` : the board with the most dots first; ``free`` : the largest
+    ``MAX_FREE`` outlines of the target's polarity outside of boards; ``faces`` : faces among the free outlines;
+    ``mirrored`` : faces that appear mirrored; ``untried`` : number of outlines beyond ``MAX_FREE``.
     """
 
     found: dict[Polarity, Ellipses]
@@ -43,25 +43,28 @@ class ImageReading:
     untried: int = 0
 
     def face_ids(self) -> set[str]:
-        """Faces that are named."""
+        """Returns the ids of the named faces."""
         return {each.face.id for each in self.faces.faces}
 
 
 def read_image(
     grey: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> ImageReading:
-    """Find the outlines of one polarity or both in an 8-bit image, and the boards and the faces among them.
+    """Finds outlines of one polarity or both in an 8-bit image, and the boards and faces among them.
 
-    Where that leaves the board or the faces unnamed that an image of a group is to show, fainter outlines are let in.
+    If the board, or enough faces for an image of a group, are not recognised, fainter outlines are used too.
     """
     reading = _read_once(grey, camera, target, board, options)
     wanted = min(len(target.faces), 1 if board is None else 2)
     short = len(reading.face_ids()) < wanted or (board is not None and not reading.boards)
     if short and not reading.untried:
         faint = replace(options, min_contrast=FAINT * options.min_contrast)
-        again = _read_once(grey, camera, target, board, faint)
-        better = (len(again.boards) > 0, len(again.face_ids())) > (len(reading.boards) > 0, len(reading.face_ids()))
-        return again if better else reading
+        second_reading = _read_once(grey, camera, target, board, faint)
+        better = (len(second_reading.boards) > 0, len(second_reading.face_ids())) > (
+            len(reading.boards) > 0,
+            len(reading.face_ids()),
+        )
+        return second_reading if better else reading
     return reading
 
 
@@ -76,18 +79,18 @@ def _read_once(
         boards = find_boards(Candidates.of(found[board.polarity], camera), board, image_corners(camera))
         for each in boards:
             free[board.polarity][each.candidates] = False
-    every = found[target.polarity].select(free[target.polarity])
-    ellipses = every.select(np.sort(np.argsort(-every.radius_px(), kind="stable")[:MAX_FREE]))
+    all_free = found[target.polarity].select(free[target.polarity])
+    ellipses = all_free.select(np.sort(np.argsort(-all_free.radius_px(), kind="stable")[:MAX_FREE]))
     finder, candidates = FaceFinder(target), Candidates.of(ellipses, camera)
     faces = finder.find(candidates)
     mirrored = finder.find_mirrored(candidates, faces.faces)
-    return ImageReading(found, tuple(boards), ellipses, faces, mirrored, len(every) - len(ellipses))
+    return ImageReading(found, tuple(boards), ellipses, faces, mirrored, len(all_free) - len(ellipses))
 
 
 def detect_image(
     image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> ImageDetection:
-    """Find and measure all circles of the target and the board in one grey image of the camera's size."""
+    """Finds and measures all circles of the target and the board in one grey image of the camera's size."""
     reading = read_image(grey_8bit(image), camera, target, board, options)
     scaled = grey_fine(image)
     named, refused, boards = reading.faces.faces, reading.faces.refused, reading.boards
@@ -127,7 +130,7 @@ def detect_image(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pattern:
-    """Ellipses that belong together, what they are, and their names for notes."""
+    """Ellipses of one face or board, their polarity, and their names for notes."""
 
     polarity: Polarity
     ellipses: Ellipses
@@ -137,21 +140,21 @@ class _Pattern:
 def _measured(
     image: np.ndarray, camera: Camera, patterns: list[_Pattern], found: dict[Polarity, Ellipses]
 ) -> list[Centres]:
-    """The centres of each pattern, all of one polarity measured at once."""
+    """Returns the centres of each pattern. All patterns of one polarity are measured at once."""
     measured: dict[int, Centres] = {}
     for polarity, every in found.items():
-        own = [i for i, pattern in enumerate(patterns) if pattern.polarity == polarity]
-        if not own:
+        members = [i for i, pattern in enumerate(patterns) if pattern.polarity == polarity]
+        if not members:
             continue
-        groups = np.repeat(np.arange(len(own)), [len(patterns[i].ellipses) for i in own])
-        together = Ellipses.concatenate([patterns[i].ellipses for i in own])
+        groups = np.repeat(np.arange(len(members)), [len(patterns[i].ellipses) for i in members])
+        together = Ellipses.concatenate([patterns[i].ellipses for i in members])
         centres = measure_centres(image, camera, together, every, groups)
-        measured |= {i: centres.select(np.flatnonzero(groups == k)) for k, i in enumerate(own)}
+        measured |= {i: centres.select(np.flatnonzero(groups == k)) for k, i in enumerate(members)}
     return [measured[i] for i in range(len(patterns))]
 
 
 def _sighting(reading: FaceReading, row: np.ndarray) -> FaceSighting:
-    """``row`` : of each candidate among the centres, −1 where it was not measured."""
+    """Returns the sighting of a reading. ``row`` : index of each candidate among the centres, −1 if not measured."""
     rows = np.where(reading.index >= 0, row[reading.index], -1)
     circles = np.flatnonzero(rows >= 0)
     return FaceSighting(reading.face.id, rows[circles], circles)
@@ -176,6 +179,6 @@ def _untried_note(reading: ImageReading) -> str:
 
 
 def image_corners(camera: Camera) -> np.ndarray:
-    """Corners of the image, around it, in normalised ideal coordinates."""
+    """Returns the corners of the image in order around it, in normalised ideal coordinates, (4, 2)."""
     right, bottom = camera.width - 0.5, camera.height - 0.5
     return camera.normalised_from_pixel(np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]]))

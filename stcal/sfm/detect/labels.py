@@ -41,18 +41,18 @@ MIN_CONFIRMED = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledImage:
-    """Observations of one image, and why anything seen in it was left out."""
+    """Observations of one image, and notes on what was excluded."""
 
     observations: ImageObservations
     notes: tuple[str, ...]
 
     def plus(self, labels: Sequence[Label], centres: Centres, notes: Sequence[str]) -> "LabelledImage":
-        """With further circles and notes."""
+        """Returns the image with further circles and notes."""
         more = labelled_image(self.observations.name, self.observations.group, labels, centres, ())
         return LabelledImage(self.observations.plus(more.observations), (*self.notes, *notes))
 
     def without(self, labels: Collection[Label], notes: Sequence[str]) -> "LabelledImage":
-        """Without some circles, and with notes."""
+        """Returns the image without the circles of ``labels``, and with further notes."""
         if not labels:
             return self
         keep = [i for i, label in enumerate(self.observations.labels) if label not in labels]
@@ -62,7 +62,7 @@ class LabelledImage:
 def labelled_image(
     name: str, group: str, labels: Sequence[Label], centres: Centres, notes: Sequence[str]
 ) -> LabelledImage:
-    """Of circles and their labels, one for each; notes that say the same become one."""
+    """Returns the image of labelled circles; identical notes are merged."""
     observations = ImageObservations(
         name=name,
         group=group,
@@ -93,7 +93,7 @@ def label_images(
     cache: Path,
     workers: int | None = None,
 ) -> list[LabelledImage]:
-    """Labelled circles of all images, in the order of their groups.
+    """Returns the labelled circles of all images, in the order of their groups.
 
     ``cache`` : folder for what the second look measures.
     """
@@ -124,8 +124,10 @@ def label_images(
 
 
 def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:
-    """Labelled circles of all images, in the order of their groups, as each image read them: the group names plain
-    boards, and what contradicts it is left out; nothing is looked for again."""
+    """Returns the labelled circles of all images, in the order of their groups, without a second look.
+
+    The group numbers plain boards, and readings that contradict it are excluded.
+    """
     groups = [named for _, named in _groups(detection)]
     focal_px = float(np.sqrt(detection.camera.focal.prod()))
     return [each for found, _ in label_groups(groups, target, board, focal_px) for each in found]
@@ -142,7 +144,7 @@ def _groups(detection: DetectionResult) -> list[tuple[list[DetectedImage], list[
 def _without_outlying(
     group: list[LabelledImage], arrangement: Arrangement, patterns: dict[str, Pattern], focal_px: float
 ) -> tuple[list[LabelledImage], Arrangement]:
-    """A group's images without the circles that contradict the rest, and the arrangement adjusted without them."""
+    """Removes circles that contradict the others of the group, and adjusts the arrangement without them."""
     arrangement, outlying = outlying_circles(arrangement, [each.observations for each in group], patterns, focal_px)
     reasons = [outlying.get(i, {}) for i in range(len(group))]
     return [e.without(r, contradicted_notes(r)) for e, r in zip(group, reasons, strict=True)], arrangement
@@ -221,7 +223,7 @@ def _arranged(
 
 
 def step_mm(target: TargetDesign, board: BoardDesign | None) -> float:
-    """Distance from circle to circle: the board's pitch, or the median of the target's."""
+    """Returns the distance between neighbouring circles: the board's pitch, or the target's median."""
     if board is not None:
         return board.pitch_mm
     steps = []
@@ -274,7 +276,7 @@ OF_A_BOARD, OF_A_FACE = ("a board of ", "board of "), ("a pattern ",)
 
 
 def leaves_a_board_out(note: str) -> bool:
-    """Whether a note is of a whole board, not of single dots."""
+    """Returns whether a note concerns a whole board, not single dots."""
     return note.startswith(OF_A_BOARD)
 
 

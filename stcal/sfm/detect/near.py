@@ -1,4 +1,4 @@
-"""Circles near their predicted places, in an image that follows another one: their common shift, then their centres."""
+"""Circles near their predicted places, in an image that follows another one: common shift and centres."""
 
 import cv2
 import numpy as np
@@ -11,17 +11,17 @@ from stcal.sfm.detect.circles.ellipses import Ellipses
 from stcal.sfm.detect.predict import PredictedCircles, stands_out
 
 SEARCH = 5.0
-"""How far from their predicted places the circles are looked for, in their mean radius, to each side."""
+"""Search range about the predicted places, in mean radii of the circles, to each side."""
 COARSE_RADIUS_PX = 2.5
-"""Radius of the circles in the small picture by which their common shift is found."""
+"""Radius of the circles in the small picture that the common shift is measured in."""
 CORRELATED = 0.3
-"""Correlation below which the shift is taken for chance, and the prediction as it is."""
+"""Smallest significant correlation. Below it the shift is ignored."""
 LEVEL_PX = 9
-"""Side of the square in the small picture whose mean is taken away."""
+"""Side of the square in the small picture whose mean is subtracted."""
 
 
 def measure_near(image: np.ndarray, camera: Camera, predicted: PredictedCircles) -> tuple[tuple[Label, ...], Centres]:
-    """The circles of a grey image of any depth that are found from their predicted places, with their centres."""
+    """Returns the labels and centres of the circles that are found at predicted places in a grey image of any depth."""
     expected = Ellipses(predicted.centre_px, predicted.shape_px, np.ones(len(predicted.labels)))
     planes = [label.plane for label in predicted.labels]
     number = {plane: i for i, plane in enumerate(dict.fromkeys(planes))}
@@ -31,10 +31,10 @@ def measure_near(image: np.ndarray, camera: Camera, predicted: PredictedCircles)
 
 
 def common_shift(grey: np.ndarray, predicted: PredictedCircles) -> np.ndarray:
-    """By how much the circles of an 8-bit image lie beside their predicted places, (2,) px, to a fraction of a radius.
+    """Returns the common shift of the circles of an 8-bit image from their predicted places, (2,) px.
 
-    The picture, and discs at the predicted places, both small and without what varies slowly, are correlated
-    (Lewis 1995, Fast normalized cross-correlation).
+    It is accurate to a fraction of a radius. The image and discs at the predicted places, both reduced and high-pass
+    filtered, are correlated (Lewis 1995, Fast normalized cross-correlation).
     """
     radius = float(np.sqrt(np.linalg.det(predicted.shape_px)).mean() ** 0.5)
     scale = min(1.0, COARSE_RADIUS_PX / radius)
@@ -60,7 +60,7 @@ def common_shift(grey: np.ndarray, predicted: PredictedCircles) -> np.ndarray:
 
 
 def _part(grey: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """A part of an image; beyond the image its edge goes on."""
+    """Returns a part of an image, with the edge replicated outside of the image."""
     (left, top), (right, bottom), (height, width) = low.tolist(), high.tolist(), grey.shape
     inside = grey[max(top, 0) : min(bottom, height), max(left, 0) : min(right, width)]
     borders = max(-top, 0), max(bottom - height, 0), max(-left, 0), max(right - width, 0)
@@ -68,5 +68,5 @@ def _part(grey: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 
 def _levelled(image: np.ndarray) -> np.ndarray:
-    """Less the mean around each pixel."""
+    """Returns the image minus the local mean around each pixel."""
     return image - cv2.blur(image, (LEVEL_PX, LEVEL_PX))

@@ -1,4 +1,4 @@
-"""Circles that are not where the rest of their group has them.
+"""Detection of circles that contradict the other observations of their group.
 
 The rim of a circle that something cuts follows an ellipse still, about another centre. One image cannot tell it from a
 circle that was made off its place; the group can: where each image was taken from, and where each plane stands, is
@@ -23,7 +23,7 @@ MIN_LIMIT_PX = 0.5
 BEYOND = 4.0
 """Times the median of the plane's circles: 4.7 σ of normal errors, of which one in 60 000 is longer."""
 BEYOND_SIGMA = 6.0
-"""Times the centre's own σ."""
+"""Smallest outlying distance in σ of the centre."""
 MIN_USUAL = 6
 """Circles of a plane that have a pose of their own and say what is usual; fewer are held to what others say of both."""
 ALIKE = 0.5
@@ -34,7 +34,7 @@ MAX_ROUNDS = 10
 def outlying_circles(
     arrangement: Arrangement, images: Sequence[ImageObservations], patterns: dict[str, Pattern], focal_px: float
 ) -> tuple[Arrangement, dict[int, dict[Label, str]]]:
-    """Circles that contradict the rest of their group, and the arrangement adjusted without them.
+    """Finds circles that contradict the others of their group, and adjusts the arrangement without them.
 
     Parameters
     ----------
@@ -130,13 +130,13 @@ class _Circles:
         return replace(found, centre_px=found.centre_px - found._eccentricity_px(table[:, 8])) if rows else found
 
     def rearranged(self, arrangement: Arrangement) -> Arrangement:
-        """The arrangement with these poses."""
+        """Returns the arrangement with these poses."""
         cameras = {i: self.camera_from_group.rigid(a) for a, i in enumerate(arrangement.camera_from_group)}
         planes = {p: self.group_from_plane.rigid(b) for b, p in enumerate(arrangement.group_from_plane)}
         return replace(arrangement, camera_from_group=cameras, group_from_plane=planes)
 
     def adjusted(self, keep: np.ndarray) -> "_Circles":
-        """With poses of least error over those to ``keep``, of the planes that show enough for a pose of their own."""
+        """Returns the circles with poses adjusted to those to ``keep`` on planes with enough circles for a pose."""
         use = keep & self.enough()
         if not use.any():
             return self
@@ -145,19 +145,19 @@ class _Circles:
         return replace(self, camera_from_group=cameras, group_from_plane=planes)
 
     def enough(self) -> np.ndarray:
-        """Mask of the circles whose plane shows enough of them."""
+        """Returns the mask of the circles on planes with enough circles."""
         return np.bincount(self.plane, minlength=1)[self.plane] >= MIN_USUAL
 
     def in_one_image(self) -> np.ndarray:
-        """Mask of the circles of faces that one image alone shows."""
+        """Returns the mask of the circles of faces that only one image shows."""
         images = [len(np.unique(self.image[self.plane == p])) for p in range(len(self.group_from_plane))]
         return np.array(
             [images[p] == 1 and row[1].plane != BOARD for p, row in zip(self.plane, self.rows, strict=True)]
         )
 
     def off_px(self) -> tuple[np.ndarray, np.ndarray]:
-        """By how much centres are off their places, (n, 2), and the derivative (n, 2, 2) by a circle's place in its
-        plane, px/mm."""
+        """Returns the deviations of centres from their places, (n, 2) px, and their derivatives (n, 2, 2) by the
+        place in the plane, px/mm."""
         rotation, xyz = self._placed()
         ideal = xyz[:, :2] / xyz[:, 2:]
         by_point = np.zeros((len(xyz), 2, 3))
@@ -167,7 +167,7 @@ class _Circles:
         return self.centre_px - self.focal_px * ideal, by_point @ rotation[:, :, :2]
 
     def _placed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations camera_from_plane (n, 3, 3), and circles in the camera frame (n, 3)."""
+        """Returns rotations camera_from_plane (n, 3, 3), and circles in the camera frame (n, 3)."""
         camera, plane = self.camera_from_group[self.image], self.group_from_plane[self.plane]
         xyz = np.einsum("nij,nj->ni", plane.rotation, self.xyz_mm) + plane.translation
         return camera.rotation @ plane.rotation, np.einsum("nij,nj->ni", camera.rotation, xyz) + camera.translation
@@ -179,7 +179,7 @@ class _Circles:
 
 
 def _worst(circles: _Circles, keep: np.ndarray) -> dict[int, str]:
-    """Of the circles to ``keep`` that are outlying the worst of every plane in every image: it draws the others."""
+    """Returns the worst outlying circle to ``keep`` of each plane and image, as it biases the others."""
     shift, by_place = circles.off_px()
     off, limit = np.linalg.norm(shift, axis=1), np.maximum(MIN_LIMIT_PX, BEYOND_SIGMA * circles.sigma_px)
     alone, enough = circles.in_one_image(), circles.enough()

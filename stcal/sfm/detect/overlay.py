@@ -1,4 +1,4 @@
-"""Overlay pictures: what was found in an image, drawn on it."""
+"""Overlay pictures: images with the measured circles drawn on them."""
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ BOARD_COLOUR = (233, 180, 86)
 QUALITY = 82
 MIN_WIDTH_PX = 1000
 MIN_LABEL_GAP = 70.0
-"""Between numbered dots, px at text size 1."""
+"""Smallest distance between numbered dots, px at text size 1."""
 
 
 def draw_overlay(
@@ -24,7 +24,7 @@ def draw_overlay(
     focal_px: np.ndarray,
     notes: int,
 ) -> bytes:
-    """A JPEG with every measured ellipse and its label.
+    """Returns a JPEG with every measured ellipse and its label.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def draw_overlay(
 
 
 def _numbered_dots(observations: ImageObservations, gap_px: float) -> set[DotLabel]:
-    """Dots of the first row and column that carry their number: the first and last, and all where there is room."""
+    """Returns the numbered dots of the first row and column: the first and last, and all if there is room."""
     place = {x: p for x, p in zip(observations.labels, observations.centre_px, strict=True) if isinstance(x, DotLabel)}
     chosen = set()
     for line in (
@@ -82,7 +82,7 @@ def _numbered_dots(observations: ImageObservations, gap_px: float) -> set[DotLab
 
 
 def _rim(centre_px: np.ndarray, shape_px: np.ndarray, scale: float) -> np.ndarray:
-    """Points of the rim in the thumbnail, in sixteenths of a pixel; lens distortion inside a circle is not visible."""
+    """Returns points of the rim in the thumbnail, in 1/16 px. Lens distortion within a circle is not visible."""
     angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     rim = centre_px + np.column_stack([np.cos(angle), np.sin(angle)]) @ shape_px.T
     return np.round(((rim + 0.5) * scale - 0.5) * 16).astype(np.int32)

@@ -1,4 +1,4 @@
-"""Poses of images and of planes that do not move against each other, of least reprojection error."""
+"""Bundle adjustment of the poses of images and of planes that do not move against each other."""
 
 from dataclasses import dataclass
 
@@ -11,16 +11,16 @@ from stcal.geometry.rigid import skew
 from stcal.geometry.robust import huber_cost, huber_weights
 
 HUBER_PX = 1.5
-"""Beyond it a residual is no longer one of centring, at which planes of a printed design are off."""
+"""Residuals beyond this have less weight: they are not errors of centring but deviations of printed planes."""
 SETTLED = 1e-4
-"""Share of χ² that the adjustment may leave: it only has to predict to a fraction of a pixel."""
+"""Relative decrease of χ² at convergence. A prediction to a fraction of a pixel is sufficient."""
 MAX_STEPS = 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneBundle:
-    """What was seen of points of planes: of n points ``image``, ``plane`` (n,), ``xyz`` (n, 3) in the plane, ``seen``
-    (n, 2) px, ideal."""
+    """n observations of points of planes: ``image``, ``plane`` : (n,); ``xyz`` : (n, 3) in the plane; ``seen`` : (n, 2)
+    measured, ideal px."""
 
     image: np.ndarray
     plane: np.ndarray
@@ -29,10 +29,10 @@ class PlaneBundle:
     focal_px: float
 
     def adjusted(self, poses: PoseStack, planes: PoseStack) -> tuple[PoseStack, PoseStack]:
-        """Poses camera_from_world of the m images and world_from_plane of the planes, the first plane held.
+        """Returns the poses camera_from_world of the m images and world_from_plane of the planes; the first plane is
+        fixed.
 
-        Where there is no minimum within the steps, the last state is as good a prediction: what it predicts is to be
-        verified anyway.
+        Without convergence the last state is returned: its predictions are verified anyway.
         """
 
         def moved(state, step: np.ndarray):
@@ -90,7 +90,7 @@ class PlaneBundle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Linear:
-    """Normal equations of the images' poses, reduced away, and of all planes' but the first."""
+    """Normal equations of the images' poses, which are eliminated, and of all planes except the first."""
 
     cost: float
     poses: np.ndarray
@@ -100,7 +100,7 @@ class _Linear:
     cross: np.ndarray
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Of the images (6m,), then of the planes."""
+        """Returns the step of the images (6m,) and planes, and the predicted gain."""
         damped = self.poses * (1 + damping * np.eye(6))
         away = reduce(damped, self.pose_right, self.cross)
         k = len(self.plane_right)

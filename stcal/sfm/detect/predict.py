@@ -25,12 +25,12 @@ from stcal.sfm.detect.circles.ellipses import MIN_DIAMETER_PX, EllipseOptions, E
 from stcal.sfm.detect.circles.fits import MIN_SIGMA
 
 MAX_STRETCH = 1.15
-"""Between the predicted and the measured ellipse along any direction, on top of half a pixel at each end: a circle
+"""Largest ratio of measured to predicted ellipse along any direction, beyond half a pixel at each end: a circle
 whose edge is cut by a seventh of its diameter has its centre off by as much as the rim test lets pass."""
 MAX_SIGMA_PX = 0.5
-"""Of a centre: fifty times that of a clear one, so that it weighs nothing and only counts."""
+"""Largest σ of a centre: fifty times that of a clear one, so its weight is negligible."""
 MIN_SIGNIFICANCE = 8.0
-"""Of the contrast, in σ of a pixel's noise around the rim: one pixel of clutter or noise is no edge."""
+"""Smallest contrast, in σ of a pixel's noise around the rim: one pixel of clutter or noise is no edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +54,7 @@ class PredictedCircles:
         object.__setattr__(self, "wanted", frozen(self.wanted, (n,), "wanted", dtype=bool))
 
     def shifted(self, by_px: np.ndarray) -> "PredictedCircles":
-        """All of them beside their places, by (2,) px."""
+        """Returns all circles shifted by (2,) px."""
         return replace(self, centre_px=self.centre_px + by_px)
 
 
@@ -167,7 +167,7 @@ def measure_predicted(
 
 
 def stands_out(found: Centres, polarity: Sequence[Polarity]) -> np.ndarray:
-    """Mask of the circles whose contrast is of the right sign and far above the noise."""
+    """Returns the mask of the circles whose contrast has the right sign and is far above the noise."""
     return _signed(found, polarity) >= _needed(found)
 
 
@@ -180,7 +180,7 @@ def _needed(found: Centres) -> np.ndarray:
 
 
 def _reasons(found: Centres, expected: Ellipses, polarity: Sequence[Polarity], camera: Camera) -> list[str]:
-    """Of each fit why it is not the circle that was expected; empty where it is."""
+    """Returns by fit why it is not the expected circle; empty if it is."""
     contrast, needed = _signed(found, polarity), _needed(found)
     off, sigma = np.linalg.norm(found.centre_px - expected.centre_px, axis=1), found.sigma_px()
     widest, narrowest = _stretch(expected.shape_px, found.shape, found.centre, camera)
@@ -213,5 +213,5 @@ def missed_notes(missed: dict[Label, str]) -> list[str]:
 
 
 def contradicted_notes(found: dict[Label, str]) -> list[str]:
-    """One line for each circle."""
+    """Returns one note for each circle."""
     return [f"{label}: {reason}; partly hidden or something else, left out" for label, reason in found.items()]

@@ -35,18 +35,18 @@ from stcal.sfm.detect.image import image_corners
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
 SMOOTHING_PX = 5
-"""Side of the Gaussian filter."""
+"""Side of the Gaussian filter, px."""
 EQUAL_SIGMA_PX = 0.05
-"""σ of every centre; only that it is the same for all matters."""
+"""σ of every centre. Only its being equal for all centres matters."""
 MIN_OUTLINE_PX = 6
 AREA_RATIO = 2.0
-"""Areas of circles of one size in one pattern differ by perspective, at most so many times."""
+"""Largest ratio of areas of equal circles in one pattern, due to perspective."""
 STEP_RATIO = 1.4
-"""Distances from one circle to the next, likewise."""
+"""Largest ratio of distances between neighbouring circles, due to perspective."""
 ZERO_COSINE = float(np.sin(np.radians(22.5)))
 """What passes for the scalar product of perpendicular directions: half way to those 45° off."""
 MAX_MISFIT = 0.25
-"""Of a circle about its place in the face's plane, radii."""
+"""Largest distance of a circle from its place in the face's plane, in radii."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class PublishedPattern:
 
     @classmethod
     def of(cls, target: TargetDesign) -> "PublishedPattern":
-        """That of a design.
+        """Returns the pattern of a design.
 
         Raises
         ------
@@ -134,7 +134,7 @@ def _place(face: FaceDesign, circle: str) -> np.ndarray:
 
 
 def _common(target: TargetDesign) -> tuple[list[str], dict[FaceDesign, str]]:
-    """Circles at the same place in every face, and by face the one that is not."""
+    """Returns the circles at the same place in every face, and by face the circle that is not."""
     first = target.faces[0]
     common = [
         circle
@@ -148,7 +148,7 @@ def _common(target: TargetDesign) -> tuple[list[str], dict[FaceDesign, str]]:
 
 
 def _along(direction: np.ndarray, place: dict[str, np.ndarray]) -> list[tuple[str, float]]:
-    """Circles in a direction from the origin, nearest first, and how far: in units of ``direction``."""
+    """Returns the circles in a direction from the origin, nearest first, with distances in units of ``direction``."""
     found = []
     for circle, xy in place.items():
         far = float(xy @ direction / (direction @ direction))
@@ -160,7 +160,7 @@ def _along(direction: np.ndarray, place: dict[str, np.ndarray]) -> list[tuple[st
 
 
 def _signs(direction: np.ndarray, diagonal: np.ndarray) -> tuple[int, int]:
-    """Of the scalar product, and, unless that is zero, of the vector product from the diagonal on."""
+    """Returns the signs of the scalar product and, unless that is zero, of the vector product with the diagonal."""
     cosine = direction @ diagonal / (np.linalg.norm(direction) * np.linalg.norm(diagonal))
     if abs(cosine) < ZERO_COSINE:
         return 0, 0
@@ -174,7 +174,7 @@ def _cross(u: np.ndarray, v: np.ndarray) -> float:
 def detect_published(
     image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> ImageDetection:
-    """All circles of the target and the board in one grey image of the camera's size, by the published rules.
+    """Finds all circles of the target and the board in one grey image of the camera's size by the published rules.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def detect_published(
 
 
 def contour_ellipses(grey: np.ndarray, polarity: Polarity, options: EllipseOptions) -> Ellipses:
-    """Ellipses fitted to the contours of what a threshold sets apart, kept by pixel count and by axis ratio."""
+    """Returns ellipses fitted to contours after thresholding, selected by pixel count and axis ratio."""
     kind = cv2.THRESH_BINARY if polarity == "bright" else cv2.THRESH_BINARY_INV
     level, mask = cv2.threshold(grey, 0, 255, kind + cv2.THRESH_OTSU)
     smallest, largest = (np.pi / 4 * d**2 for d in diameter_limits_px(grey.size, options))
@@ -262,7 +262,8 @@ class _Rules:
         self.area = candidates.radius**2
 
     def find(self, free: np.ndarray) -> tuple[list[tuple[str, np.ndarray, np.ndarray]], list[str]]:
-        """(face id, rows among the candidates, circles of the design) of the faces, and why patterns are none."""
+        """Returns (face id, rows among the candidates, circles of the design) by face, and notes on rejected
+        patterns."""
         free = free.copy()
         faces, notes = [], []
         for origin in np.argsort(-self.area, kind="stable").tolist():
@@ -284,7 +285,7 @@ class _Rules:
         return faces, notes
 
     def _beside(self, centre: int, radii: float, free: np.ndarray) -> list[int]:
-        """Small circles at that distance from a large one, in its radii."""
+        """Returns the small circles at the given distance from a large one, in its radii."""
         away = np.linalg.norm(
             np.linalg.solve(self.found.shape[centre], (self.found.xy - self.found.xy[centre]).T), axis=0
         )
@@ -294,7 +295,7 @@ class _Rules:
         return np.flatnonzero(free & near & alike).tolist()
 
     def _axes(self, origin: int, beside: list[int]) -> dict[str, int]:
-        """a and b by the sign of the vector product; the image's y points down."""
+        """Returns a and b, distinguished by the sign of the vector product; the image's y points down."""
         first, second = beside
         at = self.found.xy[origin]
         if _cross(self.found.xy[first] - at, self.found.xy[second] - at) > 0:
@@ -373,6 +374,6 @@ class _Rules:
 
 
 def _fitted_direction(xy: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """Of the line fitted to points, unit length."""
+    """Returns the unit direction of the line fitted to points."""
     way = np.linalg.svd(xy - xy.mean(0))[2][0]
     return way if way @ towards > 0 else -way

@@ -1,5 +1,6 @@
-"""What one image shows, before the group is asked: planes of the target and boards, each with its circles, and with the
-pose of each plane that they may be, which a group's arrangement is made from."""
+"""Contents of one image before comparison with its group: faces and boards with their circles.
+
+Every possible reading has a pose of its plane. The arrangement of a group is computed from these poses."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -14,32 +15,32 @@ from stcal.labels import BOARD, CircleLabel, DotLabel, Label
 from stcal.sfm.data.centres import Centres
 
 SECOND_BOARD_SHARE = 0.8
-"""A second board is one with at least this share of the dots of the first."""
+"""Smallest number of dots of a second board, as a share of the dots of the first."""
 MIN_POSE_CIRCLES = 5
-"""Four fix a pose, one more lets it be doubted."""
+"""Smallest number of circles for a pose. Four determine it, a fifth allows a check."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceSighting:
-    """A face: ``face`` id, ``rows`` : (n,) of its circles among the image's centres, ``circles`` : (n,) their places in
-    the design."""
+    """A face in an image: its id, ``rows`` : (n,) indices of its circles among the image's centres, ``circles`` : (n,)
+    their indices in the design."""
 
     face: str
     rows: np.ndarray
     circles: np.ndarray
 
     def labels(self, design: FaceDesign) -> tuple[CircleLabel, ...]:
-        """Of its circles."""
+        """Returns the labels of its circles."""
         labels = design.labels()
         return tuple(labels[i] for i in self.circles)
 
 
 OpenFace = tuple[FaceSighting, ...]
-"""A pattern that the image alone cannot name: the faces that it may be."""
+"""A pattern that the image alone cannot name: all faces that it may be."""
 
 
 def open_face_note(circles: int, faces: Iterable[str]) -> str:
-    """What is said of a pattern of so many circles that stays without a name."""
+    """Returns the note for a pattern of the given number of circles that stays without a name."""
     return (
         f"a pattern of {circles} circles that fits face {', '.join(sorted(set(faces)))} but may be another; left out, "
         "show the circles that tell the faces apart"
@@ -48,9 +49,12 @@ def open_face_note(circles: int, faces: Iterable[str]) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardSighting:
-    """A board: ``rows`` : (n,) of its dots among the image's centres, ``numberings`` : (k, n, 2) row and column of each
-    in each of the k numberings that the image admits, the likeliest first; ``unlikely`` : (u, n, 2) further ones, by
-    which dots would be covered that lie in the image: they hold where the group says so."""
+    """A board in an image.
+
+    ``rows`` : (n,) indices of its dots among the image's centres; ``numberings`` : (k, n, 2) row and column of each dot
+    in each of the k numberings that fit the image, the likeliest first; ``unlikely`` : (u, n, 2) further numberings
+    that require covered dots inside the image; the group may confirm them.
+    """
 
     rows: np.ndarray
     numberings: np.ndarray
@@ -59,12 +63,11 @@ class BoardSighting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageDetection:
-    """What one image shows.
+    """Result of detection in one image.
 
-    ``centres`` : the measured circles; ``faces`` and ``boards`` : what they were read as, the boards with the most dots
-    first, a face or the board perhaps more than once; ``open_faces`` : patterns without a name; ``mirrored`` : ids of
-    faces that the image shows as a mirror does; ``notes`` : what was seen and left out, and why; ``candidates`` :
-    outlines found.
+    ``centres`` : the measured circles; ``faces`` and ``boards`` : their readings, boards with the most dots first; a
+    face or the board may occur more than once; ``open_faces`` : patterns without a name; ``mirrored`` : ids of faces
+    that appear mirrored; ``notes`` : exclusions with reasons; ``candidates`` : number of outlines.
     """
 
     centres: Centres
@@ -77,23 +80,23 @@ class ImageDetection:
 
     @property
     def repeated(self) -> tuple[str, ...]:
-        """What is in view more than once."""
+        """The faces and the board that are in view more than once."""
         ids = [sighting.face for sighting in self.faces]
         boards = self.boards[1:2] and len(self.boards[1].rows) >= SECOND_BOARD_SHARE * len(self.boards[0].rows)
         return (BOARD,) * bool(boards) + tuple(f"face {i}" for i in sorted(set(ids)) if ids.count(i) > 1)
 
     @property
     def board(self) -> BoardSighting | None:
-        """The one board; None where there is none, or a second one as large."""
+        """The only board; None if there is none, or a second one of similar size."""
         return None if not self.boards or BOARD in self.repeated else self.boards[0]
 
     def single_faces(self) -> tuple[FaceSighting, ...]:
-        """Faces that are in view once."""
+        """Returns the faces that are in view exactly once."""
         ids = [sighting.face for sighting in self.faces]
         return tuple(sighting for sighting in self.faces if ids.count(sighting.face) == 1)
 
     def labelled_rows(self, target: TargetDesign) -> tuple[list[CircleLabel], np.ndarray]:
-        """Labels of the circles of :meth:`single_faces`, and their rows among the centres."""
+        """Returns the labels of the circles of :meth:`single_faces`, and their indices among the centres."""
         faces = self.single_faces()
         labels = [label for each in faces for label in each.labels(target.face(each.face))]
         return labels, np.concatenate([each.rows for each in faces]) if faces else np.zeros(0, int)
@@ -101,12 +104,12 @@ class ImageDetection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneView:
-    """One way to read n circles of an image as those of one plane.
+    """One reading of n circles of an image as circles of one plane.
 
-    ``plane`` : face id or ``board``; ``rows`` : (n,) among the image's centres; ``xy_mm`` : (n, 2) in the plane;
-    ``xy`` : (n, 2) seen, normalised; ``area`` : that they take up, in units of their ellipses'; ``camera_from_plane`` :
-    from these alone; ``named`` : whether the image by itself tells which plane it is; ``likely`` : whether what is not
-    seen of the plane is out of the image, rather than covered.
+    ``plane`` : face id or ``board``; ``rows`` : (n,) indices among the image's centres; ``xy_mm`` : (n, 2) in the
+    plane; ``xy`` : (n, 2) measured, normalised; ``area`` : sum of the ellipses' areas over π, normalised;
+    ``camera_from_plane`` : pose from these circles alone; ``named`` : whether the image alone identifies the plane;
+    ``likely`` : whether missing circles of the plane are outside of the image rather than covered.
     """
 
     plane: str
@@ -120,37 +123,37 @@ class PlaneView:
     likely: bool = True
 
     def xyz_mm(self) -> np.ndarray:
-        """The circles, (n, 3), plane's frame."""
+        """Returns the circles' centres, (n, 3), in the plane's frame."""
         return np.column_stack([self.xy_mm, np.zeros(len(self.xy_mm))])
 
     def span_mm(self) -> np.ndarray:
-        """Three points of the plane about its circles, (3, 3), plane's frame."""
+        """Returns three corners of the circles' bounding box, (3, 3), in the plane's frame."""
         low, high = self.xy_mm.min(0), self.xy_mm.max(0)
         return np.array([[*low, 0.0], [high[0], low[1], 0.0], [low[0], high[1], 0.0]])
 
 
 Readings = list[PlaneView]
-"""The ways to read the same circles; one holds."""
+"""Alternative readings of the same circles, of which one is right."""
 
 
 def readings_of(detection: ImageDetection, target: TargetDesign, board: BoardDesign | None) -> list[Readings]:
-    """What one image was read as, with a pose for each way to read it; without those too few to have one."""
-    found = []
+    """Returns the readings of one image with their poses. Patterns with too few circles for a pose are omitted."""
+    readings = []
     for each in detection.faces:
-        found.append([_face_view(each, target, detection, named=True)])
+        readings.append([_face_view(each, target, detection, named=True)])
     for faces in detection.open_faces:
-        own = [_face_view(each, target, detection, named=False) for each in faces]
-        found.append([view for view in own if view is not None])
+        candidates_of_pattern = [_face_view(each, target, detection, named=False) for each in faces]
+        readings.append([view for view in candidates_of_pattern if view is not None])
     if board is not None:
         for each in detection.boards:
-            found.append(_board_views(each, each.numberings, board, detection))
+            readings.append(_board_views(each, each.numberings, board, detection))
             covered = _board_views(each, each.unlikely, board, detection)
-            found[-1] += [replace(view, likely=False) for view in covered if view is not None]
-    return [[v for v in views if v is not None] for views in found if views and all(v is not None for v in views)]
+            readings[-1] += [replace(view, likely=False) for view in covered if view is not None]
+    return [[v for v in views if v is not None] for views in readings if views and all(v is not None for v in views)]
 
 
 def likely_views(readings: list[Readings]) -> list[Readings]:
-    """Without the ways to read circles by which others would be covered."""
+    """Returns the readings without those that require covered circles."""
     return [[view for view in views if view.likely] for views in readings]
 
 
@@ -163,8 +166,10 @@ def _board_views(
 
 
 def flipped_pose(view: PlaneView, design_mm: np.ndarray) -> Rigid | None:
-    """Pose of a board, of ``design_mm`` (m, 2), that the image shows as a mirror does; for a camera whose X is turned
-    round. None where there is none."""
+    """Returns the pose of a board that appears mirrored, for a camera with reversed X; None if there is no pose.
+
+    ``design_mm`` : (m, 2) all dots of the board.
+    """
     xy_mm = np.column_stack([design_mm[:, 0].min() + design_mm[:, 0].max() - view.xy_mm[:, 0], view.xy_mm[:, 1]])
     return _pose(xy_mm, view.xy * [-1, 1])
 

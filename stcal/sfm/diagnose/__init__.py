@@ -1,1 +1,1 @@
-"""Why something was left out of a finished run."""
+"""Search for why something was left out of a finished run."""

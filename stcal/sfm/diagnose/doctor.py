@@ -1,8 +1,8 @@
-"""Why something was left out of a finished run: the threshold that stopped it, its value there, what would let it in.
+"""Search for why something was left out of a finished run: the threshold that stopped it, its value, the remedy.
 
-Left out is every file, image and circle that the run itself names, and every circle of the design that by the run's
-own result is in view in a mapped image and has no label there: its image is opened again and examined at the place
-where the final model predicts it (``stcal.sfm.diagnose.examine``).
+Two kinds of things are left out: every file, image and circle that the run itself names, and every circle of the
+design that should be visible in a mapped image according to the run's result, but has no label there. For the second
+kind the image is opened again and examined at the place that the final model predicts (``stcal.sfm.diagnose.examine``).
 """
 
 from collections.abc import Callable, Sequence
@@ -37,17 +37,17 @@ def diagnose(
     workers: int | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Diagnosis:
-    """Find what a run left out, and why.
+    """Finds what a run left out, and why.
 
     Parameters
     ----------
-    images : the folder of photographs, where it is no longer the one that the run was given
+    images : the folder of photographs, if it has moved since the run
     progress : called with (stage, done, total)
 
     Raises
     ------
     InputError
-        A damaged run, one of another version, or a folder of photographs that does not exist.
+        If the run is damaged or of another version, or the folder of photographs does not exist.
     """
     if images is not None and not images.is_dir():
         raise InputError(
@@ -73,7 +73,7 @@ def diagnose(
 
 
 def _side_by_side(function: Callable, jobs: list[tuple], stage: str, workers, progress) -> list:
-    """Results in the order of the jobs."""
+    """Runs the jobs in parallel and returns their results in the order of the jobs."""
     results = [None] * len(jobs)
     for done, (i, result) in enumerate(run_parallel(function, jobs, workers), start=1):
         results[i] = result
@@ -84,58 +84,59 @@ def _side_by_side(function: Callable, jobs: list[tuple], stage: str, workers, pr
 
 def _files(run: SavedRun) -> list[Finding]:
     return [
-        Finding(each["name"], (), each["gate"], each["value"], each["limit"], "", _remedy_in(each))
-        for each in run.report["left_out"]["files"]
+        Finding(file["name"], (), file["gate"], file["value"], file["limit"], "", _remedy_in(file))
+        for file in run.report["left_out"]["files"]
     ]
 
 
 def _images(run: SavedRun, mapped: set[str]) -> list[Finding]:
-    """Images without a pose, and what was seen in them and left out; other images are examined."""
+    """Returns findings on images without a pose, and on faces and boards left out of mapped images. All other images
+    are examined later."""
     left_out = run.report["left_out"]
     findings = [
         Finding(
-            each["name"],
+            entry["name"],
             (),
-            each["gate"],
-            each["value"],
-            each["limit"],
+            entry["gate"],
+            entry["value"],
+            entry["limit"],
             "circles",
-            (NOTHING_KNOWN if each["value"] == 0 else "") + _remedy_in(each),
+            (NOTHING_KNOWN if entry["value"] == 0 else "") + _remedy_in(entry),
         )
-        for each in left_out["images"]
+        for entry in left_out["images"]
     ]
-    told = {finding.image for finding in findings}
+    reported = {finding.image for finding in findings}
     findings += [
         Finding(image.name, (), "group", None, None, "", f"link group {image.group} to the others by a face of theirs")
         for image in run.observations
-        if image.name not in mapped | told
+        if image.name not in mapped | reported
     ]
-    for each in left_out["notes"]:
-        if each["image"] not in mapped:
-            findings.append(Finding(each["image"], (), "note", None, None, "", each["note"]))
-        elif leaves_a_pattern_out(each["note"]):
-            findings.append(Finding(each["image"], (), WHOLE_PATTERN, None, None, "", each["note"]))
+    for entry in left_out["notes"]:
+        if entry["image"] not in mapped:
+            findings.append(Finding(entry["image"], (), "note", None, None, "", entry["note"]))
+        elif leaves_a_pattern_out(entry["note"]):
+            findings.append(Finding(entry["image"], (), WHOLE_PATTERN, None, None, "", entry["note"]))
     return findings
 
 
 def _circles(run: SavedRun) -> list[Finding]:
-    """Circles with a label that are not in the model."""
+    """Returns findings on labelled circles that are not in the model."""
     return [
         Finding(
-            each["image"],
-            (each["label"],),
-            each["gate"],
-            each["value"],
-            each["limit"],
-            each["unit"],
-            advice(each["gate"]),
+            circle["image"],
+            (circle["label"],),
+            circle["gate"],
+            circle["value"],
+            circle["limit"],
+            circle["unit"],
+            advice(circle["gate"]),
         )
-        for each in run.report["left_out"]["circles"]
+        for circle in run.report["left_out"]["circles"]
     ]
 
 
 def _faces(run: SavedRun) -> list[Finding]:
-    """Faces that no image helps to place, and what else the run says of whole groups."""
+    """Returns findings on faces that no image helps to place, and the run's notes."""
     findings = []
     for face_id in run.report["summary"]["faces_not_seen"]:
         labels = tuple(run.target.face(face_id).labels())
@@ -145,15 +146,18 @@ def _faces(run: SavedRun) -> list[Finding]:
 
 
 def _remedy_in(left_out: dict) -> str:
-    """The advice at the end of a reason; all of it, where no value says the rest."""
+    """Returns the advice at the end of a reason, or the whole reason if it comes without a value."""
     reason = left_out["reason"]
     return reason if left_out["value"] is None else reason.partition("; ")[2] or reason
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    """An image to open: to examine what is ``expected`` in it, or, where that is nothing, to see whether an option
-    would show enough of the ``known`` circles to place it."""
+    """An image to open and examine.
+
+    ``expected`` : circles to examine; if empty, options are tried to see whether enough of the ``known`` circles would
+    be found to place the image.
+    """
 
     path: Path
     name: str
@@ -166,15 +170,16 @@ class _Job:
 
 
 def _jobs(run: SavedRun, images: Path, models: Sequence[MetricModel], circles: dict[str, np.ndarray]) -> list[_Job]:
-    """Mapped images that lack circles in view, and images without a pose; not those of groups without a model."""
-    given = run.camera, run.target, run.board, run.options.ellipses
+    """Returns jobs for mapped images that lack visible circles, and for images without a pose. Groups without a model
+    have no jobs."""
+    settings = run.camera, run.target, run.board, run.options.ellipses
     observations = {image.name: image for image in run.observations}
     jobs = []
     for model in models:
         missing = missing_circles(model, circles, observations, run.camera, run.target, run.board)
-        jobs += [_Job(images / name, name, *given, planes, frozenset()) for name, planes in missing.items()]
+        jobs += [_Job(images / name, name, *settings, planes, frozenset()) for name, planes in missing.items()]
         jobs += [
-            _Job(images / name, name, *given, [], frozenset(model.labels))
+            _Job(images / name, name, *settings, [], frozenset(model.labels))
             for name, image in observations.items()
             if image.group == model.group and name not in model.images
         ]
@@ -182,7 +187,7 @@ def _jobs(run: SavedRun, images: Path, models: Sequence[MetricModel], circles: d
 
 
 def _decoded(job: _Job) -> tuple[np.ndarray | None, str]:
-    """The image, or what is wrong with it."""
+    """Returns the image, or None and what is wrong with it."""
     size = job.camera.height, job.camera.width
     try:
         image = decode(read_bytes(job.path, IMAGE_BYTES), job.name)
@@ -196,7 +201,8 @@ def _decoded(job: _Job) -> tuple[np.ndarray | None, str]:
 
 
 def _examine(job: _Job) -> tuple[list[CircleVerdict], str]:
-    """Verdicts on what is expected in an image; by the geometry alone where something is wrong with the image."""
+    """Returns verdicts on the expected circles of an image. They come from the geometry alone if the image cannot be
+    used."""
     image, problem = _decoded(job)
     if image is None:
         return by_geometry(job.expected, job.camera, job.options), problem
@@ -204,34 +210,38 @@ def _examine(job: _Job) -> tuple[list[CircleVerdict], str]:
 
 
 def _try_options(run: SavedRun, jobs, examined, workers, progress) -> dict[str, dict[str, set[str]]]:
-    """By image the labels that each option finds which loosens one of the image's gates."""
-    verdicts = [verdict for own, _ in examined for verdict in own]
-    tried = trials(verdicts, run.camera.width * run.camera.height, run.options.ellipses)
+    """Returns, by image, the labels that each option finds. Only options that loosen a gate of the image are tried."""
+    verdicts = [verdict for image_verdicts, _ in examined for verdict in image_verdicts]
+    all_trials = trials(verdicts, run.camera.width * run.camera.height, run.options.ellipses)
     attempts = []
-    for job, (own, problem) in zip(jobs, examined, strict=True):
-        gates = {verdict.gate for verdict in own} or {"min_diameter"}
-        useful = [trial for trial in tried if trial.gate in gates]
+    for job, (image_verdicts, problem) in zip(jobs, examined, strict=True):
+        gates = {verdict.gate for verdict in image_verdicts} or {"min_diameter"}
+        useful = [trial for trial in all_trials if trial.gate in gates]
         if useful and not problem:
             attempts.append((job, useful))
-    found = _side_by_side(_try, attempts, "try options", workers, progress)
-    return {job.name: labels for (job, _), labels in zip(attempts, found, strict=True)}
+    results = _side_by_side(_try, attempts, "try options", workers, progress)
+    return {job.name: labels for (job, _), labels in zip(attempts, results, strict=True)}
 
 
 def _try(job: _Job, tried: list[OptionTrial]) -> dict[str, set[str]]:
-    """Labels that each option finds; for an image without a pose those known, if they are enough to place it."""
+    """Returns the labels that each option finds. An image without a pose has labels only if enough known circles are
+    found to place it."""
     image, problem = _decoded(job)
     if image is None:
         raise InputError("E-RUN-IMAGES", problem)
-    found = {}
+    labels_by_option = {}
     for trial in tried:
         labels = labels_found(image, job.camera, job.target, job.board, trial.options, job.expected)
         placed = not job.known or len(labels & job.known) >= MIN_POINTS
-        found[trial.text] = labels if placed else set()
-    return found
+        labels_by_option[trial.text] = labels if placed else set()
+    return labels_by_option
 
 
 def _shown_with(run: SavedRun, mapped: set[str], options) -> dict[str, list[dict[str, set[str]]]]:
-    """For each option, by group, the labels that every image then shows; none where it has no pose even then."""
+    """Returns, for each option and group, the labels that every image then shows.
+
+    An image that even then has no pose shows none.
+    """
     return {
         text: [
             {
@@ -242,33 +252,42 @@ def _shown_with(run: SavedRun, mapped: set[str], options) -> dict[str, list[dict
             }
             for group in run.groups().values()
         ]
-        for text in dict.fromkeys(text for found in options.values() for text in found)
+        for text in dict.fromkeys(text for labels_by_option in options.values() for text in labels_by_option)
     }
 
 
 def _with_options(finding: Finding, options, shown: dict[str, list[dict[str, set[str]]]]) -> Finding:
-    """A finding that is not of one place in one image, with the options that help: those that place the image, or
-    show the circles in enough images of a group."""
+    """Adds the options that help to a finding that does not concern one place in one image.
+
+    These options place the image, or show the circles in enough images of a group.
+    """
     if finding.gate == "known_circles":
-        return replace(finding, options=tuple(text for text, found in options.get(finding.image, {}).items() if found))
+        return replace(
+            finding,
+            options=tuple(text for text, shown_labels in options.get(finding.image, {}).items() if shown_labels),
+        )
     if finding.gate != "views":
         return finding
     helping = []
     for text, groups in shown.items():
-        own = [group for group in groups if not finding.image or finding.image in group]
-        views = [sum(labels.issuperset(finding.labels) for labels in group.values()) for group in own]
+        groups_of_finding = [group for group in groups if not finding.image or finding.image in group]
+        views = [sum(labels.issuperset(finding.labels) for labels in group.values()) for group in groups_of_finding]
         if max(views, default=0) >= MIN_VIEWS:
             helping.append(text)
     return replace(finding, options=tuple(helping))
 
 
 def _findings(job: _Job, verdicts: list[CircleVerdict], problem: str, options: dict[str, set[str]]) -> list[Finding]:
-    """``options`` : labels that each option finds in the image."""
+    """Returns the findings of one image. ``options`` : labels that each option finds in the image."""
     findings = []
-    for v in verdicts:
-        remedy = advice(v.gate, v.value, v.limit, v.cause)
+    for verdict in verdicts:
+        remedy = advice(verdict.gate, verdict.value, verdict.limit, verdict.cause)
         if problem:
             remedy = f"not examined ({problem}): give the folder of the images with --images"
-        helping = tuple(text for text, labels in options.items() if v.label in labels)
-        findings.append(Finding(job.name, (v.label,), v.gate, v.value, v.limit, v.unit, remedy, helping))
+        helping = tuple(text for text, labels in options.items() if verdict.label in labels)
+        findings.append(
+            Finding(
+                job.name, (verdict.label,), verdict.gate, verdict.value, verdict.limit, verdict.unit, remedy, helping
+            )
+        )
     return findings

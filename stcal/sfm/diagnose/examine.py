@@ -1,7 +1,7 @@
-"""Why a circle that should be in view was not found: the gates of detection at its place, in detection's order.
+"""Search for why a visible circle was not found: the gates of detection at its place, in detection's order.
 
-Nothing is judged anew here: outlines, patterns, faces, board and rims go through the functions that detection itself
-uses, with the same options. Whether another option would find a circle is not guessed either: detection is run with it.
+Nothing is judged anew here. Outlines, patterns, faces, board and rims go through the functions that detection itself
+uses, with the same options. To see whether another option would find a circle, detection is run with that option.
 """
 
 from collections.abc import Sequence
@@ -32,16 +32,20 @@ from stcal.sfm.detect.image import ImageReading, detect_image, read_image
 from stcal.sfm.diagnose.trace import trace_outlines
 
 LEAST_MIN_DIAMETER_PX = 4.0
-"""The least that ``--min-diameter`` takes."""
+"""Smallest value that ``--min-diameter`` accepts."""
 LOOSER = (0.75, 0.5, 0.25)
-"""Of limits that are tried looser: outlines run at half a blob's height, and only a threshold below leaves it whole."""
+"""Factors by which limits are loosened. Outlines run at half a blob's height, and only a lower threshold leaves the
+blob whole."""
 LARGER = (1.02, 1.2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
-    """The n circles of one plane in one image: their ``pattern``, where it lies by ``camera_from_plane``, and those
-    ``missing``, (n,): in view and without a label."""
+    """The n circles of one plane in one image.
+
+    ``pattern`` : the circles; ``camera_from_plane`` : pose of the plane; ``missing``, (n,): True for circles that
+    should be visible but have no label.
+    """
 
     pattern: Pattern
     camera_from_plane: Rigid
@@ -52,23 +56,23 @@ class Expected:
 
     @property
     def is_board(self) -> bool:
-        """Whether the plane is the board, not a face."""
+        """True if the plane is the board, False if it is a face."""
         return self.pattern.plane == BOARD
 
     def image_from_plane(self) -> np.ndarray:
-        """(3, 3) homography, mm to normalised coordinates."""
+        """Returns the homography from mm in the plane to normalised image coordinates, (3, 3)."""
         return np.column_stack([self.camera_from_plane.rotation[:, :2], self.camera_from_plane.translation])
 
     def in_px(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Centres (n, 2) and shapes (n, 2, 2) of the circles' images."""
+        """Returns centres (n, 2) and shapes (n, 2, 2) of the circles' images, px."""
         return images_px(self.pattern, self.camera_from_plane, camera)
 
 
 @dataclass(frozen=True, slots=True)
 class CircleVerdict:
-    """What stopped one circle: its ``value`` did not pass the ``limit`` of ``gate``.
+    """The gate that stopped one circle: its ``value`` did not pass the ``limit`` of ``gate``.
 
-    ``cause`` : ``merged`` where its outline runs into something else, ``cut`` where it misses a part.
+    ``cause`` : ``merged`` if its outline runs into something else, ``cut`` if the outline misses a part of the circle.
     """
 
     label: str
@@ -81,7 +85,7 @@ class CircleVerdict:
 
 @dataclass(frozen=True, slots=True)
 class OptionTrial:
-    """An option to try: ``text`` names it, ``gate`` is the one that it loosens."""
+    """An option to try. ``text`` : the option as the user writes it; ``gate`` : the gate that it loosens."""
 
     gate: str
     text: str
@@ -96,7 +100,7 @@ def examine(
     options: EllipseOptions,
     planes: list[Expected],
 ) -> list[CircleVerdict]:
-    """The first gate that each missing circle of an image fails."""
+    """Returns, for each missing circle of an image, the first gate that it fails."""
     reading = read_image(grey_8bit(image), camera, target, board, options)
     verdicts = []
     for plane in planes:
@@ -105,7 +109,7 @@ def examine(
 
 
 class _Examination:
-    """One plane in one image."""
+    """Examination of the missing circles of one plane in one image."""
 
     def __init__(self, image, camera: Camera, target, board, options, reading: ImageReading, plane: Expected):
         self.image, self.camera, self.options, self.reading, self.plane = image, camera, options, reading, plane
@@ -119,19 +123,20 @@ class _Examination:
             self.fit = fit_pattern(candidates, self._homography(), self.pattern.xy_mm, self.pattern.radius_mm)
 
     def _homography(self) -> np.ndarray:
-        """What detection itself predicted the circles with, or the model's where it did not come that far."""
+        """Returns the homography with which detection predicted the circles, or that of the model if detection did not
+        get that far."""
         if self.is_board:
-            own = [homography for board in self.reading.boards for homography in board.homographies]
+            homographies = [homography for board in self.reading.boards for homography in board.homographies]
         else:
-            own = [r.homography for r in self.reading.faces.faces if r.face.id == self.pattern.plane]
-        # Of several numberings of the board the group has chosen the one that the model agrees with.
+            homographies = [r.homography for r in self.reading.faces.faces if r.face.id == self.pattern.plane]
+        # If the board has several numberings, the group chose the one that agrees with the model.
         xy, by_model = self.pattern.xy_mm, self.plane.image_from_plane()
         expected = apply_homography(by_model, xy)
-        off = [np.abs(apply_homography(h, xy) - expected).max() for h in own]
-        return own[int(np.argmin(off))] if own else by_model
+        deviations = [np.abs(apply_homography(h, xy) - expected).max() for h in homographies]
+        return homographies[int(np.argmin(deviations))] if homographies else by_model
 
     def verdicts(self) -> list[CircleVerdict]:
-        """Of all missing circles."""
+        """Returns the verdicts on all missing circles of the plane."""
         verdicts, lost = [], []
         for i in np.flatnonzero(self.plane.missing).tolist():
             if self.fit is not None and self.fit.fits()[i]:
@@ -152,18 +157,23 @@ class _Examination:
         return verdicts
 
     def _recognised(self, i: int, fit: PatternFit) -> CircleVerdict | None:
-        """The gate between outline and rim that stopped a circle, if one did: its face or the board."""
+        """Returns the gate of the face or board that stopped a circle after its outline passed, or None if there is
+        none."""
         label, reading, candidate = self.pattern.labels[i], self.reading, fit.index[i]
         count = int(fit.fits().sum())
         if self.is_board:
             if reading.boards:
-                found = any(candidate in board.candidates for board in reading.boards)
-                return None if found else CircleVerdict(label, "board_grid")
+                on_a_board = any(candidate in board.candidates for board in reading.boards)
+                return None if on_a_board else CircleVerdict(label, "board_grid")
             needed = int(np.ceil(needed_dots(self.board)))
             return CircleVerdict(label, "board_dots" if count < needed else "board_grid", count, needed, "dots")
         named = [r for r in reading.faces.faces if r.face.id == self.pattern.plane]
         if named:
-            return None if any(candidate in each.used() for each in named) else CircleVerdict(label, "pattern")
+            return (
+                None
+                if any(candidate in face_reading.used() for face_reading in named)
+                else CircleVerdict(label, "pattern")
+            )
         for refused in reading.faces.refused:
             if set(refused.used()) & set(fit.index[fit.fits()]):
                 return CircleVerdict(label, refused.gate, refused.value, refused.limit, "other readings")
@@ -171,7 +181,7 @@ class _Examination:
         return CircleVerdict(label, "face_circles" if count < needed else "face_pattern", count, needed, "circles")
 
     def _rim(self, i: int, fit: PatternFit) -> CircleVerdict:
-        """The last gate of an image."""
+        """Returns the verdict of the last gate, the measurement of the rim."""
         ellipse = self.ellipses.select(fit.index[i : i + 1])
         measured = measure_centres(grey_fine(self.image), self.camera, ellipse, self.reading.found[self.polarity])
         if not measured.ok[0]:
@@ -179,17 +189,17 @@ class _Examination:
         return CircleVerdict(self.pattern.labels[i], "board_numbering" if self.is_board else "found_now")
 
     def _pattern(self, i: int, fit: PatternFit) -> CircleVerdict:
-        """Something elliptic is at the place of a circle, but not just there, or of another size or shape."""
+        """Returns the verdict on an ellipse near the circle's place that is displaced, or of another size or shape."""
         label = self.pattern.labels[i]
         if not fit.in_place()[i]:
-            off, allowed = fit.distance[i] / fit.radius[i], fit.max_distance[i] / fit.radius[i]
-            return CircleVerdict(label, "position", float(off), float(allowed), "radii")
+            deviation, allowed = fit.distance[i] / fit.radius[i], fit.max_distance[i] / fit.radius[i]
+            return CircleVerdict(label, "position", float(deviation), float(allowed), "radii")
         stretch = max(fit.widest[i], 1 / max(fit.narrowest[i], 1e-9))
         return CircleVerdict(label, "shape", float(stretch), float(fit.max_stretch[i]))
 
 
 def by_geometry(planes: list[Expected], camera: Camera, options: EllipseOptions) -> list[CircleVerdict]:
-    """What the predicted size alone says of missing circles, for want of the image."""
+    """Returns verdicts from the predicted size of the missing circles alone, for use without the image."""
     smallest, largest = diameter_limits_px(camera.width * camera.height, options)
     verdicts = []
     for plane in planes:
@@ -205,26 +215,29 @@ def by_geometry(planes: list[Expected], camera: Camera, options: EllipseOptions)
 
 
 def trials(verdicts: Sequence[CircleVerdict], pixels: int, options: EllipseOptions) -> list[OptionTrial]:
-    """Options that could let circles in, loosened as far as these ask for, and to the end; gentle ones first."""
-    found = []
+    """Returns options that could let circles in, gentle ones first: loosened as far as the verdicts ask for, and to the
+    end."""
+    option_trials = []
     smallest, _ = diameter_limits_px(pixels, options)
-    stopped = [(v.gate, v.value) for v in verdicts if v.value is not None and not v.cause]
+    stopped = [(verdict.gate, verdict.value) for verdict in verdicts if verdict.value is not None and not verdict.cause]
     small = [value for gate, value in stopped if gate == "min_diameter" and value >= LEAST_MIN_DIAMETER_PX]
     half_px = np.floor(2 * min(small, default=LEAST_MIN_DIAMETER_PX)) / 2
     for diameter in dict.fromkeys((half_px, LEAST_MIN_DIAMETER_PX)):
         if diameter < smallest:
             looser = replace(options, min_diameter_px=float(diameter))
-            found.append(OptionTrial("min_diameter", f"--min-diameter {diameter:g}", looser))
+            option_trials.append(OptionTrial("min_diameter", f"--min-diameter {diameter:g}", looser))
     if large := [value for gate, value in stopped if gate == "max_diameter"]:
         for diameter in dict.fromkeys(10 * np.ceil(factor * max(large) / 10) for factor in LARGER):
             looser = replace(options, max_diameter_px=float(diameter))
-            found.append(OptionTrial("max_diameter", f"--max-diameter {diameter:g}", looser))
+            option_trials.append(OptionTrial("max_diameter", f"--max-diameter {diameter:g}", looser))
     for gate in ("min_contrast", "min_axis_ratio"):
-        if any(v.gate == gate and not v.cause for v in verdicts):
+        if any(verdict.gate == gate and not verdict.cause for verdict in verdicts):
             for factor in LOOSER:
                 limit = float(f"{factor * getattr(options, gate):.2g}")
-                found.append(OptionTrial(gate, f"EllipseOptions({gate}={limit:g})", replace(options, **{gate: limit})))
-    return found
+                option_trials.append(
+                    OptionTrial(gate, f"EllipseOptions({gate}={limit:g})", replace(options, **{gate: limit}))
+                )
+    return option_trials
 
 
 def labels_found(
@@ -235,14 +248,15 @@ def labels_found(
     options: EllipseOptions,
     planes: list[Expected],
 ) -> set[str]:
-    """Labels that detection with these options finds; a dot of the board is told by its place, of those expected."""
+    """Returns the labels that detection finds with these options. A dot of the board is identified by its place among
+    the expected dots."""
     detection = detect_image(image, camera, target, board, options)
-    found: set[str] = {label for each in detection.faces for label in each.labels(target.face(each.face))}
-    dots = detection.centres.centre_px[[row for each in detection.boards for row in each.rows]]
+    labels: set[str] = {label for reading in detection.faces for label in reading.labels(target.face(reading.face))}
+    dots = detection.centres.centre_px[[row for reading in detection.boards for row in reading.rows]]
     for plane in planes:
         if plane.is_board and len(dots):
             centre, shape = plane.in_px(camera)
             near = np.maximum(MAX_POSITION_ERROR * np.sqrt(np.abs(np.linalg.det(shape))), MAX_POSITION_ERROR_PX)
             distance = np.linalg.norm(centre[:, None] - dots, axis=2).min(1)
-            found |= {label for label, seen in zip(plane.pattern.labels, distance < near, strict=True) if seen}
-    return found
+            labels |= {label for label, is_near in zip(plane.pattern.labels, distance < near, strict=True) if is_near}
+    return labels

@@ -1,4 +1,4 @@
-"""What ``doctor`` writes with ``--json``."""
+"""Form of the file that ``doctor`` writes with ``--json``."""
 
 from typing import Annotated, Literal
 
@@ -18,7 +18,7 @@ class Counts(Part):
 
 
 class DoctorFile(ResultFile):
-    """Of ``doctor``."""
+    """The JSON file of ``doctor``."""
 
     format: Literal["stcal doctor 1"] = Field(description="the file's form and its version")
     summary: Counts = Field(
@@ -37,7 +37,7 @@ class DoctorFile(ResultFile):
 
     @classmethod
     def of(cls, diagnosis: Diagnosis) -> "DoctorFile":
-        """The file of a diagnosis."""
+        """Returns the file of a diagnosis."""
         return cls(
             format="stcal doctor 1",
             summary=Counts.model_validate(diagnosis),

@@ -1,4 +1,4 @@
-"""What the doctor finds, in words: the advice at every gate, the order of findings, and the table."""
+"""The findings of the doctor in words: advice for every gate, order of findings, and the table."""
 
 import math
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from numbers import Real
 from stcal.labels import BOARD, DotLabel, parse_label, parse_labels
 
 AT_MOST = ("max_diameter", "outline_area", "outline_deviation", "position", "shape", "face_readings", "residual")
-"""Gates whose limit is the largest value allowed; those of the others are the smallest needed."""
+"""Gates whose limit is the largest value allowed. The limit of every other gate is the smallest value needed."""
 ADVICE = {
     "border": "it touches the image's border: keep it inside",
     "min_diameter": "come {closer} % closer, or use a longer lens",
@@ -42,26 +42,26 @@ CAUSES = {
     "cut": "only a part of it shows: uncover it, or photograph it from elsewhere",
 }
 TRIFLES = ("views", "hidden", "note", "copy", "file_type", "folder", "excluded")
-"""Gates of what can hardly be helped, or needs no help."""
+"""Gates that can hardly be helped, or need no help."""
 WHOLE_PATTERN = "whole_pattern"
-"""Gate of a face or board that an image shows, and that was left out of it as a whole."""
+"""Gate of a face or board that is visible in an image but was left out of it as a whole."""
 MAX_LABELS = 12
 MAX_LINES = 40
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that was left out.
+    """A file, image or circle that was left out, or a note on the whole run.
 
-    ``image`` : name, empty for what concerns the whole run; ``labels`` : circles, none for a whole file or image;
-    ``gate`` : name of the threshold; ``value``, ``limit``, ``unit`` : what was measured there and what is allowed or
-    needed, None where there is no number; ``remedy`` : what to do with the scene; ``options`` : each lets it in, as
-    tried on the image, the gentlest first.
+    ``image`` : name, empty if it concerns the whole run; ``labels`` : circles, empty for a whole file or image;
+    ``gate`` : name of the threshold; ``value``, ``limit``, ``unit`` : measured value and what is allowed or needed,
+    None if there is no number; ``remedy`` : what to do with the scene; ``options`` : options each of which lets it in,
+    as tried on the image, the gentlest first.
 
     Raises
     ------
     TypeError
-        What a damaged report gave is none of that.
+        If a field from a damaged report has another type.
     """
 
     image: str
@@ -82,7 +82,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class GateCount:
-    """What a gate stopped: ``circles`` of ``images``, of which an option lets in ``by_option`` circles."""
+    """Counts of one gate: it stopped ``circles`` of ``images``; options let in ``by_option`` of these circles."""
 
     circles: int
     images: int
@@ -91,8 +91,11 @@ class GateCount:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """``files`` given, ``images`` of them that could be used, ``mapped`` images, ``circles`` : observations in the
-    model; ``findings`` : what was left out, the most useful to know first."""
+    """The findings and counts of a run.
+
+    ``files`` : number given; ``images`` : usable ones among them; ``mapped`` : mapped images; ``circles`` :
+    observations in the model; ``findings`` : what was left out, the most useful to know first.
+    """
 
     files: int
     images: int
@@ -102,21 +105,30 @@ class Diagnosis:
 
 
 def advice(gate: str, value: float | None = None, limit: float | None = None, cause: str = "") -> str:
-    """What to do with the scene for a circle that a gate stopped; ``cause`` as of the examination."""
+    """Returns what to do with the scene for a circle that a gate stopped. ``cause`` : as in :class:`OutlineEnd`."""
     closer = 0 if gate != "min_diameter" or value is None or limit is None else math.ceil(100 * (1 - value / limit))
     return CAUSES.get(cause) or ADVICE[gate].format(closer=closer)
 
 
 def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Equal reasons of one image and face together; the most useful first: whole images and faces, what an option
-    lets in, then by the number of circles; last what can hardly be helped."""
-    together = [list(own) for _, own in groupby(sorted(findings, key=_key), key=_key)]
-    together.sort(key=lambda own: (_rank(own[0]), -sum(len(f.labels) for f in own), _key(own[0])))
-    return tuple(finding for own in together for finding in own)
+    """Returns the findings sorted, with equal reasons of one image and face together.
+
+    Whole images and faces come first, then what an option lets in, then the rest, by number of circles. What can hardly
+    be helped comes last.
+    """
+    together = [list(findings_of_line) for _, findings_of_line in groupby(sorted(findings, key=_key), key=_key)]
+    together.sort(
+        key=lambda findings_of_line: (
+            _rank(findings_of_line[0]),
+            -sum(len(f.labels) for f in findings_of_line),
+            _key(findings_of_line[0]),
+        )
+    )
+    return tuple(finding for findings_of_line in together for finding in findings_of_line)
 
 
 def _key(finding: Finding) -> tuple[str, ...]:
-    """What findings of one line have in common."""
+    """Returns the key that findings of one line of the table share."""
     plane = parse_label(finding.labels[0]).plane if finding.labels else ""
     advised = finding.remedy.partition("%")[2] or finding.remedy
     return finding.image, plane, finding.gate, *finding.options[:1], advised
@@ -131,45 +143,47 @@ def _rank(finding: Finding) -> int:
 
 
 def by_gate(findings: Iterable[Finding]) -> dict[str, GateCount]:
-    """What each gate stopped in images; what is said of the whole run is no circle of an image."""
+    """Returns counts of what each gate stopped in images. Findings on the whole run do not count."""
     together: dict[str, list[Finding]] = {}
     for finding in findings:
         if finding.image:
             together.setdefault(finding.gate, []).append(finding)
     return {
         gate: GateCount(
-            sum(len(each.labels) for each in own),
-            len({each.image for each in own}),
-            sum(len(each.labels) for each in own if each.options),
+            sum(len(finding_of_gate.labels) for finding_of_gate in findings_of_gate),
+            len({finding_of_gate.image for finding_of_gate in findings_of_gate}),
+            sum(len(finding_of_gate.labels) for finding_of_gate in findings_of_gate if finding_of_gate.options),
         )
-        for gate, own in together.items()
+        for gate, findings_of_gate in together.items()
     }
 
 
 def table(diagnosis: Diagnosis, lines: int | None = MAX_LINES) -> str:
-    """Counts, what options let in, and one line for each reason; no more than ``lines`` of them."""
-    found = diagnosis.findings
+    """Returns counts, what options let in, and one line for each reason, up to ``lines`` of them."""
+    findings = diagnosis.findings
     heading = f"{diagnosis.mapped} of {diagnosis.images} images mapped, {diagnosis.circles} circles in the model"
-    if not found:
+    if not findings:
         return f"nothing was left out: {heading}, every circle in view has a label"
     files = _number(diagnosis.files - diagnosis.images, "file")
     images = _number(diagnosis.images - diagnosis.mapped, "image")
-    patterns = [each for each in found if each.gate == WHOLE_PATTERN]
+    patterns = [whole_pattern for whole_pattern in findings if whole_pattern.gate == WHOLE_PATTERN]
     whole = f"{_number(len(patterns), 'whole face or board', 'whole faces and boards')}, " if patterns else ""
-    text = [f"{heading}; left out: {files}, {images}, {whole}{_circles(found)}"]
-    for gate, count in sorted(by_gate(found).items(), key=lambda item: (-item[1].circles, -item[1].images)):
+    text = [f"{heading}; left out: {files}, {images}, {whole}{_circles(findings)}"]
+    for gate, count in sorted(by_gate(findings).items(), key=lambda item: (-item[1].circles, -item[1].images)):
         circles = f"{_number(count.circles, 'circle')} of " if count.circles else ""
         text.append(f"  {gate:<18}{circles}{_number(count.images, 'image')}")
     helping: dict[str, list[Finding]] = {}
-    for finding in found:
+    for finding in findings:
         for option in finding.options:
             helping.setdefault(option, []).append(finding)
-    for option, own in sorted(helping.items(), key=lambda item: -len(item[1])):
-        whole = sum(not finding.labels for finding in own)
-        parts = [_number(whole, "whole image")] * bool(whole) + [_circles(own)] * (whole < len(own))
+    for option, findings_of_option in sorted(helping.items(), key=lambda item: -len(item[1])):
+        whole = sum(not finding.labels for finding in findings_of_option)
+        parts = [_number(whole, "whole image")] * bool(whole) + [_circles(findings_of_option)] * (
+            whole < len(findings_of_option)
+        )
         text.append(f"{option} lets in {', '.join(parts)}")
     text.append("")
-    rows = [_line(list(own)) for _, own in groupby(found, key=_key)]
+    rows = [_line(list(findings_of_option)) for _, findings_of_option in groupby(findings, key=_key)]
     text += rows[:lines]
     if lines is not None and len(rows) > lines:
         text.append(f"… {len(rows) - lines} more lines with --all")
@@ -177,10 +191,10 @@ def table(diagnosis: Diagnosis, lines: int | None = MAX_LINES) -> str:
 
 
 def _circles(findings: Iterable[Finding]) -> str:
-    own = [finding for finding in findings if finding.labels and finding.image]
-    images = len({finding.image for finding in own})
-    circles = _number(sum(len(finding.labels) for finding in own), "circle")
-    return f"{circles} of {_number(images, 'image')}" if own else circles
+    in_images = [finding for finding in findings if finding.labels and finding.image]
+    images = len({finding.image for finding in in_images})
+    circles = _number(sum(len(finding.labels) for finding in in_images), "circle")
+    return f"{circles} of {_number(images, 'image')}" if in_images else circles
 
 
 def _number(count: int, what: str, several: str = "") -> str:
@@ -190,23 +204,23 @@ def _number(count: int, what: str, several: str = "") -> str:
 def _line(own: list[Finding]) -> str:
     first = min(own, key=lambda f: f.value if isinstance(f.value, float) else 0.0)  # asks most of whoever comes closer
     labels = [label for finding in own for label in finding.labels]
-    where = "  ".join(part for part in (first.image, _listed(labels)) if part) or "the run"
+    where = "  ".join(word for word in (first.image, _listed(labels)) if word) or "the run"
     values, limits = [f.value for f in own], [f.limit for f in own]
-    # Digits enough to tell value from limit.
+    # Enough digits to tell the value from the limit.
     digits = next((n for n in range(3, 7) if _range(values, n) != _range(limits, n)), 3)
     value, limit = _range(values, digits), _range(limits, digits)
-    with_unit = " ".join(part for part in (limit or value, first.unit) if part)
+    with_unit = " ".join(word for word in (limit or value, first.unit) if word)
     bound = f"at most {with_unit}" if first.gate in AT_MOST else f"{with_unit} needed"
-    measured = ", ".join(part for part in (value, bound) if part) if limit else with_unit if value else ""
+    measured = ", ".join(word for word in (value, bound) if word) if limit else with_unit if value else ""
     remedy = first.remedy
     if first.options:
         python = ", from Python" if first.options[0].startswith("EllipseOptions") else ""
         remedy = f"{first.options[0]} lets {'it' if len(labels) < 2 else 'them'} in{python}"
-    return f"{where}  {' '.join(part for part in (first.gate, measured) if part)}: {remedy}"
+    return f"{where}  {' '.join(word for word in (first.gate, measured) if word)}: {remedy}"
 
 
 def _range(values: list, digits: int) -> str:
-    """Smallest and largest of some values."""
+    """Returns the range of some values as a text, or the first value that is itself a text."""
     known = [value for value in values if value is not None]
     if not known:
         return ""
@@ -218,7 +232,7 @@ def _range(values: list, digits: int) -> str:
 
 
 def _listed(labels: list[str]) -> str:
-    """Labels, dots of one row of the board as ``board:2:0–5``."""
+    """Returns the labels as a text; consecutive dots of one row of the board as ``board:2:0–5``."""
     parts: list[str] = []
     dots: dict[str, list[int]] = {}
     for label in parse_labels(labels):
@@ -227,7 +241,7 @@ def _listed(labels: list[str]) -> str:
         else:
             parts.append(label)
     for row, columns in dots.items():
-        for _, run in groupby(enumerate(sorted(columns)), key=lambda each: each[1] - each[0]):
+        for _, run in groupby(enumerate(sorted(columns)), key=lambda position: position[1] - position[0]):
             first, *_, last = [column for _, column in run] * 2
             parts.append(f"{row}:{first}" if first == last else f"{row}:{first}–{last}")
     shown = ", ".join(parts[:MAX_LABELS])

@@ -1,4 +1,4 @@
-"""Which circles of the design are in view in an image, by the final model: also those that were never mapped."""
+"""The circles of the design that should be visible in an image according to the final model, even if never mapped."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from stcal.sfm.data.patterns import Pattern, ideal_border, in_view, patterns_of
 from stcal.sfm.diagnose.examine import Expected
 
 MIN_MAPPED = 3
-"""Circles of a plane that place the others."""
+"""Least number of mapped circles that place the others of their plane."""
 
 
 def missing_circles(
@@ -24,38 +24,40 @@ def missing_circles(
     target: TargetDesign,
     board: BoardDesign,
 ) -> dict[str, list[Expected]]:
-    """Planes of which circles are in view and have no label, by image of one group.
+    """Returns, by image of one group, the planes with circles that should be visible but have no label.
 
     Parameters
     ----------
-    model : the group's, target frame, mm
-    circles : centres of the target's circles, (3,) by label, target frame, mm; the model's own go first
-    observations : by image
+    model : the model of the group, target frame, mm
+    circles : centres of the target's circles, (3,) by label, target frame, mm; centres of the model take precedence
+    observations : observations by image
     """
     xyz = circles | dict(zip(model.labels, model.xyz_model, strict=True))
     patterns = patterns_of(target, board).values()
     placed = [(pattern, pose) for pattern in patterns if (pose := _placed(pattern, xyz)) is not None]
     border = ideal_border(camera)
-    found = {}
+    planes_by_image = {}
     for name, camera_from_target in zip(model.images, model.camera_from_model, strict=True):
-        seen = set(observations[name].labels)
+        labels_observed = set(observations[name].labels)
         planes = []
         for pattern, target_from_plane in placed:
             pose = camera_from_target @ target_from_plane
-            missing = in_view(pattern, pose, camera, border) & [label not in seen for label in pattern.labels]
+            missing = in_view(pattern, pose, camera, border) & [
+                label not in labels_observed for label in pattern.labels
+            ]
             if missing.any():
                 planes.append(Expected(pattern, pose, missing))
         if planes:
-            found[name] = planes
-    return found
+            planes_by_image[name] = planes
+    return planes_by_image
 
 
 def _placed(pattern: Pattern, xyz: dict[str, np.ndarray]) -> Rigid | None:
-    """target_from_plane, the rigid fit to the mapped circles; None where they are too few or in line."""
-    own = [i for i, label in enumerate(pattern.labels) if label in xyz]
-    if len(own) < MIN_MAPPED:
+    """Returns target_from_plane, fitted to the mapped circles, or None if they are too few or collinear."""
+    mapped_rows = [i for i, label in enumerate(pattern.labels) if label in xyz]
+    if len(mapped_rows) < MIN_MAPPED:
         return None
     try:
-        return align_rigid(np.array([xyz[pattern.labels[i]] for i in own]), pattern.xyz_mm()[own])
+        return align_rigid(np.array([xyz[pattern.labels[i]] for i in mapped_rows]), pattern.xyz_mm()[mapped_rows])
     except DegenerateError:
         return None

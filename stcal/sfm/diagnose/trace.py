@@ -22,11 +22,12 @@ from stcal.sfm.detect.circles.ellipses import (
 )
 
 MIN_OVERLAP = 0.2
-"""Share of a circle's predicted disc that an outline must cover to be the circle's."""
+"""Share of a circle's predicted disc that an outline must cover to belong to the circle."""
 MERGED, CUT = 1.5, 0.6
-"""Diameter of an outline over the predicted one: beyond these it runs into something else, or misses a part."""
+"""Ratios of the diameter of an outline to the predicted one beyond which it runs into something else, or misses a
+part."""
 HIDDEN = 0.25
-"""Below this share of the contrast needed there is nothing."""
+"""Share of the needed contrast below which a circle counts as hidden."""
 PROGRESS = (
     "short",
     "long",
@@ -39,15 +40,19 @@ PROGRESS = (
     "outline_deviation",
     "",
 )
-"""Gates of an outline in their order: a circle is judged by that outline of it which came furthest, …"""
+"""Gates of an outline in their order. Of several outlines of a circle, the one that passed most gates decides, …"""
 NEEDED = ("min_axis_ratio", "min_diameter")
-"""… and came closest to a limit, which is the least that is needed for these gates and the most allowed for others."""
+"""… and among these the one closest to its limit. The limit is the least needed for these gates, the most allowed for
+others."""
 
 
 @dataclass(frozen=True, slots=True)
 class OutlineEnd:
-    """The gate that stopped an outline, with value and limit, full px; ``cause`` : ``merged``, ``cut`` or empty;
-    ``rank`` : how far it came; ``ellipse`` that passed, row as of :meth:`Level.in_full`."""
+    """The gate that stopped an outline, with value and limit in px of the full image.
+
+    ``cause`` : ``merged``, ``cut`` or empty; ``rank`` : position of the gate in ``PROGRESS``; ``ellipse`` : the ellipse
+    of an outline that passed, a row as of :meth:`Level.in_full`.
+    """
 
     gate: str
     value: float | None = None
@@ -58,7 +63,7 @@ class OutlineEnd:
     ellipse: np.ndarray | None = None
 
     def closeness(self) -> float:
-        """How close the value came to the limit; comparable for one gate."""
+        """Returns how close the value came to the limit. It is comparable between values of one gate only."""
         if self.value is None or self.limit is None:
             return 0.0
         return self.value / self.limit if self.gate in NEEDED else -self.value / self.limit
@@ -67,7 +72,7 @@ class OutlineEnd:
 def trace_outlines(
     image: np.ndarray, polarity: Polarity, options: EllipseOptions, centre: np.ndarray, shape: np.ndarray
 ) -> list[OutlineEnd]:
-    """Where the outlines of n circles end.
+    """Returns where the outlines of n circles end.
 
     Parameters
     ----------
@@ -80,29 +85,32 @@ def trace_outlines(
     ends: list[list[OutlineEnd]] = [[] for _ in centre]
     limits = diameter_limits_px(image.size, options)
     for level in levels(image, options):
-        at, form = (centre - (level.scale - 1) / 2) / level.scale, shape / level.scale
+        centre_level, shape_level = (centre - (level.scale - 1) / 2) / level.scale, shape / level.scale
         for mask, gates in masks(level, polarity, threshold, options):
             contours = outlines(mask)
             boxes = np.array([cv2.boundingRect(c) for c in contours]).reshape(-1, 4)
             for k in range(len(centre)):
-                contour = _covering(mask, contours, boxes, at[k], form[k])
+                contour = _covering(mask, contours, boxes, centre_level[k], shape_level[k])
                 if contour is not None:
                     ends[k].append(_end(gates, contour, level, limits, predicted[k]))
     contrast = contrast_of(image, polarity, centre, shape)
-    found = []
-    for k, own in enumerate(ends):
-        furthest = max((end for end in own if end.rank >= 0), key=lambda end: (end.rank, end.closeness()), default=None)
+    result = []
+    for k, ends_of_circle in enumerate(ends):
+        furthest = max(
+            (end for end in ends_of_circle if end.rank >= 0), key=lambda end: (end.rank, end.closeness()), default=None
+        )
         if furthest is None:
-            found.append(_nothing(contrast[k], threshold, grey_range, predicted[k], limits))
+            result.append(_nothing(contrast[k], threshold, grey_range, predicted[k], limits))
         elif furthest.ellipse is not None:
-            found.append(_passed(image, polarity, furthest.ellipse, threshold, grey_range, centre[k], predicted[k]))
+            result.append(_passed(image, polarity, furthest.ellipse, threshold, grey_range, centre[k], predicted[k]))
         else:
-            found.append(furthest)
-    return found
+            result.append(furthest)
+    return result
 
 
 def _covering(mask, contours, boxes, centre, shape) -> np.ndarray | None:
-    """The outline whose own pixels cover most of an ellipse; the innermost of equal ones."""
+    """Returns the outline whose inside covers most of an ellipse, the innermost of equal ones, or None if no outline
+    covers enough."""
     reach = np.sqrt((shape**2).sum(1))
     low = np.maximum(np.floor(centre - reach).astype(int), 0)
     high = np.minimum(np.ceil(centre + reach).astype(int) + 1, mask.shape[::-1])
@@ -124,7 +132,7 @@ def _covering(mask, contours, boxes, centre, shape) -> np.ndarray | None:
 
 
 def _end(gates: OutlineGates, contour, level: Level, limits: tuple[float, float], predicted: float) -> OutlineEnd:
-    """Where one outline in one mask ends; what only another level or window can judge has rank −1."""
+    """Returns where one outline in one mask ends. The rank is −1 if only another level or window can judge it."""
     verdict = gates.check(contour)
     gate, value, limit = verdict.gate, verdict.value, verdict.limit
     rank, unit = PROGRESS.index(gate), ""
@@ -139,13 +147,13 @@ def _end(gates: OutlineGates, contour, level: Level, limits: tuple[float, float]
         rank = -1
     size = diameter * level.scale / predicted
     cause = "merged" if size > MERGED else "cut" if size < CUT else ""
-    if not gate or gate == "ellipse":  # nothing that has a value
+    if not gate or gate == "ellipse":  # these gates have no value
         return OutlineEnd(gate, rank=rank, cause=cause, ellipse=None if gate else level.in_full([verdict.ellipse]))
     return OutlineEnd(gate, float(value), float(limit), unit, cause, rank)
 
 
 def _passed(image, polarity, row: np.ndarray, threshold, grey_range, centre, predicted) -> OutlineEnd:
-    """An outline that is an ellipse: too faint, or not the circle's own."""
+    """Returns the verdict on an outline that is an ellipse: it is too faint, or not that of the circle."""
     at, shape = distinct(row)
     contrast = contrast_of(image, polarity, at, shape)[0]
     if contrast <= threshold:
@@ -155,7 +163,7 @@ def _passed(image, polarity, row: np.ndarray, threshold, grey_range, centre, pre
 
 
 def _nothing(contrast, threshold, grey_range, predicted, limits: tuple[float, float]) -> OutlineEnd:
-    """No outline covers the place."""
+    """Returns the verdict on a place that no outline covers."""
     if contrast <= threshold:
         return _faint(contrast, threshold, grey_range)
     for gate, limit, beyond in (

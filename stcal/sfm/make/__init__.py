@@ -1,1 +1,1 @@
-"""Targets to be made: patterns that cannot be mistaken for one another."""
+"""Design of targets whose patterns of circles cannot be mistaken for one another."""

@@ -1,4 +1,4 @@
-"""A box that stands: its four sides and its top, where they are, and where on each of them circles may lie."""
+"""The four sides and the top of a box that stands: where they are, and where circles may lie on each of them."""
 
 from dataclasses import dataclass
 
@@ -8,13 +8,17 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 
 EDGE_SHARE = 0.06
-"""From a rim to the edge of a plate, in parts of the plate's shorter side: room to cut, fold and glue."""
+"""Width of the margin along the rim of a plate that stays free of circles, as a share of the plate's shorter side. It
+leaves room to cut, fold and glue."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Side:
-    """A side: ``width``, ``height`` of its plate, mm; ``box_from_plate`` : the plate's origin is below on the left as
-    seen from outside, Y upwards, Z outwards."""
+    """A side of the box.
+
+    ``width``, ``height`` : size of its plate, mm; ``box_from_plate`` : pose of the plate. The plate's origin is at the
+    lower left as seen from outside, Y points upwards, Z outwards.
+    """
 
     name: str
     width: float
@@ -23,16 +27,17 @@ class Side:
 
     @property
     def edge(self) -> float:
-        """Free of circles, mm."""
+        """Width of the margin without circles, mm."""
         return EDGE_SHARE * min(self.width, self.height)
 
     def outline(self) -> np.ndarray:
-        """Corners of its plate, (4, 2)."""
+        """Returns the corners of the plate, (4, 2), mm."""
         return np.array([[0, 0], [self.width, 0], [self.width, self.height], [0, self.height]])
 
 
 def sides_of(size_mm: tuple[float, float, float]) -> list[Side]:
-    """Of a box of that width, height and depth, whose origin is in its middle, Z upwards."""
+    """Returns the sides of a box of this width, height and depth. The origin is in the middle of the box, Z points
+    upwards."""
     w, h, d = size_mm
     x, y, z = np.eye(3)
     rows = (
@@ -49,12 +54,12 @@ def sides_of(size_mm: tuple[float, float, float]) -> list[Side]:
 
 
 def size_of(text: str) -> tuple[float, float, float]:
-    """``W,H,D`` in mm.
+    """Parses ``W,H,D`` into width, height and depth in mm.
 
     Raises
     ------
     InputError
-        Not three lengths, or far from what a photograph shows.
+        If the text is not three lengths, or a length is outside 1 mm to 100 m.
     """
     try:
         width, height, depth = map(float, text.split(","))

@@ -1,4 +1,5 @@
-"""A target for a box, with circles that its camera sees well, and a board for it: drawn at random, and verified."""
+"""Design of a target for a box and of a board for it, at random and verified, with circles that the camera sees
+well."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -17,29 +18,30 @@ from stcal.sfm.make.pattern import HIDDEN, LARGE, Pattern, make_pattern
 from stcal.synthetic.scene import FOCAL_PER_WIDTH
 
 FARTHER = 1.1
-"""Cameras stand up to a tenth farther off than they are to."""
+"""Largest distance of a camera, as a multiple of the stated distance."""
 WELL_SEEN = 1.5
-"""Diameter of the smallest circle, most tilted and farthest away, over the smallest that is sought."""
+"""Least ratio of the smallest circle's diameter, where it is most tilted and farthest away, to the smallest diameter
+that detection looks for."""
 RADIUS_SHARE = 1 / 30
-"""Of the smaller circles where none is given, in parts of the box's shortest side."""
+"""Default radius of the smaller circles, as a share of the box's shortest side."""
 RADIUS_STEP_MM = 0.25
 PITCH_SHARE = 0.23
-"""Of the board, in parts of the box's longest side: the board reaches beyond it on all sides."""
+"""Pitch of the board, as a share of the box's longest side. The board then reaches beyond the box on all sides."""
 PITCH_STEP_MM = 5.0
 ATTEMPTS = 8
-"""Patterns drawn until one is named in all cases."""
+"""Largest number of patterns drawn until one is identified in all cases."""
 ROWS, COLUMNS = 7, 9
 BOARD_SIGMA_MM = 0.02
-"""Of dots as a good printer places them; a milled or photographic plate states its own."""
+"""Position error of dots that a good printer prints. A milled or photographic plate states its own."""
 
 
 @dataclass(frozen=True, slots=True)
 class MakeOptions:
-    """What is to be made.
+    """Options of the design.
 
-    ``size_mm`` : width, height, depth of the box; ``circles`` : of each face; ``radius_mm`` : of the smaller circles,
-    None for one that suits; ``distance_mm`` : from the cameras; ``width`` : px, 3:2 images of a 24 mm lens, where no
-    ``camera`` is given.
+    ``size_mm`` : width, height, depth of the box; ``circles`` : number of circles per face; ``radius_mm`` : radius of
+    the smaller circles, None to choose a suitable one; ``distance_mm`` : distance from the cameras; ``width`` : image
+    width in px, for 3:2 images of a 24 mm lens; used only without ``camera``.
     """
 
     size_mm: tuple[float, float, float]
@@ -52,12 +54,12 @@ class MakeOptions:
     seed: int = 0
 
     def ideal_camera(self) -> Camera:
-        """Without distortion.
+        """Returns the camera without its distortion, or a default camera if none is given.
 
         Raises
         ------
         InputError
-            The camera file states no image size.
+            If the camera file states no image size.
         """
         width, height = self.width, round(self.width * 2 / 3)
         focal = np.full(2, FOCAL_PER_WIDTH * width)
@@ -71,7 +73,8 @@ class MakeOptions:
         return Camera(width, height, focal, [(width - 1) / 2, (height - 1) / 2], np.zeros(COEFFICIENTS))
 
     def least_radius_mm(self) -> float:
-        """Of circles that are found where they are farthest away and most tilted, with room to spare."""
+        """Returns the least radius of circles that are found even where they are farthest away and most tilted, with a
+        margin."""
         camera = self.ideal_camera()
         least, _ = diameter_limits_px(camera.width * camera.height, EllipseOptions())
         px_per_mm = np.sqrt(camera.focal.prod()) / (FARTHER * self.distance_mm)
@@ -80,8 +83,11 @@ class MakeOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Made:
-    """``radius_mm`` : of the smaller circles, ``least_mm`` the smallest that the camera sees well; ``cases`` of hidden
-    circles tried, all of them named."""
+    """The designed target and board.
+
+    ``radius_mm`` : radius of the smaller circles; ``least_mm`` : smallest radius that the camera sees well; ``cases`` :
+    number of cases of hidden circles that were tried; the faces were identified in all of them.
+    """
 
     options: MakeOptions
     pattern: Pattern
@@ -92,24 +98,25 @@ class Made:
 
 
 def make_target(options: MakeOptions, progress: Callable[[int, int], None] | None = None) -> Made:
-    """A pattern for each side of the box but the one that it stands on, and a board.
+    """Returns a board, and a pattern for each side of the box except the one it stands on.
 
     Parameters
     ----------
     options : MakeOptions
     progress : callable, optional
-        (done, total) cases of hidden circles.
+        Called with (done, total), numbers of cases of hidden circles.
 
     Raises
     ------
     InputError
-        Circles too small for the camera, too few, or without room; a face that is not named with circles hidden.
+        If circles are too small or too large for the camera, too few, or without room, or if a face is not identified
+        with some of its circles hidden.
     """
     least = options.least_radius_mm()
     radius = options.radius_mm
     if radius is None:
-        suits = max(least, RADIUS_SHARE * min(options.size_mm))
-        radius = float(np.ceil(suits / RADIUS_STEP_MM - 1e-9) * RADIUS_STEP_MM)
+        suitable = max(least, RADIUS_SHARE * min(options.size_mm))
+        radius = float(np.ceil(suitable / RADIUS_STEP_MM - 1e-9) * RADIUS_STEP_MM)
     if radius < least:
         raise InputError(
             "E-MAKE-RADIUS",
@@ -130,7 +137,8 @@ def make_target(options: MakeOptions, progress: Callable[[int, int], None] | Non
 
 
 def _named(options: MakeOptions, radius_mm: float, progress: Callable[[int, int], None] | None) -> tuple[Pattern, int]:
-    """The first pattern drawn of which each face is named in all cases of hidden circles, and their number."""
+    """Returns the first pattern whose faces are all identified in every case of hidden circles, and the number of
+    cases."""
     name, sides = "box {:g} x {:g} x {:g} mm".format(*options.size_mm), sides_of(options.size_mm)
     failed, cases = [], 0
     for attempt in range(ATTEMPTS):
@@ -139,10 +147,10 @@ def _named(options: MakeOptions, radius_mm: float, progress: Callable[[int, int]
         failed, cases = unnamed_cases(pattern.target, options.ideal_camera(), options.distance_mm, HIDDEN, progress)
         if not failed:
             return pattern, cases
-    face, gone = failed[0]
+    face, hidden_ids = failed[0]
     raise InputError(
         "E-MAKE-UNNAMED",
-        f"face {face}: not named with circles {', '.join(gone)} hidden, as in {len(failed)} of {cases} cases; "
+        f"face {face}: not named with circles {', '.join(hidden_ids)} hidden, as in {len(failed)} of {cases} cases; "
         f"{ATTEMPTS} patterns tried; another --seed or more --circles needed",
     )
 
@@ -155,7 +163,7 @@ def _board(options: MakeOptions, least_mm: float) -> BoardDesign:
 
 
 def made_text(made: Made) -> str:
-    """What was made, and how well its faces are told apart."""
+    """Returns a text that describes the target and how well its faces are told apart."""
     options, target = made.options, made.pattern.target
     large, alike = LARGE * made.radius_mm, made.pattern.likeness
     common = f"at most {alike} of its circles" if alike else "never four circles"

@@ -1,4 +1,5 @@
-"""Whether detection names each face of a target with any of its circles hidden: all cases, one after the other."""
+"""Test of whether detection identifies each face of a target with any of its circles hidden, in all cases one by
+one."""
 
 from collections.abc import Callable
 from itertools import combinations
@@ -16,30 +17,30 @@ from stcal.sfm.detect.circles.ellipses import Ellipses
 from stcal.sfm.detect.faces import FaceFinder
 
 TILT_RAD = np.radians(40.0)
-"""Of the face in the views that are tried, about an axis aslant."""
+"""Tilt of the face about an oblique axis in the simulated views."""
 CONTRAST = 100.0
 
 
 def unnamed_cases(
     target: TargetDesign, camera: Camera, distance_mm: float, hidden: int, progress: Callable[[int, int], None] | None
 ) -> tuple[list[tuple[str, tuple[str, ...]]], int]:
-    """Face and hidden circles of the cases in which the finder does not read exactly the circles left, and the number
-    of all cases.
+    """Returns the cases in which the finder does not read exactly the visible circles, and the number of all cases.
 
-    The ellipses are those of circles without noise, as outlines give them to the finder.
+    A case is the face and its hidden circles. The ellipses are noise-free images of the circles, in the form in which
+    outlines give them to the finder.
     """
     finder = FaceFinder(target)
     failed, done = [], 0
     total = sum(comb(len(face.ids), hidden) for face in target.faces)
     for face in target.faces:
-        every = _seen(face, target, camera, distance_mm)
-        for gone in combinations(range(len(face.ids)), hidden):
-            kept = np.setdiff1d(np.arange(len(face.ids)), gone)
-            found = finder.find(Candidates.of(every.select(kept), camera)).faces
-            right = [reading for reading in found if reading.face is face and len(found) == 1]
+        ellipses = _seen(face, target, camera, distance_mm)
+        for hidden_rows in combinations(range(len(face.ids)), hidden):
+            visible = np.setdiff1d(np.arange(len(face.ids)), hidden_rows)
+            readings = finder.find(Candidates.of(ellipses.select(visible), camera)).faces
+            right = [reading for reading in readings if reading.face is face and len(readings) == 1]
             named = {(i, int(row)) for r in right for i, row in enumerate(r.index) if row >= 0}
-            if named != {(int(circle), row) for row, circle in enumerate(kept)}:
-                failed.append((face.id, tuple(face.ids[i] for i in gone)))
+            if named != {(int(circle), row) for row, circle in enumerate(visible)}:
+                failed.append((face.id, tuple(face.ids[i] for i in hidden_rows)))
             done += 1
             if progress is not None and (done % 20 == 0 or done == total):
                 progress(done, total)
@@ -47,7 +48,7 @@ def unnamed_cases(
 
 
 def _seen(face: FaceDesign, target: TargetDesign, camera: Camera, distance_mm: float) -> Ellipses:
-    """Images of all its circles, the face tilted and turned, its middle on the axis."""
+    """Returns the ellipses of all circles of a face that is tilted and turned, with its middle on the optical axis."""
     axis = np.array([0.6, 0.8, 0.0])
     front = np.diag([1.0, -1.0, -1.0])  # Z of the face to the camera
     turn = Rotation.from_rotvec(TILT_RAD * axis).as_matrix() @ front

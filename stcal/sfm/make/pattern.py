@@ -1,7 +1,8 @@
-"""Patterns of circles that no face shares with another, with its mirror image or with itself turned.
+"""Patterns of circles that no face shares with another face, with its mirror image or with itself turned.
 
-Circles of two sizes are strewn over each plate, each as far from the others as the best of some places lies; of several
-such patterns that is taken whose likest reading among the faces so far has the fewest circles in common.
+Circles of two sizes are placed at random on each plate. Each circle takes the one of several random places that is
+farthest from the other circles. Of several such patterns, the one is taken whose most similar reading among the
+faces so far has the fewest circles in common.
 """
 
 from dataclasses import dataclass, replace
@@ -16,23 +17,24 @@ from stcal.sfm.make.box import Side
 from stcal.synthetic.designs import face_of_drawing
 
 HIDDEN = 3
-"""Circles of a face that may be hidden, whichever: the others name it."""
+"""Number of circles of a face that may be hidden. Any set of the remaining circles identifies the face."""
 LEAST_CIRCLES = MIN_CIRCLES + HIDDEN
 LARGE = 1.6
-"""Radius of the larger circles in parts of the smaller: detection takes up to 1.3 for the same."""
+"""Radius of the larger circles as a multiple of the smaller radius. Detection takes radii up to a ratio of 1.3 for
+equal."""
 GAP = 0.8
-"""Between rims, at least, in radii of the smaller circles."""
+"""Least gap between the rims of two circles, in radii of the smaller circles."""
 PLACES, TRIES = 40, 30
-"""For each circle; patterns for each face."""
+"""Numbers of candidate places for each circle, and of candidate patterns for each face."""
 GRID_MM = 0.5
-"""Places are whole numbers of it, which can be measured again."""
+"""Grid of the coordinates of circles, so that they are round numbers that can be measured again."""
 CORNER_SHARE = 0.15
-"""In which the circles of the frame lie about the corners, in parts of the plate's sides."""
+"""Size of the area at each corner in which a circle of the frame lies, as a share of the plate's sides."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pattern:
-    """``target``, and ``likeness`` : most circles that a face has in common with another reading, 0 if under four."""
+    """A target, and its ``likeness`` : most circles that a face has in common with another reading, 0 if under four."""
 
     target: TargetDesign
     likeness: int
@@ -82,13 +84,14 @@ def make_pattern(
 
 
 def _likeness(face: FaceDesign, others: list[FaceDesign]) -> int:
-    """Most circles in common with itself turned or mirrored, and with others and their mirror images."""
+    """Returns the most circles that a face has in common with itself turned or mirrored, with another face, or with the
+    mirror image of another face."""
     pairs = [(face, False), (face, True), *((other, mirrored) for other in others for mirrored in (False, True))]
     return max(in_common(face, other, mirrored) for other, mirrored in pairs)
 
 
 def _strewn(side: Side, count: int, radius_mm: float, rng: np.random.Generator) -> FaceDesign | None:
-    """One pattern; None where the last circles had no room."""
+    """Returns one random pattern, or None if the last circles had no room."""
     size = np.array([side.width, side.height])
     large = LARGE * radius_mm
     low, high = np.full(2, side.edge + large), size - side.edge - large
@@ -103,15 +106,15 @@ def _strewn(side: Side, count: int, radius_mm: float, rng: np.random.Generator) 
     for place in range(3, count):
         radius = large if place % 2 == 0 else radius_mm
         edge = side.edge + radius
-        tried = _on_grid(edge + rng.random((PLACES, 2)) * (size - 2 * edge))
-        gap = np.linalg.norm(tried[:, None] - np.array(xy), axis=2) - np.array(radii) - radius
+        places = _on_grid(edge + rng.random((PLACES, 2)) * (size - 2 * edge))
+        gap = np.linalg.norm(places[:, None] - np.array(xy), axis=2) - np.array(radii) - radius
         gap = gap.min(1)
         if gap.max() < GAP * radius_mm:
             return None
-        xy.append(tried[int(gap.argmax())])
+        xy.append(places[int(gap.argmax())])
         radii.append(radius)
-    apart = np.linalg.norm(np.array(xy[:3])[:, None] - np.array(xy[:3]), axis=2) + np.diag([np.inf] * 3)
-    if apart.min() < 2 * large + GAP * radius_mm:
+    distances = np.linalg.norm(np.array(xy[:3])[:, None] - np.array(xy[:3]), axis=2) + np.diag([np.inf] * 3)
+    if distances.min() < 2 * large + GAP * radius_mm:
         return None
     rows = [(str(i), *place.tolist(), radius) for i, (place, radius) in enumerate(zip(xy, radii, strict=True), 1)]
     face, plate_from_face = face_of_drawing(side.name, rows, "1", "2", "3")

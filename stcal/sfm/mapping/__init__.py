@@ -1,1 +1,1 @@
-"""From labelled observations to a model of each group: the COLMAP database, the initial pair, incremental mapping."""
+"""Models of groups from labelled observations: the COLMAP database, the initial pair, incremental mapping."""

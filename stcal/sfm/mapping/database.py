@@ -1,4 +1,4 @@
-"""The COLMAP database: one camera, an image and a frame each, labelled keypoints and matches."""
+"""The COLMAP database: one camera, one frame for each image, labelled keypoints, and matches."""
 
 import csv
 import io
@@ -19,7 +19,7 @@ RIG_ID = 1
 
 
 def colmap_camera(camera: CalibratedCamera) -> pycolmap.Camera:
-    """The camera as COLMAP has it, its pixel origin included."""
+    """Returns the camera in COLMAP's form, with COLMAP's pixel origin."""
     return pycolmap.Camera(
         camera_id=CAMERA_ID,
         model=camera.colmap_model,
@@ -31,28 +31,28 @@ def colmap_camera(camera: CalibratedCamera) -> pycolmap.Camera:
 
 
 def to_colmap_px(xy_px: np.ndarray) -> np.ndarray:
-    """OpenCV pixels to COLMAP's: the one place where the pixel origin moves on the way out."""
+    """Converts OpenCV pixels to COLMAP's. The only place where the pixel origin is shifted on output."""
     return np.asarray(xy_px, float) + COLMAP_PIXEL_ORIGIN
 
 
 def from_colmap_px(xy_px: np.ndarray) -> np.ndarray:
-    """COLMAP pixels to OpenCV's: the one place where the pixel origin moves on the way in."""
+    """Converts COLMAP pixels to OpenCV's. The only place where the pixel origin is shifted on input."""
     return np.asarray(xy_px, float) - COLMAP_PIXEL_ORIGIN
 
 
 def image_ids(observations: Sequence[ImageObservations]) -> dict[str, int]:
-    """COLMAP's image id (and frame id) of every image name: 1, 2, … in the order given."""
+    """Returns COLMAP's image id, which is also the frame id, by image name: 1, 2, … in the given order."""
     return {image.name: i for i, image in enumerate(observations, start=1)}
 
 
 def match_labels(a: ImageObservations, b: ImageObservations) -> np.ndarray:
-    """Keypoint indices (n, 2) of what both images show; dots of the board are the same point in one group only."""
-    where = {label: j for j, label in enumerate(b.labels)}
+    """Returns the keypoint indices (n, 2) of the labels that both images show. Dots match within one group only."""
+    keypoint_of_label = {label: j for j, label in enumerate(b.labels)}
     same_board = a.group == b.group
     pairs = [
-        (i, where[label])
+        (i, keypoint_of_label[label])
         for i, label in enumerate(a.labels)
-        if label in where and (same_board or isinstance(label, CircleLabel))
+        if label in keypoint_of_label and (same_board or isinstance(label, CircleLabel))
     ]
     return np.array(pairs, dtype=np.uint32).reshape(-1, 2)
 
@@ -64,12 +64,12 @@ def write_database(
     pairs: np.ndarray,
     keypoints_px: Sequence[np.ndarray] | None = None,
 ) -> None:
-    """Write a new database at once: it appears complete or not at all.
+    """Writes a new database atomically: the file appears complete or not at all.
 
     Parameters
     ----------
     pairs : (n, 2) indices of the images to match, see :func:`stcal.sfm.mapping.graph.image_graph`
-    keypoints_px : one (n, 2) array for each image, OpenCV pixel origin; the measured centres where not given
+    keypoints_px : one (n, 2) array for each image, OpenCV pixel origin; by default the measured centres
     """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
@@ -88,7 +88,7 @@ def write_database(
 
 
 def remove_database(path: Path) -> None:
-    """Remove a database with its side files."""
+    """Removes a database and SQLite's files beside it."""
     for suffix in ("", "-wal", "-shm", "-journal"):
         Path(f"{path}{suffix}").unlink(missing_ok=True)
 
@@ -114,7 +114,7 @@ def _write(database, camera, observations, pairs, keypoints_px) -> None:
             matches = match_labels(a, b)
             database.write_matches(ids[a.name], ids[b.name], matches)
             geometry = pycolmap.TwoViewGeometry(inlier_matches=matches)
-            # 4.x skips pairs of configuration UNDEFINED without a word.
+            # COLMAP 4.x silently skips pairs of configuration UNDEFINED.
             geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
             database.write_two_view_geometry(ids[a.name], ids[b.name], geometry)
 
@@ -122,8 +122,8 @@ def _write(database, camera, observations, pairs, keypoints_px) -> None:
 def labels_csv(
     observations: Sequence[ImageObservations], corrected_px: Sequence[np.ndarray], residual_px: Sequence[np.ndarray]
 ) -> str:
-    """Text of ``labels.csv``: label, float64 measured and corrected centre, σ and residual of every (image, keypoint);
-    residuals that are nan, of what is not in the result, stay empty."""
+    """Returns the text of ``labels.csv``: label, measured and corrected centre (float64), covariance and residual of
+    every (image, keypoint). Residuals of keypoints that are not in the result are nan, and their cells empty."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     columns = (
@@ -136,6 +136,8 @@ def labels_csv(
         covariance = image.covariance_px2.reshape(-1, 4)[:, [0, 1, 3]]
         values = np.column_stack([image.centre_px, corrected, covariance]).tolist()
         for k, label in enumerate(image.labels):
-            own = ["" if np.isnan(v) else repr(v) for v in residual[k].tolist()]
-            writer.writerow([ids[image.name], k, image.name, image.group, label, *map(repr, values[k]), *own])
+            residual_cells = ["" if np.isnan(v) else repr(v) for v in residual[k].tolist()]
+            writer.writerow(
+                [ids[image.name], k, image.name, image.group, label, *map(repr, values[k]), *residual_cells]
+            )
     return stream.getvalue()

@@ -1,8 +1,8 @@
-"""Which pairs of images the database holds, and which images of a group are mapped first.
+"""Pairs of images in the database, and the images of a group that are mapped first.
 
-With labels known a match says nothing that its label does not: it is enough that the images of a circle hang together
-(its track). In large sets a few images that see the scene from all sides, the skeleton, are paired with one another,
-and every other image with those of them that stand nearest or that its circles need.
+Labels are known, so a match adds no information to them: it is enough that the images of each circle are connected
+(its track). In large sets a few images that see the scene from all sides, the skeleton, are paired with one another.
+Every other image is paired with the images of the skeleton that are nearest or that its circles need.
 """
 
 from collections.abc import Sequence
@@ -22,21 +22,24 @@ from stcal.sfm.data.observations import ImageObservations
 
 GraphKind = Literal["all", "sparse"]
 SPARSE_FROM = 80
-"""Sets of more images get a sparse graph: from here on it is the faster one (scripts/studies/scale_study.py)."""
+"""Largest set of images that gets all pairs. Above it the sparse graph is faster (scripts/studies/scale_study.py)."""
 MIN_SHARED = 6
-"""Pairs of images with fewer labels in common are not written."""
+"""Smallest number of common labels of a pair of images that is written."""
 SKELETON = 20
-"""Images of a group that are mapped first; groups of no more are mapped as they are."""
+"""Number of images of a group that are mapped first. Smaller groups are mapped as a whole."""
 MIN_VIEWS = 3
-"""Of every circle in the skeleton, where the group has as many."""
+"""Smallest number of views of every circle in the skeleton, if the group has that many."""
 NEIGHBOURS = 3
-"""Images of the skeleton that each other image is paired with at least."""
+"""Smallest number of skeleton images that each image outside the skeleton is paired with."""
 MIN_DOTS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageGraph:
-    """``pairs`` : (n, 2) indices of images, ascending; ``skeleton`` : by group the indices that are mapped first."""
+    """Pairs of images to match.
+
+    ``pairs`` : (n, 2) indices of images, ascending; ``skeleton`` : indices of the images mapped first, by group.
+    """
 
     kind: GraphKind
     pairs: np.ndarray
@@ -46,13 +49,13 @@ class ImageGraph:
 def image_graph(
     observations: Sequence[ImageObservations], board: BoardDesign, kind: GraphKind | None = None
 ) -> ImageGraph:
-    """Pairs of images with at least six labels in common: all, or so few that every track still hangs together.
+    """Returns all pairs of images with at least six common labels, or just enough to keep every track connected.
 
-    ``kind`` : sparse above ``SPARSE_FROM`` images where None.
+    ``kind`` : if None, sparse for more than ``SPARSE_FROM`` images.
     """
     kind = kind_of_graph(len(observations), kind)
-    seen = incidence(observations)
-    shared = (seen.astype(np.float32) @ seen.T.astype(np.float32)).astype(np.int32)
+    sees = incidence(observations)
+    shared = (sees.astype(np.float32) @ sees.T.astype(np.float32)).astype(np.int32)
     groups: dict[str, list[int]] = {}
     for i, image in enumerate(observations):
         groups.setdefault(image.group, []).append(i)
@@ -62,34 +65,34 @@ def image_graph(
     skeleton, pairs = {}, set()
     for name, indices in members.items():
         direction = np.array([_direction(observations[i], board) for i in indices])
-        chosen = _skeleton(direction, seen[indices])
+        chosen = _skeleton(direction, sees[indices])
         skeleton[name] = indices[chosen]
         pairs |= {(i, j) for i, j in combinations(skeleton[name].tolist(), 2) if shared[i, j] >= MIN_SHARED}
-        pairs |= _links(indices, chosen, direction, seen, shared)
-    _join_tracks(pairs, seen, shared, np.isin(np.arange(len(observations)), np.concatenate([*skeleton.values()])))
+        pairs |= _links(indices, chosen, direction, sees, shared)
+    _join_tracks(pairs, sees, shared, np.isin(np.arange(len(observations)), np.concatenate([*skeleton.values()])))
     return ImageGraph(kind, np.array(sorted(pairs), int).reshape(-1, 2), skeleton)
 
 
 def kind_of_graph(images: int, kind: GraphKind | None = None) -> GraphKind:
-    """Which graph so many images get, where it is not given."""
+    """Returns the given kind of graph, or the default for this number of images."""
     return kind or ("sparse" if images > SPARSE_FROM else "all")
 
 
 def incidence(observations: Sequence[ImageObservations]) -> np.ndarray:
-    """Which image sees which circle, (images, circles) bool; dots of the board are others in every group."""
+    """Returns which image sees which circle, (images, circles) bool. Dots of two groups are different circles."""
     column: dict[tuple[str, str], int] = {}
     rows, columns = [], []
     for i, image in enumerate(observations):
         for label in image.labels:
             columns.append(column.setdefault((image.group if isinstance(label, DotLabel) else "", label), len(column)))
         rows += [i] * len(image)
-    seen = np.zeros((len(observations), len(column)), bool)
-    seen[rows, columns] = True
-    return seen
+    sees = np.zeros((len(observations), len(column)), bool)
+    sees[rows, columns] = True
+    return sees
 
 
 def _direction(image: ImageObservations, board: BoardDesign) -> np.ndarray:
-    """Unit vector (3,) from the board's middle to the camera, board frame; nan where the board does not tell."""
+    """Returns the unit vector (3,) from the board's middle to the camera, board frame; nan if there is no pose."""
     dots = [k for k, label in enumerate(image.labels) if isinstance(label, DotLabel)]
     if len(dots) >= MIN_DOTS:
         design = board.places_mm(image.labels[k] for k in dots)[:, :2]
@@ -98,13 +101,13 @@ def _direction(image: ImageObservations, board: BoardDesign) -> np.ndarray:
         except DegenerateError:
             return np.full(3, np.nan)
         middle = board.pitch_mm * np.array([board.columns - 1, board.rows - 1, 0]) / 2
-        way = camera_from_board.inverse().translation - middle
-        return way / np.linalg.norm(way)
+        offset = camera_from_board.inverse().translation - middle
+        return offset / np.linalg.norm(offset)
     return np.full(3, np.nan)
 
 
 def _skeleton(direction: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Indices (into the group) of images far apart that see every circle from ``MIN_VIEWS`` places."""
+    """Returns indices (into the group) of images far apart that see every circle at least ``MIN_VIEWS`` times."""
     count = len(direction)
     if count <= SKELETON:
         return np.arange(count)
@@ -127,7 +130,7 @@ def _skeleton(direction: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def _links(indices, chosen, direction, seen, shared) -> set[tuple[int, int]]:
-    """Pairs of every other image of a group with the skeleton: the nearest, and those that its circles need."""
+    """Returns pairs of the group's other images with skeleton images: the nearest, and those their circles need."""
     pairs = set()
     skeleton = indices[chosen]
     for k in np.setdiff1d(np.arange(len(indices)), chosen):
@@ -136,39 +139,39 @@ def _links(indices, chosen, direction, seen, shared) -> set[tuple[int, int]]:
         order = skeleton[np.argsort(-near, kind="stable")]
         order = order[shared[i, order] >= MIN_SHARED]
         picked = list(order[:NEIGHBOURS])
-        rest = list(order[NEIGHBOURS:])
+        candidates = list(order[NEIGHBOURS:])
         open_labels = seen[i] & seen[order].any(0) & ~seen[picked].any(0)
         while open_labels.any():
-            best = max(rest, key=lambda j: int((seen[j] & open_labels).sum()))
+            best = max(candidates, key=lambda j: int((seen[j] & open_labels).sum()))
             picked.append(best)
-            rest.remove(best)
+            candidates.remove(best)
             open_labels &= ~seen[best]
         pairs |= {(int(min(i, j)), int(max(i, j))) for j in picked}
     return pairs
 
 
 def _join_tracks(pairs: set[tuple[int, int]], seen: np.ndarray, shared: np.ndarray, preferred: np.ndarray) -> None:
-    """Add pairs until the images of every circle hang together as far as all pairs would make them."""
+    """Adds pairs until the images of every circle are as connected as all pairs would make them."""
     for column in range(seen.shape[1]):
         images = np.flatnonzero(seen[:, column])
-        part = track_parts(np.array(sorted(pairs), int).reshape(-1, 2), images)
-        for candidates in (preferred[images], np.ones(len(images), bool)):
-            if part.max(initial=0) == 0:
+        component = track_parts(np.array(sorted(pairs), int).reshape(-1, 2), images)
+        for allowed in (preferred[images], np.ones(len(images), bool)):
+            if component.max(initial=0) == 0:
                 break
-            own = np.flatnonzero(candidates)
-            i, j = np.triu_indices(len(own), 1)
-            i, j = own[i], own[j]
+            usable = np.flatnonzero(allowed)
+            i, j = np.triu_indices(len(usable), 1)
+            i, j = usable[i], usable[j]
             count = shared[images[i], images[j]]
-            useful = np.flatnonzero((part[i] != part[j]) & (count >= MIN_SHARED))
+            useful = np.flatnonzero((component[i] != component[j]) & (count >= MIN_SHARED))
             for k in useful[np.argsort(-count[useful], kind="stable")]:
-                a, b = part[i[k]], part[j[k]]
+                a, b = component[i[k]], component[j[k]]
                 if a != b:
-                    part[part == max(a, b)] = min(a, b)
+                    component[component == max(a, b)] = min(a, b)
                     pairs.add((int(images[i[k]]), int(images[j[k]])))
 
 
 def track_parts(pairs: np.ndarray, images: np.ndarray) -> np.ndarray:
-    """Number of the connected part that each of the ``images`` (ascending) lies in, over ``pairs`` among them."""
+    """Returns the connected component of each of the ``images`` (ascending) in the graph of ``pairs`` among them."""
     inside = np.isin(pairs, images).all(1)
     i, j = np.searchsorted(images, pairs[inside]).T
     matrix = coo_array((np.ones(len(i)), (i, j)), shape=(len(images), len(images)))

@@ -1,4 +1,4 @@
-"""Mapping with pycolmap: incremental, seeded with our pair, intrinsics fixed, few points."""
+"""Incremental mapping with pycolmap: few points, fixed intrinsics, seeded with the initial pair chosen by stcal."""
 
 import shutil
 from collections.abc import Collection
@@ -20,16 +20,19 @@ from stcal.sfm.mapping.resect import assemble, complete
 
 SEED = 1
 MAX_REPROJECTION_PX = 4.0
-"""Observations further off than this from their label's point are left out of the model (COLMAP's filter)."""
+"""Largest reprojection error of an observation in the model (COLMAP's filter)."""
 MIN_AGREEMENT = 0.5
-"""Share of the circles seen twice that a model must explain."""
+"""Share of the circles seen at least twice that a model must contain."""
 LOG_ERRORS_ONLY = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapping:
-    """``model`` of a group; ``left_out`` : image name → reason; ``seeded`` : how the initial pair was registered;
-    ``outliers`` : observations far off their label's point."""
+    """Result of mapping one group.
+
+    ``model`` : model of the group; ``outliers`` : observations with a large reprojection error; ``left_out`` : reason
+    by image name; ``seeded`` : how the initial pair was registered.
+    """
 
     model: WorldModel
     outliers: tuple[Outlier, ...]
@@ -46,14 +49,14 @@ def map_group(
     pairs: list[PairScore],
     camera: Camera,
 ) -> Mapping:
-    """Map one group of the database: the ``skeleton`` by COLMAP, the other images resected by their labels.
+    """Maps one group of the database: COLMAP maps the ``skeleton``, the other images are resected by their labels.
 
-    The chosen pair seeds COLMAP; where COLMAP's gates refuse it, our own relative pose is registered instead.
+    The chosen pair seeds COLMAP. If COLMAP's checks reject it, the relative pose of the ranking is registered instead.
 
     Raises
     ------
     MappingError
-        No model of two or more images.
+        There is no model of two or more images.
     """
     names = [image.name for image in group if image.name in skeleton]
     first, second = (next(i for i in group if i.name == name) for name in (pairs[0].first, pairs[0].second))
@@ -79,7 +82,7 @@ def map_group(
 
 
 def left_out(group: list[ImageObservations], model: WorldModel) -> dict[str, str]:
-    """Reason by name of every image that the model does not have."""
+    """Returns why images of the group are not in the model, by image name."""
     reasons = {}
     for image in group:
         if image.name not in model.images:
@@ -109,7 +112,7 @@ def _require_agreement(model: WorldModel, group: list[ImageObservations]) -> Non
 
 
 def pipeline_options(names: list[str], pair: tuple[int, int]) -> pycolmap.IncrementalPipelineOptions:
-    """COLMAP's options for few labelled points and a known camera."""
+    """Returns COLMAP's options for few labelled points and a known camera."""
     options = pycolmap.IncrementalPipelineOptions()
     options.image_names = names
     options.init_image_id1, options.init_image_id2 = pair
@@ -136,7 +139,7 @@ def pipeline_options(names: list[str], pair: tuple[int, int]) -> pycolmap.Increm
 def seeded_mapping(
     database: Path, scratch: Path, names: list[str], pair: tuple[int, int]
 ) -> pycolmap.Reconstruction | None:
-    """The largest model that COLMAP's mapper makes of the named images from a pair (ids); None where it makes none."""
+    """Returns the largest model that COLMAP maps from the named images and initial pair (ids); None if it maps none."""
     pycolmap.logging.minloglevel = LOG_ERRORS_ONLY
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
@@ -148,7 +151,7 @@ def seeded_mapping(
 
 
 def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Reconstruction | None:
-    """COLMAP's incremental mapper driven from here, starting from our relative pose of the pair."""
+    """Runs COLMAP's incremental mapper step by step, starting from the relative pose of ``pair``."""
     pycolmap.logging.minloglevel = LOG_ERRORS_ONLY
     options = pipeline_options(names, (ids[pair.first], ids[pair.second]))
     with pycolmap.Database.open(str(database)) as opened:
@@ -184,25 +187,29 @@ def _own_mapping(database: Path, names, ids, pair: PairScore) -> pycolmap.Recons
 def labelled_model(
     reconstruction: pycolmap.Reconstruction, group: list[ImageObservations], ids: dict[str, int], camera: Camera
 ) -> tuple[WorldModel, tuple[Outlier, ...]]:
-    """One point for each label, with every observation of the label that agrees with it; and those that do not.
+    """Returns a model with one point for each label and the observations that agree with it, and the outliers.
 
     Images of the group that the reconstruction lacks are resected by their labels.
     """
-    known = reconstruction.images  # COLMAP forgets images that share nothing with the others
-    registered = [image for image in group if ids[image.name] in known and known[ids[image.name]].has_pose]
-    poses = [rigid_from_colmap(known[ids[image.name]].cam_from_world()) for image in registered]
-    places: dict[Label, dict[int, int]] = {}
+    colmap_images = reconstruction.images  # COLMAP drops images that have nothing in common with the others
+    registered = [
+        image for image in group if ids[image.name] in colmap_images and colmap_images[ids[image.name]].has_pose
+    ]
+    poses = [rigid_from_colmap(colmap_images[ids[image.name]].cam_from_world()) for image in registered]
+    votes_of_label: dict[Label, dict[int, int]] = {}
     for image in registered:
-        for k, point in enumerate(known[ids[image.name]].points2D):
+        for k, point in enumerate(colmap_images[ids[image.name]].points2D):
             if point.has_point3D():
-                votes = places.setdefault(image.labels[k], {})
+                votes = votes_of_label.setdefault(image.labels[k], {})
                 votes[point.point3D_id] = votes.get(point.point3D_id, 0) + 1
-    xyz = {label: reconstruction.point3D(max(votes, key=votes.__getitem__)).xyz for label, votes in places.items()}
+    xyz = {
+        label: reconstruction.point3D(max(votes, key=votes.__getitem__)).xyz for label, votes in votes_of_label.items()
+    }
     model = assemble(WorldModel, group[0].group, registered, poses, xyz)
     if len(registered) < len(group):
         model = complete(model, group, camera, MAX_REPROJECTION_PX)
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
-    off = residual > MAX_REPROJECTION_PX
+    is_outlier = residual > MAX_REPROJECTION_PX
     outliers = [
         Outlier(
             model.images[model.image_index[k]],
@@ -210,6 +217,6 @@ def labelled_model(
             float(residual[k]),
             MAX_REPROJECTION_PX,
         )
-        for k in np.flatnonzero(off)
+        for k in np.flatnonzero(is_outlier)
     ]
-    return model.without(off), tuple(outliers)
+    return model.without(is_outlier), tuple(outliers)

@@ -1,4 +1,4 @@
-"""COLMAP's models: ours written in its form, and models that COLMAP made or someone edited read back with labels."""
+"""COLMAP's model files: writes models in this form, and reads models of COLMAP, or edited ones, back with labels."""
 
 import math
 import os
@@ -21,17 +21,18 @@ from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
 
 LOG_NOTHING = 4
-"""Errors come as exceptions."""
+"""Level of COLMAP's log that prints nothing. Errors are raised as exceptions."""
 KEYPOINT_TOLERANCE_PX = 0.002
-"""A model's keypoints are the database's: float32 has steps of 0.0005 px at x = 5000 and 0.002 px at x = 30 000."""
+"""Largest deviation of a keypoint from the database. Steps of float32: 0.0005 px at x = 5000, 0.002 px at x = 30
+000."""
 MAX_RMS_PX = 4.0
-"""Of a model's keypoints about the images of their points, per axis; what is further off COLMAP leaves out."""
+"""Largest RMS reprojection error of a model per axis. COLMAP excludes observations that are further off."""
 MAX_LENGTH_ERROR = 1e-3
-"""A text may state quaternions with few digits; they are normalised."""
+"""Largest deviation of a quaternion's length from 1. Text files may hold few digits; quaternions are normalised."""
 
 
 def rigid_from_colmap(pose: pycolmap.Rigid3d) -> Rigid:
-    """Our transform of COLMAP's."""
+    """Returns COLMAP's transform as a :class:`Rigid`."""
     return Rigid(pose.rotation.matrix(), pose.translation)
 
 
@@ -41,10 +42,10 @@ def to_reconstruction(
     ids: dict[str, int],
     camera: CalibratedCamera,
 ) -> tuple[pycolmap.Reconstruction, dict[int, tuple[str, str]]]:
-    """COLMAP's form of models that share one world, and (group, label) of every point id.
+    """Returns models that share one world in COLMAP's form, and (group, label) by point id.
 
-    Keypoints are all of the image, in the database's order, corrected where the model has them. A circle that two
-    groups have in the same place is one point; its group is then empty.
+    Keypoints are all keypoints of each image, in the database's order, corrected if the model contains them. A circle
+    at the same place in two groups is one point with an empty group.
     """
     reconstruction = pycolmap.Reconstruction()
     reconstruction.add_camera_with_trivial_rig(colmap_camera(camera))
@@ -59,7 +60,7 @@ def to_reconstruction(
         for name, pose, rows in zip(model.images, model.camera_from_model, model.rows_by_image(), strict=True):
             image = pycolmap.Image(name=name, camera_id=CAMERA_ID, image_id=ids[name])
             keypoints = to_colmap_px(model.keypoints_px(by_name[name], rows))
-            image.points2D = pycolmap.Point2DList([pycolmap.Point2D(each) for each in keypoints])
+            image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy_px) for xy_px in keypoints])
             reconstruction.add_image_with_trivial_frame(
                 image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
             )
@@ -67,8 +68,11 @@ def to_reconstruction(
                 tracks[places[model.point_index[row]]].add_element(ids[name], int(model.keypoint[row]))
     names = {}
     for (label, xyz), track in tracks.items():
-        own = groups[label, xyz]
-        names[reconstruction.add_point3D(np.array(xyz), track)] = (own.pop() if len(own) == 1 else "", label)
+        groups_of_point = groups[label, xyz]
+        names[reconstruction.add_point3D(np.array(xyz), track)] = (
+            groups_of_point.pop() if len(groups_of_point) == 1 else "",
+            label,
+        )
     reconstruction.update_point_3d_errors()
     return reconstruction, names
 
@@ -80,25 +84,26 @@ def write_model(
     ids: dict[str, int],
     camera: CalibratedCamera,
 ) -> None:
-    """Write models that share one world as COLMAP's binary files.
+    """Writes models that share one world as COLMAP's binary files.
 
     Raises
     ------
     InputError
-        What stands in the files is not what was to be written.
+        The files do not contain what was to be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_reconstruction(to_reconstruction(models, observations, ids, camera)[0], folder)
 
 
 def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: Path, text: bool = False) -> None:
-    """Write a model as COLMAP's files into an existing folder and read it back: COLMAP's writers do not say when the
-    disk is full.
+    """Writes a model as COLMAP's files into an existing folder and reads it back.
+
+    COLMAP's writers do not report a full disk.
 
     Raises
     ------
     InputError
-        What stands in the files is not what was to be written.
+        The files do not contain what was to be written.
     """
     try:
         (reconstruction.write_text if text else reconstruction.write_binary)(str(folder))
@@ -115,8 +120,10 @@ def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: Path, 
 
 
 def _numbers(reconstruction: pycolmap.Reconstruction) -> list[np.ndarray]:
-    """Everything in a model: cameras, poses, keypoints with their points, points with their tracks; 12 digits of each
-    number, as text loses the last ones."""
+    """Returns the numbers of a model: cameras, poses, keypoints with point ids, points with track lengths.
+
+    Numbers are rounded to 12 digits, as text files lose the last digits.
+    """
     cameras = [[i, *c.params] for i, c in sorted(reconstruction.cameras.items())]
     images, keypoints, points = [], [], []
     for i, image in sorted(reconstruction.images.items()):
@@ -131,11 +138,11 @@ def _numbers(reconstruction: pycolmap.Reconstruction) -> list[np.ndarray]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadModel:
-    """A COLMAP model with labels: one :class:`WorldModel` for each group that it has images of, all in its world.
+    """A COLMAP model with labels: one :class:`WorldModel` for each group of its images, all in the model's world.
 
-    ``camera`` : the model's own, refined perhaps; ``unlabelled`` : points whose keypoints name no label, or several;
-    ``split`` : labels that more than one point stands for, the longest track was taken; ``absent`` : points that
-    keypoints name, but the model does not have.
+    ``camera`` : camera of the model, possibly refined; ``unlabelled`` : number of points whose keypoints have no label
+    or several; ``split`` : number of labels with several points, of which the longest track is used; ``absent`` :
+    number of points that keypoints name but the model does not contain.
     """
 
     path: Path
@@ -146,42 +153,42 @@ class ReadModel:
     absent: int
 
     def in_mm(self) -> tuple[MetricModel, ...]:
-        """The groups of a model that was written in mm, as a run's ``target_model`` is."""
+        """Returns the groups of a model that was written in mm, like a run's ``target_model``."""
         return tuple(group.metric(Similarity(1.0, Rigid())) for group in self.groups)
 
 
 def find_models(folder: str | Path) -> list[Path]:
-    """Folders with a COLMAP model: this one, or those in it (as the mapper writes them: 0, 1, …).
+    """Returns the folders with a COLMAP model among this folder and its subfolders (the mapper writes 0, 1, …).
 
     Raises
     ------
     InputError
-        There is none.
+        No folder contains a model.
     """
     folder = Path(folder)
-    found = []
+    models = []
     if folder.is_dir():
-        inner = sorted([folder, *folder.glob("*"), *folder.glob("*/*")])
-        found = [p for p in inner if any(os.path.exists(p / f"images.{kind}") for kind in ("bin", "txt"))]
-    if not found:
+        candidates = sorted([folder, *folder.glob("*"), *folder.glob("*/*")])
+        models = [p for p in candidates if any(os.path.exists(p / f"images.{kind}") for kind in ("bin", "txt"))]
+    if not models:
         raise InputError(
             "E-MODEL-UNREADABLE",
             f"model {folder}: no COLMAP model (cameras, images and points3D as .bin or .txt) there; "
             "give the folder that the mapper or the GUI wrote",
         )
-    return found
+    return models
 
 
 def read_model(
     path: Path, observations: Sequence[ImageObservations], ids: dict[str, int], corrected_px: Sequence[np.ndarray]
 ) -> ReadModel:
-    """Read a model that rests on the keypoints of our database; labels come by (image, keypoint).
+    """Reads a model that is based on the keypoints of the run's database. (image, keypoint) determines the label.
 
     Raises
     ------
     InputError
-        A damaged model, more than one camera, an image that is not of the run, keypoints of another database, or
-        poses and points that do not fit them.
+        The model is damaged, has more than one camera, an image that is not in the run, or keypoints of another
+        database; or its poses and points do not fit the keypoints.
     """
     reconstruction = open_model(path)
     cameras = list(reconstruction.cameras.values())
@@ -191,16 +198,16 @@ def read_model(
         )
     native = cameras[0]
     camera = camera_from_colmap(native.model.name, native.width, native.height, list(native.params), path)
-    place = {image.name: i for i, image in enumerate(observations)}
+    index_of_name = {image.name: i for i, image in enumerate(observations)}
     members: dict[str, list] = {}
     for image in reconstruction.images.values():
         if not image.has_pose:
             continue
-        if image.name not in place:
-            cut = any(" " in name and name.split()[0] == image.name for name in place)
+        if image.name not in index_of_name:
+            is_cut = any(" " in name and name.split()[0] == image.name for name in index_of_name)
             remedy = (
                 "COLMAP reads names in texts up to a space: write the model as binary"
-                if cut
+                if is_cut
                 else "give the run that the model's database came from"
             )
             raise InputError(
@@ -208,32 +215,32 @@ def read_model(
                 f"model {path}: image {image.name} is not of this run ({observations[0].name} … "
                 f"{observations[-1].name}); {remedy}",
             )
-        i = place[image.name]
+        i = index_of_name[image.name]
         require_keypoints(path, image, observations[i].labels, corrected_px[i])
         members.setdefault(observations[i].group, []).append((observations[i], corrected_px[i], image))
-    point_label, unlabelled = _labels_of_points(reconstruction, place, observations)
+    point_label, unlabelled = _labels_of_points(reconstruction, index_of_name, observations)
     groups, split = [], 0
     for name, images in sorted(members.items()):
-        images.sort(key=lambda each: ids[each[0].name])
-        model, several = _group_model(path, name, images, reconstruction, point_label)
-        split += several
+        images.sort(key=lambda entry: ids[entry[0].name])
+        model, split_of_group = _group_model(path, name, images, reconstruction, point_label)
+        split += split_of_group
         if model is not None:
             _require_fit(path, model, camera.sized(0, 0))
             groups.append(model)
     if not groups:
         raise InputError("E-MODEL-EMPTY", f"model {path}: no image with a pose and labelled points; map again")
-    named = {p.point3D_id for image in reconstruction.images.values() for p in image.points2D if p.has_point3D()}
-    absent = len(named - set(reconstruction.points3D))
+    named_points = {p.point3D_id for image in reconstruction.images.values() for p in image.points2D if p.has_point3D()}
+    absent = len(named_points - set(reconstruction.points3D))
     return ReadModel(path, camera.sized(0, 0), tuple(groups), unlabelled, split, absent)
 
 
 def open_model(path: Path) -> pycolmap.Reconstruction:
-    """A model's files as COLMAP's object.
+    """Opens a model's files with COLMAP.
 
     Raises
     ------
     InputError
-        They are damaged, or one is missing.
+        A file is damaged or missing.
     """
     pycolmap.logging.minloglevel = LOG_NOTHING
     try:
@@ -252,31 +259,31 @@ def open_model(path: Path) -> pycolmap.Reconstruction:
 
 
 class _Walk:
-    """A place in a binary file that only moves on."""
+    """A position in a binary file that only moves forward."""
 
     def __init__(self, data: bytes):
         self.data, self.at = data, 0
 
     def skip(self, size: int) -> None:
-        """Pass over bytes; ValueError at the end of the file."""
+        """Skips bytes; raises ValueError at the end of the file."""
         self.at += size
         if self.at > len(self.data):
             raise ValueError("ends too soon")
 
     def number(self, kind: str) -> int:
-        """The next number, of a kind of :mod:`struct`."""
+        """Reads the next number, in a format of :mod:`struct`."""
         start = self.at
         self.skip(struct.calcsize(f"<{kind}"))
         return struct.unpack_from(f"<{kind}", self.data, start)[0]
 
     def skip_text(self) -> None:
-        """Pass over text and the zero behind it."""
+        """Skips a text and its terminating zero."""
         end = self.data.find(b"\0", self.at)
         self.skip(end + 1 - self.at if end >= 0 else len(self.data) + 1)
 
 
 def parameter_count(model: int) -> int:
-    """Of a camera model, by COLMAP's number; ValueError where there is none of that number."""
+    """Returns the number of parameters of the camera model with COLMAP's id; raises ValueError for an unknown id."""
     return len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1).params)
 
 
@@ -317,12 +324,14 @@ _RECORDS: dict[str, Callable[[_Walk], None]] = {
     "images": _skip_image,
     "points3D": _skip_point,
 }
-"""How to pass over one record of each binary file; a file is a count and so many records."""
+"""Functions that skip one record of each binary file. A file is a count followed by that many records."""
 
 
 def _require_whole(file: Path, skip: Callable[[_Walk], None]) -> None:
-    """The counts in a file must fit its size, or ValueError: behind the end of a file pycolmap reads on without a word,
-    for hours and into all memory, or takes for the missing numbers what it read last."""
+    """Raises ValueError if the counts in a file do not fit its size.
+
+    pycolmap silently reads past the end of a file, for hours and until memory is full, or repeats the last numbers.
+    """
     walk = _Walk(read_bytes(file, MODEL_BYTES))
     try:
         for _ in range(walk.number("Q")):
@@ -334,12 +343,12 @@ def _require_whole(file: Path, skip: Callable[[_Walk], None]) -> None:
 
 
 def require_keypoints(path: Path, image: pycolmap.Image, labels: Sequence[str], corrected_px: np.ndarray) -> None:
-    """The model must rest on our keypoints, or (image, keypoint) names nothing.
+    """Checks that the model uses the run's keypoints, as only then (image, keypoint) determines a label.
 
     Raises
     ------
     InputError
-        Another number of them, or one that is elsewhere.
+        The number of keypoints differs, or a keypoint is elsewhere.
     """
     xy = from_colmap_px(np.array([point.xy for point in image.points2D]).reshape(-1, 2))
     if len(xy) != len(corrected_px):
@@ -359,7 +368,7 @@ def require_keypoints(path: Path, image: pycolmap.Image, labels: Sequence[str], 
 
 
 def _require_fit(path: Path, model: GroupModel, camera: Camera) -> None:
-    """Poses, points and camera must go with the keypoints: damaged numbers are numbers still."""
+    """Checks that poses, points and camera fit the keypoints. Damaged files may still hold valid numbers."""
     with np.errstate(all="ignore"):
         residual = np.linalg.norm(model.residuals_px(camera), axis=1)
         rms = float(np.sqrt((residual**2).mean() / 2))
@@ -374,15 +383,15 @@ def _require_fit(path: Path, model: GroupModel, camera: Camera) -> None:
 
 
 def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
-    """camera_from_model of an image of the model.
+    """Returns camera_from_model of an image of the model.
 
     Raises
     ------
     InputError
-        A quaternion that is far from unit length, or a translation that is not finite.
+        The quaternion is far from unit length, or the translation is not finite.
     """
     pose = image.cam_from_world()
-    length = math.hypot(*pose.rotation.quat)  # of any numbers, without a warning
+    length = math.hypot(*pose.rotation.quat)  # accepts any numbers without a warning
     if not (abs(length - 1) <= MAX_LENGTH_ERROR and np.isfinite(pose.translation).all()):
         raise InputError(
             "E-MODEL-POSE",
@@ -394,8 +403,11 @@ def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
 
 
 def _labels_of_points(reconstruction, place, observations) -> tuple[dict[int, tuple[str, str]], int]:
-    """(group, label) of each point by its track; the group is empty for circles, which are the same in all groups."""
-    found, unlabelled = {}, 0
+    """Returns (group, label) by point id, and the number of points without a unique label.
+
+    The group is empty for circles of the target, which are the same in all groups.
+    """
+    label_of_point, unlabelled = {}, 0
     for point_id, point in reconstruction.points3D.items():
         names = set()
         for element in point.track.elements:
@@ -403,14 +415,14 @@ def _labels_of_points(reconstruction, place, observations) -> tuple[dict[int, tu
             label = image.labels[element.point2D_idx]
             names.add((image.group if isinstance(label, DotLabel) else "", label))
         if len(names) == 1:
-            found[point_id] = names.pop()
+            label_of_point[point_id] = names.pop()
         else:
             unlabelled += 1
-    return found, unlabelled
+    return label_of_point, unlabelled
 
 
 def _group_model(path: Path, group: str, images, reconstruction, point_label) -> tuple[WorldModel | None, int]:
-    """One group of the model, and how many labels had several points."""
+    """Returns the model of one group (None without labelled points) and the number of labels with several points."""
     rows = []  # image, keypoint, point id
     for i, (_, _, image) in enumerate(images):
         for k, point in enumerate(image.points2D):
@@ -418,11 +430,11 @@ def _group_model(path: Path, group: str, images, reconstruction, point_label) ->
                 rows.append((i, k, point.point3D_id))
     if not rows:
         return None, 0
-    length: dict[Label, dict[int, int]] = {}
+    votes_of_label: dict[Label, dict[int, int]] = {}
     for _, _, point_id in rows:
-        votes = length.setdefault(point_label[point_id][1], {})
+        votes = votes_of_label.setdefault(point_label[point_id][1], {})
         votes[point_id] = votes.get(point_id, 0) + 1
-    chosen = {label: max(sorted(votes), key=votes.__getitem__) for label, votes in length.items()}
+    chosen = {label: max(sorted(votes), key=votes.__getitem__) for label, votes in votes_of_label.items()}
     labels = sorted(chosen)
     index = {chosen[label]: i for i, label in enumerate(labels)}
     image_index, keypoint, point_id = np.array([row for row in rows if row[2] in index]).T
@@ -448,4 +460,4 @@ def _group_model(path: Path, group: str, images, reconstruction, point_label) ->
         shift_px=measured - corrected,
         covariance_px2=np.array([o.covariance_px2[k] for o, k in zip(observed, keypoint, strict=True)]),
     )
-    return model, sum(len(votes) > 1 for votes in length.values())
+    return model, sum(len(votes) > 1 for votes in votes_of_label.values())

@@ -1,4 +1,4 @@
-"""The initial pair, as in Zhang & Wei (2017): of all pairs the largest median ray angle that is still safe."""
+"""The initial pair as in Zhang & Wei (2017): the pair with the largest median ray angle that is still safe."""
 
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -17,19 +17,20 @@ from stcal.sfm.mapping.database import match_labels
 
 RANSAC_PX = 1.0
 MIN_LABELS = 8
-"""Shared labels that a pair needs: five fix an essential matrix, the others choose among its solutions."""
+"""Smallest number of common labels of a pair. Five determine essential matrices, the others select one of them."""
 MIN_IN_FRONT = 0.9
 OVER_LIMIT = "median angle over the limit"
 SAFE_ANGLE_RAD = np.radians(60.0)
 MIN_ANGLE_RAD = np.radians(1.0)
-"""Below this median angle the camera has not moved as far as reconstruction is concerned."""
+"""Smallest median ray angle of a pair. Below it the camera's movement is too small for a reconstruction."""
 
 
 @dataclass(frozen=True, slots=True)
 class PairOptions:
-    """``max_angle_rad`` : largest median ray angle that is still safe.
+    """Options of the choice of the initial pair.
 
-    Where None, 60°; and should every pair of a group be beyond that, the one with the smallest angle is taken.
+    ``max_angle_rad`` : largest median ray angle that is still safe. If None, 60°; if all pairs of a group exceed it,
+    the pair with the smallest angle is then used.
     """
 
     max_angle_rad: float | None = None
@@ -42,15 +43,18 @@ class PairOptions:
             )
 
     def limit_rad(self) -> float:
-        """The limit in force."""
+        """Returns the limit that is used."""
         return SAFE_ANGLE_RAD if self.max_angle_rad is None else self.max_angle_rad
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairScore:
-    """One pair: ``first``, ``second`` image names; ``shared`` labels; ``median_angle_rad`` over the triangulated
-    points; ``in_front`` share of them; ``forward`` |t_z|/‖t‖; ``second_from_first`` with unit translation;
-    ``verdict`` : ``chosen``, ``usable`` or why not."""
+    """Quality of one pair as the initial pair.
+
+    ``first``, ``second`` : image names; ``shared`` : number of common labels; ``median_angle_rad`` : median ray angle
+    of the triangulated points; ``in_front`` : share of the points in front of both cameras; ``forward`` : |t_z|/‖t‖;
+    ``second_from_first`` : relative pose with unit translation; ``verdict`` : ``chosen``, ``usable`` or why not usable.
+    """
 
     first: str
     second: str
@@ -62,12 +66,12 @@ class PairScore:
     verdict: str
 
     def pose(self) -> Rigid:
-        """``second_from_first``.
+        """Returns ``second_from_first``.
 
         Raises
         ------
         MappingError
-            None was found.
+            The pair has no relative pose.
         """
         if self.second_from_first is None:
             raise MappingError(
@@ -79,14 +83,14 @@ class PairScore:
 def rank_pairs(
     group: list[ImageObservations], camera: Camera, options: PairOptions, board: BoardDesign | None = None
 ) -> list[PairScore]:
-    """All pairs of a group, the chosen one first, then the usable by angle, then the rest.
+    """Returns all pairs of a group: the chosen pair first, then the usable pairs by angle, then the others.
 
-    ``board`` : by which pairs are posed that have nothing else in common; a plane has two essential matrices.
+    ``board`` : gives the relative pose of pairs with only the board in common, as a plane has two essential matrices.
 
     Raises
     ------
     MappingError
-        No pair is usable: too few common labels, or a camera that did not move.
+        No pair is usable: too few labels in common, or the camera did not move.
     """
     scores = [_score(a, b, camera, options, board) for a, b in combinations(group, 2)]
     scores.sort(key=lambda s: (s.verdict != "usable", -round(s.median_angle_rad, 9), -s.shared, s.first, s.second))
@@ -100,28 +104,28 @@ def rank_pairs(
 
 
 def _no_pair(group, scores: list[PairScore], options: PairOptions) -> str:
-    where = f"group {group[0].group}: no initial pair"
+    prefix = f"group {group[0].group}: no initial pair"
     if not scores:
-        return f"{where}: 1 usable image, 2 needed; add photographs from other places"
+        return f"{prefix}: 1 usable image, 2 needed; add photographs from other places"
     angle = max(s.median_angle_rad for s in scores)
     shared = max(s.shared for s in scores)
     if shared < MIN_LABELS:
-        return f"{where}: at most {shared} circles in common, {MIN_LABELS} needed; photograph faces and board together"
+        return f"{prefix}: at most {shared} circles in common, {MIN_LABELS} needed; photograph faces and board together"
     if angle < MIN_ANGLE_RAD:
         return (
-            f"{where}: the camera did not move (largest median ray angle {np.degrees(angle):.2f}°, "
+            f"{prefix}: the camera did not move (largest median ray angle {np.degrees(angle):.2f}°, "
             f"{np.degrees(MIN_ANGLE_RAD):.0f}° needed); take the photographs from different places"
         )
     behind = [s for s in scores if MIN_ANGLE_RAD <= s.median_angle_rad <= options.limit_rad()]
     if behind:
         best = max(behind, key=lambda s: s.in_front)
         return (
-            f"{where}: {best.first}, {best.second}: {best.verdict}; check that the camera file belongs to the images, "
+            f"{prefix}: {best.first}, {best.second}: {best.verdict}; check that the camera file belongs to the images, "
             "and that nothing but the camera moved"
         )
     smallest = min(s.median_angle_rad for s in scores if s.median_angle_rad > 0)
     return (
-        f"{where} with a median ray angle of {np.degrees(MIN_ANGLE_RAD):.0f}° to "
+        f"{prefix} with a median ray angle of {np.degrees(MIN_ANGLE_RAD):.0f}° to "
         f"{np.degrees(options.limit_rad()):.0f}° (measured {np.degrees(smallest):.1f}° to {np.degrees(angle):.1f}°); "
         "add views in between, raise --max-angle, or check that the camera file belongs to the images"
     )
@@ -146,7 +150,7 @@ def _score(
     cosine = (to_a * to_b).sum(1) / np.maximum(np.linalg.norm(to_a, axis=1) * np.linalg.norm(to_b, axis=1), 1e-300)
     angle = float(np.median(np.arccos(np.clip(cosine, -1, 1))))
     in_front, forward = float(front.mean()), float(abs(pose.translation[2]))
-    # Where a rotation explains the pair, noise alone fixes the translation: angles and depths mean nothing then.
+    # If a rotation explains the pair, only noise determines the translation: angles and depths are meaningless.
     if _is_rotation(xy_a, xy_b, camera):
         angle = min(angle, MIN_ANGLE_RAD / 2)
         verdict = "a mere rotation explains the pair: the camera hardly moved"
@@ -162,7 +166,7 @@ def _score(
 
 
 def _is_rotation(xy_a: np.ndarray, xy_b: np.ndarray, camera: Camera) -> bool:
-    """Whether a mere rotation of the camera explains the pair to a pixel."""
+    """Returns whether a pure rotation of the camera explains the pair to one pixel RMS."""
     rays_a = np.column_stack([xy_a, np.ones(len(xy_a))])
     rays_b = np.column_stack([xy_b, np.ones(len(xy_b))])
     rays_a /= np.linalg.norm(rays_a, axis=1)[:, None]
@@ -174,7 +178,7 @@ def _is_rotation(xy_a: np.ndarray, xy_b: np.ndarray, camera: Camera) -> bool:
 
 
 def _relative_pose(xy_a: np.ndarray, xy_b: np.ndarray, threshold: float) -> Rigid | None:
-    """b_from_a with unit translation: five-point RANSAC (Nistér 2004) and decomposition, on normalised points."""
+    """Returns b_from_a with unit translation by five-point RANSAC (Nistér 2004) on normalised points."""
     essential, inliers = cv2.findEssentialMat(
         xy_a, xy_b, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=threshold, maxIters=200
     )
@@ -187,23 +191,23 @@ def _relative_pose(xy_a: np.ndarray, xy_b: np.ndarray, threshold: float) -> Rigi
 
 
 def share_board_alone(a: ImageObservations, b: ImageObservations) -> bool:
-    """Whether two images have nothing in common but dots of the board."""
+    """Returns whether all common labels of two images are dots of the board."""
     return all(isinstance(label, DotLabel) for label in set(a.labels) & set(b.labels))
 
 
 def _pose_by_board(xy_a: np.ndarray, xy_b: np.ndarray, xy_mm: np.ndarray) -> Rigid | None:
-    """b_from_a with unit translation, from both images' poses of the board."""
+    """Returns b_from_a with unit translation, from the poses of the board in both images."""
     try:
         a, b = (refine_planar_pose(camera_from_plane(fit_homography(xy_mm, xy)), xy_mm, xy) for xy in (xy_a, xy_b))
     except (ConvergenceError, DegenerateError):
         return None
-    found = b @ a.inverse()
-    length = float(np.linalg.norm(found.translation))
-    return Rigid(found.rotation, found.translation / length) if length > 0 else None
+    b_from_a = b @ a.inverse()
+    length = float(np.linalg.norm(b_from_a.translation))
+    return Rigid(b_from_a.rotation, b_from_a.translation / length) if length > 0 else None
 
 
 def triangulate(xy_a: np.ndarray, xy_b: np.ndarray, b_from_a: Rigid) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) in frame a by the linear method, and the mask of those in front of both cameras."""
+    """Returns points (n, 3) in frame a by linear triangulation, and the mask of points in front of both cameras."""
     rows = np.zeros((len(xy_a), 4, 4))
     p = np.hstack([b_from_a.rotation, b_from_a.translation[:, None]])
     for k in range(2):

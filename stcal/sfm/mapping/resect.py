@@ -1,4 +1,4 @@
-"""Bring the images of a group that the mapper did not take into its model: by their labels, one at a time."""
+"""Resection of the images that the mapper did not register: one image at a time, by the labels."""
 
 import numpy as np
 
@@ -12,17 +12,17 @@ from stcal.sfm.mapping.models import rigid_from_colmap
 
 SEED = 1
 MIN_SHARE = 0.25
-"""Of an image's known circles that must fit, as COLMAP's own registration asks (abs_pose_min_inlier_ratio)."""
+"""Smallest share of an image's known circles that must fit, as in COLMAP (abs_pose_min_inlier_ratio)."""
 MIN_RAY_ANGLE_RAD = np.radians(0.5)
-"""Between some two rays of a new point, or its depth is a guess."""
+"""Smallest value of the largest angle between the rays of a new point. Below it the depth is too uncertain."""
 
 
 def complete(model: WorldModel, group: list[ImageObservations], camera: Camera, max_error_px: float) -> WorldModel:
-    """The model with every further image of the group that its points place, and with the circles that these add.
+    """Returns the model with all images of the group that its points can resect, and with the circles that these add.
 
-    An image is placed by six or more labelled points, and a quarter of those that it shows, within ``max_error_px``
-    (RANSAC and refinement of pycolmap on ideal coordinates); circles that the model lacks are triangulated from all
-    images then placed. Observations are all of each placed image.
+    An image is placed if at least six of its labelled points, and at least a quarter of those that the model contains,
+    fit within ``max_error_px`` (RANSAC and refinement of pycolmap on ideal coordinates). Circles that the model lacks
+    are then triangulated from all placed images. All observations of placed images are used.
     """
     xyz = dict(zip(model.labels, model.xyz_model, strict=True))
     poses = dict(zip(model.images, model.camera_from_model, strict=True))
@@ -39,14 +39,14 @@ def complete(model: WorldModel, group: list[ImageObservations], camera: Camera, 
 def assemble(
     kind: type[M], group: str, images: list[ImageObservations], poses: list[Rigid], xyz: dict[Label, np.ndarray]
 ) -> M:
-    """The model of placed images and labelled points with all observations that they have of one another."""
+    """Returns the model of placed images and labelled points, with all observations of these points in these images."""
     labels = sorted(xyz)
     index = {label: i for i, label in enumerate(labels)}
     rows = [
         (i, index[label], k) for i, image in enumerate(images) for k, label in enumerate(image.labels) if label in index
     ]
     image_index, point_index, keypoint = np.array(rows, int).reshape(-1, 3).T
-    first = np.cumsum([0, *(len(image) for image in images)])[image_index] + keypoint
+    row = np.cumsum([0, *(len(image) for image in images)])[image_index] + keypoint
     return kind(
         group=group,
         images=tuple(image.name for image in images),
@@ -56,9 +56,9 @@ def assemble(
         image_index=image_index,
         point_index=point_index,
         keypoint=keypoint,
-        measured_px=np.concatenate([image.centre_px for image in images])[first],
+        measured_px=np.concatenate([image.centre_px for image in images])[row],
         shift_px=np.zeros((len(rows), 2)),
-        covariance_px2=np.concatenate([image.covariance_px2 for image in images])[first],
+        covariance_px2=np.concatenate([image.covariance_px2 for image in images])[row],
     )
 
 
@@ -82,7 +82,7 @@ def _resect(
 
 
 def _triangulated(images: list[ImageObservations], poses: dict[str, Rigid], known) -> dict[Label, np.ndarray]:
-    """Circles that are not known, each where its rays meet best (least squares of distances), by label."""
+    """Returns the places of circles that are not ``known``, by label: least squares of distances from the rays."""
     rays: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for image in images:
         pose = poses[image.name]
@@ -90,11 +90,11 @@ def _triangulated(images: list[ImageObservations], poses: dict[str, Rigid], know
             if label not in known:
                 direction = pose.rotation.T @ np.append(image.centre[k], 1.0)
                 rays.setdefault(label, []).append((pose.inverse().translation, direction / np.linalg.norm(direction)))
-    found = {}
-    for label, own in rays.items():
-        centre, direction = (np.array(each) for each in zip(*own, strict=True))
+    places = {}
+    for label, rays_of_label in rays.items():
+        centre, direction = (np.array(values) for values in zip(*rays_of_label, strict=True))
         if np.arccos(np.clip(direction @ direction.T, -1, 1)).max() < MIN_RAY_ANGLE_RAD:
             continue
         across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-        found[label] = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, centre))
-    return found
+        places[label] = np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, centre))
+    return places

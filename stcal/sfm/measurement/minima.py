@@ -1,4 +1,4 @@
-"""The minima of one image's residuals over the pose: two of them where a face is seen alone."""
+"""Minima of one image's residuals over the pose. There are two if a single face is visible."""
 
 from functools import partial
 
@@ -15,17 +15,17 @@ from stcal.sfm.measurement.problem import PoseProblem, descent_near
 from stcal.sfm.measurement.target import TargetCircles
 
 MIN_CIRCLES = 4
-"""Of one face: fewer do not fix its homography."""
+"""Least number of circles of one face. Fewer do not determine its homography."""
 WORST_SHARE = 0.5
-"""Centres at least so much beyond the limit as the worst one go with it; the others may only have been pulled along."""
+"""Share of the worst excess from which centres are removed with the worst one. The others may only be pulled along."""
 MIN_BREADTH = 0.05
-"""Of the circles seen, over their length: in a row they leave the rotation about it open."""
+"""Least ratio of breadth to length of the visible circles. Circles in a row leave the rotation about the row open."""
 
 
 def start_pose(
     names: list[CircleLabel], problem: PoseProblem, target: TargetCircles, where: str
 ) -> tuple[PoseStack, Rigid]:
-    """Pose by the homography of the face with the most circles, and target_from_plane of that face."""
+    """Returns the pose from the homography of the face with the most circles, and target_from_plane of that face."""
     faces: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         faces.setdefault(name.face, []).append(i)
@@ -58,20 +58,23 @@ def start_pose(
 
 
 def minima_without_outliers(problem: PoseProblem, start: PoseStack, plane: Rigid, names: list[CircleLabel], where: str):
-    """The minima by single centres without those that contradict the others, the indices kept, and the outliers."""
+    """Returns the minima without centres that contradict the others, the indices kept, and the outliers.
+
+    Each centre is weighted on its own, without covariance between centres.
+    """
     keep, outliers = np.arange(len(names)), []
     alone = len({name.face for name in names}) == 1
     failure = f"{where}: no pose found; check the labels, and that the camera file belongs to the images"
     while True:
-        part = problem if len(keep) == len(names) else problem.select(keep)
-        both = two_minima(partial(descent_near, part), start, plane, failure, planar=alone)
-        found, limit = both.minima, both.outlier_limit
-        excess = found.length[0] / limit
+        subset = problem if len(keep) == len(names) else problem.select(keep)
+        both = two_minima(partial(descent_near, subset), start, plane, failure, planar=alone)
+        best, limit = both.minima, both.outlier_limit
+        excess = best.length[0] / limit
         bad = excess > max(1.0, WORST_SHARE * excess.max())
         if not bad.any():
-            return found, keep, tuple(outliers)
-        residual = np.linalg.norm(part.in_px(part.seen(found.poses[[0]])[0][0]), axis=1)
-        sigma = residual / found.length[0]
+            return best, keep, tuple(outliers)
+        residual = np.linalg.norm(subset.in_px(subset.seen(best.poses[[0]])[0][0]), axis=1)
+        sigma = residual / best.length[0]
         outliers += [
             Outlier(where, names[keep[i]], float(residual[i]), float(limit * sigma[i])) for i in np.flatnonzero(bad)
         ]
@@ -82,4 +85,4 @@ def minima_without_outliers(problem: PoseProblem, start: PoseStack, plane: Rigid
                 f"{where}: {len(outliers)} of {len(names)} circles contradict the others, first {outliers[0].label} by "
                 f"{outliers[0].residual_px:.2g} px; check that camera file, faces.json and images belong together",
             )
-        start = found.poses
+        start = best.poses

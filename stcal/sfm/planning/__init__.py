@@ -1,1 +1,1 @@
-"""Which photographs to take: before any is taken, and after a run."""
+"""Choice of photographs to take: before any is taken, and after a run."""

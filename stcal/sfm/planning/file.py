@@ -1,4 +1,4 @@
-"""What ``plan`` and ``advise`` write with ``--json``."""
+"""Forms of the JSON files of ``plan`` and ``advise``."""
 
 from typing import Literal
 
@@ -38,7 +38,7 @@ class FaceForecast(Part):
 
 
 class ForecastPart(Part):
-    """Of both files; σ against the reference face, target frame."""
+    """The part that both files share: σ against the reference face, in the target frame."""
 
     worst_face: str = Field(description="the face whose position is known worst")
     worst_sigma_um: float = Field(description="its `position_sigma_um`")
@@ -53,7 +53,7 @@ class ForecastPart(Part):
 
     @classmethod
     def of(cls, forecast: Forecast, shares: dict[str, dict[str, float]]) -> "ForecastPart":
-        """Faces, worst face and scale of a forecast."""
+        """Returns the faces, the worst face and the scale of a forecast."""
         worst, sigma = forecast.worst()
         faces = {face: FaceForecast.of(forecast, face, shares[face]) for face in forecast.face_covariance}
         return ForecastPart(
@@ -68,7 +68,7 @@ class RemedyRow(Part):
 
 
 class PlannedPart(Part):
-    """What is planned."""
+    """The planned photographs."""
 
     format: Literal["stcal plan 1"] = Field(description="the file's form and its version")
     images_per_group: int = Field(description="photographs")
@@ -86,7 +86,8 @@ class PlannedPart(Part):
 
 
 class PlanFile(ForecastPart, PlannedPart, ResultFile):
-    """Of ``plan``: what is planned, the forecast, and what would help (fields of bases come last base first)."""
+    """The JSON file of ``plan``: the planned photographs, the forecast, and what would help. Fields of bases come last
+    base first."""
 
     remedies: list[RemedyRow] = Field(
         description="`what` could be changed, `worst_sigma_um` after that, null where it is not possible for `reason`"
@@ -94,7 +95,7 @@ class PlanFile(ForecastPart, PlannedPart, ResultFile):
 
     @classmethod
     def of_plan(cls, plan: Plan) -> "PlanFile":
-        """The file of a plan."""
+        """Returns the file of a plan."""
         options, camera = plan.options, plan.setup.camera
         return cls(
             format="stcal plan 1",
@@ -165,7 +166,7 @@ class AdviceFormat(Part):
 
 
 class AdviceFile(ForecastPart, AdviceFormat, ResultFile):
-    """Of ``advise``: the forecast as it is now, and further photographs."""
+    """The JSON file of ``advise``: the present forecast, and further photographs."""
 
     views: list[ViewRow] = Field(
         description="further photographs, one after the other: `group`; `from_image`, the photograph in the middle of "
@@ -186,7 +187,7 @@ class AdviceFile(ForecastPart, AdviceFormat, ResultFile):
 
     @classmethod
     def of_advice(cls, advice: Advice) -> "AdviceFile":
-        """The file of an advice."""
+        """Returns the file of an advice."""
         return cls(
             format="stcal advice 1",
             **dict(ForecastPart.of(advice.now, advice.shares)),

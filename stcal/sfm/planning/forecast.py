@@ -1,5 +1,7 @@
-"""The σ to expect of a geometry, photographed or only planned: centring noise by the size and tilt of the circles, then
-the covariance of the joint adjustment itself."""
+"""Forecast of the σ of a geometry, photographed or only planned.
+
+Centring noise follows from the size and tilt of the circles, the covariance from the joint adjustment itself.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,18 +25,18 @@ from stcal.sfm.data.model import MetricModel
 IMAGE_NOISE = 0.01
 """Standard deviation of the grey values, as a fraction of full scale."""
 CONTRAST = 0.7
-"""Of circle and surroundings, as a fraction of full scale."""
+"""Contrast between circle and surroundings, as a fraction of full scale."""
 BLUR_PX = 0.76
-"""Of an edge, standard deviation: a lens of 0.7 px and the pixels themselves, 1/√12 px."""
+"""Blur of an edge, standard deviation: a lens of 0.7 px and the pixels themselves, 1/√12 px."""
 PRACTICE = 1.3
-"""Centres against the Cramér–Rao bound, as runs on rendered photographs have them: brightness gradients to be
-estimated, quantisation, neighbouring edges."""
+"""Ratio of the σ of centres to the Cramér–Rao bound in runs on rendered photographs. It is due to estimated brightness
+gradients, quantisation and neighbouring edges."""
 ONE_PLATE = 0.99
 """Share of the board's variance that all groups have in common where one plate is in all of them."""
 ENOUGH = 10_000
-"""Observations from which the law of their noise is read."""
+"""Number of observations from which the parameters of their noise are estimated."""
 OFF = 1e-2
-"""A source of error that is switched off keeps this share of its σ, so that nothing becomes singular."""
+"""Share of its σ that a source of error keeps when it is switched off, so that nothing becomes singular."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,19 +59,20 @@ class CentreNoise:
 
     @classmethod
     def expected(cls) -> "CentreNoise":
-        """Of good photographs: see the constants of this file."""
+        """Returns the noise of good photographs, from the constants of this file."""
         return cls(PRACTICE * IMAGE_NOISE / CONTRAST * float(np.sqrt(2 * np.sqrt(np.pi) * BLUR_PX)))
 
     @classmethod
     def measured(cls, models: Sequence[MetricModel], camera: Camera, radius_mm: dict[Label, float]) -> "CentreNoise":
-        """Fitted to the covariances that the observations of metric models carry, evenly chosen ones of large sets."""
+        """Returns the noise fitted to the covariances of the observations of metric models. Large sets are thinned out
+        evenly."""
         step = max(1, sum(len(model.point_index) for model in models) // ENOUGH)
-        some = [model.observed(np.arange(0, len(model.point_index), step)) for model in models]
-        rims = [_Rims.of(model, camera, radius_mm) for model in some]
+        sampled = [model.observed(np.arange(0, len(model.point_index), step)) for model in models]
+        rims = [_Rims.of(model, camera, radius_mm) for model in sampled]
         ratio = np.concatenate(
             [
                 np.trace(rim.information @ m.covariance_px2, axis1=1, axis2=2) / 2
-                for rim, m in zip(rims, some, strict=True)
+                for rim, m in zip(rims, sampled, strict=True)
             ]
         )
         narrow = np.concatenate([rim.minor_px for rim in rims]) ** -2
@@ -80,11 +83,11 @@ class CentreNoise:
         return cls(float(np.sqrt(level)), float(np.sqrt(slope / level)))
 
     def scaled(self, factor: float) -> "CentreNoise":
-        """The same with all σ multiplied."""
+        """Returns the same noise with all σ multiplied by a factor."""
         return replace(self, edge=factor * self.edge, floor_px=factor * self.floor_px)
 
     def applied(self, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> MetricModel:
-        """The metric model with the covariances that its observations are to have."""
+        """Returns the metric model with the covariances that this noise gives its observations."""
         rims = _Rims.of(model, camera, radius_mm)
         size = self.edge**2 * (1 + (self.narrow_px / rims.minor_px) ** 2)
         covariance = size[:, None, None] * np.linalg.inv(rims.information) + self.floor_px**2 * np.eye(2)
@@ -100,7 +103,7 @@ class _Rims:
 
     @classmethod
     def of(cls, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> "_Rims":
-        """To first order in radius over distance, which a σ does not notice: ellipses."""
+        """Returns the rims as ellipses, to first order in radius over distance. The error is negligible for a σ."""
         normal = np.zeros((len(model.labels), 3))
         for members in model.points_by_face().values():
             normal[members] = fit_plane(model.xyz_model[members]).normal
@@ -115,9 +118,11 @@ class _Rims:
 
 
 def _rim_integrals(minor: np.ndarray, major: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """∮ nₓ² ds around ellipses with these semi-axes, along the minor and along the major one: complete elliptic
-    integrals (Abramowitz and Stegun 1964, 17.3)."""
-    m = np.maximum(1 - (minor / major) ** 2, 1e-6)  # what a circle itself would need is a limit
+    """Returns ∮ nₓ² ds around ellipses with these semi-axes, along the minor and along the major axis.
+
+    They are complete elliptic integrals (Abramowitz and Stegun 1964, 17.3).
+    """
+    m = np.maximum(1 - (minor / major) ** 2, 1e-6)  # for a circle the formula is defined as a limit only
     first, second = ellipk(m), ellipe(m)
     return 4 * major * (second - (1 - m) * first) / m, 4 * minor**2 / major * (first - second) / m
 
@@ -142,20 +147,21 @@ class Setup:
     sigma0: float = 1.0
 
     def radius_mm(self) -> dict[Label, float]:
-        """Radius by label."""
+        """Radius by label, mm."""
         return self.target.radius_of() | self.board.radius_of()
 
     def better_board(self, factor: float) -> "Setup":
-        """The same with another σ of the board."""
+        """Returns the same setup with the σ of the board multiplied by a factor."""
         return replace(self, board=replace(self.board, sigma_mm=factor * self.board.sigma_mm))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
-    """σ to expect, target frame.
+    """The σ to expect, target frame.
 
-    ``face_covariance`` : (6, 6) by face but the reference, rad and mm; ``circle_sigma_mm`` by label: root of the trace;
-    ``scale_sigma`` : of the target's size, relative; ``derivatives`` : serves other views of the same circles.
+    ``face_covariance`` : (6, 6) by face except the reference face, rad and mm; ``circle_sigma_mm`` : root of the trace,
+    by label; ``scale_sigma`` : relative σ of the target's size; ``derivatives`` : reusable for other views of the same
+    circles.
     """
 
     face_covariance: dict[str, np.ndarray]
@@ -168,23 +174,23 @@ class Forecast:
         object.__setattr__(self, "face_covariance", fixed)
 
     def position_sigma_mm(self) -> dict[str, float]:
-        """By face; see :func:`position_sigma_mm`."""
+        """Returns the σ of each face's position, see :func:`position_sigma_mm`."""
         return {face: position_sigma_mm(c) for face, c in self.face_covariance.items()}
 
     def worst(self) -> tuple[str, float]:
-        """The face whose position is known worst, and its σ in mm."""
+        """Returns the face with the largest σ of position, and this σ in mm."""
         return worst_of(self.position_sigma_mm())
 
 
 def worst_of(sigma: dict[str, float]) -> tuple[str, float]:
-    """The face of the largest σ, and that."""
+    """Returns the face with the largest σ, and this σ."""
     face = max(sigma, key=sigma.__getitem__)
     return face, sigma[face]
 
 
 Photographs = Mapping[str, np.ndarray]
-"""By group, what all of its images say of its points and the intrinsics, see
-:func:`stcal.sfm.adjust.joint.photographs_of`: computed once, as the images are many and stay as they are."""
+"""Normal equations of all images of a group for its points and the intrinsics, by group, see
+:func:`stcal.sfm.adjust.joint.photographs_of`. They are computed once, as the images are many and do not change."""
 
 
 def forecast(
@@ -193,26 +199,26 @@ def forecast(
     known: Derivatives | None = None,
     photographs: Photographs | None = None,
 ) -> Forecast:
-    """σ of the target from metric models, mm, target frame, as the joint adjustment would state them.
+    """Returns the σ of the target from metric models, mm, target frame, as the joint adjustment would state them.
 
-    ``known`` : derivatives of an earlier forecast of the same circles; ``photographs`` of groups, where known.
+    ``known`` : derivatives of an earlier forecast of the same circles; ``photographs`` : those of the groups, if known.
     """
     joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
-    own = known or derivatives(joint, setup.start, setup.target, setup.frame)
+    used_derivatives = known or derivatives(joint, setup.start, setup.target, setup.frame)
     covariance = setup.sigma0**2 * joint.covariance_mm2
     reference = setup.start.reference_face
-    circles = np.sqrt(np.trace(own.circle_covariance(covariance), axis1=1, axis2=2))
+    circles = np.sqrt(np.trace(used_derivatives.circle_covariance(covariance), axis1=1, axis2=2))
     return Forecast(
-        {face: c for face, c in own.face_covariance(covariance).items() if face != reference},
+        {face: c for face, c in used_derivatives.face_covariance(covariance).items() if face != reference},
         dict(zip(joint.labels, circles.tolist(), strict=True)),
         scale_sigma(joint.xyz_model, covariance),
-        own,
+        used_derivatives,
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PositionsWith:
-    """Gives :meth:`Forecast.position_sigma_mm` with one further view, as :func:`forecast` would."""
+    """Computes :meth:`Forecast.position_sigma_mm` with one further view, as :func:`forecast` would."""
 
     now: Extensible
     setup: Setup
@@ -222,42 +228,42 @@ class PositionsWith:
     def of(
         cls, models: Sequence[MetricModel], setup: Setup, known: Derivatives, photographs: Photographs | None = None
     ) -> "PositionsWith":
-        """Beside these models; ``known`` and ``photographs`` as of :func:`forecast`."""
+        """Prepares views in addition to these models. ``known`` and ``photographs`` are as in :func:`forecast`."""
         now = extensible(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
         return cls(now, setup, known)
 
     def __call__(self, view: MetricModel) -> dict[str, float]:
-        """By face, mm."""
+        """Returns the σ of each face's position with this view, mm."""
         faces = self.known.face_covariance(self.setup.sigma0**2 * self.now.with_view(view))
         return {f: position_sigma_mm(c) for f, c in faces.items() if f != self.setup.start.reference_face}
 
 
 def position_sigma_mm(face_covariance: np.ndarray) -> float:
-    """Root of the trace of a face's position, so that it is the RMS length of the error."""
+    """Returns the root of the trace of a face's position covariance, which is the RMS length of the error."""
     return float(np.sqrt(np.trace(face_covariance[3:, 3:])))
 
 
 def without_sources(
     models: Sequence[MetricModel], setup: Setup, known: Derivatives, photographs: Photographs | None = None
 ) -> dict[str, Forecast]:
-    """The forecast with each source of error in turn switched off: images, board, intrinsics where they are refined."""
+    """Returns the forecast with each source of error switched off in turn: images, board, and intrinsics if refined."""
     if photographs is None:
         fixed, quiet = None, None
         quieter = [replace(model, covariance_px2=OFF**2 * model.covariance_px2) for model in models]
     else:
         fixed = {m.group: photographs[m.group][: 3 * len(m.labels), : 3 * len(m.labels)] for m in models}
         quiet, quieter = {group: normal / OFF**2 for group, normal in photographs.items()}, models
-    found = {
+    forecasts = {
         "image noise": forecast(quieter, setup, known, quiet),
         "board": forecast(models, setup.better_board(OFF), known, photographs),
     }
     if setup.prior is not None:
-        found["intrinsics"] = forecast(models, replace(setup, prior=None), known, fixed)
-    return found
+        forecasts["intrinsics"] = forecast(models, replace(setup, prior=None), known, fixed)
+    return forecasts
 
 
 def variance_shares(whole: Forecast, without: dict[str, Forecast]) -> dict[str, dict[str, float]]:
-    """By face and source: the share of the variance of the face's position that goes with the source."""
+    """Returns, by face and source, the share of the variance of the face's position that is due to the source."""
     return {
         face: {source: 1 - (each.position_sigma_mm()[face] / sigma) ** 2 for source, each in without.items()}
         for face, sigma in whole.position_sigma_mm().items()

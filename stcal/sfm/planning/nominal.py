@@ -1,4 +1,4 @@
-"""Where the faces of a target are before it is photographed: as its design says, or from an earlier run."""
+"""Nominal poses of the faces of a target before it is photographed, from its design or from an earlier run."""
 
 from pathlib import Path
 
@@ -13,12 +13,13 @@ from stcal.sfm.adjust.file import FacePoses
 
 
 def nominal_poses(target: TargetDesign, faces: Path | None) -> dict[str, Rigid]:
-    """Pose of every face in one frame; ``faces`` : a ``faces.json``, or None for the rough poses of the design.
+    """Returns the pose of every face in one frame. ``faces`` : a ``faces.json``, or None for the rough poses of the
+    design.
 
     Raises
     ------
     InputError
-        A face without rough pose and no ``faces.json``, a file that is none, or one that lacks a face.
+        If a face has no rough pose and there is no ``faces.json``, or if that file is invalid or lacks a face.
     """
     if faces is None:
         rough = target.rough_poses()

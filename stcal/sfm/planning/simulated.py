@@ -1,4 +1,4 @@
-"""A simulated scene as the stages after detection see it: labelled centres without pixels, and the true models."""
+"""A simulated scene as the stages after detection receive it: labelled centres without pixels, and the true models."""
 
 from collections.abc import Sequence
 
@@ -12,11 +12,11 @@ from stcal.synthetic.observe import image_circles
 from stcal.synthetic.scene import Scene
 
 EXACT_SIGMA_PX = 0.005
-"""σ stated of centres without noise."""
+"""The σ that is stated for centres without noise."""
 
 
 def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: float = 0.0) -> list[ImageObservations]:
-    """Ellipse centres of all circles that must be found, with Gaussian noise of ``noise_px`` per axis as their σ.
+    """Returns the ellipse centres of all circles that must be found, with Gaussian noise of σ ``noise_px`` per axis.
 
     ``missing`` : share of the circles that detection loses.
     """
@@ -42,7 +42,8 @@ def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: fl
 
 
 def true_models(scene: Scene, observations: Sequence[ImageObservations]) -> list[MetricModel]:
-    """Models of the groups at the true geometry, mm, target frame, with these observations; no eccentricity yet."""
+    """Returns models of the groups at the true geometry, mm, target frame, with these observations, not yet corrected
+    for eccentricity."""
     models = []
     for name, images in by_group(observations).items():
         group = scene.groups[name]

@@ -1,4 +1,4 @@
-"""What ``plan`` and ``advise`` answer, as text for people."""
+"""Results of ``plan`` and ``advise`` as text for people."""
 
 from stcal.sfm.planning.advise import Advice
 from stcal.sfm.planning.file import MICRO, PPM, ForecastPart
@@ -8,7 +8,7 @@ from stcal.sfm.planning.views import PlannedView
 
 
 def forecast_table(forecast: Forecast, shares: dict[str, dict[str, float]]) -> list[str]:
-    """One line for each face, 80 columns for short names."""
+    """Returns one line for each face, in 80 columns if names are short."""
     rows = ForecastPart.of(forecast, shares).faces
     circles = {face: f"{row.worst_circle} {row.worst_circle_sigma_um:.2f}" for face, row in rows.items()}
     wide, worst = max([4, *map(len, rows)]), max([8, *map(len, circles.values())])
@@ -20,25 +20,25 @@ def forecast_table(forecast: Forecast, shares: dict[str, dict[str, float]]) -> l
     for face, row in rows.items():
         position = " ".join(f"{s:5.2f}" for s in [*row.translation_sigma_um, row.position_sigma_um])
         rotation = " ".join(f"{s:5.2f}" for s in row.rotation_sigma_mdeg)
-        parts = _shares_text(row.variance_shares)
-        lines.append(f"{face:>{wide}} {position} {rotation}  {circles[face]:<{worst}}  {parts}")
+        shares_text = _shares_text(row.variance_shares)
+        lines.append(f"{face:>{wide}} {position} {rotation}  {circles[face]:<{worst}}  {shares_text}")
     return lines
 
 
 def _shares_text(shares: dict[str, float]) -> str:
-    """The largest first."""
+    """Returns the shares as a text, the largest first."""
     ordered = sorted(shares.items(), key=lambda each: -each[1])
     return ", ".join(f"{source.removeprefix('image ')} {100 * max(share, 0.0):.0f} %" for source, share in ordered)
 
 
 def plan_text(plan: Plan, noise: str) -> str:
-    """The forecast as a table; ``noise`` : where the σ of the centres comes from."""
+    """Returns the forecast as a table. ``noise`` : where the σ of the centres comes from."""
     camera, options = plan.setup.camera, plan.options
-    kept = "the same board in all groups" if options.one_board else "a board of its own in each group"
+    boards = "the same board in all groups" if options.one_board else "a board of its own in each group"
     worst, sigma = plan.forecast.worst()
     lines = [
         f"groups {', '.join(plan.groups)}, {options.images} images each, {camera.width}×{camera.height} px, "
-        f"{options.distance_mm:g} mm away, spread ±{options.spread_deg:g}°; {kept}, σ "
+        f"{options.distance_mm:g} mm away, spread ±{options.spread_deg:g}°; {boards}, σ "
         f"{MICRO * plan.setup.board.sigma_mm:g} µm",
         f"{plan.observations} centres, σ {plan.centre_sigma_px:.4f} px RMS: {noise}",
         *forecast_table(plan.forecast, plan.shares),
@@ -48,15 +48,15 @@ def plan_text(plan: Plan, noise: str) -> str:
         f"{'what would help':<28} worst face µm",
     ]
     reachable = [(r.sigma_mm, r.what) for r in plan.remedies if r.sigma_mm is not None]
-    for worst_mm, what in sorted(reachable, key=lambda each: each[0]):
-        lines.append(f"{what:<28} {MICRO * worst_mm:6.2f}   {100 * (worst_mm / sigma - 1):+.0f} %")
+    for worst_mm, change in sorted(reachable, key=lambda each: each[0]):
+        lines.append(f"{change:<28} {MICRO * worst_mm:6.2f}   {100 * (worst_mm / sigma - 1):+.0f} %")
     lines += [f"{r.what:<28}      –   {r.reason}" for r in plan.remedies if r.sigma_mm is None]
     lines.append("where board and cameras happen to stand (--seed) makes about ±3 %")
     return "\n".join(lines)
 
 
 def advice_text(advice: Advice) -> str:
-    """What to photograph next, as a table that a photographer can follow."""
+    """Returns what to photograph next, as a table that a photographer can follow."""
     worst, sigma = advice.now.worst()
     lines = [*forecast_table(advice.now, advice.shares), f"worst is face {worst}, {MICRO * sigma:.2f} µm"]
     if advice.board_dominates:
@@ -86,16 +86,16 @@ def advice_text(advice: Advice) -> str:
     ]
     if advice.new_groups:
         lines += ["", "faces not photographed together yet, with the board beside them, as a new group:"]
-        for each in advice.new_groups:
+        for pair in advice.new_groups:
             lines.append(
-                f"  faces {each.faces[0]} and {each.faces[1]}, {each.images} images: worst is face {each.face}, "
-                f"{MICRO * sigma:.2f} → {MICRO * each.sigma_mm:.2f} µm"
+                f"  faces {pair.faces[0]} and {pair.faces[1]}, {pair.images} images: worst is face {pair.face}, "
+                f"{MICRO * sigma:.2f} → {MICRO * pair.sigma_mm:.2f} µm"
             )
     return "\n".join([*lines, "", _verdict(advice)])
 
 
 def next_text(advice: Advice) -> str:
-    """The first view of :func:`advice_text`, in a line."""
+    """Returns the first view of :func:`advice_text` in one line."""
     if not advice.choices:
         return "no other view within ±50° shows the whole board and a face"
     choice = advice.choices[0]
@@ -106,7 +106,8 @@ def next_text(advice: Advice) -> str:
 
 
 def where(view: PlannedView) -> str:
-    """``25° right, 12° up``, as the photograph to go from shows them."""
+    """Returns the direction from the named photograph to the view, as seen in that photograph: ``25° right, 12°
+    up``."""
     parts = []
     for angle, names in ((view.azimuth_deg, ("right", "left")), (view.elevation_deg, ("up", "down"))):
         if angle:
@@ -117,7 +118,7 @@ def where(view: PlannedView) -> str:
 
 
 def _verdict(advice: Advice) -> str:
-    """The best of what was computed."""
+    """Returns the worst face after each kind of remedy, the best first."""
     board = advice.better_board.worst()[1]
     ways = [(board, "a board of half the σ")]
     if advice.choices:

@@ -1,1 +1,1 @@
-"""From photographs of the target on an arm to joint values that reach points, in one go."""
+"""The way from photographs of the target on an arm to joint values that reach points, in one go."""

@@ -1,4 +1,4 @@
-"""The folder: every step's files by the names of its own command, all or none."""
+"""The output folder: the files of every step by the names of its own command, all or none."""
 
 from stcal.io.saving import json_text
 from stcal.robot.axes.report import axes_file, axes_page
@@ -18,8 +18,8 @@ POSES = "poses.csv"
 
 
 def files_of(result: FromPhotos) -> dict[str, str]:
-    """By name, all that is written."""
-    identified, found = result.identified.robot, result.compensated
+    """Returns the contents of all files, by name."""
+    identified, compensated = result.identified.robot, result.compensated
     files = {
         POSES: poses_csv(result.measured)[0],
         "poses.json": json_text(poses_file(result.measured)),
@@ -31,16 +31,16 @@ def files_of(result: FromPhotos) -> dict[str, str]:
             "axes.json": json_text(axes_file(result.axes)),
             "axes.html": axes_page(result.axes, result.data.where),
         }
-    said = f"Identified from {result.data.where}: {result.identified.rank} parameters."
+    source = f"Identified from {result.data.where}: {result.identified.rank} parameters."
     files |= {
-        "identified.toml": robot_toml(identified, [said]),
+        "identified.toml": robot_toml(identified, [source]),
         "identified.json": json_text(identified_file(result.identified, result.nominal)),
         "identified.html": identified_page(result.identified, result.nominal),
     }
-    if found is not None:
+    if compensated is not None:
         files |= {
-            "compensated.csv": compensated_csv(found, identified),
-            "compensated.json": json_text(compensation_file(found, identified)),
-            "compensated.html": compensation_page(found, identified),
+            "compensated.csv": compensated_csv(compensated, identified),
+            "compensated.json": json_text(compensation_file(compensated, identified)),
+            "compensated.html": compensation_page(compensated, identified),
         }
     return files | {"report.html": from_photos_page(result, tuple(files))}

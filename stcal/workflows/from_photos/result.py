@@ -1,4 +1,4 @@
-"""What was found on the way from photographs to joint values."""
+"""The results on the way from photographs to joint values."""
 
 from dataclasses import dataclass
 
@@ -20,31 +20,31 @@ DRAWING, AXES, SAME_ROWS = "as drawn", "by the axis method", "identified, the sa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FromPhotos:
-    """What was found on the way.
+    """Results of all steps, from photographs to joint values.
 
     Parameters
     ----------
     images : str
-        The folder.
+        Folder of the photographs.
     measured : MeasureResult
         Poses of the target.
     nominal : Robot
-        As drawn.
+        The arm as drawn.
     data : Measurements
         Poses with their joint values.
     axes : AxesResult or None
-        The axis method, where every joint is swept …
+        Result of the axis method, where every joint is swept.
     without_axes : str
-        … and else why not.
+        Reason why there is no result of the axis method.
     identified : Identified
-        From all poses.
+        Identification from all poses.
     compensated : Compensated or None
         Joint values for the targets, where there are any.
     errors : dict of str to Figures
         Position errors of the rows, mm: as drawn and by the axis method with base and tool fitted, identified, and of
         rows held out.
     notes : tuple of str
-        On rows and photographs that have no partner, and of what was read.
+        Notes on rows and photographs that have no partner, and on the input.
     """
 
     images: str
@@ -59,16 +59,18 @@ class FromPhotos:
     notes: tuple[str, ...]
 
     def sigma_mm(self) -> np.ndarray:
-        """(t,) predicted σ of the tool's position at the targets, mm; nan where not reached, or of unmeasured tools."""
-        found, sigma = self.compensated, self.identified.predicted
-        if found is None or sigma is None:
+        """Returns predicted σ (t,) of the tool's position at the targets, mm; nan where a target is not reached, or its
+        tool was not measured."""
+        compensated, sigma = self.compensated, self.identified.predicted
+        if compensated is None or sigma is None:
             return np.zeros(0)
-        at = predicted_at(sigma, self.identified.state, "pose", found.found.q, found.targets.tools)
-        return np.where(found.found.usable, at, np.nan)
+        at = predicted_at(sigma, self.identified.state, "pose", compensated.found.q, compensated.targets.tools)
+        return np.where(compensated.found.usable, at, np.nan)
 
     def moves(self) -> np.ndarray:
-        """(t, n) joint values to send less those of the arm as drawn, rad or mm; nan where one of both is none."""
-        found = self.compensated
-        if found is None or found.nominal is None:
+        """Returns joint values to send minus those of the arm as drawn, (t, n), rad or mm; nan where one of them does
+        not exist."""
+        compensated = self.compensated
+        if compensated is None or compensated.nominal is None:
             return np.zeros((0, len(self.nominal.rows)))
-        return np.where(found.compared()[:, None], found.found.q - found.nominal.q, np.nan)
+        return np.where(compensated.compared()[:, None], compensated.found.q - compensated.nominal.q, np.nan)

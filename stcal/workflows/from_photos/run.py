@@ -1,7 +1,7 @@
-"""From photographs of the target on an arm to joint values that reach points: measure, axes, identify, compensate.
+"""The run from photographs of the target on an arm to joint values that reach points.
 
-The way of Zhang & Wei (2017) in one go. Every step's files are those of its own command, so that each can be repeated
-by itself.
+The steps are measure, axes, identify, compensate. It is the method of Zhang & Wei (2017) in one go. The files of every
+step are those of its own command, so that each step can be repeated by itself.
 """
 
 import tempfile
@@ -59,17 +59,17 @@ def from_photos(
     Parameters
     ----------
     images, camera, target, design, board, progress
-        As of :func:`stcal.sfm.measurement.images.measure`.
+        As in :func:`stcal.sfm.measurement.images.measure`.
     joints : path
-        Table of joint values with a column ``key`` that names each one's photograph (CSV).
+        Table of joint values with a column ``key`` that names the photograph of each row (CSV).
     nominal : Robot
-        The arm as drawn, mm and rad; what the controller commands by.
+        The arm as drawn, mm and rad; the model by which the controller commands it.
     targets : path or Table, optional
         Poses or joint values to compensate.
     key : str
-        Name of that column.
+        Name of the column of photographs.
     measure_options, options
-        Of measuring and of identifying; the defaults where None.
+        Options of measuring and of identifying; the defaults where None.
 
     Returns
     -------
@@ -79,10 +79,10 @@ def from_photos(
     Raises
     ------
     StcalError
-        One of its kinds, of the step that failed, with a one-line message that says what to do.
+        One of its subclasses, from the step that failed, with a one-line message that says what to do.
     """
-    # before the work, as both may be refused
-    values = read_joints(joints, key, [each.name for each in find_images(images)[0]], nominal)
+    # Both are read before the work, as both may be refused.
+    values = read_joints(joints, key, [file.name for file in find_images(images)[0]], nominal)
     carried = dict.fromkeys(targets_of(values), Rigid())
     wanted = None if targets is None else read_targets(targets, replace(nominal, tools=carried))
     measured = measure(images, camera, target, design, board, measure_options, progress)
@@ -90,19 +90,20 @@ def from_photos(
 
 
 def read_joints(path: str | Path, key: str, photographs: Sequence[str], nominal: Robot) -> Table:
-    """Joint values with the name of each one's photograph in the column ``image``, in place of ``key``.
+    """Returns joint values with the name of each row's photograph in the column ``image``, which replaces ``key``.
 
     Raises
     ------
     InputError
-        No such column, none of the photographs, one twice, poses beside the joint values, or not those of the robot.
+        No such column, no row of the photographs, one twice, poses beside the joint values, or other joints than the
+        robot's.
     """
     values, nowhere = read_table(path, "joints"), np.zeros(len(photographs))
     files = Table(PHOTOGRAPHS, {key: list(photographs)} | dict.fromkeys(POSE, nowhere), range(len(photographs)))
     join(files, values, key)
     joint_values(values, nominal)
-    own = {name: column for name, column in values.columns.items() if name not in (key, IMAGE)}
-    return replace(values, columns={IMAGE: values.text(key)} | own, rows=())
+    remaining = {name: column for name, column in values.columns.items() if name not in (key, IMAGE)}
+    return replace(values, columns={IMAGE: values.text(key)} | remaining, rows=())
 
 
 def from_measured(
@@ -113,26 +114,28 @@ def from_measured(
     wanted: Targets | None = None,
     options: IdentifyOptions | None = None,
 ) -> FromPhotos:
-    """The steps after the photographs are measured; arguments and errors as of :func:`from_photos`.
+    """Perform the steps after the photographs are measured; arguments and errors as in :func:`from_photos`.
 
-    ``values`` : as of :func:`read_joints`; ``wanted`` : what to compensate.
+    ``values`` : table from :func:`read_joints`; ``wanted`` : targets to compensate.
     """
     with tempfile.TemporaryDirectory(prefix="stcal-photos-") as folder:
-        own = Path(folder) / POSES
-        save(own, poses_csv(measured)[0])
-        joined = join(replace(read_table(own, "poses"), where=PHOTOGRAPHS), values, IMAGE)
+        poses_file = Path(folder) / POSES
+        save(poses_file, poses_csv(measured)[0])
+        joined = join(replace(read_table(poses_file, "poses"), where=PHOTOGRAPHS), values, IMAGE)
     data = read_measurements(joined.table, nominal)
     axes, without = _axes(data, nominal)
-    found = identify(nominal, data, options)
-    compensated = None if wanted is None else compensate(found.robot, wanted, nominal)
+    identified = identify(nominal, data, options)
+    compensated = None if wanted is None else compensate(identified.robot, wanted, nominal)
     models = {DRAWING: nominal} if axes is None else {DRAWING: nominal, AXES: axes.robot}
     evaluation = evaluate(models, data)
     good = ~evaluation.wrong
-    errors = {name: Figures.of(each.errors_mm[good]) for name, each in zip(models, evaluation.robots, strict=True)}
-    errors[SAME_ROWS] = Figures.of(found.fitted_mm[good])
-    if found.held_out is not None:
-        held = found.held_out.position_mm[:, good]
-        errors[f"identified, {found.held_out.folds} folds held out"] = Figures.of(held[np.isfinite(held)])
+    errors = {
+        name: Figures.of(evaluated.errors_mm[good]) for name, evaluated in zip(models, evaluation.robots, strict=True)
+    }
+    errors[SAME_ROWS] = Figures.of(identified.fitted_mm[good])
+    if identified.held_out is not None:
+        held = identified.held_out.position_mm[:, good]
+        errors[f"identified, {identified.held_out.folds} folds held out"] = Figures.of(held[np.isfinite(held)])
     return FromPhotos(
         images,
         measured,
@@ -140,7 +143,7 @@ def from_measured(
         data,
         axes,
         without,
-        found,
+        identified,
         compensated,
         errors,
         joined.notes + tuple(data.notes),
@@ -148,11 +151,11 @@ def from_measured(
 
 
 def _axes(data: Measurements, nominal: Robot) -> tuple[AxesResult | None, str]:
-    """The axis method by the rows that sweep one joint each; or why not."""
+    """Returns the axis method's result from the rows that sweep one joint each, or the reason why there is none."""
     try:
         arcs, _ = find_arcs(data, nominal)
         rows = np.unique(np.concatenate([arc.rows for arc in arcs]))
         length_mm = length_of(data)
         return robot_from_sweeps(data[rows], nominal, places=None if length_mm is None else ring(length_mm)), ""
-    except StcalError as error:  # a step that can be done without
+    except StcalError as error:  # the workflow can do without this step
         return None, str(error).removeprefix(f"{data.where}: ")

@@ -1,4 +1,4 @@
-"""Hand, eye and arm at a time, from joint values and images: ``stcal handeye --with-kinematics``."""
+"""Hand-eye calibration together with the arm, from joint values and images: ``stcal handeye --with-kinematics``."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ COMPONENTS = ("rx", "ry", "rz", "x", "y", "z")
 class Arm:
     """A robot at joint values (m, n), moved by small motions of its axes: :class:`stcal.handeye.methods.arm.ArmModel`.
 
-    Its base and flange stay where they are: hand and eye take up where these sit.
+    Its base and flange frames stay where they are: X and Z absorb the error of their places.
     """
 
     robot: Robot
@@ -39,29 +39,29 @@ class Arm:
 
     @property
     def angles(self) -> np.ndarray:
-        """(k,) of bool: which parameters are rad."""
+        """Boolean array (k,): True for parameters in rad."""
         return np.array([component < 3 for _, component in chain_parameters(self._chain())])
 
     def poses(self, parameters: np.ndarray) -> Poses:
-        """base_from_flange, m."""
+        """Returns base_from_flange, m poses."""
         return flange_poses(moved_chain(self._chain(), parameters), self.q)
 
     def slope(self, parameters: np.ndarray) -> np.ndarray:
-        """(m, 6, k) of :meth:`poses` by a step of the parameters."""
+        """Returns the derivative (m, 6, k) of :meth:`poses` by a step of the parameters."""
         chain = moved_chain(self._chain(), parameters)
         return chain_jacobian(chain, self.q, flange_poses(chain, self.q))
 
     def __getitem__(self, rows) -> "Arm":
-        """At those joint values."""
+        """Returns the arm at these joint values alone."""
         return Arm(self.robot, self.q[rows])
 
     def identified(self, parameters: np.ndarray) -> Robot:
-        """The robot with these parameters, as D-H rows; base and tools as they were."""
+        """Returns the robot with these parameters, as D-H rows; base and tools stay as they were."""
         moved = robot_from_chain(moved_chain(self._chain(), parameters), dict(self.robot.tools), self.robot)
         return replace(moved, world_from_base=self.robot.world_from_base)
 
     def names(self) -> tuple[str, ...]:
-        """(k,) of the parameters: J2 rx in rad, J2 x in mm, in the frame of the joint."""
+        """Returns the names (k,) of the parameters: J2 rx in rad, J2 x in mm, in the frame of the joint."""
         return tuple(f"J{joint + 1} {COMPONENTS[c]}" for joint, c in chain_parameters(self._chain()))
 
     def _chain(self) -> Chain:
@@ -69,14 +69,14 @@ class Arm:
 
 
 def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[RobotPoses, Arm]:
-    """The robot's poses by its file, from a table with columns ``image`` and ``q1_deg`` … (CSV).
+    """Returns the robot's poses by its file, from a table with columns ``image`` and ``q1_deg`` … (CSV).
 
-    Where the table has base_from_flange_… too, what was understood says how far these are off.
+    Where the table has base_from_flange_… too, ``understood`` says how far these poses are off.
 
     Raises
     ------
     InputError
-        Missing columns, or values that are none; an image that has two rows.
+        Missing columns, values that are not numbers, or an image that has two rows.
     """
     table = read_table(path, "robot poses", quaternions)
     arm = Arm(robot, joint_values(table, robot))
@@ -103,22 +103,22 @@ def with_arm(
     workers: int | None,
     progress: Callable[[int, int], None],
 ) -> Outcome:
-    """The calibration with the arm's parameters and the intrinsics among the unknowns, beside the one without.
+    """Returns the calibration with the arm's parameters and the intrinsics among the unknowns, beside the one without.
 
     Parameters
     ----------
     outcome : Outcome
-        Of the same poses, by the robot's file.
+        Calibration of the same poses, by the robot's file.
     arm : Arm
-        At the joint values of these poses.
+        The arm at the joint values of these poses.
     options : HandEyeOptions
-        As the outcome was solved with.
+        Options of the outcome.
     prior : CameraPrior, optional
-        Of the intrinsics.
+        Prior of the intrinsics.
     rows : (s, k) int array
         Poses to hold out; none where empty.
     workers, progress
-        As of :func:`stcal.handeye.cross_validate`.
+        As in :func:`stcal.handeye.cross_validate`.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def with_arm(
     Raises
     ------
     StcalError
-        As :func:`stcal.handeye.handeye`.
+        For the reasons given in :func:`stcal.handeye.handeye`.
     """
     pairs, views, setup = outcome.pairs, outcome.views, outcome.result.setup
     if pairs is None or views is None:
@@ -144,9 +144,9 @@ def with_arm(
     if adjusted is None or adjusted.arm is None or adjusted.arm_covariance is None:
         raise ValueError("reprojection with an arm has its parameters")
     sigma = np.sqrt(np.diag(adjusted.arm_covariance))
-    found = ArmFound(arm.robot.name, arm.names(), adjusted.arm, sigma, outcome.held_out)
+    arm_found = ArmFound(arm.robot.name, arm.names(), adjusted.arm, sigma, outcome.held_out)
     if held_out is not None and outcome.held_out is not None:
-        now, before = (each.means()["board_mm"] for each in (held_out, outcome.held_out))
+        now, before = (errors.means()["board_mm"] for errors in (held_out, outcome.held_out))
         if now >= before:
             notes = (
                 *notes,
@@ -154,4 +154,4 @@ def with_arm(
                 "them): leave --with-kinematics out, or take more poses",
             )
     model = prior.colmap_model if prior else ""
-    return replace(outcome, result=result, held_out=held_out, colmap_model=model, notes=notes, arm=found)
+    return replace(outcome, result=result, held_out=held_out, colmap_model=model, notes=notes, arm=arm_found)

@@ -1,4 +1,5 @@
-"""Hand-eye calibration from a file of poses or from images of any board: ``stcal handeye`` composes three systems."""
+"""Hand-eye calibration from a file of poses or from images of any board, for ``stcal handeye``. It composes three
+systems."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,13 +26,13 @@ from stcal.workflows.handeye.arm import with_arm
 from stcal.workflows.handeye.inputs import HandEyeInput
 
 ALL, AUTO = "all", "auto"
-"""In place of a method's name: all of them, compared; the way of solving that predicts best."""
+"""Words in place of a method's name: all methods, compared; the way of solving that predicts best."""
 
 
 @dataclass(frozen=True, slots=True)
 class Splits:
-    """Of the cross-validation: how many, poses in each (a quarter if None), which, and processes for it; and the last
-    motions to predict, if any."""
+    """Settings of the cross-validation: number of repeats, poses held out in each (a quarter if None), seed, processes;
+    and number of the last motions to predict, if any."""
 
     repeats: int = 15
     held_out: int | None = None
@@ -48,13 +49,15 @@ def calibrate(
     validation: Splits,
     progress: Progress = lambda *_: None,
 ) -> Outcome:
-    """The result, its errors on poses held out, and all methods compared where ``method`` is :data:`ALL`, or the way
-    of solving that predicts best where it is :data:`AUTO`.
+    """Returns the result and its errors on poses held out.
+
+    All methods are compared where ``method`` is :data:`ALL`;
+    the way of solving that predicts best is used where it is :data:`AUTO`.
 
     Raises
     ------
     StcalError
-        As :func:`stcal.handeye.handeye`; what was left out before is said with it.
+        For the reasons given in :func:`stcal.handeye.handeye`; the message also names what was left out before.
     """
     try:
         return _outcome(given, setup, method, options, validation, progress)
@@ -96,14 +99,14 @@ def _outcome(
     if method == ALL:
         done = partial(progress, "methods")
         compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=done)
-        held_out = next(each.held_out for each in compared if each.method == result.method)
+        held_out = next(comparison.held_out for comparison in compared if comparison.method == result.method)
     elif len(rows) and choice is None and not notes:
         done = partial(progress, "held out")
         try:
             held_out = cross_validate(pairs, setup, asked, views, options, rows, validation.workers, done)
         except DegenerateError as error:
             notes = (f"no errors on poses held out: {error}",)
-    if held_out is not None and choice is None:  # a choice is widened when it is made, beside its rivals
+    if held_out is not None and choice is None:  # a choice is widened when it is made, with its rivals
         result = widened_by_scatter(result, held_out)
     if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
         notes = (*notes, meant)
@@ -111,7 +114,7 @@ def _outcome(
     if validation.motions is not None:
         motions = predict_motions(pairs, setup, result.method, views, options, validation.motions)
     model = options.intrinsics.colmap_model if options.intrinsics else ""
-    own = views is not None and all(view.covariance is not None for view in views.views)
+    own_sigmas = views is not None and all(view.covariance is not None for view in views.views)
     if options.symmetries:
         mended = repair(pairs, setup, options.symmetries, views)
         pairs, views = mended.pairs, mended.views
@@ -122,7 +125,7 @@ def _outcome(
         compared,
         given.pitch_mm,
         model,
-        own,
+        own_sigmas,
         given.left_out,
         notes,
         motions,

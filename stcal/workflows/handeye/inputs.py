@@ -1,4 +1,4 @@
-"""What hand-eye is calibrated from: pose pairs of one file or two, or images of a board with the robot's poses."""
+"""Inputs of a hand-eye calibration: pose pairs of one file or two, or images of a board with the robot's poses."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,20 +32,20 @@ from stcal.workflows.handeye.times import Timing, robot_at_images
 NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()
 PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
-"""What board files call the distance by which a board's size is stated."""
+"""Keys in board files for the distance by which a board's size is stated."""
 Source = Path | Table | Told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandEyeInput:
-    """What is calibrated from.
+    """Input of a hand-eye calibration.
 
     ``where`` : its files; ``views`` : of the board, where images were given, with its ``symmetries`` and the camera's
     ``prior``; ``pitch_mm`` of the board's file; ``left_out`` : (image or row, why); ``understood`` : a line for each
-    file that is not a table of the package; ``setup`` : as a file says it; ``unit_mm`` : of a model without a unit,
-    about, by which ``pairs`` are multiplied already; ``folder`` : of the images; ``arm`` : at the joint values of the
-    ``pairs``, where its parameters are to be solved for; ``timed`` : times of the pairs in the robot's stream, where
-    its poses were taken by time.
+    file that is not a table of the package; ``setup`` : where a file states it; ``unit_mm`` : approximate unit of a
+    model without a unit, by which ``pairs`` are multiplied already; ``folder`` : of the images; ``arm`` : at the joint
+    values of the ``pairs``, where its parameters are to be solved for; ``timed`` : times of the pairs in the robot's
+    stream, where its poses were taken by time.
     """
 
     where: str
@@ -71,17 +71,19 @@ def two_files(
     quaternions: Order = "wxyz",
     timing: Timing = WITHOUT_OPTIONS,
 ) -> Told | None:
-    """The robot's poses and the camera's, joined; None of two tables of the package's own, which are joined as such.
+    """Returns the robot's poses and the camera's, joined.
+
+    The result is None for two tables of the package's own, which are joined as tables.
 
     Raises
     ------
     InputError
-        As :func:`~stcal.handeye.data.inputs.read_two`; options that tables do not need.
+        As in :func:`~stcal.handeye.data.inputs.read_two`; or options were given that tables do not need.
     """
-    found = read_two(first, second, said, key, quaternions, timing.tolerance_s, timing.offset)
-    if found is None:
+    told = read_two(first, second, said, key, quaternions, timing.tolerance_s, timing.offset)
+    if told is None:
         _require_unsaid(said, f"{first}, {second}")
-    return found
+    return told
 
 
 @one_thread()
@@ -97,26 +99,25 @@ def read_input(
     timing: Timing = WITHOUT_OPTIONS,
     robot: Robot | None = None,
 ) -> HandEyeInput:
-    """Pose pairs from their file or files; or from a folder of images with the files ``poses``, ``camera`` and
-    ``board``.
+    """Returns pose pairs from their files, or from a folder of images with ``poses``, ``camera`` and ``board``.
 
-    ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``said`` : what
-    files do not say themselves; ``timing`` : of poses by time; ``robot`` : at whose joint values, in ``poses``, the
-    images were taken, if its parameters are to be solved for.
+    ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``said`` : the
+    user's statements about what files do not state; ``timing`` : of poses by time; ``robot`` : the robot at whose joint
+    values, in ``poses``, the images were taken, if its parameters are to be solved for.
 
     Raises
     ------
     InputError
-        A file is missing or not as it should be, one too many was given, or no image shows the board.
+        A file is missing or not of the required form, one file too many was given, or no image shows the board.
     """
     if isinstance(source, Path) and source.is_dir():
         poses, camera, board = _all_three(source, poses, camera, board)
         if robot is None:
-            found = read_robot_poses(poses, quaternions, said)
-            return _from_images(source, found, poses, camera, board, workers, progress, timing)
+            robot_poses = read_robot_poses(poses, quaternions, said)
+            return _from_images(source, robot_poses, poses, camera, board, workers, progress, timing)
         _require_by_name(timing)
-        found, arm = read_arm(poses, robot, quaternions)
-        return _from_images(source, found, poses, camera, board, workers, progress, None, arm)
+        robot_poses, arm = read_arm(poses, robot, quaternions)
+        return _from_images(source, robot_poses, poses, camera, board, workers, progress, None, arm)
     if robot is not None:
         raise InputError(
             "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, in which the arm is seen to err"
@@ -164,7 +165,7 @@ def _require_by_name(timing: Timing) -> None:
 
 
 def _require_timed(source: Source, timing: Timing) -> None:
-    """Options of times go with images, or with poses of both sides in files of their own."""
+    """Refuse options of times without images or without poses of both sides in files of their own."""
     if timing.image_times is not None:
         raise InputError(
             "E-OPTION-NEEDS", "--image-times: only with a folder of images; poses have their times beside them"
@@ -188,12 +189,12 @@ def _require_unsaid(said: Said, where: str) -> None:
 
 
 def setup_of(said: Said, told: str | None, where: str) -> Setup:
-    """As the user says, as a file says, or eye-in-hand.
+    """Returns the setup that the user states, or that a file states, or eye-in-hand.
 
     Raises
     ------
     InputError
-        Both say, but not the same.
+        The user and the file contradict each other.
     """
     if said.setup and told and said.setup != told:
         raise InputError(
@@ -204,7 +205,7 @@ def setup_of(said: Said, told: str | None, where: str) -> Setup:
 
 
 def _from_told(told: Told, said: Said) -> HandEyeInput:
-    """With lengths of a model without a unit brought to mm, about, by the robot's motions."""
+    """Returns the input. Lengths of a model without a unit are brought to mm, approximately, by the robot's motions."""
     setup, pairs, unit, understood = setup_of(said, told.setup, told.pairs.where), told.pairs, None, told.understood
     if told.scaled:
         pairs, unit = _about_mm(pairs, setup)
@@ -221,7 +222,7 @@ def _from_told(told: Told, said: Said) -> HandEyeInput:
 
 
 def _about_mm(pairs: HandEyePoses, setup: Setup) -> tuple[HandEyePoses, float]:
-    """Pairs with the camera's lengths times what the robot's motions make of their unit, mm."""
+    """Returns the pairs with the camera's lengths in mm, and the factor, which is found from the robot's motions."""
     scale = start.robust(Loop.of(pairs, setup), True)[2]
     if not scale > 0:
         raise DegenerateError(
@@ -229,16 +230,19 @@ def _about_mm(pairs: HandEyePoses, setup: Setup) -> tuple[HandEyePoses, float]:
             f"{pairs.where}: the model's lengths do not follow the robot's motions; check that images and poses belong "
             "together, and move the flange farther",
         )
-    seen = pairs.camera_from_board
-    return replace(pairs, camera_from_board=Poses(seen.rotation, scale * seen.translation)), scale
+    given = pairs.camera_from_board
+    return replace(pairs, camera_from_board=Poses(given.rotation, scale * given.translation)), scale
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photographed:
-    """What one camera's images show: ``names`` : of those that show the board and have a pose; ``seen`` : the board in
-    them; ``rows`` : (k,) their robot poses, of ``base_from_flange``; ``covariance`` of these; ``how`` they were
-    matched; ``unused`` : what of the board was seen and not used; ``robot`` : its poses by image; others as
-    :class:`HandEyeInput`."""
+    """The content of one camera's images.
+
+    ``names`` : images that show the board and have a pose; ``seen`` : views of the board in them; ``rows`` : (k,) their
+    robot poses, rows of ``base_from_flange``; ``covariance`` of ``base_from_flange``; ``how`` : how they were matched;
+    ``unused`` : parts of the board that were seen and not used; ``robot`` : its poses by image; the other fields are as
+    in :class:`HandEyeInput`.
+    """
 
     names: tuple[str, ...]
     seen: Views
@@ -263,43 +267,45 @@ def photographed(
     progress: Progress,
     timing: Timing | None = WITHOUT_OPTIONS,
 ) -> Photographed:
-    """Corners of the board in all images that have a pose.
+    """Returns the corners of the board in all images that have a pose.
 
     Raises
     ------
     InputError
-        No image shows the board, or none has a pose.
+        No image shows the board, or no image has a pose.
     """
     model = read_camera(camera)
     files, skipped = find_images(source)
     at_images = robot_at_images(robot, [file.name for file in files], timing)
     robot, late = at_images.robot, dict(at_images.left_out)
     files = [file for file in files if file.name not in late]
-    rows, missing, how = _rows_of_images(robot, files, source)
+    rows, missing, matching = _rows_of_images(robot, files, source)
     with_pose = [file for file in files if file.name in rows]
-    found = detect_boards(with_pose, model, design, (), workers, partial(progress, "board"))
-    views = found.views()
-    left_out = [(each.name, each.reason) for each in (*skipped, *found.skipped)]
+    detections = detect_boards(with_pose, model, design, (), workers, partial(progress, "board"))
+    views = detections.views()
+    left_out = [(skipped_image.name, skipped_image.reason) for skipped_image in (*skipped, *detections.skipped)]
     left_out += [*late.items(), *_without_partner(files, rows, missing, robot.file)]
     if not views:
-        first = f"{found.skipped[0].name}: {found.skipped[0].reason}"
+        first = f"{detections.skipped[0].name}: {detections.skipped[0].reason}"
         raise InputError(
             "E-IMAGES-NO-BOARD", f"image folder {source}: the board is in none of {len(with_pose)} images: {first}"
         )
-    seen = Views(found.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in views.values()))
-    at = np.array([rows[name] for name in views])
-    prior = camera_prior(refinable(model.calibrated(found.camera.width, found.camera.height)))
+    corners = Views(
+        detections.camera, tuple(View(v.xyz_board, v.xy_px, v.covariance_px2, v.normal) for v in views.values())
+    )
+    rows_of_views = np.array([rows[name] for name in views])
+    prior = camera_prior(refinable(model.calibrated(detections.camera.width, detections.camera.height)))
     return Photographed(
         tuple(views),
-        seen,
-        at,
+        corners,
+        rows_of_views,
         robot.base_from_flange,
         robot.covariance,
-        found.symmetries,
+        detections.symmetries,
         prior,
         tuple(left_out),
-        how,
-        tuple(found.unused()),
+        matching,
+        tuple(detections.unused()),
         robot,
         at_images.timed(tuple(views)),
     )
@@ -316,46 +322,46 @@ def _from_images(
     timing: Timing | None,
     arm: Arm | None = None,
 ) -> HandEyeInput:
-    """Pairs of all images that show the board and have a pose."""
+    """Returns the pairs of all images that show the board and have a pose."""
     design = load_boards(board)
-    found = photographed(source, robot, camera, design, workers, progress, timing)
-    robot = found.robot
-    pairs = pairs_of_views(found.base_from_flange[found.rows], found.seen, found.names, str(source))
-    if found.covariance is not None:
-        pairs = replace(pairs, base_from_flange_covariance=found.covariance[found.rows])
-    understood = _robot_lines(robot, found.how) if not robot.own else ()
-    understood += tuple(f"board: {each}" for each in found.unused)
+    photos = photographed(source, robot, camera, design, workers, progress, timing)
+    robot = photos.robot
+    pairs = pairs_of_views(photos.base_from_flange[photos.rows], photos.seen, photos.names, str(source))
+    if photos.covariance is not None:
+        pairs = replace(pairs, base_from_flange_covariance=photos.covariance[photos.rows])
+    understood = _robot_lines(robot, photos.how) if not robot.own else ()
+    understood += tuple(f"board: {part}" for part in photos.unused)
     return HandEyeInput(
         f"{source.name}, {poses.name}",
         pairs,
-        found.seen,
-        found.symmetries,
-        found.prior,
+        photos.seen,
+        photos.symmetries,
+        photos.prior,
         pitch_of(design),
-        found.left_out,
+        photos.left_out,
         understood,
         folder=source,
-        arm=arm and arm[found.rows],
-        timed=found.timed,
+        arm=arm and arm[photos.rows],
+        timed=photos.timed,
     )
 
 
 def pitch_of(design: Board) -> float | None:
-    """Of dots or squares, mm; None of tags."""
+    """Returns the pitch of dots or squares, mm; None for tags."""
     return next((getattr(design, key) for key in PITCHES if hasattr(design, key)), None)
 
 
 def _rows_of_images(
     robot: RobotPoses, files: list[ImageFile], source: Path
 ) -> tuple[dict[str, int], tuple[str, ...], str]:
-    rows, missing, how = robot.pairing([file.name for file in files])
+    rows, missing, matching = robot.pairing([file.name for file in files])
     if not rows:
         raise InputError(
             "E-POSES-UNMATCHED",
             f"{robot.where}: no row is of an image in {source}: {robot.images[0]} … there, {files[0].name} … here; "
             "correct them",
         )
-    return rows, missing, how
+    return rows, missing, matching
 
 
 def _without_partner(
@@ -379,24 +385,24 @@ def dry_run(
     timing: Timing = WITHOUT_OPTIONS,
     robot: Robot | None = None,
 ) -> list[str]:
-    """What is understood of the inputs, line by line, without looking for the board in images.
+    """Returns lines on how the inputs are understood, without looking for the board in images.
 
     Raises
     ------
     InputError
-        As :func:`read_input`.
+        For the reasons given in :func:`read_input`.
     """
     if isinstance(source, Path) and source.is_dir():
         return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, said, timing, robot)
-    given = read_input(source, poses, camera, board, quaternions=quaternions, said=said, timing=timing)
-    lines = list(given.understood) if isinstance(source, Told) or given.understood else own_told(source, quaternions)
-    setup = setup_of(said, given.setup, given.where)
-    how = "as you say" if said.setup else "as the file says" if given.setup else "by default"
-    lines += [f"setup: {setup}, {how}", f"pairs: {len(given.pairs)}"]
-    if given.unit_mm is not None:
-        lines.append(f"scale: a unit of the model is about {given.unit_mm:.6g} mm by the robot's motions")
-    lines += spread_text(given.pairs.base_from_flange, setup)
-    return lines + [f"left out {name}: {reason}" for name, reason in given.left_out]
+    inputs = read_input(source, poses, camera, board, quaternions=quaternions, said=said, timing=timing)
+    lines = list(inputs.understood) if isinstance(source, Told) or inputs.understood else own_told(source, quaternions)
+    setup = setup_of(said, inputs.setup, inputs.where)
+    origin = "as you say" if said.setup else "as the file says" if inputs.setup else "by default"
+    lines += [f"setup: {setup}, {origin}", f"pairs: {len(inputs.pairs)}"]
+    if inputs.unit_mm is not None:
+        lines.append(f"scale: a unit of the model is about {inputs.unit_mm:.6g} mm by the robot's motions")
+    lines += spread_text(inputs.pairs.base_from_flange, setup)
+    return lines + [f"left out {name}: {reason}" for name, reason in inputs.left_out]
 
 
 def _dry_images(
@@ -409,7 +415,7 @@ def _dry_images(
     timing: Timing,
     arm: Robot | None,
 ) -> list[str]:
-    """Of a folder of images."""
+    """Returns the lines on a folder of images."""
     if arm is not None:
         _require_by_name(timing)
     robot = read_robot_poses(poses, quaternions, said) if arm is None else read_arm(poses, arm, quaternions)[0]
@@ -418,17 +424,17 @@ def _dry_images(
     at_images = robot_at_images(robot, [file.name for file in files], None if arm else timing)
     robot, every = at_images.robot, len(files)
     files = [file for file in files if file.name not in dict(at_images.left_out)]
-    rows, missing, how = _rows_of_images(robot, files, source)
+    rows, missing, matching = _rows_of_images(robot, files, source)
     setup = setup_of(said, None, source.name)
     kind = kind_of(design)
     lines = [
-        *_robot_lines(robot, how),
+        *_robot_lines(robot, matching),
         f"camera: {camera.name}: {model.width} × {model.height} px, focal length {model.focal[0]:.6g} px",
         f"board: {board.name}: {kind}",
         f"setup: {setup}, {'as you say' if said.setup else 'by default'}",
         f"images: {len(rows)} of {every} with a pose of the robot; the board was not looked for",
         *spread_text(robot.base_from_flange[list(rows.values())], setup),
     ]
-    left_out = [(each.name, each.reason) for each in skipped] + list(at_images.left_out)
+    left_out = [(skipped_image.name, skipped_image.reason) for skipped_image in skipped] + list(at_images.left_out)
     left_out += _without_partner(files, rows, missing, poses.name)
     return lines + [f"left out {name}: {reason}" for name, reason in left_out]

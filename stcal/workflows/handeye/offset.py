@@ -1,4 +1,4 @@
-"""The offset between the clocks of robot and camera, found before hand and eye and carried through them."""
+"""The offset between the clocks of robot and camera, found before X and Z and carried through them."""
 
 from dataclasses import replace
 
@@ -18,14 +18,16 @@ from stcal.workflows.handeye.inputs import HandEyeInput
 def at_offset(
     given: HandEyeInput, setup: Setup, options: HandEyeOptions
 ) -> tuple[HandEyeInput, HandEyeOptions, TimeOffset]:
-    """The same with the robot's poses at the offset that is found; numberings of a symmetric board are put right.
+    """Returns the same input with the robot's poses at the estimated offset.
+
+    Numberings of a symmetric board are put right.
 
     Raises
     ------
     InputError
-        No times, or a robot of four axes.
+        There are no times, or the robot has four axes.
     StcalError
-        As :func:`~stcal.handeye.time_offset.estimate_offset`.
+        For the reasons given in :func:`~stcal.handeye.time_offset.estimate_offset`.
     """
     timed = given.timed
     if timed is None:
@@ -43,26 +45,26 @@ def at_offset(
     if options.symmetries:
         mended = repair(pairs, setup, options.symmetries, views)
         pairs, views, notes = mended.pairs, mended.views, mended.notes()
-    found = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
-    kept = np.flatnonzero(found.kept)
-    out = [
+    offset = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
+    rows = np.flatnonzero(offset.kept)
+    outside = [
         (name, "outside of the robot's times at the time offset")
-        for name, k in zip(pairs.names, found.kept, strict=True)
+        for name, k in zip(pairs.names, offset.kept, strict=True)
         if not k
     ]
     given = replace(
         given,
-        pairs=replace(pairs[kept], base_from_flange=found.base_from_flange),
-        views=None if views is None else views[kept],
+        pairs=replace(pairs[rows], base_from_flange=offset.base_from_flange),
+        views=None if views is None else views[rows],
         symmetries=(),
-        left_out=(*given.left_out, *out),
+        left_out=(*given.left_out, *outside),
         understood=(*given.understood, *notes),
     )
-    return given, replace(options, symmetries=()), found
+    return given, replace(options, symmetries=()), offset
 
 
 def with_offset(outcome: Outcome, offset: TimeOffset | None) -> Outcome:
-    """With the offset in the report, and its σ in those of the transforms."""
+    """Returns the outcome with the offset in the report, and its σ in those of the transforms."""
     if offset is None:
         return outcome
     return replace(outcome, result=offset.carried(outcome.result), time_offset=offset)

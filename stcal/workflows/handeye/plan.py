@@ -17,13 +17,13 @@ from stcal.robot.use.compensation import joint_columns
 from stcal.workflows.handeye.inputs import HandEyeInput
 
 LEAST_REACHED = 0.5
-"""Share of the poses taken that a robot file must reach to be that robot's."""
+"""Share of the poses taken that the arm of a robot file must reach to be accepted as this robot."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planned:
-    """``result`` : of the poses taken; ``poses`` : those to take; ``joints`` : (k,) values of each by its column, deg
-    or mm, with a robot file; ``notes`` : on them."""
+    """``result`` : from the poses taken; ``poses`` : poses to take; ``joints`` : joint values (k,) of these by column,
+    deg or mm, with a robot file; ``notes`` : on the poses."""
 
     result: HandEye
     poses: NextPoses
@@ -42,11 +42,11 @@ def plan_next(given: HandEyeInput, setup: Setup, count: int = 3, robot: Robot | 
     setup : {"eye-in-hand", "eye-to-hand"}
         What carries the camera.
     count : int
-        Poses wanted.
+        Number of poses to plan.
     robot : Robot, optional
-        Within whose joint limits they are to be, from its own base to its flange, no tool.
+        Robot within whose joint limits the poses are to be, from its own base to its flange, no tool.
     seed : int
-        Of the candidates.
+        Seed of the candidates.
 
     Returns
     -------
@@ -55,9 +55,9 @@ def plan_next(given: HandEyeInput, setup: Setup, count: int = 3, robot: Robot | 
     Raises
     ------
     InputError
-        As :func:`stcal.handeye.plan_poses`, or the robot does not reach half of the poses taken.
+        For the reasons given in :func:`stcal.handeye.plan_poses`, or the robot does not reach half of the poses taken.
     DegenerateError
-        As :func:`stcal.handeye.handeye`.
+        For the reasons given in :func:`stcal.handeye.handeye`.
     """
     options = HandEyeOptions(with_scale=given.unit_mm is not None, symmetries=given.symmetries)
     result = handeye(given.pairs, setup, None, given.views, options)
@@ -73,30 +73,31 @@ def plan_next(given: HandEyeInput, setup: Setup, count: int = 3, robot: Robot | 
 
 
 def _taken(robot: Robot, given: HandEyeInput) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Joint values (n,) of the last pose taken that the robot reaches."""
+    """Returns the joint values (n,) of the last pose taken that the robot reaches, and notes on poses that it does
+    not."""
     flange = given.pairs.base_from_flange
-    found = inverse(robot, flange, _middle(robot))
-    beyond = [name for name, usable in zip(given.pairs.names, found.usable, strict=True) if not usable]
-    what = f"robot {robot.name}: reaches {len(flange) - len(beyond)} of the {len(flange)} poses taken"
+    solutions = inverse(robot, flange, _middle(robot))
+    beyond = [name for name, usable in zip(given.pairs.names, solutions.usable, strict=True) if not usable]
+    message = f"robot {robot.name}: reaches {len(flange) - len(beyond)} of the {len(flange)} poses taken"
     if len(beyond) > (1 - LEAST_REACHED) * len(flange):
         raise InputError(
             "E-PLAN-ROBOT",
-            f"{what}, first not {beyond[0]}; give the robot's own file, in whose base and flange (no tool) the "
+            f"{message}, first not {beyond[0]}; give the robot's own file, in whose base and flange (no tool) the "
             "poses are",
         )
-    notes = (f"{what}, not {', '.join(beyond)}: do its lengths and limits hold for this arm?",) if beyond else ()
-    return found.q[np.flatnonzero(found.usable)[-1]], notes
+    notes = (f"{message}, not {', '.join(beyond)}: do its lengths and limits hold for this arm?",) if beyond else ()
+    return solutions.q[np.flatnonzero(solutions.usable)[-1]], notes
 
 
 def _middle(robot: Robot) -> np.ndarray:
-    """(n,) of the limits, 0 where there are none."""
+    """Returns the middle (n,) of the joint limits, 0 where there are none."""
     middle = robot.limits().mean(1)
     return np.where(np.isfinite(middle), middle, 0.0)
 
 
 def _reach(robot: Robot, near: np.ndarray) -> Callable[[Poses], np.ndarray]:
     def reachable(flange: Poses) -> np.ndarray:
-        """Whether within the limits, and not where joints are not determined."""
+        """Returns True where a pose is within the limits and its joint values are determined."""
         return np.array([status == REACHED for status in inverse(robot, flange, near).status])
 
     return reachable

@@ -23,12 +23,12 @@ def calibrate_rig(
     validation: Splits | None = None,
     progress: Progress = lambda *_: None,
 ) -> RigOutcome:
-    """All cameras in one adjustment, each by itself, and the errors of both on poses of the robot held out.
+    """Solve all cameras in one adjustment and each by itself, and compare both on held-out poses of the robot.
 
     Raises
     ------
     StcalError
-        As :func:`stcal.handeye.handeye_rig`; what was left out before is said with it.
+        For the reasons given in :func:`stcal.handeye.handeye_rig`; the message also names what was left out before.
     """
     validation = validation or Splits()
     options = RigOptions(refine=refine, with_scale=with_scale, symmetries=given.symmetries)
@@ -36,9 +36,13 @@ def calibrate_rig(
     try:
         rig = handeye_rig(poses, setup, options)
     except StcalError as error:
-        out = [(each.name, *one) for each, own in zip(given.files.cameras, given.left_out, strict=True) for one in own]
-        if out:
-            error.append(f"; {len(out)} left out before, first {out[0][0]}: {out[0][1]}: {out[0][2]}")
+        dropped = [
+            (camera.name, *item)
+            for camera, items in zip(given.files.cameras, given.left_out, strict=True)
+            for item in items
+        ]
+        if dropped:
+            error.append(f"; {len(dropped)} left out before, first {dropped[0][0]}: {dropped[0][1]}: {dropped[0][2]}")
         raise
     poses, options = same_numbering(poses, setup, given.symmetries), replace(options, symmetries=())
     notes, held_out, factor = given.notes, None, 1.0
@@ -58,7 +62,7 @@ def calibrate_rig(
 
 def _part(given: RigInput, poses: RigPoses, rig: Rig, held_out: RigHeldOut | None, refine: bool, i: int) -> Outcome:
     camera, result = poses.cameras[i], rig.cameras[i]
-    own = all(view.covariance is not None for view in camera.views.views)
+    own_sigmas = all(view.covariance is not None for view in camera.views.views)
     errors = None if held_out is None else held_out.cameras[i].poses()
     prior = camera.prior
     return Outcome(
@@ -67,7 +71,7 @@ def _part(given: RigInput, poses: RigPoses, rig: Rig, held_out: RigHeldOut | Non
         errors,
         pitch_mm=given.pitch_mm,
         colmap_model=prior.colmap_model if refine and prior is not None else "",
-        own_sigmas=bool(own),
+        own_sigmas=bool(own_sigmas),
         left_out=given.left_out[i],
         pairs=poses.pairs(i),
         views=camera.views,

@@ -1,4 +1,4 @@
-"""What a rig is calibrated from: the images of each camera, and the robot's poses that several of them share."""
+"""Inputs of a rig calibration: the images of each camera, and the robot's poses that several cameras share."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,8 +22,8 @@ from stcal.workflows.handeye.times import Timing
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigInput:
-    """``files``; ``given``; ``symmetries`` of the board and its ``pitch_mm``; ``left_out`` : of each camera (image or
-    row, why); ``understood`` : a line on each file of poses, and on what the cameras share; ``notes``."""
+    """``files``; ``given``; ``symmetries`` of the board and its ``pitch_mm``; ``left_out`` : (image or row, why) of
+    each camera; ``understood`` : a line on each file of poses, and on the poses that cameras share; ``notes``."""
 
     files: RigFiles
     given: RigPoses
@@ -43,34 +43,36 @@ def read_rig(
     said: Said | None = None,
     tolerance_s: float = TOLERANCE_S,
 ) -> RigInput:
-    """The board in all images of all cameras, with the robot's poses.
+    """Returns the board in all images of all cameras, with the robot's poses.
 
     Raises
     ------
     InputError
-        What is wrong with a file; the message names the camera.
+        The message says what is wrong with a file, and names the camera.
     """
     design, cameras = load_boards(files.board), []
-    by_file = {each.poses: read_robot_poses(each.poses, quaternions, said) for each in files.cameras}
-    robots = [_of_camera(by_file[each.poses], each.images, files) for each in files.cameras]
-    for each, robot in zip(files.cameras, robots, strict=True):
-        named, timing = partial(_named, progress, each.name), Timing(tolerance_s, each.times)
+    by_file = {
+        camera_files.poses: read_robot_poses(camera_files.poses, quaternions, said) for camera_files in files.cameras
+    }
+    robots = [_of_camera(by_file[camera_files.poses], camera_files.images, files) for camera_files in files.cameras]
+    for camera_files, robot in zip(files.cameras, robots, strict=True):
+        named, timing = partial(_named, progress, camera_files.name), Timing(tolerance_s, camera_files.times)
         try:
-            seen = photographed(each.images, robot, each.camera, design, workers, named, timing)
+            photos = photographed(camera_files.images, robot, camera_files.camera, design, workers, named, timing)
         except InputError as error:
-            raise InputError(error.code, f"camera {each.name}: {error}") from error
-        cameras.append(seen)
-    flange, names, rows = _shared([(seen.robot, seen) for seen in cameras])
+            raise InputError(error.code, f"camera {camera_files.name}: {error}") from error
+        cameras.append(photos)
+    flange, names, rows = _shared([(photos.robot, photos) for photos in cameras])
     every = tuple(
-        RigCamera(each.name, seen.seen, own, seen.names, seen.prior)
-        for each, seen, own in zip(files.cameras, cameras, rows, strict=True)
+        RigCamera(camera_files.name, photos.seen, camera_rows, photos.names, photos.prior)
+        for camera_files, photos, camera_rows in zip(files.cameras, cameras, rows, strict=True)
     )
-    given = RigPoses(flange, every, names, files.file.name)
+    rig_poses = RigPoses(flange, every, names, files.file.name)
     understood = [f"robot: {robot.understood}" for robot in by_file.values()]
-    for each, seen in zip(files.cameras, cameras, strict=True):
-        understood += [f"{each.name}: images matched {seen.how}"] if seen.how else []
-        if seen.timed is not None:
-            understood.append(f"{each.name}: {seen.robot.understood}")
+    for camera_files, photos in zip(files.cameras, cameras, strict=True):
+        understood += [f"{camera_files.name}: images matched {photos.how}"] if photos.how else []
+        if photos.timed is not None:
+            understood.append(f"{camera_files.name}: {photos.robot.understood}")
     shared = np.bincount(np.concatenate(rows), minlength=len(names)) > 1
     if len(every) > 1:
         understood.append(f"{int(shared.sum())} of {len(names)} poses of the robot are of several cameras' images")
@@ -79,8 +81,8 @@ def read_rig(
         notes += ("no pose of the robot is of two cameras' images: they share the board alone",)
     if any(robot.covariance is not None for robot in by_file.values()):
         notes += ("covariances of the robot's poses are not used for a rig: σ of the robot are estimated",)
-    left_out = tuple(seen.left_out for seen in cameras)
-    return RigInput(files, given, cameras[0].symmetries, pitch_of(design), left_out, tuple(understood), notes)
+    left_out = tuple(photos.left_out for photos in cameras)
+    return RigInput(files, rig_poses, cameras[0].symmetries, pitch_of(design), left_out, tuple(understood), notes)
 
 
 def _named(progress: Progress, name: str, stage: str, done: int, total: int) -> None:
@@ -88,46 +90,46 @@ def _named(progress: Progress, name: str, stage: str, done: int, total: int) -> 
 
 
 def _of_camera(robot: RobotPoses, images: Path, files: RigFiles) -> RobotPoses:
-    """Rows of one camera, where a file names all cameras' images with the folders in which they lie."""
-    folders = {each.images.name for each in files.cameras}
+    """Returns the rows of one camera, where a file names the images of all cameras with their folders."""
+    folders = {camera_files.images.name for camera_files in files.cameras}
     prefixed = [image.partition("/")[0] in folders and "/" in image for image in robot.images]
     if not all(prefixed) or not prefixed:
         return robot
-    own = [i for i, image in enumerate(robot.images) if image.partition("/")[0] == images.name]
-    if not own:
+    rows = [i for i, image in enumerate(robot.images) if image.partition("/")[0] == images.name]
+    if not rows:
         raise InputError(
             "E-POSES-UNMATCHED",
             f"{robot.where}: no row is of an image in {images}: {robot.images[0]} … there; correct them",
         )
     return replace(
         robot,
-        images=tuple(robot.images[i].partition("/")[2] for i in own),
-        base_from_flange=robot.base_from_flange[own],
-        covariance=None if robot.covariance is None else robot.covariance[own],
-        places=tuple(robot.places[i] for i in own),
+        images=tuple(robot.images[i].partition("/")[2] for i in rows),
+        base_from_flange=robot.base_from_flange[rows],
+        covariance=None if robot.covariance is None else robot.covariance[rows],
+        places=tuple(robot.places[i] for i in rows),
     )
 
 
 def _shared(cameras: list[tuple[RobotPoses, Photographed]]) -> tuple[Poses, tuple[str, ...], list[np.ndarray]]:
-    """Poses of the robot that any image is of, what each is called, and those of each camera's images.
+    """Returns the poses of the robot at which any image was taken, their names, and the poses of each camera's images.
 
-    Measured values are never equal to the last digit: equal poses are one, whatever the row or the file. A camera that
-    has one pose twice says that poses are commanded ones: then a row of a file is a pose.
+    Measured values are never equal to the last digit, so equal poses are one pose, whatever the row or the file. If one
+    camera has a pose twice, the poses are commanded ones, and each row of a file counts as a pose of its own.
     """
     keys = []
-    for _, seen in cameras:
-        taken = seen.base_from_flange[seen.rows]
+    for _, photos in cameras:
+        taken = photos.base_from_flange[photos.rows]
         both = zip(taken.rotation, taken.translation, strict=True)
         keys.append([turn.tobytes() + place.tobytes() for turn, place in both])
-    if any(len(set(own)) < len(own) for own in keys):
-        keys = [[f"{robot.where}: {robot.places[r]}".encode() for r in seen.rows] for robot, seen in cameras]
+    if any(len(set(camera_keys)) < len(camera_keys) for camera_keys in keys):
+        keys = [[f"{robot.where}: {robot.places[r]}".encode() for r in photos.rows] for robot, photos in cameras]
     number: dict[bytes, int] = {}
     flange, names, rows = [], [], []
-    for (robot, seen), own in zip(cameras, keys, strict=True):
-        for name, row, key in zip(seen.names, seen.rows, own, strict=True):
+    for (robot, photos), camera_keys in zip(cameras, keys, strict=True):
+        for name, row, key in zip(photos.names, photos.rows, camera_keys, strict=True):
             if key not in number:
                 number[key] = len(number)
-                flange.append(seen.base_from_flange[int(row)])
+                flange.append(photos.base_from_flange[int(row)])
                 names.append(robot.images[row] if robot.images else name)
-        rows.append(np.array([number[key] for key in own]))
+        rows.append(np.array([number[key] for key in camera_keys]))
     return Poses.of(flange), tuple(names), rows

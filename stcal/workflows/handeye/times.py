@@ -1,4 +1,4 @@
-"""The robot's poses at the times of images, and the offset between the clocks of both."""
+"""The robot's poses at the times of images, and the options of the offset between the clocks of both."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ from stcal.io.table import read_table
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """``tolerance_s`` : within which the nearest sample stands for a pose that cannot be interpolated;
-    ``image_times`` : file with ``image`` and ``time_s``, where names of images are no times; ``offset`` : whether
-    the clocks' offset is wanted."""
+    """``tolerance_s`` : within which the nearest sample replaces a pose that cannot be interpolated; ``image_times`` :
+    file with ``image`` and ``time_s``, where names of images are not times; ``offset`` : whether the clocks' offset is
+    estimated."""
 
     tolerance_s: float = TOLERANCE_S
     image_times: Path | None = None
@@ -26,8 +26,8 @@ class Timing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AtImages:
-    """``robot`` : its poses by image, as they were where no times were needed; ``left_out`` : (image, why); ``timed`` :
-    stream and the time of each image that is left, by name."""
+    """``robot`` : its poses by image, unchanged where no times were needed; ``left_out`` : (image, why); ``stream``,
+    ``seconds`` : the stream and the time of each remaining image, by name."""
 
     robot: RobotPoses
     left_out: tuple[tuple[str, str], ...] = ()
@@ -35,20 +35,21 @@ class AtImages:
     seconds: dict[str, float] | None = None
 
     def timed(self, names: Sequence[str]) -> Timed | None:
-        """Of these images."""
+        """Returns the stream and the times of these images; None where no times were needed."""
         if self.stream is None or self.seconds is None:
             return None
         return Timed(self.stream, np.array([self.seconds[name] for name in names]))
 
 
 def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | None) -> AtImages:
-    """Poses of the robot at the times of images, where both have times that are not the same; never where ``timing`` is
-    None, as of joint values, which belong to images by name.
+    """Returns poses of the robot at the times of images, where both have times that are not the same.
+
+    Poses stay as they are where ``timing`` is None, since joint values belong to images by name.
 
     Raises
     ------
     InputError
-        No times where an option needs them, or no image within the stream.
+        There are no times where an option needs them, or no image lies within the stream.
     """
     if timing is None:
         return AtImages(robot)
@@ -58,7 +59,7 @@ def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | No
         if timing.offset or timing.image_times or robot.timed:
             _require_times(robot, images, samples, names)
         return AtImages(robot)
-    if not robot.timed and any(stem_of(name) != name for name in robot.images):  # of images by their names
+    if not robot.timed and any(stem_of(name) != name for name in robot.images):  # poses of images by their names
         return AtImages(robot)
     if not timing.offset and all(time in samples for time in images.values()):
         rows = {name: samples.index(time) for name, time in images.items()}
@@ -70,25 +71,25 @@ def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | No
     taken = taken_at(stream, seconds, timing.tolerance_s)
     if not taken.kept.any():
         raise InputError("E-POSES-UNMATCHED", f"{robot.where}: no image has a pose: {known[0]}: {taken.why[0]}")
-    kept = [known[i] for i in np.flatnonzero(taken.kept)]
-    more = "" if robot.covariance is None else "; its covariances are of other times and not used"
-    found = replace(
+    names_kept = [known[i] for i in np.flatnonzero(taken.kept)]
+    note = "" if robot.covariance is None else "; its covariances are of other times and not used"
+    robot_then = replace(
         robot,
-        images=tuple(kept),
+        images=tuple(names_kept),
         base_from_flange=taken.base_from_flange,
         covariance=None,
-        places=tuple(f"time of {name}" for name in kept),
-        understood=f"{robot.understood}{more}; {taken.said}",
+        places=tuple(f"time of {name}" for name in names_kept),
+        understood=f"{robot.understood}{note}; {taken.said}",
         own=False,
         timed=False,
     )
     left_out = [(name, why) for name, why in zip(known, taken.why, strict=True) if why]
     left_out += [(name, f"no time in {timing.image_times}") for name in names if name not in images]
-    return AtImages(found, tuple(left_out), stream, dict(zip(known, seconds.tolist(), strict=True)))
+    return AtImages(robot_then, tuple(left_out), stream, dict(zip(known, seconds.tolist(), strict=True)))
 
 
 def _of_rows(robot: RobotPoses, rows: dict[str, int]) -> RobotPoses:
-    """Times that are those of samples: rows by image, of which others are no mistake."""
+    """Returns the poses whose times are those of images: ``rows`` by image. Rows without an image are no mistake."""
     at = list(rows.values())
     return replace(
         robot,
@@ -103,7 +104,7 @@ def _of_rows(robot: RobotPoses, rows: dict[str, int]) -> RobotPoses:
 
 
 def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal] | None:
-    """By image, as the file of times says, or as the names are."""
+    """Returns times by image, as the file of times states them, or as the names state them."""
     if timing.image_times is None:
         times = stamps_of(names)
         return None if times is None else dict(zip(names, times, strict=True))
@@ -111,10 +112,10 @@ def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal]
     stated = dict(zip(table.text("image"), table.text("time_s"), strict=True))
     if len(stated) < len(table):
         raise InputError("E-TABLE-ROW-REPEATED", f"{table.where}: an image in two rows; one each needed")
-    found = {}
+    time_of_image = {}
     for name in names:
-        alone = name.rsplit("/", 1)[-1]
-        text = next((stated[key] for key in (name, alone, alone.rsplit(".", 1)[0]) if key in stated), None)
+        file_name = name.rsplit("/", 1)[-1]
+        text = next((stated[key] for key in (name, file_name, file_name.rsplit(".", 1)[0]) if key in stated), None)
         if text is None:
             continue
         time = time_of(text)
@@ -122,17 +123,17 @@ def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal]
             raise InputError(
                 "E-TABLE-NUMBER", f"{table.where}: time_s of {name} is {text!r}, a number of seconds needed"
             )
-        found[name] = time
-    if not found:
+        time_of_image[name] = time
+    if not time_of_image:
         raise InputError(
             "E-POSES-UNMATCHED",
             f"{table.where}: no row is of an image: {next(iter(stated))} … there, {names[0]} … here",
         )
-    return found
+    return time_of_image
 
 
 def _require_times(robot: RobotPoses, images: dict[str, Decimal] | None, samples: object, names: Sequence[str]) -> None:
-    """Say which side has none."""
+    """Raise an error that says which side has no times."""
     if images is None:
         raise InputError(
             "E-IMAGE-NAME-TIME",

@@ -1,1 +1,2 @@
-"""Poses as other programs write them, each file told by its content: read :mod:`.tell` first."""
+"""Readers of poses as other programs write them; the format of each file is recognised from its content. Read
+:mod:`.tell` first."""

@@ -1,4 +1,4 @@
-"""NumPy's files npy and npz, without anything that could be code."""
+"""Readers of NumPy's files npy and npz that never execute code from the file."""
 
 import io
 import tokenize
@@ -12,18 +12,18 @@ from stcal.errors import InputError
 from stcal.io.files import MB, TABLE_BYTES
 
 NPY, NPZ = b"\x93NUMPY", b"PK\x03\x04"
-"""With which the files begin."""
+"""First bytes of the files."""
 DAMAGED = (ValueError, TypeError, EOFError, OSError, MemoryError, OverflowError, SyntaxError, tokenize.TokenError)
-"""What NumPy raises of files that are not whole; their heads are literals of Python."""
+"""Errors that NumPy raises for damaged files, whose heads are literals of Python."""
 
 
 def load_npy(data: bytes, where: str) -> np.ndarray:
-    """The array of an npy file.
+    """Returns the array of an npy file.
 
     Raises
     ------
     InputError
-        Damaged, or of objects, which only a program could load.
+        The file is damaged, or holds objects, which only a program could load.
     """
     stream = io.BytesIO(data)
     try:
@@ -36,10 +36,10 @@ def load_npy(data: bytes, where: str) -> np.ndarray:
         raise InputError(
             "E-NUMPY-CONTENT", f"{where}: an array of {kind}, numbers needed; save it with np.save of a float array"
         )
-    left, needed = len(data) - stream.tell(), int(np.prod([int(n) for n in shape], dtype=object)) * kind.itemsize
-    if left != needed:
+    available, needed = len(data) - stream.tell(), int(np.prod([int(n) for n in shape], dtype=object)) * kind.itemsize
+    if available != needed:
         raise InputError(
-            "E-NUMPY-UNREADABLE", f"{where}: {left} bytes of numbers, {needed} needed by its head; save it again"
+            "E-NUMPY-UNREADABLE", f"{where}: {available} bytes of numbers, {needed} needed by its head; save it again"
         )
     if not shape or not needed:
         raise InputError("E-NUMPY-CONTENT", f"{where}: an array of shape {shape}; poses needed")
@@ -50,38 +50,38 @@ def load_npy(data: bytes, where: str) -> np.ndarray:
 
 
 def load_npz(data: bytes, where: str) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """The arrays of an npz file by name, and the names of those that are not numbers.
+    """Returns the arrays of an npz file by name, and the names of those that are not numbers.
 
     Raises
     ------
     InputError
-        Damaged, or larger than any such file is when unpacked.
+        The file is damaged, or larger than any such file is when unpacked.
     """
-    found, other = {}, []
+    arrays, others = {}, []
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = [each for each in archive.infolist() if each.filename.endswith(".npy")]
-            size = sum(each.file_size for each in members)
+            members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
+            size = sum(member.file_size for member in members)
             if size > TABLE_BYTES:
                 raise InputError(
                     "E-FILE-TOO-LARGE", f"{where}: {size / MB:.0f} MB unpacked, at most {TABLE_BYTES // MB} MB are read"
                 )
-            for each in members:
-                with archive.open(each) as stream:
+            for member in members:
+                with archive.open(member) as stream:
                     content = stream.read(TABLE_BYTES + 1)
-                name = each.filename.removesuffix(".npy")
+                name = member.filename.removesuffix(".npy")
                 if _is_text(content):
-                    found[name] = _texts(content)
+                    arrays[name] = _texts(content)
                     continue
                 try:
-                    found[name] = load_npy(content, f"{where}: {name}")
+                    arrays[name] = load_npy(content, f"{where}: {name}")
                 except InputError:
-                    other.append(name)
+                    others.append(name)
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, *DAMAGED) as error:
         raise _damaged(where, error) from error
-    if not found:
+    if not arrays:
         raise InputError("E-NUMPY-CONTENT", f"{where}: no arrays of numbers; save it with np.savez")
-    return found, tuple(other)
+    return arrays, tuple(others)
 
 
 def _is_text(content: bytes) -> bool:
@@ -89,9 +89,9 @@ def _is_text(content: bytes) -> bool:
 
 
 def _texts(content: bytes) -> list[str]:
-    """Names of images, mostly."""
+    """Returns the strings of an array, which are mostly names of images."""
     try:
-        return [str(each) for each in np.load(io.BytesIO(content), allow_pickle=False).ravel()]
+        return [str(text) for text in np.load(io.BytesIO(content), allow_pickle=False).ravel()]
     except MemoryError as error:
         raise ValueError("a head that is larger than its file") from error
 

@@ -19,12 +19,12 @@ FORM = "COLMAP model"
 
 
 def model_file(folder: Path) -> Path | None:
-    """The file of the images in a folder that is a model, None of other folders."""
+    """Returns the file of the images in a folder that is a model; None for other folders."""
     return next((folder / name for name in (TEXT, BINARY) if (folder / name).is_file()), None)
 
 
 def is_text(text: str) -> bool:
-    """Whether these are the lines of images.txt."""
+    """True if these are the lines of images.txt."""
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if not _IMAGE.fullmatch(first.strip()) or _floats(first.split()) is not None:
         return False
@@ -32,12 +32,12 @@ def is_text(text: str) -> bool:
 
 
 def read_text(text: str, where: str) -> Content:
-    """Of images.txt: two lines for each image, the second of its points.
+    """Returns the poses in images.txt, which has two lines for each image; the second holds its points.
 
     Raises
     ------
     InputError
-        A line that is not as it should be.
+        A line does not have the form of the format.
     """
     rows, names, places, expected = [], [], [], True
     for i, line in enumerate(text.splitlines(), 1):
@@ -59,12 +59,12 @@ def read_text(text: str, where: str) -> Content:
 
 
 def read_binary(path: Path, where: str) -> Content:
-    """Of images.bin.
+    """Returns the poses in images.bin.
 
     Raises
     ------
     InputError
-        It ends too early, or goes on.
+        The file ends too early, or has bytes after its end.
     """
     try:
         data = read_bytes(path, MODEL_BYTES)

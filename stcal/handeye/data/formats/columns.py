@@ -1,4 +1,4 @@
-"""CSV files with columns of other programs: Euler angles, rotation vectors, exports of ROS bags."""
+"""Reader of CSV files with columns of other programs: Euler angles, rotation vectors, exports of ROS bags."""
 
 import csv
 import re
@@ -36,18 +36,19 @@ _STAMP = (("secs", "nsecs"), ("sec", "nanosec"))
 
 
 def todays(table: Table) -> bool:
-    """Whether the columns are those of the package's own tables, a place with its unit and a quaternion."""
+    """True if the columns are those of the package's own tables: a place with its unit, and a quaternion."""
     prefixes = ("", *(f"{name}_" for name in EVERY_FRAME))
-    return any(table.has(f"{each}x", LENGTHS) and f"{each}qw" in table for each in prefixes)
+    return any(table.has(f"{prefix}x", LENGTHS) and f"{prefix}qw" in table for prefix in prefixes)
 
 
 def read_columns(table: Table, text: str, key: str, said: Said) -> Content | None:
-    """What is told of a table by its columns; None where no poses are in it.
+    """Returns the poses in the columns of a table; None where it has none.
 
     Raises
     ------
     InputError
-        Some columns of a pose only, no rotations, several topics in one file, or a convention that must be said.
+        Some columns of a pose are missing, rotations are missing, one file holds several topics, or the convention must
+        be stated.
     """
     messages = _messages(table)
     if messages:
@@ -73,7 +74,8 @@ def read_columns(table: Table, text: str, key: str, said: Said) -> Content | Non
 
 
 def _row_names(table: Table, text: str, key: str) -> tuple[str, ...]:
-    """Image or time of each row as it is written, for nanoseconds have more digits than a float; or none."""
+    """Returns the image or time of each row as text, since nanoseconds have more digits than a float; empty where no
+    column names the rows."""
     column = next((name for name in (key, *NAMES) if name in table), None)
     if column is None:
         lower = {name.lower(): name for name in table.columns}
@@ -81,10 +83,10 @@ def _row_names(table: Table, text: str, key: str) -> tuple[str, ...]:
     if column is not None:
         return _cells(text, column, table)
     for prefix in ("field.header.stamp.", "header.stamp.", "stamp."):
-        for seconds, rest in _STAMP:
-            if f"{prefix}{seconds}" in table and f"{prefix}{rest}" in table:
-                whole, part = (_cells(text, f"{prefix}{each}", table) for each in (seconds, rest))
-                return tuple(f"{s}.{n.zfill(9)}" for s, n in zip(whole, part, strict=True))
+        for seconds, fractions in _STAMP:
+            if f"{prefix}{seconds}" in table and f"{prefix}{fractions}" in table:
+                whole, nanoseconds = (_cells(text, f"{prefix}{field}", table) for field in (seconds, fractions))
+                return tuple(f"{s}.{n.zfill(9)}" for s, n in zip(whole, nanoseconds, strict=True))
     return ()
 
 
@@ -92,14 +94,14 @@ def _cells(text: str, column: str, table: Table) -> tuple[str, ...]:
     rows = [row for row in text.splitlines() if row.strip() and not row.lstrip().startswith("#")]
     cells = list(csv.reader(rows))
     at = [name.strip() for name in cells[0]].index(column)
-    found = tuple(row[at].strip() for row in cells[1:])
-    require_each_once(found, places_of(table), table.where)
-    return found
+    values = tuple(row[at].strip() for row in cells[1:])
+    require_each_once(values, places_of(table), table.where)
+    return values
 
 
 @dataclass(frozen=True, slots=True)
 class _Message:
-    """``of`` : its topic or field; ``place``, ``turn`` : its columns, x, y, z and w, x, y, z."""
+    """``of`` : topic or field of the message; ``place``, ``turn`` : its columns, x, y, z and w, x, y, z."""
 
     of: str
     place: tuple[str, ...]
@@ -107,8 +109,9 @@ class _Message:
 
 
 def _messages(table: Table) -> list[_Message]:
-    """Poses and transforms of ROS among the columns, as ``rostopic echo -p``, PlotJuggler and pandas name them."""
-    found = []
+    """Returns the poses and transforms of ROS among the columns, as ``rostopic echo -p``, PlotJuggler and pandas name
+    them."""
+    messages = []
     for column in table.columns:
         match = _MESSAGE.fullmatch(column)
         if not match:
@@ -125,41 +128,41 @@ def _messages(table: Table) -> list[_Message]:
                     raise InputError(
                         "E-TABLE-COLUMN-MISSING", f"{table.where}: {column} without {missing[0]}; export the whole pose"
                     )
-                found.append(_Message(match["of"], place, turned))
-    return found
+                messages.append(_Message(match["of"], place, turned))
+    return messages
 
 
 def _of_messages(table: Table, messages: Sequence[_Message], names: tuple[str, ...]) -> Content:
     sides = []
-    for each in messages:
+    for message in messages:
         role: Role | None = None
         if len(messages) > 1:
-            said_by: list[Role | None] = [role_of(word) for word in re.split(r"[./]+", each.of) if word]
-            role = next((found for found in said_by if found is not None), None)
-        frames = Frames(FRAMES[role][0], f"by the topic {each.of}", False) if role else None
+            said_by: list[Role | None] = [role_of(word) for word in re.split(r"[./]+", message.of) if word]
+            role = next((named_role for named_role in said_by if named_role is not None), None)
+        frames = Frames(FRAMES[role][0], f"by the topic {message.of}", False) if role else None
         places = places_of(table)
-        rotation = of_quaternions(np.column_stack([table.numbers(c) for c in each.turn]), places, table.where)
-        at = np.column_stack([table.numbers(c) for c in each.place])
+        rotation = of_quaternions(np.column_stack([table.numbers(c) for c in message.turn]), places, table.where)
+        at = np.column_stack([table.numbers(c) for c in message.place])
         sides.append(Side(rotation, at, places, "quaternions x, y, z, w by name", ROS, frames, names))
     roles = [side.frames.role if side.frames else None for side in sides]
     if len(sides) > 1 and (None in roles or len(set(roles)) < len(roles)):
-        topics = ", ".join(each.of for each in messages)
+        topics = ", ".join(message.of for message in messages)
         raise InputError(
             "E-POSES-MIXED",
             f"{table.where}: poses of {len(messages)} topics, {topics}; export the robot's and the camera's each to a "
             "file of its own, and give --a and --b",
         )
     for column in ("field.header.frame_id", "header.frame_id", "field.child_frame_id", "child_frame_id"):
-        if column in table and len(found := sorted(set(table.text(column)))) > 1:
+        if column in table and len(named_role := sorted(set(table.text(column)))) > 1:
             raise InputError(
                 "E-POSES-MIXED",
-                f"{table.where}: {column} is {', '.join(found[:3])}; export the rows of one of them alone",
+                f"{table.where}: {column} is {', '.join(named_role[:3])}; export the rows of one of them alone",
             )
     return Content("ROS bag export", tuple(sides))
 
 
 def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ...], said: Said) -> Side | None:
-    """Poses of the columns that begin with a prefix; None where it has no place or no rotation."""
+    """Returns the poses in the columns that begin with a prefix; None where place or rotation is missing."""
     place = _place(table, prefix)
     if place is None:
         return None
@@ -175,16 +178,17 @@ def _place(table: Table, prefix: str) -> tuple[np.ndarray, Unit | None] | None:
     for form in ("{}", "t{}", "p{}", "pos_{}", "{}_pos"):
         for unit in LENGTHS:
             columns = [find_column(table, prefix, f"{form.format(axis)}_{unit}") for axis in "xyz"]
-            found = [column for column in columns if column is not None]
-            if len(found) == len("xyz"):
-                values = np.column_stack([table.numbers(column) for column in found])
+            present = [column for column in columns if column is not None]
+            if len(present) == len("xyz"):
+                values = np.column_stack([table.numbers(column) for column in present])
                 return values, Unit(unit, "by the columns", True)
-            if found and form == "{}":
+            if present and form == "{}":
                 raise InputError(
-                    "E-TABLE-COLUMN-MISSING", f"{table.where}: {', '.join(found)} alone; x, y and z in one unit needed"
+                    "E-TABLE-COLUMN-MISSING",
+                    f"{table.where}: {', '.join(present)} alone; x, y and z in one unit needed",
                 )
         columns = [find_column(table, prefix, form.format(axis)) for axis in "xyz"]
-        found = [column for column in columns if column is not None]
-        if len(found) == len("xyz"):
-            return np.column_stack([table.numbers(column) for column in found]), None
+        present = [column for column in columns if column is not None]
+        if len(present) == len("xyz"):
+            return np.column_stack([table.numbers(column) for column in present]), None
     return None

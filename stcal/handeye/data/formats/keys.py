@@ -1,4 +1,4 @@
-"""Names under which programs keep poses, and which transform each name means."""
+"""Names under which programs keep poses, and the transform that each name means."""
 
 import re
 
@@ -10,7 +10,7 @@ _WORDS = {
     "camera": "camera|cam|sensor|optical",
     "board": "board|target|marker|tag|object|pattern|checkerboard|chessboard|charuco|aruco",
 }
-"""Frames by the words that name them."""
+"""Words that name each frame."""
 _ANY = "|".join(f"(?P<{{0}}_{frame}>{words})" for frame, words in _WORDS.items())
 _LEFT, _RIGHT = _ANY.replace("{0}", "a"), _ANY.replace("{0}", "b")
 _FORMS = (
@@ -20,28 +20,29 @@ _FORMS = (
     (re.compile(rf"(?:{_LEFT})_?t_?(?:{_RIGHT})"), "ab", False),
     (re.compile(rf"t_(?:{_LEFT})_(?:{_RIGHT})"), "ab", False),
 )
-"""Names of transforms; which of the two frames is the first of ``a_from_b``; whether there is no other reading."""
+"""Forms of names of transforms; which of the two frames is the first of ``a_from_b``; and whether no other reading is
+possible."""
 _PART = re.compile(r"(?:rot|trans|rotation|translation|rvecs?|tvecs?|[rth])_(?=[a-z_]+2)")
-"""Of rotation, translation or the whole matrix, before a name like OpenCV's gripper2base."""
+"""Prefix for rotation, translation or the whole matrix, before a name like OpenCV's gripper2base."""
 ROLES_BY_NAME: dict[Role, re.Pattern] = {
     "robot": re.compile(r"(robot|arm|hand|gripper|flange|eef?|end_?effector|tcp)(_?(pose|transform|matri(x|ce))s?)?"),
     "camera": re.compile(
         r"(tracking|optical|camera|cam|board|target|marker|tag|object|pattern)(_?(pose|transform|matri(x|ce))s?)?"
     ),
 }
-"""Names that tell whose poses they are, but not in which direction."""
+"""Names that tell whether poses are the robot's or the camera's, but not in which direction."""
 
 
 def frames_of(key: str) -> Frames | None:
-    """The transform that a name means, None where it means none."""
+    """Returns the transform that a name means; None where it means none."""
     name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
     if name in EVERY_FRAME:
         return Frames(name, f"by its name {key}")
     bare = _PART.sub("", name, count=1) if _PART.match(name) else name
     for form, order, only in _FORMS:
-        found = form.fullmatch(bare)
-        if found:
-            sides = {part[0]: part[2:] for part, text in found.groupdict().items() if text is not None}
+        match = form.fullmatch(bare)
+        if match:
+            sides = {part[0]: part[2:] for part, text in match.groupdict().items() if text is not None}
             frames = f"{sides[order[0]]}_from_{sides[order[1]]}"
             if frames in EVERY_FRAME:
                 return Frames(frames, f"by its name {key}", only)
@@ -49,6 +50,6 @@ def frames_of(key: str) -> Frames | None:
 
 
 def role_of(key: str) -> Role | None:
-    """Whose poses a name says they are, where no direction is in it."""
+    """Returns the side whose poses a name means, where the name has no direction."""
     name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
     return next((role for role, form in ROLES_BY_NAME.items() if form.fullmatch(name)), None)

@@ -1,4 +1,4 @@
-"""Lines of numbers: 4×4 matrices, TUM's trajectories, rows of place and rotation."""
+"""Reader of lines of numbers: 4×4 matrices, TUM's trajectories, rows of place and rotation."""
 
 import re
 from collections import Counter
@@ -14,12 +14,13 @@ _SEPARATORS = re.compile(r"[\s,;]+")
 _BRACKETS = str.maketrans("[]()", "    ")
 _QUATERNION = re.compile(r"(?<![a-z])q[a-z_]*?([wxyz])\b")
 TUM, MATRIX = 8, 16
-"""Numbers of a line that holds a whole pose."""
+"""Numbers in a line that holds a whole pose."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """``number`` in the file, ``label`` before the numbers, which stand as text too."""
+    """``number`` of the line in the file; ``label`` before the numbers; ``values``; ``first`` : first number as
+    text."""
 
     number: int
     label: str
@@ -28,12 +29,12 @@ class Line:
 
 
 def read_numbers(text: str, said: Said, where: str) -> Content | None:
-    """What is told of lines of numbers, each line with a name before them or none; None where there are others.
+    """Returns the poses in lines of numbers, each with or without a name before them; None for any other text.
 
     Raises
     ------
     InputError
-        Lines of unequal length, 3×4 matrices, no rotations, or a convention that must be said.
+        Lines of unequal length, 3×4 matrices, no rotations, or a convention that must be stated.
     """
     lines, comments = [], []
     for i, raw in enumerate(text.splitlines(), 1):
@@ -80,8 +81,8 @@ def read_numbers(text: str, said: Said, where: str) -> Content | None:
 
 
 def _line(number: int, text: str) -> Line | None:
-    """A line of numbers, one that is a name alone, or a name and numbers; None of all else."""
-    robot = re.fullmatch(r"p?\s*\[(.*)\]", text)  # of UR: p[x, y, z, rx, ry, rz]
+    """Returns a line of numbers, a name alone, or a name and numbers; None for any other text."""
+    robot = re.fullmatch(r"p?\s*\[(.*)\]", text)  # as UR writes poses: p[x, y, z, rx, ry, rz]
     tokens = [t for t in _SEPARATORS.split((robot[1] if robot else text).translate(_BRACKETS)) if t]
     if not tokens:
         return Line(number, "", [], "")
@@ -89,10 +90,10 @@ def _line(number: int, text: str) -> Line | None:
     label = ""
     if values[0] is None:
         label, values = tokens[0], values[1:]
-        if label.endswith(":") or label == "-" or not (values or "." in label):  # of YAML, or a word
+        if label.endswith(":") or label == "-" or not (values or "." in label):  # a line of YAML, or a word
             return None
-    kept = [value for value in values if value is not None]
-    return Line(number, label, kept, tokens[0]) if len(kept) == len(values) else None
+    numbers = [value for value in values if value is not None]
+    return Line(number, label, numbers, tokens[0]) if len(numbers) == len(values) else None
 
 
 def _number(token: str) -> float | None:
@@ -103,7 +104,7 @@ def _number(token: str) -> float | None:
 
 
 def _blocks(lines: list[Line], where: str) -> Content | None:
-    """Matrices of four lines each, a name before each or none."""
+    """Returns matrices of four lines each, with or without a name before each."""
     names, rows, starts = [], [], []
     for line in lines:
         if line.label:
@@ -132,13 +133,14 @@ def _blocks(lines: list[Line], where: str) -> Content | None:
 
 
 def _tum(values: np.ndarray, lines: list[Line], places: tuple[str, ...], comments: list[str], where: str) -> Content:
-    """timestamp tx ty tz qx qy qz qw; another order of the quaternion where a comment states it, as EuRoC does."""
-    order = next((found for c in comments if len(found := _QUATERNION.findall(c.lower())) == 4), list("xyzw"))
+    """Returns poses from lines of timestamp tx ty tz qx qy qz qw. A comment may state another order of the quaternion,
+    as in EuRoC."""
+    order = next((letters for c in comments if len(letters := _QUATERNION.findall(c.lower())) == 4), list("xyzw"))
     if sorted(order) != sorted("wxyz"):
         order = list("xyzw")
     names = tuple(line.first for line in lines)
     require_each_once(names, places, where)
-    wxyz = values[:, 4:][:, [order.index(each) for each in "wxyz"]]
+    wxyz = values[:, 4:][:, [order.index(component) for component in "wxyz"]]
     rotation = of_quaternions(wxyz, places, where)
     turned = f"quaternions {', '.join(order)}"
     side = Side(rotation, values[:, 1:4], places, turned, Unit("m", "as in TUM"), names=names, trajectory=True)

@@ -1,4 +1,4 @@
-"""What a file of poses holds, as it stands there; and what the user says where the file cannot."""
+"""The content of a file of poses, and what the user states where the file does not."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,15 +17,15 @@ FRAMES: dict[Role, tuple[str, str]] = {
     "robot": ("base_from_flange", "flange_from_base"),
     "camera": ("camera_from_board", "board_from_camera"),
 }
-"""What is wanted of each side, and its inverse."""
+"""The transform that is needed for each side, and its inverse."""
 EVERY_FRAME = tuple(name for names in FRAMES.values() for name in names)
 MATRICES = "4×4 matrices"
 
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """``name`` : one of :data:`FRAMES`; ``by`` : how it is known, in words; ``stated`` : by the file itself, so that an
-    option cannot say otherwise."""
+    """``name`` : one of :data:`FRAMES`; ``by`` : how it is known, in words; ``stated`` : whether the file itself states
+    it, so that an option cannot contradict it."""
 
     name: str
     by: str
@@ -38,7 +38,7 @@ class Frames:
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """Of lengths: ``name`` as in :data:`stcal.io.table.LENGTHS`; ``by``, ``stated`` as of :class:`Frames`."""
+    """Unit of length: ``name`` as in :data:`stcal.io.table.LENGTHS`; ``by``, ``stated`` as in :class:`Frames`."""
 
     name: str
     by: str
@@ -52,21 +52,21 @@ class Side:
     Parameters
     ----------
     rotation, translation : (m, 3, 3), (m, 3) arrays
-        Of each; lengths in ``unit``.
+        Rotation and translation of each pose; lengths in ``unit``.
     places : tuple of str
-        Where each stands in its file: ``line 7``.
+        Place of each pose in its file: ``line 7``.
     turned : str
         How rotations are written, in words.
     unit, frames
         None where the file does not say.
     names : tuple of str
-        Image or timestamp of each, where there are such.
+        Image or timestamp of each pose; empty where there are none.
     trajectory : bool
-        Whether poses are those of what moves, in a world, as in files of trajectories.
+        Whether poses are those of a moving body in a world, as in files of trajectories.
     scaled : bool
-        Whether the lengths have no unit at all, like those of a model of COLMAP.
+        Whether the lengths have no unit at all, like those of a COLMAP model.
     covariance : (m, 6, 6) array, optional
-        mm and rad, of what ``frames`` says.
+        Covariances of the transforms of ``frames``, mm and rad.
     """
 
     rotation: np.ndarray
@@ -91,8 +91,8 @@ class Side:
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """``form`` : of the file, in words; ``sides`` : one that is not told apart, or one of each role; ``setup`` : where
-    the file says so; ``passed_over`` : what else stands in it."""
+    """``form`` : of the file, in words; ``sides`` : one side whose role is not known, or one side of each role;
+    ``setup`` : where the file states it; ``passed_over`` : other content of the file that is not used."""
 
     form: str
     sides: tuple[Side, ...]
@@ -100,21 +100,21 @@ class Content:
     passed_over: tuple[str, ...] = ()
 
     def of(self, role: Role) -> Side | None:
-        """The side that is said to be of this role."""
-        return next((each for each in self.sides if each.frames is not None and each.frames.role == role), None)
+        """Returns the side that is stated to be of this role."""
+        return next((side for side in self.sides if side.frames is not None and side.frames.role == role), None)
 
     @property
     def both(self) -> bool:
-        """Whether these are pose pairs."""
+        """True if these are pose pairs."""
         return len(self.sides) == len(ROLES)
 
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What the user says of files that do not say it themselves.
+    """The user's statements about files that do not state these themselves.
 
     ``rotation`` : a name of :data:`stcal.io.poses.rotations.ALIASES` or an order of axes; ``length_unit`` : one of
-    :data:`stcal.io.table.LENGTHS`; ``frames`` : names of :data:`EVERY_FRAME`, at most one of each role; ``setup`` ;
+    :data:`stcal.io.table.LENGTHS`; ``frames`` : names of :data:`EVERY_FRAME`, at most one of each role; ``setup``;
     ``own`` : rotation and unit of one role's poses, where they differ.
     """
 
@@ -128,20 +128,20 @@ class Said:
     def of_options(
         cls, rotation: Sequence[str], length_unit: Sequence[str], frames: Sequence[str], setup: str | None = None
     ) -> "Said":
-        """Of the values of ``--rotation``, ``--length-unit``, each for all poses or as ``robot=`` and ``camera=``, and
-        ``--poses-are``.
+        """Returns the statements in the values of ``--rotation`` and ``--length-unit``, each for all poses or as
+        ``robot=`` and ``camera=``, and of ``--poses-are``.
 
         Raises
         ------
         InputError
-            A name that is none, or two of the same.
+            A name is not known, or is given twice.
         """
         whole: dict[str, str] = {}
-        own: list[tuple[Role, str, str]] = []
+        by_role: list[tuple[Role, str, str]] = []
         for option, values in (("rotation", rotation), ("length_unit", length_unit)):
             for value in values:
                 role, equals, name = value.partition("=")
-                given = [each for each in own if each[:2] == (role, option)] if equals else option in whole
+                given = [entry for entry in by_role if entry[:2] == (role, option)] if equals else option in whole
                 if given:
                     raise InputError(
                         "E-OPTION-REPEATED",
@@ -150,26 +150,26 @@ class Said:
                 if not equals:
                     whole[option] = role
                 elif role in ROLES:
-                    own.append(("robot" if role == "robot" else "camera", option, name))
+                    by_role.append(("robot" if role == "robot" else "camera", option, name))
                 else:
                     raise InputError(
                         "E-OPTION-VALUE",
                         f"--{option.replace('_', '-')} {value}: robot= or camera= needed before the name",
                     )
-        return cls(whole.get("rotation"), whole.get("length_unit"), tuple(frames), setup, tuple(own))
+        return cls(whole.get("rotation"), whole.get("length_unit"), tuple(frames), setup, tuple(by_role))
 
     def of(self, role: Role) -> "Said":
-        """What holds for poses of this role."""
-        own = {name: value for each, name, value in self.own if each == role}
+        """Returns the statements that hold for poses of this role."""
+        values = {name: value for entry_role, name, value in self.own if entry_role == role}
         return Said(
-            own.get("rotation", self.rotation), own.get("length_unit", self.length_unit), self.frames, self.setup
+            values.get("rotation", self.rotation), values.get("length_unit", self.length_unit), self.frames, self.setup
         )
 
     def options(self) -> list[str]:
-        """Names of those given."""
+        """Returns the names of the options that were given."""
         every = {"--rotation": self.rotation, "--length-unit": self.length_unit, "--poses-are": self.frames}
-        own = {f"--{name.replace('_', '-')}" for _, name, _ in self.own}
-        return [name for name, value in every.items() if value or name in own]
+        of_one_role = {f"--{name.replace('_', '-')}" for _, name, _ in self.own}
+        return [name for name, value in every.items() if value or name in of_one_role]
 
     def __post_init__(self):
         unknown = [name for name in self.frames if name not in EVERY_FRAME]
@@ -186,17 +186,17 @@ class Said:
             )
 
     def frames_of(self, role: Role) -> str | None:
-        """What poses of this role are said to be."""
+        """Returns the transform that poses of this role are stated to be; None where it is not stated."""
         return next((name for name in self.frames if name in FRAMES[role]), None)
 
 
 def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations and translations of homogeneous matrices (m, 4, 4).
+    """Returns the rotations and translations of homogeneous matrices (m, 4, 4).
 
     Raises
     ------
     InputError
-        A last row that is not 0 0 0 1, or no rotation.
+        A last row that is not 0 0 0 1, or a matrix whose upper left part is not a rotation.
     """
     require_finite(matrices, places, where)
     bad = np.flatnonzero(np.abs(matrices[:, 3] - [0, 0, 0, 1]).max(axis=1) > 0)
@@ -211,7 +211,13 @@ def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tupl
 
 
 def require_each_once(names: Sequence[str], places: Sequence[str], where: str, kind: str = "") -> None:
-    """Refuse a name, of an image or a time stamp as ``kind`` says, that has two poses."""
+    """Refuse a name that two poses have. ``kind`` says whether it names an image or a time stamp.
+
+    Raises
+    ------
+    InputError
+        A name occurs twice.
+    """
     first: dict[str, str] = {}
     for name, place in zip(names, places, strict=True):
         if name in first:

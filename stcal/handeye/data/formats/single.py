@@ -1,4 +1,4 @@
-"""One pose as JSON and YAML files hold it: a matrix, a message of ROS, a file of Zivid, OpenCV's matrix."""
+"""Reader of one pose as JSON and YAML files hold it: a matrix, a message of ROS, a file of Zivid, OpenCV's matrix."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ ZIVID = Unit("mm", "as in Zivid")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class One:
-    """``rotation`` (3, 3), ``translation`` (3,), ``turned`` and ``unit`` as of :class:`.record.Side`; ``form`` : of the
+    """``rotation`` (3, 3), ``translation`` (3,), ``turned`` and ``unit`` as in :class:`.record.Side`; ``form`` : of the
     file, where the pose shows it; ``name``."""
 
     rotation: np.ndarray
@@ -44,7 +44,8 @@ class One:
 
 
 def numbers(value: Any) -> np.ndarray | None:
-    """An array of numbers as lists, arrays or OpenCV's matrix hold it; None of all else, and of ragged lists."""
+    """Returns an array of numbers from lists, arrays or OpenCV's matrix; None for anything else, and for ragged
+    lists."""
     if isinstance(value, Mapping):
         if not {"rows", "cols", "data"} <= value.keys():
             return None
@@ -63,19 +64,20 @@ def numbers(value: Any) -> np.ndarray | None:
 
 
 def _all_numbers(value: Any) -> bool:
-    """Text that looks like a number is none; null is not a number, to be told by its place."""
+    """True if all values are numbers or null. Text that looks like a number is not a number; a null is reported later
+    with its place."""
     if isinstance(value, list | tuple):
-        return all(_all_numbers(each) for each in value)
+        return all(_all_numbers(item) for item in value)
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
 def one(value: Any, said: Said, place: str, where: str) -> One | None:
-    """The pose in a value, None where it has not the shape of one.
+    """Returns the pose in a value; None where the value does not have the shape of one.
 
     Raises
     ------
     InputError
-        It has the shape, but is no pose; or its convention must be said.
+        The value has the shape of a pose, but is not valid; or its convention must be stated.
     """
     array = numbers(value)
     if array is not None:
@@ -83,17 +85,17 @@ def one(value: Any, said: Said, place: str, where: str) -> One | None:
     if not isinstance(value, Mapping):
         return None
     if isinstance(value.get("FloatMatrix"), Mapping):
-        found = one(value["FloatMatrix"].get("Data"), said, place, where)
-        return found and _named(found, value, unit=ZIVID, form="Zivid pose file")
-    found = _of_parts(value, said, place, where) or _of_scalars(value, place, where)
-    if found is None:
+        pose = one(value["FloatMatrix"].get("Data"), said, place, where)
+        return pose and _named(pose, value, unit=ZIVID, form="Zivid pose file")
+    pose = _of_parts(value, said, place, where) or _of_scalars(value, place, where)
+    if pose is None:
         inside = [value[key] for key in WRAPPED if key in value]
         if not inside:  # OpenCV's FileStorage: one matrix under any name
-            inside = [each for each in value.values() if isinstance(each, Mapping) and "rows" in each]
+            inside = [item for item in value.values() if isinstance(item, Mapping) and "rows" in item]
             inside = inside if len(inside) == 1 else []
         if len(inside) == 1:
-            found = one(inside[0], said, place, where)
-    return found and _named(found, value)
+            pose = one(inside[0], said, place, where)
+    return pose and _named(pose, value)
 
 
 def _named(found: One, value: Mapping, unit: Unit | None = None, form: str = "") -> One:
@@ -102,17 +104,17 @@ def _named(found: One, value: Mapping, unit: Unit | None = None, form: str = "")
 
 
 def name_in(value: Mapping) -> str:
-    """Image, timestamp or number that stands beside a pose; of a message of ROS, its stamp."""
+    """Returns the image, timestamp or number that stands beside a pose; for a message of ROS, its stamp."""
     for key in NAME_KEYS:
-        given = value.get(key)
-        if isinstance(given, str | int | float) and not isinstance(given, bool):
-            return str(given).strip()
+        value_of_key = value.get(key)
+        if isinstance(value_of_key, str | int | float) and not isinstance(value_of_key, bool):
+            return str(value_of_key).strip()
     header = value.get("header")
     stamp = header.get("stamp") if isinstance(header, Mapping) else value.get("stamp")
     if isinstance(stamp, Mapping):
-        seconds, rest = stamp.get("secs", stamp.get("sec")), stamp.get("nsecs", stamp.get("nanosec"))
-        if isinstance(seconds, int) and isinstance(rest, int):
-            return f"{seconds}.{rest:09d}"
+        seconds, nanoseconds = stamp.get("secs", stamp.get("sec")), stamp.get("nsecs", stamp.get("nanosec"))
+        if isinstance(seconds, int) and isinstance(nanoseconds, int):
+            return f"{seconds}.{nanoseconds:09d}"
     return str(stamp) if isinstance(stamp, int | float) and not isinstance(stamp, bool) else ""
 
 
@@ -132,7 +134,7 @@ def _of_array(array: np.ndarray, said: Said, place: str, where: str) -> One | No
 
 
 def _of_parts(value: Mapping, said: Said, place: str, where: str) -> One | None:
-    """A translation and a rotation under two keys."""
+    """Returns the pose from a translation and a rotation under two keys."""
     at = next((value[key] for key in PLACE_KEYS if key in value), None)
     turn_key = next((key for key in TURN_KEYS if key in value), None)
     if at is None or turn_key is None:
@@ -167,7 +169,8 @@ def _of_parts(value: Mapping, said: Said, place: str, where: str) -> One | None:
 
 
 def _of_scalars(value: Mapping, place: str, where: str) -> One | None:
-    """x, y, z, qw, qx, qy, qz beside each other: metres, as in data of ROS-Industrial."""
+    """Returns the pose from x, y, z, qw, qx, qy, qz beside each other; lengths in metres, as in data of
+    ROS-Industrial."""
     keys = ("x", "y", "z", "qw", "qx", "qy", "qz")
     if not set(keys) <= value.keys():
         return None

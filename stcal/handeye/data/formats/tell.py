@@ -1,4 +1,4 @@
-"""Which format a file of poses has, told by its content whatever its name; read this first."""
+"""Recognition of the format of a file of poses from its content, whatever its name. Read this first."""
 
 import json
 import re
@@ -24,32 +24,31 @@ KNOWN = (
     "ROS bag as CSV, or COLMAP's images.txt"
 )
 SUFFIXES = (".yaml", ".yml", ".json", ".txt", ".csv", ".npy", ".npz")
-"""Of files with one pose each, in a folder."""
+"""Endings of files with one pose each, in a folder."""
 
 
 class NotToldError(InputError):
-    """No format that is known; another reader may know it."""
+    """An error for a file whose format is not known here; another reader may know it."""
 
 
 def read_content(path: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Content | None:
-    """What a file, a folder of files with a pose each, or a COLMAP model holds; None of the package's own tables, and
-    of tables that their readers explain better.
+    """Returns the content of a file, of a folder of files with a pose each, or of a COLMAP model. Returns None for the
+    package's own tables, and for tables whose readers give better messages.
 
-    ``key`` : the column that names rows, where there is one; ``quaternions`` as of
-    :func:`~stcal.io.table.read_table`.
+    ``key`` : the column that names rows, where there is one; ``quaternions`` as in :func:`~stcal.io.table.read_table`.
 
     Raises
     ------
     InputError
-        What is wrong with it.
+        The message says what is wrong with the file.
     """
-    found = _read(path, said, key, quaternions)
-    if found is not None and quaternions != "wxyz" and found.form != TABLE:
+    content = _read(path, said, key, quaternions)
+    if content is not None and quaternions != "wxyz" and content.form != TABLE:
         raise InputError(
             "E-OPTION-NEEDS",
-            f"{path}: --quaternions {quaternions} is of a CSV file's columns, not of {found.form}; leave it out",
+            f"{path}: --quaternions {quaternions} is of a CSV file's columns, not of {content.form}; leave it out",
         )
-    return found
+    return content
 
 
 def _read(path: Path, said: Said, key: str, quaternions: Order) -> Content | None:
@@ -66,11 +65,11 @@ def _read(path: Path, said: Said, key: str, quaternions: Order) -> Content | Non
     if data.startswith(NPY):
         return _required(read_tree(load_npy(data, where), "NumPy array", said, where), where)
     if data.startswith(NPZ):
-        arrays, other = load_npz(data, where)
-        found = read_tree(next(iter(arrays.values())) if len(arrays) == 1 else arrays, "NumPy arrays", said, where)
-        if found is None:
-            found = read_tree(arrays, "NumPy arrays", said, where)
-        return replace(_required(found, where), passed_over=(*_required(found, where).passed_over, *other))
+        arrays, others = load_npz(data, where)
+        content = read_tree(next(iter(arrays.values())) if len(arrays) == 1 else arrays, "NumPy arrays", said, where)
+        if content is None:
+            content = read_tree(arrays, "NumPy arrays", said, where)
+        return replace(_required(content, where), passed_over=(*_required(content, where).passed_over, *others))
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -83,23 +82,23 @@ def _of_text(text: str, path: Path, said: Said, key: str, quaternions: Order) ->
     first = next((line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if not first:
         return None
-    if first[0] in "{[" and (found := _json(text)) is not None:
-        return _required(read_tree(found, "JSON", said, where), where)
+    if first[0] in "{[" and (content := _json(text)) is not None:
+        return _required(read_tree(content, "JSON", said, where), where)
     if colmap.is_text(text):
         return colmap.read_text(text, where)
-    found = read_numbers(text, said, where)
-    if found is not None:
-        return found
+    content = read_numbers(text, said, where)
+    if content is not None:
+        return content
     if re.match(r"[^:\[{]*,", first):
         table = read_table(path, "pose file", quaternions)
         return None if todays(table) else read_columns(table, text, key, said)
     value = _yaml(text, where)
     if not isinstance(value, list | dict):
         return None
-    found = read_tree(value, "YAML", said, where)
-    if found is None:
+    content = read_tree(value, "YAML", said, where)
+    if content is None:
         raise NotToldError("E-POSES-NOT-FOUND", f"{where}: no poses found in it; {KNOWN} needed")
-    return found
+    return content
 
 
 def _required(found: Content | None, where: str) -> Content:
@@ -109,7 +108,7 @@ def _required(found: Content | None, where: str) -> Content:
 
 
 def _json(text: str):
-    """JSON, or an object on each line; None where it is none."""
+    """Returns the content of JSON, or of an object on each line; None where the text is neither."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -122,7 +121,7 @@ def _json(text: str):
 
 
 def _yaml(text: str, where: str):
-    """YAML; several documents, as ``rostopic echo`` prints messages, are a list."""
+    """Returns the content of YAML. Several documents, as ``rostopic echo`` prints messages, are a list."""
     if len(text.encode("utf-8")) > SETTINGS_BYTES:
         raise InputError(
             "E-FILE-TOO-LARGE", f"{where}: {len(text) // MB} MB of YAML, at most {SETTINGS_BYTES // MB} MB are read"
@@ -130,17 +129,17 @@ def _yaml(text: str, where: str):
     headless = re.sub(r"\A\s*%YAML:?\s*[\d.]+\s*\n", "", text)
     parts = [part for part in re.split(r"^---[ \t]*$", headless, flags=re.MULTILINE) if part.strip()]
     try:
-        found = [load_yaml(part) for part in parts]
+        documents = [load_yaml(part) for part in parts]
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise NotToldError(
             "E-YAML-INVALID", f"{where}: not YAML ({' '.join(str(error).split())[:100]}); {KNOWN} needed"
         ) from error
-    return found[0] if len(found) == 1 else found
+    return documents[0] if len(documents) == 1 else documents
 
 
 def _of_folder(folder: Path, said: Said) -> Content | None:
-    """A pose from each file, named by the file; None of a folder without such files."""
-    files = sorted(each for each in folder.iterdir() if each.suffix.lower() in SUFFIXES and each.is_file())
+    """Returns a pose from each file, named by the file; None for a folder without such files."""
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     if not files:
         return None
     read = []

@@ -1,4 +1,4 @@
-"""Poses in JSON, YAML and npz files: which values are poses, and of which side."""
+"""Reader of poses in JSON, YAML and npz files: it finds which values are poses, and of which side."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -31,12 +31,12 @@ OPENCV = "OpenCV's hand-eye arrays"
 
 
 def read_tree(value: Any, form: str, said: Said, where: str) -> Content | None:
-    """What is told of plain values; None where no poses are found.
+    """Returns the poses in plain values; None where there are none.
 
     Raises
     ------
     InputError
-        Poses that are none, more than two sides, or a convention that must be said.
+        A pose is not valid, there are more than two sides, or the convention must be stated.
     """
     if isinstance(value, Mapping):
         if "parameters" in value and "transform" in value:
@@ -44,38 +44,41 @@ def read_tree(value: Any, form: str, said: Said, where: str) -> Content | None:
                 "E-POSES-NOT-FOUND",
                 f"{where}: the result of an easy_handeye calibration; give its samples, NAME.samples",
             )
-        if (found := easy_handeye(value, said, where)) is not None:
-            return found
-        if (found := _of_keys(value, form, said, where)) is not None:
-            return found
+        if (content := easy_handeye(value, said, where)) is not None:
+            return content
+        if (content := _of_keys(value, form, said, where)) is not None:
+            return content
         if (single := one(value, said, "the pose", where)) is not None:
             return Content(single.form or form, (_side([single], ("the pose",), where),))
-        if (found := _by_name(value, form, said, where)) is not None:
-            return found
+        if (content := _by_name(value, form, said, where)) is not None:
+            return content
         for key in HOLDERS:
             if isinstance(value.get(key), Mapping | list | np.ndarray):
-                found = read_tree(value[key], form, said, where)
-                if found is not None:
-                    others = tuple(str(other) for other in value if other != key)
-                    return Content(found.form, found.sides, found.setup, (*found.passed_over, *others))
+                content = read_tree(value[key], form, said, where)
+                if content is not None:
+                    others = tuple(str(unused_key) for unused_key in value if unused_key != key)
+                    return Content(content.form, content.sides, content.setup, (*content.passed_over, *others))
         return None
     return _of_list(value, form, said, where) if isinstance(value, list | np.ndarray) and len(value) else None
 
 
 def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
-    """Samples of easy_handeye, ROS 1 and 2. For a camera that stands still it writes the robot's poses inverted."""
+    """Returns the samples of easy_handeye, ROS 1 and 2. For a camera that stands still it writes the robot's poses
+    inverted."""
     samples, parameters = value.get("samples", value), value.get("parameters")
     if isinstance(samples, Mapping) and {"hand_world_samples", "camera_marker_samples"} <= samples.keys():
         lists = [samples["hand_world_samples"], samples["camera_marker_samples"]]
-        lists = [each.get("transforms") if isinstance(each, Mapping) else each for each in lists]
-    elif isinstance(samples, list) and samples and all(isinstance(each, Mapping) for each in samples):
-        seen = next((key for key in ("tracking", "optical") if key in samples[0]), None)
-        if seen is None or "robot" not in samples[0]:
+        lists = [entry.get("transforms") if isinstance(entry, Mapping) else entry for entry in lists]
+    elif isinstance(samples, list) and samples and all(isinstance(entry, Mapping) for entry in samples):
+        camera_key = next((key for key in ("tracking", "optical") if key in samples[0]), None)
+        if camera_key is None or "robot" not in samples[0]:
             return None
         for i, sample in enumerate(samples, 1):
-            if "robot" not in sample or seen not in sample:
-                raise InputError("E-POSE-INCOMPLETE", f"{where}: sample {i}: robot and {seen} needed; take it out")
-        lists = [[each["robot"] for each in samples], [each[seen] for each in samples]]
+            if "robot" not in sample or camera_key not in sample:
+                raise InputError(
+                    "E-POSE-INCOMPLETE", f"{where}: sample {i}: robot and {camera_key} needed; take it out"
+                )
+        lists = [[entry["robot"] for entry in samples], [entry[camera_key] for entry in samples]]
     else:
         return None
     setup = None
@@ -91,8 +94,8 @@ def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
         Frames("camera_from_board", "as easy_handeye writes it", False),
     )
     sides = []
-    for each, of in zip(lists, frames, strict=True):
-        side = _listed(each if isinstance(each, list) else [], said, where, of, "sample")
+    for entry, frames_of_side in zip(lists, frames, strict=True):
+        side = _listed(entry if isinstance(entry, list) else [], said, where, frames_of_side, "sample")
         if side is None:
             raise InputError(
                 "E-POSES-NOT-FOUND", f"{where}: samples of easy_handeye without transforms; take samples, and save them"
@@ -102,36 +105,36 @@ def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
 
 
 def _of_keys(value: Mapping, form: str, said: Said, where: str) -> Content | None:
-    """Stacks of poses, of each side under keys that name it."""
+    """Returns stacks of poses, each side under keys that name it."""
     parts: dict[str, dict[str, Any]] = {}
     named: dict[str, Frames] = {}
-    other, names = [], ()
-    for key, each in value.items():
-        if str(key).lower() in LISTED_NAMES and isinstance(each, list | np.ndarray):
-            names = tuple(str(name) for name in each)
+    others, names = [], ()
+    for key, item in value.items():
+        if str(key).lower() in LISTED_NAMES and isinstance(item, list | np.ndarray):
+            names = tuple(str(name) for name in item)
             continue
         frames = frames_of(key)
         role = role_of(key) if frames is None else frames.role
-        shaped = isinstance(each, list | Mapping | np.ndarray)
-        if role is None or not shaped or (frames is None and _side_of(each, said, where, None) is None):
-            other.append(str(key))
+        shaped = isinstance(item, list | Mapping | np.ndarray)
+        if role is None or not shaped or (frames is None and _side_of(item, said, where, None) is None):
+            others.append(str(key))
             continue
         frames = frames or Frames(FRAMES[role][0], "by default", False)
-        parts.setdefault(frames.name, {})[str(key)] = each
+        parts.setdefault(frames.name, {})[str(key)] = item
         named[frames.name] = frames
     if not parts:
         return None
     roles = [frames.role for frames in named.values()]
     if len(set(roles)) < len(roles):
-        keys = ", ".join(key for each in parts.values() for key in each)
+        keys = ", ".join(key for item in parts.values() for key in item)
         raise InputError(
             "E-POSES-MIXED", f"{where}: {keys}: more than one set of the same poses; leave one of each side in the file"
         )
     sides = []
-    for name, each in parts.items():
-        side = _of_parts(each, said, where, named[name])
+    for name, item in parts.items():
+        side = _of_parts(item, said, where, named[name])
         if side is None:
-            keys = ", ".join(each)
+            keys = ", ".join(item)
             raise InputError(
                 "E-POSES-NOT-FOUND", f"{where}: {keys}: no poses; 4×4 matrices, or rotations and translations, needed"
             )
@@ -140,12 +143,12 @@ def _of_keys(value: Mapping, form: str, said: Said, where: str) -> Content | Non
         raise InputError("E-NAMES-COUNT", f"{where}: {len(names)} names of {len(sides[0])} poses; one each needed")
     if names:
         sides = [_renamed(side, names, where) for side in sides]
-    opencv = any("2" in key for each in parts.values() for key in each)
-    return Content(OPENCV if opencv else form, _same_count(sides, where), None, tuple(other))
+    opencv = any("2" in key for item in parts.values() for key in item)
+    return Content(OPENCV if opencv else form, _same_count(sides, where), None, tuple(others))
 
 
 def _of_parts(parts: dict[str, Any], said: Said, where: str, frames: Frames) -> Side | None:
-    """Poses under one key, or rotations and translations under two."""
+    """Returns the poses under one key, or those of rotations and translations under two."""
     if len(parts) == 1:
         return _side_of(next(iter(parts.values())), said, where, frames)
     if len(parts) != 2:
@@ -154,7 +157,7 @@ def _of_parts(parts: dict[str, Any], said: Said, where: str, frames: Frames) -> 
         )
     arrays = {}
     for key, value in parts.items():
-        array = numbers([_flat(each) for each in value] if isinstance(value, list) else value)
+        array = numbers([_flat(item) for item in value] if isinstance(value, list) else value)
         if array is None:
             raise InputError("E-POSES-COUNT", f"{where}: {key}: not as many numbers for each pose; correct it")
         arrays[key] = array
@@ -185,39 +188,39 @@ def _flat(value: Any) -> Any:
 
 
 def _by_name(value: Mapping, form: str, said: Said, where: str) -> Content | None:
-    """A pose for each name: of images, mostly."""
-    if not value or not all(isinstance(each, Mapping | list | np.ndarray) for each in value.values()):
+    """Returns a pose for each name; the names are mostly those of images."""
+    if not value or not all(isinstance(item, Mapping | list | np.ndarray) for item in value.values()):
         return None
-    found = []
-    for key, each in value.items():
-        single = one(each, said, str(key), where)
+    poses = []
+    for key, item in value.items():
+        single = one(item, said, str(key), where)
         if single is None:
             return None
-        found.append(One(single.rotation, single.translation, single.turned, single.unit, single.form, str(key)))
-    return Content(found[0].form or form, (_side(found, tuple(map(str, value)), where),))
+        poses.append(One(single.rotation, single.translation, single.turned, single.unit, single.form, str(key)))
+    return Content(poses[0].form or form, (_side(poses, tuple(map(str, value)), where),))
 
 
 def _of_list(value: Any, form: str, said: Said, where: str) -> Content | None:
-    if all(isinstance(each, Mapping) for each in value):
-        found = _of_pairs(value, form, said, where)
-        if found is not None:
-            return found
+    if all(isinstance(item, Mapping) for item in value):
+        content = _of_pairs(value, form, said, where)
+        if content is not None:
+            return content
     side = _side_of(value, said, where, None)
     if side is None:
         return None
-    singles = [one(each, said, "pose", where) for each in value[:1]] if isinstance(value, list) else []
+    singles = [one(item, said, "pose", where) for item in value[:1]] if isinstance(value, list) else []
     return Content((singles[0].form if singles and singles[0] else "") or form, (side,))
 
 
 def _of_pairs(value: Sequence[Mapping], form: str, said: Said, where: str) -> Content | None:
-    """A list of which each entry holds the poses of both sides, or of one, under keys that name them."""
+    """Returns the poses of a list whose entries hold the poses of both sides, or of one, under keys that name them."""
     sides: dict[Role, tuple[str, Frames]] = {}
-    other = []
-    for key, each in value[0].items():
+    others = []
+    for key, entry in value[0].items():
         frames = frames_of(key)
         role = role_of(key) if frames is None else frames.role
-        if role is None or one(each, said, "pose 1", where) is None:
-            other.append(str(key))
+        if role is None or one(entry, said, "pose 1", where) is None:
+            others.append(str(key))
             continue
         if role in sides:
             raise InputError(
@@ -227,25 +230,27 @@ def _of_pairs(value: Sequence[Mapping], form: str, said: Said, where: str) -> Co
         sides[role] = (key, frames or Frames(FRAMES[role][0], "by default", False))
     if not sides:
         return None
-    names = [name_in(each) for each in value]
+    names = [name_in(entry) for entry in value]
     named = all(names)
     read = []
     for key, frames in sides.values():
-        for i, each in enumerate(value, 1):
-            if key not in each:
+        for i, entry in enumerate(value, 1):
+            if key not in entry:
                 raise InputError(
                     "E-POSE-INCOMPLETE",
                     f"{where}: pose {i}: {key} is missing, which pose 1 has; add it, or take the pose out",
                 )
-        side = _listed([each[key] for each in value], said, where, frames, "pose")
+        side = _listed([entry[key] for entry in value], said, where, frames, "pose")
         if side is None:
             raise InputError("E-POSE-VALUE", f"{where}: {key}: not a pose in every entry; correct it")
         read.append(_renamed(side, tuple(names), where) if named else side)
     moveit = {key for key, _ in sides.values()} == MOVEIT
     if moveit:
         read = [replace(side, unit=ROS) for side in read]
-    rest = tuple(key for key in other if not (named and key in ("image", "name", "header", "timestamp", "stamp", "id")))
-    return Content("MoveIt hand-eye samples" if moveit else form, tuple(read), None, rest)
+    unused = tuple(
+        key for key in others if not (named and key in ("image", "name", "header", "timestamp", "stamp", "id"))
+    )
+    return Content("MoveIt hand-eye samples" if moveit else form, tuple(read), None, unused)
 
 
 def _renamed(side: Side, names: tuple[str, ...], where: str) -> Side:
@@ -254,16 +259,16 @@ def _renamed(side: Side, names: tuple[str, ...], where: str) -> Side:
 
 
 def _side_of(value: Any, said: Said, where: str, frames: Frames | None) -> Side | None:
-    """One side in a list, a stack or a mapping by name; None where that holds no poses."""
+    """Returns one side from a list, a stack or a mapping by name; None where it holds no poses."""
     if isinstance(value, Mapping):
         single = one(value, said, "the pose", where)
         if single is not None:
             return _side([single], ("the pose",), where, frames)
-        found = _by_name(value, "", said, where)
-        return found and replace(found.sides[0], frames=frames)
+        content = _by_name(value, "", said, where)
+        return content and replace(content.sides[0], frames=frames)
     if not isinstance(value, list | np.ndarray) or not len(value):
         return None
-    if isinstance(value, list) and any(isinstance(each, Mapping) for each in value):
+    if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
         return _listed(value, said, where, frames, "pose")
     array = numbers(value)
     if array is None:
@@ -289,29 +294,29 @@ def _side_of(value: Any, said: Said, where: str, frames: Frames | None) -> Side 
 
 
 def _listed(values: Sequence, said: Said, where: str, frames: Frames | None, what: str) -> Side | None:
-    """Poses one by one; None where the first is none."""
+    """Returns poses one by one; None where the first value is not a pose."""
     places = tuple(f"{what} {i}" for i in range(1, len(values) + 1))
-    found = []
+    poses = []
     for value, place in zip(values, places, strict=True):
         single = one(value, said, place, where)
-        if single is None and not found:
+        if single is None and not poses:
             return None
         if single is None:
             raise InputError(
                 "E-POSE-VALUE", f"{where}: {place}: no pose like the one before it; correct it, or take it out"
             )
-        found.append(single)
-    return _side(found, places, where, frames) if found else None
+        poses.append(single)
+    return _side(poses, places, where, frames) if poses else None
 
 
 def _side(found: Sequence[One], places: tuple[str, ...], where: str, frames: Frames | None = None) -> Side:
-    units = {(each.unit.name if each.unit else "", each.turned) for each in found}
+    units = {(pose.unit.name if pose.unit else "", pose.turned) for pose in found}
     if len(units) > 1:
         raise InputError(
             "E-POSES-MIXED",
             f"{where}: poses of {len(units)} kinds: {'; '.join(sorted(t for _, t in units))}; one needed",
         )
-    names = tuple(each.name for each in found)
+    names = tuple(pose.name for pose in found)
     if not all(names):
         names = ()
     require_each_once(names, places[: len(names)], where)

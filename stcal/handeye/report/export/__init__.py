@@ -1,4 +1,4 @@
-"""A hand-eye transform in the files of other programs, each read back as it is made."""
+"""Export of a hand-eye transform to files of other programs; each file is read back and compared."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -46,13 +46,16 @@ __all__ = [
 ]
 
 SAME_MM, SAME_RAD = 1e-6, 1e-9
-"""A file read back is off by no more than the digits printed."""
+"""Largest deviations of a transform that is read back; the digits printed cause less."""
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """``write`` : text from the result, its transforms by name, and the file's name without its ending; ``read`` : the
-    transforms, or the one pose, back from the text."""
+    """A file format.
+
+    ``write`` : returns the text for a result, its named transforms, and the file's name without its ending; ``read`` :
+    returns the transforms, or the one pose, of the text.
+    """
 
     write: Callable[[HandEye, list[Static], str], str]
     read: Callable[[str], "list[Static] | Rigid"]
@@ -65,7 +68,7 @@ ROS_FORMS = {
     "easy-handeye": Form(ros.easy_handeye, ros.read_easy_handeye),
     "easy-handeye2": Form(ros.easy_handeye2, ros.read_easy_handeye2),
 }
-"""With names of frames, and the camera's link on demand."""
+"""Formats that hold names of frames, and the camera's link on demand."""
 FORMS = ROS_FORMS | {
     "zivid": Form(lambda result, *_: zivid_yaml(result), read_zivid),
     "kuka": Form(lambda result, _, name: robots.kuka_dat(result, program_name(name)), KUKA.first),
@@ -73,16 +76,16 @@ FORMS = ROS_FORMS | {
     "ur": Form(lambda result, *_: robots.ur_script(result), UR.first),
     "fanuc": Form(lambda result, _, name: robots.fanuc_program(result, program_name(name)), FANUC.first),
 }
-"""By the word of ``--export``."""
+"""All formats, by the word of ``--export``."""
 
 
 def require_form(form: str) -> None:
-    """Refuse a form that is none.
+    """Checks the name of a format.
 
     Raises
     ------
     InputError
-        With those there are.
+        The format is unknown; the message lists all formats.
     """
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
@@ -96,32 +99,32 @@ def exported(
     child: str = "",
     camera_frame: CameraFrame = "optical",
 ) -> str:
-    """The file's text, read back and found to be the transform.
+    """Returns the file's text, after reading it back and comparing the transform.
 
     Parameters
     ----------
     form : str
-        Of :data:`FORMS`.
+        One of :data:`FORMS`.
     name : str
-        The file's, without its ending: easy_handeye and controllers of robots have it inside too.
+        Name of the file without its ending; files of easy_handeye and of robot controllers hold it too.
     parent, child, camera_frame
-        Of :data:`ROS_FORMS`, as of :func:`~stcal.handeye.report.export.frames.tree`.
+        Frames for :data:`ROS_FORMS`; see :func:`~stcal.handeye.report.export.frames.tree`.
 
     Raises
     ------
     InputError
-        No such form, or a name of a frame that it cannot hold.
+        The format is unknown, or cannot hold the name of a frame.
     """
     require_form(form)
     transforms = tree(result, parent, child, camera_frame)
     text = FORMS[form].write(result, transforms, name)
-    found = FORMS[form].read(text)
-    if isinstance(found, Rigid):
-        found, transforms = [Static("", "", found)], [Static("", "", result.mount_from_camera)]
-    for own, wanted in zip(found, transforms, strict=False):
-        off = own.pose.inverse() @ wanted.pose
-        same_names = (own.parent, own.child) == (wanted.parent, wanted.child)
-        if not same_names or off.angle_rad() > SAME_RAD or np.abs(off.translation).max() > SAME_MM:
+    read_back = FORMS[form].read(text)
+    if isinstance(read_back, Rigid):
+        read_back, transforms = [Static("", "", read_back)], [Static("", "", result.mount_from_camera)]
+    for static, wanted in zip(read_back, transforms, strict=False):
+        difference = static.pose.inverse() @ wanted.pose
+        same_names = (static.parent, static.child) == (wanted.parent, wanted.child)
+        if not same_names or difference.angle_rad() > SAME_RAD or np.abs(difference.translation).max() > SAME_MM:
             raise StcalError(
                 "E-EXPORT-READ-BACK", f"--export {form}: the file does not give the transform back; use another form"
             )

@@ -1,4 +1,4 @@
-"""Frames of an exported transform: their names, ROS's two frames of a camera, and what is said of the result."""
+"""Frames of an exported transform: their names, ROS's two frames of a camera, and comments on the result."""
 
 from typing import Literal
 
@@ -12,28 +12,28 @@ from stcal.handeye.result import HandEye
 from stcal.io.poses.static import Static
 
 CAMERA_FRAME = "camera_optical_frame"
-"""What ROS calls a frame whose Z looks along the line of sight and X to the right, as ours does."""
+"""Name in ROS of a camera frame with Z along the line of sight and X to the right, as in stcal."""
 CAMERA_LINK = "camera_link"
-"""What ROS calls one whose X looks along the line of sight, Y to the left and Z up."""
+"""Name in ROS of a camera frame with X along the line of sight, Y to the left and Z up."""
 LINK_FROM_OPTICAL = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
-"""Of one origin: REP 103, suffix frames."""
+"""Rotation between both frames, which share their origin: REP 103, suffix frames."""
 CameraFrame = Literal["optical", "link"]
 
 
 def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> list[Static]:
-    """What a tree of frames needs to hold the camera, each frame with one parent.
+    """Returns the transforms that add the camera to a tree of frames, in which each frame has one parent.
 
     Parameters
     ----------
     parent, child : str
-        Names of the frames; flange or base, and :data:`CAMERA_FRAME` or :data:`CAMERA_LINK`, where none are given.
+        Names of the frames. If empty: flange or base, and :data:`CAMERA_FRAME` or :data:`CAMERA_LINK`.
     camera_frame : str
         ``optical``: the camera's own frame; ``link``: the link, and the optical frame in it.
 
     Raises
     ------
     InputError
-        Names that are none, or not all different.
+        A name is invalid, or the names are not all different.
     """
     mount, *names = frame_names(result.setup, parent, child, camera_frame)
     require_frame_names(mount, *names)
@@ -45,7 +45,7 @@ def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: Camer
 
 
 def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame) -> tuple[str, ...]:
-    """Of the frames of :func:`tree`, from the root; the optical frame of a link NAME_link is NAME_optical_frame."""
+    """Returns the names of the frames of :func:`tree` from the root; NAME_link has the child NAME_optical_frame."""
     mount = parent or FRAMES[setup].mount
     if camera_frame == "optical":
         return mount, child or CAMERA_FRAME
@@ -54,12 +54,12 @@ def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame
 
 
 def require_frame_names(*names: str) -> None:
-    """Refuse names of frames that are none, or not all different; empty ones stand for the usual.
+    """Checks that names of frames are printable and all different; empty names stand for the defaults.
 
     Raises
     ------
     InputError
-        A character that no file and no terminal shows, or a name twice.
+        A name has a control character, or occurs twice.
     """
     given = [name for name in names if name]
     for name in given:
@@ -70,7 +70,7 @@ def require_frame_names(*names: str) -> None:
 
 
 def said_of(result: HandEye) -> list[str]:
-    """Lines for comments, in ASCII, as controllers of robots need them: what it is, σ, and the covariance."""
+    """Returns lines for comments: the transform's name, σ, and covariance. ASCII only, for robot controllers."""
     frames = FRAMES[result.setup]
     lines = [f"stcal {stcal.__version__}: {frames.camera}, {result.setup}, {result.method}, {len(result.names)} poses"]
     if result.covariance is None:

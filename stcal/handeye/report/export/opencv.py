@@ -1,4 +1,4 @@
-"""Matrices of a hand-eye calibration as YAML: of OpenCV's FileStorage, and of Zivid's SDK."""
+"""Matrices of a hand-eye calibration as YAML: for OpenCV's FileStorage, and for Zivid's SDK."""
 
 import yaml
 
@@ -9,7 +9,7 @@ from stcal.io.plain_yaml import load_yaml, opencv_matrix
 
 
 def opencv_yaml(result: HandEye) -> str:
-    """A file for ``cv2.FileStorage``: both transforms, 4×4, and their covariances where there are any; mm, rad."""
+    """Returns a file for ``cv2.FileStorage``: both transforms, 4×4, and their covariances if there are any; mm, rad."""
     covariances = (result.covariance, result.stand_covariance)
     lines = ["%YAML:1.0", "---", f'setup: "{result.setup}"', f'method: "{result.method}"', 'unit: "mm"']
     for (name, pose), covariance in zip(result.transforms.items(), covariances, strict=True):
@@ -20,7 +20,7 @@ def opencv_yaml(result: HandEye) -> str:
 
 
 def zivid_yaml(result: HandEye) -> str:
-    """What ``zivid.Matrix4x4`` saves and loads: 4×4, mm."""
+    """Returns a file as ``zivid.Matrix4x4`` saves and loads it: 4×4, mm."""
     head = "".join(f"# {line}\n" for line in said_of(result))
     content = {
         "__version__": {"serializer": 1, "data": 1},
@@ -30,5 +30,5 @@ def zivid_yaml(result: HandEye) -> str:
 
 
 def read_zivid(text: str) -> Rigid:
-    """Back from it."""
+    """Returns the transform in a file of :func:`zivid_yaml`, mm."""
     return Rigid.from_matrix(load_yaml(text)["FloatMatrix"]["Data"])

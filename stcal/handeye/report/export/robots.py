@@ -1,4 +1,4 @@
-"""A hand-eye transform as frames of robot controllers: KUKA, ABB, Universal Robots, FANUC."""
+"""Export of a hand-eye transform as a frame of robot controllers: KUKA, ABB, Universal Robots, FANUC."""
 
 import numpy as np
 
@@ -8,31 +8,31 @@ from stcal.handeye.result import HandEye
 from stcal.io.poses.controllers import ABB, FANUC, KUKA, UR
 
 REMARK = 32
-"""Characters of a remark in a FANUC program."""
+"""Largest number of characters of a remark in a FANUC program."""
 
 
 def kuka_dat(result: HandEye, name: str) -> str:
-    """A data list of KRL with the frame."""
+    """Returns a data list of KRL with the frame."""
     head = "".join(f"; {line}\n" for line in said_of(result))
     frame = f"DECL GLOBAL FRAME {FRAMES[result.setup].camera}={{{KUKA.write(result.mount_from_camera)}}}\n"
     return f"&ACCESS RVP\nDEFDAT {name} PUBLIC\n{head}{frame}ENDDAT\n"
 
 
 def abb_module(result: HandEye, name: str) -> str:
-    """A module of RAPID with a ``pose``."""
+    """Returns a module of RAPID with a ``pose``."""
     head = "".join(f"  ! {line}\n" for line in said_of(result))
     frame = f"  PERS pose {FRAMES[result.setup].camera}:=[{ABB.write(result.mount_from_camera)}];\n"
     return f"MODULE {name}\n{head}{frame}ENDMODULE\n"
 
 
 def ur_script(result: HandEye) -> str:
-    """A pose of URScript."""
+    """Returns a pose of URScript."""
     head = "".join(f"# {line}\n" for line in said_of(result))
     return f"{head}{FRAMES[result.setup].camera} = {UR.write(result.mount_from_camera)}\n"
 
 
 def fanuc_program(result: HandEye, name: str) -> str:
-    """A program (LS) with the frame as its position."""
+    """Returns a program (LS) with the frame as its position."""
     remarks = [FRAMES[result.setup].camera]
     if result.covariance is not None:
         sigma = np.sqrt(np.diag(result.covariance))

@@ -1,6 +1,6 @@
-"""A hand-eye transform for ROS: messages, URDF, publishers of static transforms, MoveIt, easy_handeye.
+"""Export of a hand-eye transform for ROS: messages, URDF, publishers of static transforms, MoveIt, easy_handeye.
 
-Each file has a reader here, by the rules of the program that takes it.
+Each kind of file has a reader that follows the rules of the program that uses the file.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -28,18 +28,18 @@ IN_HAND = "eye-in-hand"
 
 
 def ros_yaml(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
-    """``geometry_msgs/TransformStamped`` as YAML, for a static transform; lengths in metres.
+    """Returns ``geometry_msgs/TransformStamped`` as YAML, for a static transform; lengths in metres.
 
-    ``parent``, ``child``, ``camera_frame`` : as of :func:`~stcal.handeye.report.export.frames.tree`; a document for
-    each of its transforms.
+    ``parent``, ``child``, ``camera_frame`` : see :func:`~stcal.handeye.report.export.frames.tree`. Each of its
+    transforms becomes one document.
     """
     return messages(tree(result, parent, child, camera_frame))
 
 
 def urdf_joint(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
-    """A fixed joint of URDF: ``origin`` in metres, and roll, pitch, yaw about the parent's axes in rad.
+    """Returns a fixed joint of URDF: ``origin`` in metres, and roll, pitch, yaw about the parent's axes in rad.
 
-    Of ``camera_frame`` ``link`` two joints with the links that they lead to, in a ``robot`` that xacro includes.
+    For ``camera_frame`` ``link`` these are two joints with their child links, in a ``robot`` that xacro can include.
     """
     transforms = tree(result, parent, child, camera_frame)
     joints = [fixed_joint(each) for each in transforms]
@@ -50,13 +50,13 @@ def urdf_joint(result: HandEye, parent: str = "", child: str = "", camera_frame:
 
 
 def read_urdf(text: str) -> list[Static]:
-    """Back from :func:`urdf_joint`."""
+    """Returns the transforms in a text of :func:`urdf_joint`."""
     root = ElementTree.fromstring(text)
     return [static_of_joint(joint) for joint in ([root] if root.tag == "joint" else root.findall("joint"))]
 
 
 def easy_handeye(result: HandEye, transforms: list[Static], name: str) -> str:
-    """``~/.ros/easy_handeye/NAME.yaml`` of ROS 1's easy_handeye."""
+    """Returns the file ``~/.ros/easy_handeye/NAME.yaml`` of ROS 1's easy_handeye."""
     first = transforms[0]
     turn = dict(zip(("qx", "qy", "qz", "qw"), xyzw(first.pose), strict=True))
     content = {
@@ -74,15 +74,15 @@ def easy_handeye(result: HandEye, transforms: list[Static], name: str) -> str:
 
 
 def read_easy_handeye(text: str) -> list[Static]:
-    """Back from :func:`easy_handeye`."""
+    """Returns the transform in a text of :func:`easy_handeye`."""
     content = load_yaml(text)
-    own, frames = content["transformation"], content["parameters"]
-    pose = pose_of_metres([own[c] for c in "xyz"], [own[f"q{c}"] for c in "xyzw"])
+    numbers, frames = content["transformation"], content["parameters"]
+    pose = pose_of_metres([numbers[c] for c in "xyz"], [numbers[f"q{c}"] for c in "xyzw"])
     return [_static_of_frames(frames, frames["eye_on_hand"], pose)]
 
 
 def easy_handeye2(result: HandEye, transforms: list[Static], name: str) -> str:
-    """``~/.ros2/easy_handeye2/calibrations/NAME.calib`` of ROS 2's easy_handeye2."""
+    """Returns the file ``~/.ros2/easy_handeye2/calibrations/NAME.calib`` of ROS 2's easy_handeye2."""
     first = transforms[0]
     content = {
         "parameters": {
@@ -102,15 +102,15 @@ def easy_handeye2(result: HandEye, transforms: list[Static], name: str) -> str:
 
 
 def read_easy_handeye2(text: str) -> list[Static]:
-    """Back from :func:`easy_handeye2`."""
+    """Returns the transform in a text of :func:`easy_handeye2`."""
     content = load_yaml(text)
-    own, frames = content["transform"], content["parameters"]
-    pose = pose_of_metres([own["translation"][c] for c in "xyz"], [own["rotation"][c] for c in "xyzw"])
+    numbers, frames = content["transform"], content["parameters"]
+    pose = pose_of_metres([numbers["translation"][c] for c in "xyz"], [numbers["rotation"][c] for c in "xyzw"])
     return [_static_of_frames(frames, frames["calibration_type"] == "eye_in_hand", pose)]
 
 
 def _robot_frames(result: HandEye, first: Static) -> dict[str, str]:
-    """The robot's frame that does not carry the camera, and the board's, have no part in the transform."""
+    """Returns the names of all frames. The frame of the board, and the robot's frame without the camera, are unused."""
     frames = FRAMES[result.setup]
     carries = {frames.mount: first.parent, frames.stand: frames.stand}
     return {

@@ -1,4 +1,4 @@
-"""The pixels that a rim is fitted to: a band around it in the image, without those of circles beside it."""
+"""The pixels that a rim is fitted to: a band around it in the image, without pixels of neighbouring circles."""
 
 import numpy as np
 
@@ -11,12 +11,12 @@ RIM_CLEARANCE_PX = 1.5
 
 
 def boxes(ellipses: Ellipses) -> np.ndarray:
-    """Half widths and heights, (n, 2) px, of what a rim may move in."""
+    """Returns half widths and heights, (n, 2) px, of the boxes that the rims may move in."""
     return 1.25 * np.sqrt((ellipses.shape_px**2).sum(2)) + 3 * BAND_PX
 
 
 def monomials(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Cubic monomials, (10, ...)."""
+    """Returns the monomials up to third degree, (10, ...)."""
     found = np.empty((10, *x.shape), x.dtype)
     found[0], found[1], found[2] = 1, x, y
     found[3], found[4], found[5] = x * x, x * y, y * y
@@ -25,7 +25,7 @@ def monomials(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def local_ideal_maps(camera: Camera, centre_px: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Cubic polynomials, (n, 2, 10), from the box around each candidate (scaled to ±1) to ideal pixels."""
+    """Returns cubic polynomials, (n, 2, 10), that map the box around each candidate (scaled to ±1) to ideal pixels."""
     knots = np.cos(np.pi * (np.arange(6) + 0.5) / 6)
     x, y = (g.ravel() for g in np.meshgrid(knots, knots))
     basis = monomials(x, y)
@@ -35,7 +35,7 @@ def local_ideal_maps(camera: Camera, centre_px: np.ndarray, half: np.ndarray) ->
 
 
 def intruders(ellipses: Ellipses, neighbours: Ellipses, half: np.ndarray) -> list[list[tuple[np.ndarray, np.ndarray]]]:
-    """For every ellipse the (centre from its own, inverse shape) of other candidates that reach into its box."""
+    """Returns by ellipse the (relative centre, inverse shape) of other candidates that reach into its box."""
     reach = np.sqrt((neighbours.shape_px**2).sum(2))
     gap = np.abs(ellipses.centre_px[:, None] - neighbours.centre_px) - half[:, None] - reach
     near = (gap < 0).all(2)
@@ -55,7 +55,7 @@ def intruders(ellipses: Ellipses, neighbours: Ellipses, half: np.ndarray) -> lis
 
 
 def offsets(low: np.ndarray, high: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns (w,) and rows (h, 1) of a box, px from ``place``."""
+    """Returns columns (w,) and rows (h, 1) of a box, px from ``place``."""
     x, y = ((np.arange(a, b) - c).astype(np.float32) for a, b, c in zip(low, high, place, strict=True))
     return x, y[:, None]
 
@@ -67,13 +67,13 @@ def near_rim(
     width: float,
     beside: list[tuple[np.ndarray, np.ndarray]],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns, in a box, of the pixels within a band around a rim.
+    """Returns rows and columns, in a box, of the pixels within a band around a rim.
 
     Parameters
     ----------
     offset : the box's columns and rows, px from a place in it, as :func:`offsets` gives them
     on_unit : (2, 2) matrix that takes the ellipse to the unit circle
-    centre : (2,) of the ellipse, px from that place
+    centre : (2,) centre of the ellipse, px from that place
     width : half width of the band, in the lengths that ``on_unit`` measures
     beside : (centre from that place, inverse shape) of ellipses whose pixels are left out
     """

@@ -35,7 +35,8 @@ class Candidates:
 
     @classmethod
     def of(cls, ellipses: Ellipses, camera: Camera) -> "Candidates":
-        """Lens distortion removed from centres exactly, from shapes to first order."""
+        """Returns the candidates of ellipses: lens distortion is removed from centres exactly, from shapes to first
+        order."""
         xy = camera.normalised_from_pixel(ellipses.centre_px)
         _, distorted_by_ideal = camera.distort_jacobian(xy)
         shape = np.linalg.solve(distorted_by_ideal, ellipses.shape_px / camera.focal[:, None])
@@ -43,7 +44,7 @@ class Candidates:
         return cls(xy, shape, radius, ellipses.contrast, 1 / float(np.sqrt(camera.focal.prod())), KDTree(xy))
 
     def mirrored(self) -> "Candidates":
-        """As a mirror shows them: x turned about."""
+        """Returns the mirror image of the candidates, with reversed x."""
         flip = np.array([-1.0, 1.0])
         xy = self.xy * flip
         return Candidates(xy, flip[:, None] * self.shape * flip, self.radius, self.contrast, self.px, KDTree(xy))
@@ -53,7 +54,7 @@ class Candidates:
 
 
 def singular_values(m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Largest and smallest singular values, (...,), of 2×2 matrices (..., 2, 2), in closed form."""
+    """Returns the largest and smallest singular values, (...,), of 2×2 matrices (..., 2, 2), in closed form."""
     half_trace = (m**2).sum((-1, -2)) / 2
     det = np.abs(m[..., 0, 0] * m[..., 1, 1] - m[..., 0, 1] * m[..., 1, 0])
     root = np.sqrt(np.maximum(half_trace**2 - det**2, 0))
@@ -65,7 +66,7 @@ class PatternFit:
     """The candidate nearest to each of the m circles of a pattern, and how well it fits the prediction.
 
     ``index`` : (m,); ``radius`` : (m,) predicted, of equal area; ``distance``, ``max_distance`` : (m,) from the
-    predicted place, and what is allowed; ``widest``, ``narrowest``, ``max_stretch`` : (m,) extremes over all
+    predicted place, and the limit; ``widest``, ``narrowest``, ``max_stretch`` : (m,) extremes over all
     directions of the ratio between the predicted and the found ellipse, and how far from 1 they may be (by a factor).
     """
 
@@ -78,18 +79,18 @@ class PatternFit:
     max_stretch: np.ndarray
 
     def in_place(self) -> np.ndarray:
-        """Mask of the circles with a candidate at their place."""
+        """Returns the mask of the circles with a candidate at their place."""
         return self.distance < self.max_distance
 
     def fits(self) -> np.ndarray:
-        """Mask of the circles with a candidate of their size and shape at their place."""
+        """Returns the mask of the circles with a candidate of their size and shape at their place."""
         return self.in_place() & (self.widest < self.max_stretch) & (self.narrowest > 1 / self.max_stretch)
 
 
 def fit_pattern(
     candidates: Candidates, image_from_plane: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, slack: float = 1.0
 ) -> PatternFit:
-    """Compare a pattern with the candidates nearest to it; arguments as of :func:`match_pattern`."""
+    """Compares a pattern with its nearest candidates; arguments as in :func:`match_pattern`."""
     predicted = apply_homography(image_from_plane, xy_plane)
     local = homography_jacobian(image_from_plane, xy_plane) * radius[..., None, None]
     size = np.sqrt(np.abs(np.linalg.det(local)))
@@ -105,7 +106,7 @@ def fit_pattern(
 def match_pattern(
     candidates: Candidates, image_from_plane: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, slack: float = 1.0
 ) -> np.ndarray:
-    """For every circle of a pattern the candidate at its predicted place, of its predicted size and shape.
+    """Returns for each circle of a pattern the candidate at its predicted place with its predicted size and shape.
 
     Parameters
     ----------
@@ -115,7 +116,7 @@ def match_pattern(
 
     Returns
     -------
-    index : (m,) or (k, m) int, −1 where there is none
+    index : (m,) or (k, m) int, −1 if there is none
     """
     fit = fit_pattern(candidates, image_from_plane, xy_plane, radius, slack)
     index = np.where(fit.fits(), fit.index, -1)
@@ -129,8 +130,8 @@ def match_pattern(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grown:
-    """k patterns: ``index`` (k, m) of the candidates of their circles, −1 where there is none; ``homography`` (k, 3, 3)
-    into normalised coordinates; ``holds`` (k,) where four circles or more hold together."""
+    """k grown patterns: ``index`` : (k, m) candidates of their circles, −1 if there is none; ``homography`` : (k, 3,
+    3) to normalised coordinates; ``holds`` : (k,) whether the match converged with four circles or more."""
 
     index: np.ndarray
     homography: np.ndarray
@@ -140,13 +141,13 @@ class Grown:
 def grow_matches(
     candidates: Candidates, index: np.ndarray, xy_plane: np.ndarray, radius: np.ndarray, rounds: int = 8
 ) -> Grown:
-    """Alternate between fitting homographies to the matched circles and matching anew, until nothing changes.
+    """Alternates between fitting homographies to the matched circles and matching again, until nothing changes.
 
     Parameters
     ----------
-    index : (k, m) to start from, −1 where there is none
-    xy_plane, radius : (k, m, 2), (k, m) circles of each pattern; radius 0 behind the last one of a shorter pattern, at
-        the place of one that is there
+    index : (k, m) start, −1 if there is none
+    xy_plane, radius : (k, m, 2), (k, m) circles of each pattern; radius 0 behind the last circle of a shorter pattern,
+        with the place of an existing circle
     """
     index, there = index.copy(), radius > 0
     homography, holds = np.full((len(index), 3, 3), np.nan), np.zeros(len(index), bool)
@@ -174,7 +175,7 @@ def grow_matches(
 
 
 def _spread_out(matched: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Where four circles or more are matched, not all in one row or column; (k,)."""
+    """Returns whether four circles or more, not all in one row or column, are matched; (k,)."""
     low = np.where(matched[..., None], xy, np.inf).min(1)
     high = np.where(matched[..., None], xy, -np.inf).max(1)
     return (matched.sum(1) >= MIN_HOMOGRAPHY_POINTS) & (high > low).all(1)

@@ -32,15 +32,15 @@ from stcal.sfm.detect.circles.fits import Fits
 from stcal.sfm.detect.circles.sigmas import correlation, covariances
 
 PIXELS_AT_ONCE = 30_000
-"""Of the ellipses that are fitted side by side: their derivatives are 1.5 MB, which stay in a core's cache."""
+"""Number of pixels of ellipses that are fitted side by side: their derivatives, 1.5 MB, stay in a core's cache."""
 SECTORS = 16
 MIN_RIM = 0.8
-"""Share of the rim's sectors that must follow the model; less is a circle partly hidden or cut off."""
+"""Smallest share of the rim's sectors that follow the model. With less, the circle is partly hidden or cut off."""
 MAX_RIM_RESIDUAL = 0.15
-"""RMS residual of a sector that follows the model, as a fraction of the contrast."""
+"""Largest RMS residual of a sector that follows the model, as a fraction of the contrast."""
 UNTRUSTED = 0.2
-"""Share of the move that following the waves leaves unexplained at most (circles of 8 to 28 px, halves darker by 5 to
-30 %); it goes into σ."""
+"""Largest share of the shift by uneven brightness that the correction leaves (circles of 8 to 28 px, halves darker by
+5 to 30 %). It is added to σ."""
 
 
 def measure_centres(
@@ -50,15 +50,15 @@ def measure_centres(
     neighbours: Ellipses,
     groups: np.ndarray | None = None,
 ) -> Centres:
-    """Measure ``ellipses`` in a grey image of any depth.
+    """Measures ``ellipses`` in a grey image of any depth.
 
     Parameters
     ----------
     image : (height, width) array, uint8 or uint16
-    ellipses : what to measure
-    neighbours : all candidates of the image; pixels of those that come near are left out
-    groups : (n,) numbers of the patterns that they belong to, whose circles share the factor for what correlates the
-        pixels; one pattern where None
+    ellipses : ellipses to measure
+    neighbours : all candidates of the image; pixels of near ones are excluded
+    groups : (n,) number of each ellipse's pattern; circles of one pattern share the factor for correlation between
+        pixels; one pattern if None
     """
     focal = float(np.sqrt(camera.focal.prod()))
     found = _fitted(image, camera, ellipses, neighbours)
@@ -85,8 +85,8 @@ def measure_centres(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rims:
-    """n fitted ellipses, ideal px: ``centre`` (n, 2), ``shape`` and ``covariance`` (n, 2, 2) as if pixels were
-    independent, ``chance`` (n,), and what :class:`Centres` says; of no contrast and no rim where the fit failed."""
+    """n fitted ellipses, ideal px: ``centre`` : (n, 2); ``shape`` and ``covariance`` : (n, 2, 2) for independent
+    pixels; ``chance`` : (n,); others as in :class:`Centres`. Contrast and rim are zero if the fit failed."""
 
     centre: np.ndarray
     shape: np.ndarray
@@ -100,13 +100,13 @@ class _Rims:
 
     @classmethod
     def joined(cls, parts: list["_Rims"], order: np.ndarray) -> "_Rims":
-        """Row k of the parts, one behind the other, in place ``order[k]``."""
+        """Returns the concatenated parts with row k at place ``order[k]``."""
         place = np.argsort(order)
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts])[place] for f in fields(cls)))
 
 
 def _fitted(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: Ellipses) -> _Rims:
-    """Fit circles of like size side by side, as many as a processor's cache holds the pixels of."""
+    """Fits circles of similar size side by side, as many as a processor's cache holds pixels."""
     half = bands.boxes(ellipses)
     to_ideal = bands.local_ideal_maps(camera, ellipses.centre_px, half)
     masks = bands.intruders(ellipses, neighbours, half)
@@ -122,7 +122,7 @@ def _fitted(image: np.ndarray, camera: Camera, ellipses: Ellipses, neighbours: E
 
 
 def _rims(fits: Fits) -> _Rims:
-    """The fits."""
+    """Returns the fitted ellipses with noise, rim and covariance."""
     n = len(fits.blur)
     near = (np.abs(fits.reduced) * fits.blur[:, None] < np.maximum(1.5, fits.blur)[:, None]) & (fits.real > 0)
     angle = np.arctan2(fits.on_unit[:, 1][near], fits.on_unit[:, 0][near])
@@ -130,7 +130,7 @@ def _rims(fits: Fits) -> _Rims:
     total = np.bincount(sector, minlength=n * SECTORS).reshape(n, SECTORS)
     square = np.bincount(sector, fits.residual[near] ** 2, minlength=n * SECTORS).reshape(n, SECTORS)
     contrast = fits.levels[:, 3].astype(float)
-    with np.errstate(divide="ignore", invalid="ignore"):  # of those that failed
+    with np.errstate(divide="ignore", invalid="ignore"):  # for failed fits
         noise = robust_sigmas(np.abs(fits.residual), fits.real > 0)
         rim = (square <= ((MAX_RIM_RESIDUAL * contrast) ** 2 + (2 * noise) ** 2)[:, None] * total).mean(1)
         covariance, chance = covariances(fits)

@@ -13,15 +13,15 @@ from stcal.geometry.arrays import frozen
 from stcal.io.images import percentiles, shrunk
 
 WINDOWS_PX = (41, 193)
-"""Sides of the windows whose mean is the threshold, at every level of the pyramid."""
+"""Sides of the windows whose mean is the threshold, on every level of the pyramid."""
 WINDOW_OVER_DIAMETER = 3.0
-"""A blob must be this much smaller than the window, or it pulls the mean up to itself."""
+"""Smallest ratio of window to blob. In a smaller window the blob pulls the mean towards itself."""
 HALF_SCALE_FROM_PX = 8_000_000
-"""Images of more pixels start the pyramid at half scale, unless smaller circles are asked for …"""
+"""Images of more pixels start the pyramid at half scale, unless smaller circles are required …"""
 MIN_DIAMETER_AT_HALF_SCALE_PX = 9.0
-"""… than these."""
+"""Smallest default diameter at half scale."""
 MIN_DIAMETER_PX = 4.5
-"""Of the circle of the same area: a circle 8 px across at 70° has 4.7."""
+"""Smallest diameter of the circle of the same area: a circle 8 px across at 70° has 4.7."""
 DOUBLE_SCALE_BELOW_PX = 1_500_000
 """Images of fewer pixels start at double scale: the outline of a small ellipse is coarse."""
 REACH_PX = 11
@@ -29,15 +29,15 @@ OUTLINE_LEVEL = 0.45
 """Outlines run at this fraction of the highest value within reach."""
 MIN_LEVEL_DIAMETER_PX = 3.0
 MIN_COARSE_DIAMETER_PX = 24.0
-"""Smaller ones were sought on the level before, where outlines tell more."""
+"""Smallest diameter on coarse levels. Smaller ellipses are found on finer levels, where outlines are more accurate."""
 MAX_OUTLINE_DEVIATION = 0.025
 """RMS deviation of the outline from the ellipse, in units of its radius (a square has 0.07) …"""
 MAX_OUTLINE_DEVIATION_PX = 0.45
-"""… on top of what pixels and noise do to any outline."""
+"""Additional deviation by pixels and noise."""
 MAX_AREA_ERROR = 0.15
 """Largest difference between the areas of the outline and of its ellipse, as a fraction of the latter."""
 MIN_THRESHOLD = 4.0
-"""Grey values, of the 8-bit image."""
+"""Smallest threshold, in grey values of the 8-bit image."""
 
 OPTION_RANGES = {
     "min_diameter_px": (1.0, 1e6),
@@ -49,9 +49,9 @@ OPTION_RANGES = {
 
 @dataclass(frozen=True, slots=True)
 class EllipseOptions:
-    """What counts as a candidate.
+    """Limits for candidates.
 
-    ``min_diameter_px``, ``max_diameter_px`` : diameter of the circle of the same area; where None, the smallest is
+    ``min_diameter_px``, ``max_diameter_px`` : diameter of the circle of the same area; if None, the smallest is
     4.5 px, and 9 px in images over 8 megapixels;
     ``min_axis_ratio`` : minor over major axis (cos 70° is 0.34; blur and pixels take some more);
     ``min_contrast`` : inside against surroundings, as a fraction of the image's grey range.
@@ -94,15 +94,15 @@ class Ellipses:
 
     @classmethod
     def concatenate(cls, parts: list["Ellipses"]) -> "Ellipses":
-        """All parts, one after the other."""
+        """Returns the ellipses of all parts, one part after the other."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def radius_px(self) -> np.ndarray:
-        """Radius of the circle of the same area, (n,)."""
+        """Returns the radius of the circle of the same area, (n,)."""
         return np.sqrt(np.abs(np.linalg.det(self.shape_px)))
 
     def select(self, keep: np.ndarray) -> "Ellipses":
-        """Those of the indices or mask ``keep``."""
+        """Returns the ellipses of the indices or mask ``keep``."""
         return Ellipses(self.centre_px[keep], self.shape_px[keep], self.contrast[keep])
 
 
@@ -116,7 +116,8 @@ class Level:
     lowest: float
 
     def in_full(self, rows: list[tuple[float, ...]]) -> np.ndarray:
-        """Ellipses of the level, rows (x, y, full axis 1, full axis 2, angle of axis 1 in degrees), in the image."""
+        """Converts ellipses, rows (x, y, full axis 1, full axis 2, angle of axis 1 in deg), from the level to the
+        image."""
         table = np.array(rows).reshape(-1, 5)
         table[:, :2] = table[:, :2] * self.scale + (self.scale - 1) / 2
         table[:, 2:4] *= self.scale
@@ -125,7 +126,7 @@ class Level:
 
 @dataclass(frozen=True, slots=True)
 class OutlineVerdict:
-    """The first ``gate`` that an outline fails, with its ``value`` and ``limit``, empty where it passes all;
+    """The first ``gate`` that an outline fails, with its ``value`` and ``limit``, empty if it passes all;
     ``ellipse`` : (x, y, full axis 1, full axis 2, angle of axis 1 in degrees), fitted after the first three gates."""
 
     gate: str
@@ -136,7 +137,7 @@ class OutlineVerdict:
 
 @dataclass(frozen=True, slots=True)
 class OutlineGates:
-    """What an outline in one mask must keep to; px of the level, ``shortest`` and ``longest`` in points."""
+    """Limits for outlines in one mask; px of the level, ``shortest`` and ``longest`` in points."""
 
     width: int
     height: int
@@ -147,7 +148,7 @@ class OutlineGates:
     longest: float
 
     def check(self, contour: np.ndarray) -> OutlineVerdict:
-        """Fit the ellipse, and pass the outline through the gates."""
+        """Fits the ellipse and checks the outline against the limits."""
         if len(contour) < self.shortest:
             return OutlineVerdict("short", len(contour), self.shortest)
         if len(contour) > self.longest:
@@ -178,7 +179,7 @@ class OutlineGates:
 
 
 def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions) -> Ellipses:
-    """Blobs of one polarity with an elliptic outline, in an 8-bit grey image; centres good to about 0.1 px."""
+    """Finds blobs of one polarity with an elliptic outline in an 8-bit grey image; centres are good to about 0.1 px."""
     threshold, _ = contrast_threshold(image, options)
     found = [_rows(level, polarity, threshold, options) for level in levels(image, options)]
     centre, shape = distinct(np.concatenate(found))
@@ -188,20 +189,20 @@ def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions
 
 
 def contrast_threshold(image: np.ndarray, options: EllipseOptions) -> tuple[float, float]:
-    """Contrast that a circle must exceed, and the image's grey range that it is a fraction of; grey values."""
+    """Returns the contrast that a circle must exceed, and the image's grey range that defines it; grey values."""
     low, high = percentiles(image[::8, ::8], [0.5, 99.9])
     grey_range = max(high, 1.0) - low
     return max(MIN_THRESHOLD, options.min_contrast * grey_range), grey_range
 
 
 def diameter_limits_px(pixels: int, options: EllipseOptions) -> tuple[float, float]:
-    """Smallest and largest diameter sought in an image of that many pixels."""
+    """Returns the smallest and largest diameter to find in an image of the given number of pixels."""
     default = MIN_DIAMETER_AT_HALF_SCALE_PX if pixels > HALF_SCALE_FROM_PX else MIN_DIAMETER_PX
     return options.min_diameter_px or default, options.max_diameter_px
 
 
 def levels(image: np.ndarray, options: EllipseOptions) -> Iterator[Level]:
-    """The pyramid, finest level first."""
+    """Yields the levels of the pyramid, the finest first."""
     scale, minimum = 1.0, diameter_limits_px(image.size, options)[0]
     if image.size > HALF_SCALE_FROM_PX and minimum >= MIN_DIAMETER_AT_HALF_SCALE_PX:
         image, scale = shrunk(image, 0.5), 2.0
@@ -220,7 +221,8 @@ def levels(image: np.ndarray, options: EllipseOptions) -> Iterator[Level]:
 
 
 def contrast_of(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Median grey value in the middle less the median around, (n,); the other way round for dark circles."""
+    """Returns the median grey value in the middle minus the median around, (n,); with opposite sign for dark
+    circles."""
     angle = np.arange(16) * (np.pi / 8)
     unit = np.column_stack([np.cos(angle), np.sin(angle)])
 
@@ -236,7 +238,7 @@ def contrast_of(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape
 def masks(
     level: Level, polarity: Polarity, threshold: float, options: EllipseOptions
 ) -> Iterator[tuple[np.ndarray, OutlineGates]]:
-    """Masks of what stands out in one level, one for each window that circles of the level fit into, with the gates for
+    """Yields masks of blobs in one level, one for each window that circles of the level fit into, and the limits for
     outlines in them."""
     smooth = cv2.GaussianBlur(level.image, (3, 3), 0)
     for window in WINDOWS_PX:
@@ -257,18 +259,18 @@ def masks(
 
 
 def outlines(mask: np.ndarray) -> list[np.ndarray]:
-    """Outer outlines in a mask; the rims of holes are none."""
+    """Returns the outer outlines in a mask, without outlines of holes."""
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     return [contours[i] for i in np.flatnonzero(hierarchy[0, :, 3] < 0).tolist()] if contours else []
 
 
 def outline_area(contour: np.ndarray) -> float:
-    """Area of the pixels that an outline goes around, the outline's own included."""
+    """Returns the area of the pixels inside an outline, including its own."""
     return cv2.contourArea(contour) + 0.5 * cv2.arcLength(contour, True) + 1
 
 
 def _rows(level: Level, polarity: Polarity, threshold: float, options: EllipseOptions) -> np.ndarray:
-    """Ellipses of one level, as of :meth:`Level.in_full`."""
+    """Returns the ellipses of one level, rows as in :meth:`Level.in_full`."""
     rows = []
     for mask, gates in masks(level, polarity, threshold, options):
         for contour in outlines(mask):
@@ -279,7 +281,7 @@ def _rows(level: Level, polarity: Polarity, threshold: float, options: EllipseOp
 
 
 def _outline_deviation(points, cx, cy, d1, d2, angle_deg) -> float:
-    """RMS distance of the outline from the ellipse over what is allowed."""
+    """Returns the RMS distance of the outline from the ellipse divided by its limit."""
     angle = np.radians(angle_deg)
     c, s = np.cos(angle), np.sin(angle)
     dx, dy = points[:, 0] - cx, points[:, 1] - cy
@@ -289,7 +291,7 @@ def _outline_deviation(points, cx, cy, d1, d2, angle_deg) -> float:
 
 
 def distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres and shapes, one of each: rows come finest level first, and the first of those that coincide stays."""
+    """Returns centres and shapes without duplicates: of coincident rows the first, from the finest level, is kept."""
     if not len(table):
         return np.zeros((0, 2)), np.zeros((0, 2, 2))
     centre = table[:, :2]

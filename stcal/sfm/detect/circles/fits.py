@@ -1,4 +1,4 @@
-"""Blurred ellipses fitted to grey values, many side by side: the descent."""
+"""The least-squares fit of blurred ellipses to grey values, many side by side."""
 
 import numpy as np
 
@@ -12,26 +12,26 @@ START_BLUR_PX = 0.8
 BLUR_LIMITS_PX = (0.25, 12.0)
 STEPS = 12
 RESELECTIONS = 4
-"""In so many first steps the band is laid anew …"""
+"""Number of first steps in which the band of pixels is selected again …"""
 RESELECT_PX = 0.3
 RESELECT_BAND = 0.15
-"""… when the centre or the width of the band has changed by more than this."""
+"""… if the centre or the width of the band changed by more than this."""
 PARAMETERS = 12
 MIN_PIXELS = 30
 CONVERGED_PX = 2e-3
-"""The step after one of this size is a tenth of it at most: what is left is far below any σ."""
+"""Size of the last step. The next one is at most a tenth of it, which is far below any σ."""
 ROBUST_WIDTH = 5.0
 """Residuals beyond this many standard deviations lose weight (Geman–McClure)."""
 MAX_SHIFT = 0.35
 """Largest move of the centre from its candidate, in mean radii (plus one pixel)."""
 MIN_SIGMA = 0.4
-"""Grey values: what quantisation leaves of noise, and a little more."""
+"""Smallest σ of a pixel, in grey values: quantisation noise and a little more."""
 WAVES = (1, 2, 3)
-"""Harmonics around the rim of what planes do not follow."""
+"""Harmonics around the rim of brightness that the planes do not describe."""
 UNEVEN = 0.004
 """Amplitude of that harmonic, as a share of the contrast, that moves a centre by about 2 µm in 100 …"""
 UNEVEN_CHI2 = 23.0
-"""… and its χ² of two degrees of freedom: by chance one circle in 100 000."""
+"""… and its χ² with two degrees of freedom: a false-alarm probability of one in 100 000 circles."""
 WAVE_STEPS = 8
 CUSP = 0.3
 """The edge's distance has a cusp in the middle of the ellipse; slopes and waves are kept to what they are at this share
@@ -79,14 +79,15 @@ class Fits:
                 return
 
     def _holds(self, active, move) -> np.ndarray:
-        """Mask of those whose step was one and stayed near the start; the others have failed."""
+        """Returns the mask of fits with a finite step that stayed near the start; the others are marked as failed."""
         away = np.linalg.norm(self.centre[active] - self.start[active], axis=1)
         holds = np.isfinite(move) & (away <= MAX_SHIFT * self.radius[active] + 1)
         self.failed[active[~holds]] = True
         return holds
 
     def _follow_waves(self):
-        """Go on with brightness that varies around the rim on the sides, inside or outside, where it does."""
+        """Continues the fits with brightness that varies around the rim, on the side (inside, outside) where this is
+        seen."""
         inside, outside = (self._is_uneven(side) & ~self.failed for side in (True, False))
         if not (inside | outside).any():
             return
@@ -107,7 +108,7 @@ class Fits:
         self.uneven = np.where((inside | outside)[:, None], before - self.centre, 0.0)
 
     def _is_uneven(self, inside: bool) -> np.ndarray:
-        """Whether the residuals' third harmonic around the rim, on one side of it, is significant and matters; (n,)."""
+        """Returns whether the residuals' third harmonic on one side of the rim is significant and relevant; (n,)."""
         own = ((-self.reduced if inside else self.reduced) > 1.0) & (self.weight > 0.5)
         many = own.sum(1) >= MIN_PIXELS
         c, s = np.moveaxis(self.direction(), 1, 0)
@@ -122,12 +123,12 @@ class Fits:
         return many & (chi2 > UNEVEN_CHI2) & matters
 
     def direction(self) -> np.ndarray:
-        """Cosine and sine of each pixel's angle on the unit circle, (n, 2, m)."""
+        """Returns cosine and sine of each pixel's angle on the unit circle, (n, 2, m)."""
         square = (self.on_unit**2).sum(1, keepdims=True)
         return self.on_unit / np.maximum(np.sqrt(square), np.float32(CUSP))
 
     def _lay_bands(self, active) -> np.ndarray:
-        """Choose the pixels anew where centre or blur have changed; those of ``active`` that have enough."""
+        """Selects the pixels again if centre or blur changed; returns the ``active`` fits with enough pixels."""
         wanted = np.maximum(bands.BAND_PX, BAND_BLURS * self.blur[active])
         moved = np.abs(self.centre[active] - self.selected[active]).max(1)
         anew = (moved > RESELECT_PX) | (np.abs(wanted / self.band[active] - 1) > RESELECT_BAND)
@@ -149,7 +150,7 @@ class Fits:
         return active[~few]
 
     def _widen(self, m: int):
-        """Make room for ``m`` pixels of each ellipse."""
+        """Makes room for ``m`` pixels of each ellipse."""
         more = m - self.grey.shape[1]
         if more > 0:
             for name in ("grey", "real", "weight", "residual", "reduced", "ideal", "on_unit", "scores"):
@@ -158,7 +159,7 @@ class Fits:
             self.ideal[:, 0, -more:] = self.radius[:, None]  # not in the middle, where nothing has a direction
 
     def _take(self, i: int):
-        """Grey values and ideal coordinates of one ellipse's pixels."""
+        """Stores grey values and ideal coordinates of one ellipse's pixels."""
         rows, columns = self.rows[i], self.columns[i]
         n = len(rows)
         dx, dy = self.offset[i]
@@ -170,9 +171,10 @@ class Fits:
         self.real[i], self.weight[i] = np.arange(self.real.shape[1]) < n, self.real[i]
 
     def _step(self, active, robust: bool, waves: tuple[bool, ...] = ()) -> np.ndarray:
-        """One Gauss–Newton step over all parameters of ``active``; the moves of the centres, NaN where one breaks.
+        """Makes one Gauss–Newton step of all parameters of ``active``; returns moves of the centres, NaN for failed
+        steps.
 
-        ``waves`` : sides, inside the rim and outside, on which brightness varies around it.
+        ``waves`` : sides of the rim on which brightness varies around it, True for inside.
         """
         if not len(active):
             return np.zeros(0)
@@ -246,8 +248,8 @@ class Fits:
 
 
 def _normal_above(x: np.ndarray, bell: np.ndarray) -> np.ndarray:
-    """Share of a normal distribution above ``x``, to 3e-7, from ``bell``, exp(−x²/2) (Abramowitz and Stegun 1964,
-    7.1.26): in single precision as good as SciPy's, in a sixth of its time."""
+    """Returns the share of a normal distribution above ``x``, to 3e-7, from ``bell``, exp(−x²/2) (Abramowitz and
+    Stegun 1964, 7.1.26): in single precision as good as SciPy's, in a sixth of its time."""
     t = 1 / (1 + np.float32(0.3275911 / np.sqrt(2)) * np.abs(x))
     tail = np.float32(1.061405429 / 2) * t
     for c in (-1.453152027, 1.421413741, -0.284496736, 0.254829592):
@@ -258,13 +260,13 @@ def _normal_above(x: np.ndarray, bell: np.ndarray) -> np.ndarray:
 
 
 def _around(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cosines and sines around the rim, (n, 2 k, m)."""
+    """Returns the cosines and sines of the harmonics around the rim, (n, 2 k, m)."""
     angle = np.arctan2(b, a)[:, None] * np.array(WAVES, np.float32)[:, None]
     return np.concatenate([np.cos(angle), np.sin(angle)], 1)
 
 
 def _levels(planes: np.ndarray, weight: np.ndarray, grey: np.ndarray) -> np.ndarray:
-    """Brightness of the planes, (n, k), by linear least squares; NaN where they cannot be told apart."""
+    """Returns the brightness of the planes, (n, k), by linear least squares; NaN if they are not determined."""
     weighted = planes * weight[:, None]
     normal = (weighted @ np.swapaxes(planes, 1, 2)).astype(float)
     normal[:, *np.diag_indices(normal.shape[1])] *= 1 + 1e-9
@@ -272,7 +274,7 @@ def _levels(planes: np.ndarray, weight: np.ndarray, grey: np.ndarray) -> np.ndar
 
 
 def _inverses(normal: np.ndarray) -> np.ndarray:
-    """Of normal equations (n, k, k), each scaled to a unit diagonal meanwhile; NaN where one has none."""
+    """Returns the inverses of normal matrices (n, k, k), computed with unit diagonals; NaN for singular ones."""
     scale = 1 / np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
     scale = scale[:, :, None] * scale[:, None]
     try:
@@ -284,7 +286,7 @@ def _inverses(normal: np.ndarray) -> np.ndarray:
 
 
 def _weights(residual: np.ndarray, inside: np.ndarray, real: np.ndarray) -> np.ndarray:
-    """Weights of the pixels: equal but for outliers, which are judged by the spread on the edge itself.
+    """Returns the weights of the pixels: equal except for outliers, judged by the residuals' spread on the edge.
 
     Weighting the darker side up by its lower noise was tried: the edge's own errors decide, and it gained nothing.
     """

@@ -1,19 +1,19 @@
-"""What errors in the pixels do to a centre: the covariance of a fit, and what correlation between pixels adds."""
+"""Propagation of pixel errors to a centre: the covariance of a fit, and the effect of correlation between pixels."""
 
 import numpy as np
 
 from stcal.sfm.detect.circles.fits import CUSP, Fits
 
 MIN_NOISE2 = 1e-12
-"""Square of grey values: no noise at all."""
+"""Noise variance, in squared grey values, that counts as no noise."""
 CHANCE_WAVES = 3
 """So many odd harmonics around the rim stand for the first: the third, the fifth, the seventh. Higher ones are shorter
 than what correlates the pixels: JPEG's blocks are of 8 px, and the seventh wave around a circle of 6 px is of 5. (JPEG
 50 to 95 on 240 sheets of 200 circles: errors over σ were within 0.9…1.15 on 227 with 1 wave, 235 with 2, 234 with 3,
 219 with 4; the fewer, the more is left to chance.)"""
 MAX_CHANCE = 4.2
-"""Squares of one circle over their median: by chance one in a thousand (χ² of six degrees of freedom); a dirty circle
-does not speak for the others."""
+"""Largest ratio of one circle's squares to the median: exceeded by chance by one in a thousand (χ² of six degrees of
+freedom). It bounds the influence of a dirty circle."""
 SHARP_PX, SHARP = 1.5, 0.33
 """Where the blur is wider than this, in pixels or in the ellipse's smaller radius, how the fit answers to a shift is
 asked of the image; below it that changed σ by 1 %, and it costs a tenth of the fit."""
@@ -30,7 +30,7 @@ def correlation(chance: np.ndarray) -> float:
 
 
 def covariances(fits: Fits) -> tuple[np.ndarray, np.ndarray]:
-    """Of the centres, (n, 2, 2), as if pixels were independent, and :func:`_chance` over that noise.
+    """Returns covariances of the centres, (n, 2, 2), for independent pixels, and :func:`_chance` over their noise.
 
     The noise is that of the pixels where the centre's weight is: errors sit on the edge more than beside it. The
     covariance is S·H·Sᵀ, H the inverse of the normal equations, S⁻¹ the share of a shift of the image that one step
@@ -74,14 +74,14 @@ def _chance(fits: Fits, edge: np.ndarray, total: np.ndarray) -> np.ndarray:
 
 
 def _narrowest(fits: Fits) -> np.ndarray:
-    """The ellipses' smaller radii, px."""
+    """Returns the ellipses' smaller radii, px."""
     xx, xy, yy = fits.inverse_shape[:, 0, 0], fits.inverse_shape[:, 0, 1], fits.inverse_shape[:, 1, 1]
     return 2 / (xx + yy + np.hypot(xx - yy, 2 * xy))
 
 
 def _exact_slope(fits: Fits, i: int, slope: np.ndarray) -> np.ndarray:
-    """Derivatives of one model by the centre, (2, pixels): the step's, ``slope``, and the change of the distance's
-    own slope."""
+    """Returns the derivatives of one model by the centre, (2, pixels): those of the step, ``slope``, and the change
+    of the distance's slope."""
     on_unit, reduced = fits.on_unit[i, :, : slope.shape[1]], fits.reduced[i, : slope.shape[1]]
     inverse_shape = fits.inverse_shape[i].astype(np.float32)
     rho = np.maximum(np.hypot(*on_unit), np.float32(CUSP))
@@ -91,7 +91,7 @@ def _exact_slope(fits: Fits, i: int, slope: np.ndarray) -> np.ndarray:
 
 
 def _residual_slope(fits: Fits, i: int) -> np.ndarray:
-    """Derivatives of one residual by the place, (2, pixels); none where a neighbour is not in the band."""
+    """Returns the derivatives of one residual by the place, (2, pixels); zero if a neighbour is not in the band."""
     rows, columns = fits.rows[i], fits.columns[i]
     patch = np.full((fits.high[i] - fits.low[i])[::-1], np.nan, np.float32)
     patch[rows, columns] = fits.residual[i, : len(rows)]
