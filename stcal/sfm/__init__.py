@@ -1,4 +1,4 @@
-"""From a folder of images to the calibrated target; read ``pipeline.py`` first."""
+"""Calibration of a target from a folder of images; read ``pipeline.py`` first."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The main job: from a folder of images to the calibrated target. Each call is a stage; its result is saved."""
+"""The main job: calibrates a target from a folder of images. Each call is a stage, and its result is saved."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from stcal.sfm.runs.solve import solve_groups, ungrouped, unseen_board, usable_g
 from stcal.sfm.runs.transaction import RunFolder, run_folder
 
 DRAWN_WITH = "matplotlib.backends.backend_svg", "mpl_toolkits.mplot3d.axes3d"
-"""What figures of the report take half a second to load."""
+"""Modules that draw the figures of the report. They take half a second to load."""
 
 
 @one_thread()
@@ -50,27 +50,27 @@ def run(
     images
         Folder with one folder of images for each group.
     camera
-        COLMAP's cameras.txt, OpenCV's YAML or XML, or what :func:`stcal.io.cameras.read.read_camera` returned.
+        COLMAP's cameras.txt, OpenCV's YAML or XML, or the result of :func:`stcal.io.cameras.read.read_camera`.
     out
         The run's folder: new, empty, or of an earlier run.
     target, board
-        Designs or their TOML files; the reference design where None.
+        Designs or their TOML files; the reference design if None.
     options
-        What to do; the defaults where None.
+        Options of the run; the defaults if None.
     progress
         Called with (stage, done, total).
     reload_s
-        The report's page loads itself anew so often, for a run that is repeated; never where None.
+        Seconds after which the page of the report reloads itself, for a run that is repeated; never if None.
 
     Returns
     -------
     RunResult
-        ``target`` is the calibrated target; everything is in the folder too.
+        ``target`` is the calibrated target. All results are in the folder, too.
 
     Raises
     ------
     StcalError
-        One of its kinds, with a one-line message that says what to do.
+        A subclass of it, with a one-line message that says what to do.
     """
     progress = progress or (lambda *_: None)
     model = camera if isinstance(camera, CameraModel) else read_camera(camera)
@@ -113,8 +113,8 @@ def _published(
     options: RunOptions,
     progress: Progress,
 ) -> RunResult | StcalError:
-    """The same photographs by the published method, or why it has no result."""
-    own = replace(
+    """Returns the result of the published method on the same photographs, or the error that prevents it."""
+    published_options = replace(
         options, solve="paper", frame="three-point", eccentricity=False, refine_camera=False, compare=None
     ).settled(target)
 
@@ -122,8 +122,8 @@ def _published(
         progress(f"{stage}, as published", done, total)
 
     try:
-        detection, labelled = _labelled(images, model, folder, target, board, own, told)
-        return _solved(detection, labelled, model, folder, target, board, own, told)
+        detection, labelled = _labelled(images, model, folder, target, board, published_options, told)
+        return _solved(detection, labelled, model, folder, target, board, published_options, told)
     except StcalError as error:
         return error
 
@@ -139,11 +139,11 @@ def _solved(
     progress: Progress,
 ) -> RunResult:
     load_in_processes(*DRAWN_WITH)
-    known = model.calibrated(detection.camera.width, detection.camera.height)
-    known = refinable(known) if options.refine_camera else known
-    observations = [each.observations for each in labelled]
+    calibrated_camera = model.calibrated(detection.camera.width, detection.camera.height)
+    calibrated_camera = refinable(calibrated_camera) if options.refine_camera else calibrated_camera
+    observations = [image.observations for image in labelled]
     board_alone = options.board_only or is_board_alone(detection)
-    if board_alone and options.solve == "joint":  # of faces, which there are none of
+    if board_alone and options.solve == "joint":  # which adjusts faces, and there are none
         options = replace(options, solve="chain", refine_camera=False)
     groups, unusable = usable_groups(by_group(observations), detection.skipped, board_alone)
 
@@ -151,18 +151,20 @@ def _solved(
     graph = image_graph(observations, board, options.graph)
     scratch = folder.stage / "scratch"
     solutions, unsolved = solve_groups(
-        observations, graph, scratch, folder.cache, known, target, board, options, progress, groups
+        observations, graph, scratch, folder.cache, calibrated_camera, target, board, options, progress, groups
     )
-    models, settled = [s.model for s in solutions], options.adjustment(target)
+    models, adjust_options = [s.model for s in solutions], options.adjustment(target)
     if board_alone:
         progress("faces", 0, 1)
-        calibration = calibrate_board(models, known, board, settled)
+        calibration = calibrate_board(models, calibrated_camera, board, adjust_options)
         progress("faces", 1, 1)
     else:
-        calibration = calibrate(models, known, target, board, settled, camera_prior(known), progress)
+        calibration = calibrate(
+            models, calibrated_camera, target, board, adjust_options, camera_prior(calibrated_camera), progress
+        )
     return RunResult(
         out=folder.out,
-        camera=known,
+        camera=calibrated_camera,
         target_design=target,
         board_design=board,
         options=options,
@@ -191,7 +193,7 @@ def detect(
     options: RunOptions,
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
-    """Detection, labels, ``detections.csv`` and overlays, into a claimed folder."""
+    """Detects and labels the images, and writes ``detections.csv`` and overlays into a claimed folder."""
     detection, labelled = labelled_images(images, camera, folder, target, board, options, progress)
     with overlays_beside(detection, labelled, target, folder.stage, progress):
         return detection, labelled
@@ -206,9 +208,9 @@ def labelled_images(
     options: RunOptions,
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
-    """Detection, labels and ``detections.csv``, into a claimed folder."""
+    """Detects and labels the images, and writes ``detections.csv`` into a claimed folder."""
     detection, labelled = _labelled(images, camera, folder, target, board, options, progress)
-    save(folder.stage / "detections.csv", detections_csv([each.observations for each in labelled]))
+    save(folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
     return detection, labelled
 
 
@@ -221,8 +223,8 @@ def _labelled(
     options: RunOptions,
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
-    """Detection and labels, by the rules that the options ask for."""
-    files, other = chosen_images(images, options.exclude)
+    """Detects and labels the images by the rules that the options ask for."""
+    files, skipped = chosen_images(images, options.exclude)
     step = counted(progress, "detect", len(files))
     published = options.solve == "paper"
     if published:
@@ -231,7 +233,7 @@ def _labelled(
     detection = detect_files(
         files, camera, target, board, options.ellipses, folder.cache, options.workers, step, detector
     )
-    detection = replace(detection, skipped=(*other, *detection.skipped))
+    detection = replace(detection, skipped=(*skipped, *detection.skipped))
     require_upright(detection.images)
     if board is not None and (options.board_only or is_board_alone(detection)):
         return detection, label_boards(detection, target, board)

@@ -1,1 +1,1 @@
-"""From models without unit to calibrated faces: adjustment, scale, frames, chaining, covariances."""
+"""Adjustment of models without unit to calibrated faces: scale, frames, chaining, covariances."""

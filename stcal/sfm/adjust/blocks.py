@@ -1,7 +1,8 @@
-"""Normal equations of one group in the joint adjustment, reduced to what all groups share (Helmert blocking).
+"""Normal equations of one group, reduced to the unknowns that all groups share (Helmert blocking).
 
 Unknowns of a group: cameras, dots, the board's pose. Shared: the target's circles, the board's shape, the intrinsics.
-Cameras are eliminated image by image, then dots and pose at once, so that what remains does not grow with the images.
+Cameras are eliminated image by image, then dots and pose at once, so that the size of the rest does not grow with the
+number of images.
 """
 
 from dataclasses import dataclass, replace
@@ -19,11 +20,11 @@ from stcal.sfm.data.model import GroupModel, MetricModel
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shared:
-    """What all groups share.
+    """Unknowns that all groups share.
 
-    ``xyz_model`` : (c, 3) circles, mm; ``shape_mm`` : (d, 3) deviation of the dots from the design that all groups
-    have in common, board frame; ``camera`` ; ``basis`` : (16, q) derivative of the camera's parameters by those that
-    are adjusted.
+    ``xyz_model`` : (c, 3) circles, mm; ``shape_mm`` : (d, 3) deviation of the dots from the design that all groups have
+    in common, board frame; ``camera`` ; ``basis`` : (16, q) derivative of the camera's parameters by those that are
+    adjusted.
     """
 
     xyz_model: np.ndarray
@@ -34,12 +35,13 @@ class Shared:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """One group.
+    """One group of the joint adjustment.
 
-    ``model_from_board`` ; ``design`` : (e, 3) its dots, board frame; ``sigma_mm`` of a dot about the common shape;
-    ``dots``, ``circles`` : points of the model that are dots and circles; ``dot_place`` : (e,) of each dot in the
-    common shape, empty where each group has its own; ``circle_place`` : of each circle among all; ``photographs`` :
-    (3p + q, 3p + q) normal matrix of its points and the intrinsics, where it is known for all of its images.
+    ``model_from_board`` ; ``design`` : (e, 3) designed positions of its dots, board frame; ``sigma_mm`` : σ of a dot
+    about the common shape; ``dots``, ``circles`` : indices of the model's points that are dots and circles;
+    ``dot_place`` : (e,) index of each dot in the common shape, empty if each group has its own; ``circle_place`` :
+    index of each circle among all; ``photographs`` : (3p + q, 3p + q) normal matrix of its points and the intrinsics
+    from all of its images, if it is known.
     """
 
     model: MetricModel
@@ -53,23 +55,27 @@ class Block:
     photographs: np.ndarray | None = None
 
     def expected_dots(self, shared: Shared) -> np.ndarray:
-        """Design and common shape, (e, 3), board frame."""
+        """Returns the sum of design and common shape, (e, 3), board frame."""
         return self.design + shared.shape_mm[self.dot_place] if len(self.dot_place) else self.design
 
     def board_residual(self) -> np.ndarray:
-        """Adjusted minus design, (e, 3), board frame, mm."""
+        """Returns the adjusted dots minus the design, (e, 3), board frame, mm."""
         return self.model_from_board.inverse() @ self.model.xyz_model[self.dots] - self.design
 
     def cost(self, shared: Shared, huber: float) -> float:
-        """Squared residuals over σ², Huber's beyond ``huber``; infinite behind a camera."""
-        own = self.board_residual() + self.design - self.expected_dots(shared)
-        return image_cost(self.model, shared.camera, huber) + float(((own / self.sigma_mm) ** 2).sum())
+        """Returns squared residuals over σ², Huber's cost beyond ``huber``; infinite for a point behind a camera."""
+        residual = self.board_residual() + self.design - self.expected_dots(shared)
+        return image_cost(self.model, shared.camera, huber) + float(((residual / self.sigma_mm) ** 2).sum())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reduced:
-    """``normal``, ``right`` over the group's outer unknowns (its circles, dots of the common shape, intrinsics); what
-    brings a step of those back to dots and board (``inner``) and then to the ``cameras``, where these are moved."""
+    """Normal equations of a group after elimination of its own unknowns.
+
+    ``normal``, ``right`` : over the group's outer unknowns (its circles, dots of the common shape, intrinsics);
+    ``inner`` : gives the step of dots and board from that of the outer unknowns; ``cameras`` : then gives the step of
+    the cameras, if these are moved.
+    """
 
     normal: np.ndarray
     right: np.ndarray
@@ -78,42 +84,47 @@ class Reduced:
 
     @property
     def gain(self) -> float:
-        """By how much the unknowns that are reduced away lower the cost alone."""
+        """Decrease of the cost by the eliminated unknowns alone."""
         return self.inner.gain + (self.cameras.gain if self.cameras else 0.0)
 
 
 def normalised(model: GroupModel, camera: Camera) -> np.ndarray:
-    """Residuals over σ, (n, 2)."""
+    """Returns the residuals over σ, (n, 2)."""
     return model.whiten(model.residuals_px(camera))
 
 
 def image_cost(model: GroupModel, camera: Camera, huber: float) -> float:
-    """Squared residuals over σ², Huber's beyond ``huber``; infinite behind a camera."""
+    """Returns squared residuals over σ², Huber's cost beyond ``huber``; infinite for a point behind a camera."""
     if (model.xyz_camera()[:, 2] <= 0).any():
         return np.inf
     return float(huber_cost(np.linalg.norm(normalised(model, camera), axis=1), huber).sum())
 
 
 def robust_weights(model: GroupModel, camera: Camera, huber: float) -> np.ndarray:
-    """Huber's weights, (n,), of the lengths of the residuals over σ."""
+    """Returns Huber's weights, (n,), for the lengths of the residuals over σ."""
     return huber_weights(np.linalg.norm(normalised(model, camera), axis=1), huber)
 
 
 def reduced(block: Block, shared: Shared, huber: float) -> Reduced:
-    """Cameras, dots and the board's pose reduced away."""
+    """Eliminates cameras, dots and the board's pose."""
     if block.photographs is None:
         normal, right, cameras = without_cameras(block.model, shared.camera, shared.basis, huber)
     else:  # for the covariance alone: nothing is moved
         normal, right, cameras = block.photographs, np.zeros(len(block.photographs)), None
     full, full_right, inner, outer = _with_board(block, shared, normal, right)
-    away = reduce(full[np.ix_(inner, inner)][None], full_right[None, inner], full[np.ix_(inner, outer)][None])
-    return Reduced(full[np.ix_(outer, outer)] - away.normal, full_right[outer] - away.right, away, cameras)
+    reduction = reduce(full[np.ix_(inner, inner)][None], full_right[None, inner], full[np.ix_(inner, outer)][None])
+    return Reduced(
+        full[np.ix_(outer, outer)] - reduction.normal, full_right[outer] - reduction.right, reduction, cameras
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEquations:
-    """Normal equations of a model's m images: ``normal``, ``right`` over p points and s others, (3p + s); ``block`` :
-    (m, 6, 6), ``block_right`` : (m, 6) of the poses; ``cross`` : (m, 6, 3p + s) between them."""
+    """Normal equations of a model's m images.
+
+    ``normal``, ``right`` : over p points and s other unknowns, (3p + s); ``block`` : (m, 6, 6), ``block_right`` :
+    (m, 6), of the poses; ``cross`` : (m, 6, 3p + s) between the poses and the rest.
+    """
 
     normal: np.ndarray
     right: np.ndarray
@@ -125,7 +136,7 @@ class PoseEquations:
 def equations_of_poses(
     model: GroupModel, by_pose: np.ndarray, by_point: np.ndarray, by_others: np.ndarray, residual: np.ndarray
 ) -> PoseEquations:
-    """From derivatives (n, 2, 6), (n, 2, 3), (n, 2, s) and residuals (n, 2), all over σ."""
+    """Returns the equations for derivatives (n, 2, 6), (n, 2, 3), (n, 2, s) and residuals (n, 2), all over σ."""
     m, p, s = len(model.images), len(model.labels), by_others.shape[2]
     at = np.swapaxes(by_pose, 1, 2)
     cross = np.zeros((m, 6, 3 * p + s))
@@ -150,7 +161,7 @@ def equations_of_poses(
 def without_cameras(
     model: GroupModel, camera: Camera, basis: np.ndarray, huber: float
 ) -> tuple[np.ndarray, np.ndarray, Reduction]:
-    """Normal equations over points (3p) and intrinsics (q), and the way back to the cameras."""
+    """Returns normal equations over points (3p) and intrinsics (q), and the reduction that gives the cameras."""
     by_pose, by_point = projection_jacobians(model, camera)
     root = np.sqrt(robust_weights(model, camera, huber))[:, None]
     by_intrinsics = np.zeros((*by_pose.shape[:2], 0))
@@ -158,14 +169,17 @@ def without_cameras(
         xyz = model.xyz_camera()
         by_intrinsics = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis
     a, c, e = (model.whiten(d) * root[..., None] for d in (by_pose, by_point, by_intrinsics))
-    own = equations_of_poses(model, a, c, e, normalised(model, camera) * root)
-    cameras = reduce(own.block, own.block_right, own.cross)
-    return own.normal - cameras.normal, own.right - cameras.right, cameras
+    equations = equations_of_poses(model, a, c, e, normalised(model, camera) * root)
+    cameras = reduce(equations.block, equations.block_right, equations.cross)
+    return equations.normal - cameras.normal, equations.right - cameras.right, cameras
 
 
 def rows_of_view(model: GroupModel, camera: Camera, basis: np.ndarray) -> np.ndarray:
-    """Of a model of one image, n observations: rows (2n − 6, 3p + q) of the whitened equations over its points and the
-    intrinsics that are orthogonal to the pose; their squares are :func:`without_cameras`'s normal matrix."""
+    """Returns the whitened equations of a model of one image with its pose eliminated, (2n − 6, 3p + q).
+
+    The rows are over the points and the intrinsics, for n observations, and orthogonal to the pose. Their squares give
+    the normal matrix of :func:`without_cameras`.
+    """
     by_pose, by_point = projection_jacobians(model, camera)
     n, p = len(model.point_index), len(model.labels)
     rows = np.zeros((n, 2, 3 * p + basis.shape[1]))
@@ -178,8 +192,11 @@ def rows_of_view(model: GroupModel, camera: Camera, basis: np.ndarray) -> np.nda
 
 
 def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndarray):
-    """Append pose of the board and common shape with the observations dot = pose · (design + shape ± σ); indices of
-    what is eliminated (dots, pose) and of what stays (circles, shape, intrinsics)."""
+    """Appends pose of the board and common shape with the observations dot = pose · (design + shape ± σ).
+
+    The last two results are the indices of the eliminated unknowns (dots, pose) and of the rest (circles, shape,
+    intrinsics).
+    """
     p, q, d = len(block.model.labels), shared.basis.shape[1], len(block.dots)
     s = 3 * len(block.dot_place)
     size = 3 * p + q
@@ -188,20 +205,20 @@ def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndar
     rotation, weight = block.model_from_board.rotation, 1 / block.sigma_mm**2
     turned = block.expected_dots(shared) @ rotation.T
     gap = block.model.xyz_model[block.dots] - (turned + block.model_from_board.translation)
-    # Each dot by itself (1), the pose and its place in the common shape (−rotation): three rows that no other dot has.
-    own, pose = 3 * block.dots[:, None] + np.arange(3), slice(size, size + 6)
+    # Each dot has three rows of its own: derivatives by the dot (1), the pose, and the common shape (−rotation).
+    dot_index, pose = 3 * block.dots[:, None] + np.arange(3), slice(size, size + 6)
     by_pose = np.concatenate([skew(turned), -np.broadcast_to(np.eye(3), (d, 3, 3))], axis=2)
-    full[own, own] += weight
-    full_right[own] -= weight * gap
-    full[own, pose] += weight * by_pose
-    full[pose, own.ravel()] = full[own.ravel(), pose].T
+    full[dot_index, dot_index] += weight
+    full_right[dot_index] -= weight * gap
+    full[dot_index, pose] += weight * by_pose
+    full[pose, dot_index.ravel()] = full[dot_index.ravel(), pose].T
     flat = by_pose.reshape(3 * d, 6)
     full[pose, pose] += weight * flat.T @ flat
     full_right[pose] -= weight * gap.ravel() @ flat
     if s:
         place = size + 6 + np.arange(s).reshape(d, 3)
-        full[own[:, :, None], place[:, None]] = -weight * rotation
-        full[place[:, :, None], own[:, None]] = -weight * rotation.T
+        full[dot_index[:, :, None], place[:, None]] = -weight * rotation
+        full[place[:, :, None], dot_index[:, None]] = -weight * rotation.T
         full[place, place] += weight
         full_right[place] += weight * gap @ rotation
         full[place, pose] = -weight * rotation.T @ by_pose
@@ -214,7 +231,7 @@ def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndar
 
 
 def step_of(block: Block, reduced: Reduced, outer: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """Step (3p + 6m + 6,) of the group's points, cameras and board beside one of its outer unknowns."""
+    """Returns the step (3p + 6m + 6,) of the group's points, cameras and board for a step of its outer unknowns."""
     points, d = np.zeros((len(block.model.labels), 3)), len(block.dots)
     (inner,) = reduced.inner.back(outer)
     points[block.circles] = outer[: 3 * len(block.circles)].reshape(-1, 3)
@@ -225,7 +242,7 @@ def step_of(block: Block, reduced: Reduced, outer: np.ndarray, intrinsics: np.nd
 
 
 def moved(block: Block, step: np.ndarray) -> Block:
-    """The group after a step of :func:`step_of`."""
+    """Returns the group after a step of :func:`step_of`."""
     model, p = block.model, 3 * len(block.model.labels)
     cameras = moved_poses(model.camera_from_model, step[p:-6].reshape(-1, 6))
     points = model.xyz_model + step[:p].reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""From the models of the groups to the calibrated target: scale, faces, chaining, joint adjustment."""
+"""Calibration of the target from the models of the groups: scale, faces, chaining, joint adjustment."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,15 +22,19 @@ from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.model import GroupModel, M, MetricModel, WorldModel
 
 JOINT_ROUNDS = 2
-"""Eccentricity moves by nanometres between the first and the second joint adjustment."""
+"""Number of joint adjustments. Eccentricity changes by nanometres between the first and the second."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """``target`` is the answer; ``scales`` by group; ``faces`` of the single groups; ``joint`` where it was asked for;
-    ``sigma_factor`` : by how much residuals of the single groups exceed the centres' own σ; ``models`` : those that
-    the answer rests on, mm, target frame, groups that are not linked to it absent; ``camera`` : as refined where it
-    was, else as given; ``notes`` : faces without a frame, and why; an adjustment that did not settle."""
+    """The calibrated target, and what it rests on.
+
+    ``target`` : the result; ``scales`` : by group; ``faces`` : faces of the single groups; ``joint`` : joint adjustment
+    if it was requested; ``sigma_factor`` : ratio of the residuals of the single groups to the centres' own σ;
+    ``models`` : models that the result rests on, mm, target frame, without groups that are not linked to it;
+    ``camera`` : refined camera if it was refined, else the given one; ``notes`` : faces without a frame and the
+    reasons, and an adjustment that did not settle.
+    """
 
     target: CalibratedTarget
     scales: dict[str, Scale]
@@ -53,7 +57,7 @@ def calibrate(
 ) -> Calibration:
     """Calibrate the target from the groups' models (worlds without unit, corrections settled).
 
-    ``prior`` : the camera's intrinsics as observations, for options that refine them; ``progress`` : called with
+    ``prior`` : intrinsics of the camera as observations, for options that refine them; ``progress`` : called with
     (``faces``, done, total) after the chain, each joint adjustment, and the covariances.
 
     Raises
@@ -61,7 +65,7 @@ def calibrate(
     ScaleError
         A group's board is not mapped.
     MappingError
-        No face is, or the reference face is not, or a face is not linked to it.
+        No face is mapped, the reference face is not mapped, or a face is not linked to it.
     ConvergenceError
         The adjustment finds no minimum.
     """
@@ -70,12 +74,12 @@ def calibrate(
     scales = {model.group: find_scale(model, board, published) for model in models}
     metric = [model.metric(scales[model.group].group_from_world()) for model in models]
     faces, notes = _faces(metric, camera, target, options)
-    gone = unlinked_faces(faces, options.reference_face)
-    faces = [each for each in faces if each.face not in gone]
+    unlinked = unlinked_faces(faces, options.reference_face)
+    faces = [face for face in faces if face.face not in unlinked]
     notes += [
         f"face {face_id}: left out, never linked to reference face {options.reference_face}; add a group that shows it "
         "together with a face that is linked"
-        for face_id in gone
+        for face_id in unlinked
     ]
     try:
         calibrated = (chain_singly if published else chain_faces)(faces, target, options.reference_face)
@@ -107,8 +111,9 @@ def calibrate(
 def calibrate_board(
     models: Sequence[WorldModel], camera: Camera, board: BoardDesign, options: AdjustOptions
 ) -> Calibration:
-    """Scale from models of the board alone: a target without faces, the models in the board's frame. Zhang & Wei
-    (2017), §4.1.
+    """Returns the scale from models of the board alone: a target without faces, and the models in the board's frame.
+
+    Zhang & Wei (2017), §4.1.
 
     Raises
     ------
@@ -131,17 +136,20 @@ def calibrate_board(
 def _faces(
     models: Sequence[MetricModel], camera: Camera, target: TargetDesign, options: AdjustOptions
 ) -> tuple[list[FaceInGroup], list[str]]:
-    """Frames of the faces in all groups, and notes. Frame circles that a group does not map are placed by the face's
-    others: as other groups have them, or, where no group maps all three, as the design has them. (The joint adjustment
-    starts from there, and takes them from all groups.)"""
-    own = [faces_of_group(model, camera, target, options.frame) for model in models]
-    whole = _circles_of([face for found, _ in own for face in found])
-    if any(notes for _, notes in own):
-        known = {face.id: whole.get(face.id) for face in target.faces}
-        own = [faces_of_group(model, camera, target, options.frame, known) for model in models]
-    notes = [note for _, more in own for note in more]
+    """Returns the frames of the faces in all groups, and notes.
+
+    Frame circles that a group does not map are placed by the other circles of the face: as other groups have them, or
+    as the design has them if no group maps all three. The joint adjustment starts from these places, and then takes the
+    circles from all groups.
+    """
+    results = [faces_of_group(model, camera, target, options.frame) for model in models]
+    circles_by_face = _circles_of([face for group_faces, _ in results for face in group_faces])
+    if any(notes for _, notes in results):
+        known = {face.id: circles_by_face.get(face.id) for face in target.faces}
+        results = [faces_of_group(model, camera, target, options.frame, known) for model in models]
+    notes = [note for _, group_notes in results for note in group_notes]
     mapped = {label for m in models for label in m.labels}
-    for face_id in sorted({face.face for found, _ in own for face in found} - whole.keys()):
+    for face_id in sorted({face.face for group_faces, _ in results for face in group_faces} - circles_by_face.keys()):
         face = target.face(face_id)
         unseen = missing_frame_circles(face, {x.circle for x in face.labels() if x in mapped})
         if unseen:
@@ -150,25 +158,25 @@ def _faces(
                 "where the design has it against the face's other circles, and σ carries how far circles are off the "
                 "design"
             )
-    return [face for found, _ in own for face in found], notes
+    return [face for group_faces, _ in results for face in group_faces], notes
 
 
 def _circles_of(faces: Sequence[FaceInGroup]) -> dict[str, dict[str, np.ndarray]]:
-    """Circles (3,) in their face's frame by face and id, means over the groups."""
+    """Returns circles (3,) in the frame of their face, by face and id, as means over the groups."""
     places: dict[str, dict[str, list[np.ndarray]]] = {}
-    for each in faces:
-        for label, xyz in zip(each.labels, each.xyz_face, strict=True):
-            places.setdefault(each.face, {}).setdefault(label.circle, []).append(xyz)
-    return {face_id: {c: np.mean(xyz, axis=0) for c, xyz in own.items()} for face_id, own in places.items()}
+    for face in faces:
+        for label, xyz in zip(face.labels, face.xyz_face, strict=True):
+            places.setdefault(face.face, {}).setdefault(label.circle, []).append(xyz)
+    return {face_id: {c: np.mean(xyz, axis=0) for c, xyz in centres.items()} for face_id, centres in places.items()}
 
 
 def _placed(model: WorldModel, scale: Scale, start: CalibratedTarget) -> MetricModel:
-    """The model in mm in the target frame, by its chain."""
+    """Returns the model in mm in the target frame, placed by its chain."""
     return model.metric(start.target_from_group[model.group] @ scale.group_from_world())
 
 
 def _unsettled(joint: JointResult) -> list[str]:
-    """What is to be said of an adjustment that stopped on the way."""
+    """Returns the note on a joint adjustment that stopped before its minimum, if it did."""
     if joint.settled:
         return []
     return [
@@ -178,40 +186,43 @@ def _unsettled(joint: JointResult) -> list[str]:
 
 
 def _joint_rounds(options: AdjustOptions, prior: CameraPrior | None) -> int:
-    """How many joint adjustments are made; refined intrinsics want one more."""
+    """Returns the number of joint adjustments; refined intrinsics need one more."""
     return 0 if options.solve != "joint" else JOINT_ROUNDS + (options.refine_camera and prior is not None)
 
 
 def _adjust_all(
     models: list[MetricModel], factor: float, camera: Camera, target, board, options: AdjustOptions, prior, step
 ) -> tuple[JointResult, float]:
-    """The joint adjustment from the chained result, and the factor on the centres' σ; eccentricity follows, and with
-    refined intrinsics that factor too: a wrong camera makes residuals of its own."""
+    """Runs the joint adjustments from the chained result; returns the last one and the factor on the centres' σ.
+
+    The eccentricity is computed anew before each adjustment. With refined intrinsics the factor is computed anew, too:
+    a wrong camera causes residuals of its own.
+    """
     radius = target.radius_of() | board.radius_of()
-    own = [m.covariance_px2 for m in models]
+    covariances = [m.covariance_px2 for m in models]
     rounds = _joint_rounds(options, prior)
     prior = prior if options.refine_camera else None
     current = camera
     for _ in range(rounds):
         if options.eccentricity:
             models = [replace(m, shift_px=eccentricity_px(m, current, radius, 1.0)) for m in models]
-        models = [replace(m, covariance_px2=factor**2 * c) for m, c in zip(models, own, strict=True)]
+        models = [replace(m, covariance_px2=factor**2 * c) for m, c in zip(models, covariances, strict=True)]
         result = adjust_jointly(models, board, camera, options.flatness_mm, prior, current)
         models, current = list(result.models), result.camera
         step(None)
         if prior is not None:
-            plain = [replace(m, covariance_px2=c) for m, c in zip(models, own, strict=True)]
-            factor = image_sigma_factor([adjust(m, current) for m in plain], current)
+            unscaled = [replace(m, covariance_px2=c) for m, c in zip(models, covariances, strict=True)]
+            factor = image_sigma_factor([adjust(m, current) for m in unscaled], current)
     return result, factor
 
 
 def image_sigma_factor(models: Sequence[GroupModel], camera: Camera) -> float:
-    """How much larger the residuals of free networks are than the centres' own σ (one variance component)."""
+    """Returns the ratio of the residuals of free networks to the centres' own σ (one variance component)."""
     square = sum(float((m.whiten(m.residuals_px(camera)) ** 2).sum()) for m in models)
     redundancy = sum(2 * len(m.image_index) - 6 * len(m.images) - 3 * len(m.labels) + 7 for m in models)
     return float(np.sqrt(square / redundancy)) if redundancy > 0 else 1.0
 
 
 def with_sigma(model: M, factor: float) -> M:
-    """The model with its observations' σ scaled."""
+    """Returns the model with the σ of its observations multiplied by ``factor``."""
     return replace(model, covariance_px2=factor**2 * model.covariance_px2)

@@ -1,4 +1,4 @@
-"""Chain the faces of all groups into the target frame, and say how far the ways to a face disagree."""
+"""Chains the faces of all groups into the target frame, and measures how far the ways to a face disagree."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,12 +15,15 @@ from stcal.sfm.adjust.faces import FaceInGroup
 MAX_CHAIN_STEPS = 4
 MAX_CHAINS = 12
 Way = tuple[tuple[str, ...], tuple[str, ...]]
-"""Faces from the first to the last, and the groups between them."""
+"""The faces from the first to the last, and the groups that link them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceChain:
-    """One way from the reference face to another: faces and groups in turn, and how far it is off the combination."""
+    """One way from the reference face to another face, and its deviation from the combined pose.
+
+    Along the way, ``faces`` and ``groups`` alternate.
+    """
 
     faces: tuple[str, ...]
     groups: tuple[str, ...]
@@ -30,13 +33,14 @@ class FaceChain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedTarget:
-    """The result.
+    """Result of the calibration: poses of the faces and centres of the circles in the target frame.
 
-    ``target_from_face`` by face; ``circles`` : label → (3,) mm in the target frame; ``target_from_group`` : metric
-    group frames; ``face_covariance`` : 6×6 by face (rotation rad, translation mm; perturbation in the target frame
-    about the face's origin), ``circle_covariance`` : 3×3 mm² by label, ``distance_sigma_mm`` : of the distance between
-    the origins of two faces, ``scale_sigma`` : relative, of all lengths together, and ``covariance_mm2`` : (3c, 3c) of
-    all circles together, target frame, in their order; empty and None where none was computed.
+    ``target_from_face`` : by face; ``circles`` : label → (3,) mm in the target frame; ``target_from_group`` : by group,
+    pose of its metric frame; ``face_covariance`` : 6×6 by face (rotation rad, translation mm; perturbation in the
+    target frame about the face's origin); ``circle_covariance`` : 3×3 mm² by label; ``distance_sigma_mm`` : σ of the
+    distance between the origins of two faces; ``scale_sigma`` : relative σ of all lengths together;
+    ``covariance_mm2`` : joint covariance (3c, 3c) of all circles, target frame, in their order. Covariances and σ are
+    empty or None if none was computed.
     """
 
     reference_face: str
@@ -51,15 +55,15 @@ class CalibratedTarget:
 
 
 def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
-    """Combine the faces of all groups into the target frame, that of the reference face.
+    """Combines the faces of all groups into the target frame, which is the frame of the reference face.
 
-    Every group states the pose of its faces against one another; a least-squares adjustment over all groups, weighted
-    by how well each face is fixed in each group, gives one pose for each face.
+    Each group provides the poses of its faces relative to one another. A least-squares adjustment over all groups,
+    weighted by how well each face is determined in each group, gives one pose for each face.
 
     Raises
     ------
     InputError
-        The reference face is not of the design.
+        The design has no such reference face.
     MappingError
         The reference face is not mapped, or a face is not linked to it.
     """
@@ -70,40 +74,44 @@ def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: s
 
 
 def chain_singly(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:
-    """The faces by single transforms, each by its shortest way through the groups: Zhang & Wei (2017), eq. 11 with the
-    inverses where they belong. Other ways to a face are not used; circles are those of the way's last group.
+    """Chains each face to the reference face by single transforms, along its shortest way through the groups.
+
+    Zhang & Wei (2017), eq. 11, with the inverses where they belong. Other ways to a face are not used. The circles of a
+    face are those of the last group of its way.
 
     Raises
     ------
     InputError
-        The reference face is not of the design.
+        The design has no such reference face.
     MappingError
         The reference face is not mapped, or a face is not linked to it.
     """
-    shortest = {face_id: found[0] for face_id, found in _ways(faces, target, reference).items()}
+    shortest = {face_id: ways[0] for face_id, ways in _ways(faces, target, reference).items()}
     target_from_face = {face_id: _along(way, faces) for face_id, way in shortest.items()}
     nearest: dict[str, FaceInGroup] = {}
-    for each in sorted(faces, key=lambda each: len(shortest[each.face][1])):
-        nearest.setdefault(each.group, each)
+    for face in sorted(faces, key=lambda face: len(shortest[face.face][1])):
+        nearest.setdefault(face.group, face)
     target_from_group = {g: target_from_face[f.face] @ f.group_from_face.inverse() for g, f in nearest.items()}
     last = {face_id: groups[-1] for face_id, (_, groups) in shortest.items() if groups}
-    last.setdefault(reference, next(each.group for each in faces if each.face == reference))
-    own = [each for each in faces if each.group == last[each.face]]
-    return CalibratedTarget(reference, target_from_face, _circles(own, target_from_face, target), target_from_group)
+    last.setdefault(reference, next(face.group for face in faces if face.face == reference))
+    faces_used = [face for face in faces if face.group == last[face.face]]
+    return CalibratedTarget(
+        reference, target_from_face, _circles(faces_used, target_from_face, target), target_from_group
+    )
 
 
 def _ways(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> dict[str, list[Way]]:
-    """From the reference to every face, the shortest first, by face."""
+    """Returns the ways from the reference face to every face, by face, the shortest first."""
     target.face(reference)
-    seen = {each.face for each in faces}
-    if reference not in seen:
+    mapped = {face.face for face in faces}
+    if reference not in mapped:
         raise MappingError(
             "E-FACE-REFERENCE",
             f"reference face {reference}: not mapped in any group; add a group that shows it, or choose one of "
-            f"{', '.join(sorted(seen)) or 'none'} with --reference-face",
+            f"{', '.join(sorted(mapped)) or 'none'} with --reference-face",
         )
-    chains = {face_id: _chains(faces, reference, face_id) for face_id in sorted(seen)}
-    unlinked = [face_id for face_id, found in chains.items() if not found]
+    chains = {face_id: _chains(faces, reference, face_id) for face_id in sorted(mapped)}
+    unlinked = [face_id for face_id, ways in chains.items() if not ways]
     if unlinked:
         raise MappingError(
             "E-FACE-UNLINKED",
@@ -114,14 +122,16 @@ def _ways(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) ->
 
 
 def unlinked_faces(faces: Sequence[FaceInGroup], reference: str) -> list[str]:
-    """Faces that no way through the groups links to the reference face, where another face is linked; else none: then
-    nothing would be left, and :func:`chain_faces` says so."""
-    linked = {each.face for each in faces if each.face == reference or _chains(faces, reference, each.face)}
-    return sorted({each.face for each in faces} - linked) if len(linked) > 1 else []
+    """Returns the faces that no way through the groups links to the reference face.
+
+    The list is empty if no other face is linked: nothing would remain, and :func:`chain_faces` raises the error.
+    """
+    linked = {face.face for face in faces if face.face == reference or _chains(faces, reference, face.face)}
+    return sorted({face.face for face in faces} - linked) if len(linked) > 1 else []
 
 
 def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -> dict[str, tuple[FaceChain, ...]]:
-    """All ways to every face but the reference, with their distance from the calibrated pose."""
+    """Returns all ways to every face but the reference face, with their deviations from the calibrated pose."""
     return {
         face_id: tuple(_measure(way, faces, pose) for way in _chains(faces, calibrated.reference_face, face_id))
         for face_id, pose in calibrated.target_from_face.items()
@@ -130,18 +140,18 @@ def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -
 
 
 def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
-    """Simple ways from one face to another, the shortest first: (faces, groups)."""
+    """Returns the simple ways from one face to another as (faces, groups), the shortest first."""
     by_group: dict[str, list[str]] = {}
-    for each in faces:
-        by_group.setdefault(each.group, []).append(each.face)
-    queue, found = [((start,), ())], []
+    for face in faces:
+        by_group.setdefault(face.group, []).append(face.face)
+    queue, complete = [((start,), ())], []
     for way, groups in queue:
         if way[-1] == goal:
-            found.append((way, groups))
-            if len(found) == MAX_CHAINS:
+            complete.append((way, groups))
+            if len(complete) == MAX_CHAINS:
                 break
             continue
-        if found and len(way) > len(found[0][0]):
+        if complete and len(way) > len(complete[0][0]):
             break
         if len(way) <= max(MAX_CHAIN_STEPS, len(by_group)):
             queue += [
@@ -151,7 +161,7 @@ def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
                 for face_id in members
                 if face_id not in way
             ]
-    return found
+    return complete
 
 
 def _measure(chain, faces: Sequence[FaceInGroup], combined: Rigid) -> FaceChain:
@@ -162,8 +172,8 @@ def _measure(chain, faces: Sequence[FaceInGroup], combined: Rigid) -> FaceChain:
 
 
 def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:
-    """reference_from_face along one chain."""
-    pose = {(each.group, each.face): each.group_from_face for each in faces}
+    """Returns reference_from_face along one chain."""
+    pose = {(face.group, face.face): face.group_from_face for face in faces}
     way, groups = chain
     result = Rigid()
     for group, a, b in zip(groups, way[:-1], way[1:], strict=True):
@@ -172,54 +182,57 @@ def _along(chain, faces: Sequence[FaceInGroup]) -> Rigid:
 
 
 def _pose_information(each: FaceInGroup) -> np.ndarray:
-    """6×6 information of (rotation rad, translation mm) of a face frame, perturbed in the face frame."""
+    """Returns the 6×6 information of (rotation rad, translation mm) of a face frame, perturbed in that frame."""
     jacobian = np.concatenate([-skew(each.xyz_face), np.broadcast_to(np.eye(3), (len(each.labels), 3, 3))], axis=2)
     return np.einsum("nki,nkl,nlj->ij", jacobian, each.information, jacobian)
 
 
 def _adjust(faces: Sequence[FaceInGroup], chains, reference: str) -> tuple[dict[str, Rigid], dict[str, Rigid]]:
-    """Poses of faces and groups in the target frame by weighted least squares over all (group, face).
+    """Estimates the poses of faces and groups in the target frame by weighted least squares over all (group, face).
 
-    Poses are perturbed on the right, so that a face's own step is minus its residual.
+    Poses are perturbed on the right, so that the step of a face enters its residual with the factor −1.
     """
     start = {face_id: _along(found[0], faces) for face_id, found in chains.items()}
-    groups = list(dict.fromkeys(each.group for each in faces))
+    groups = list(dict.fromkeys(face_in_group.group for face_in_group in faces))
     start_group = {}
-    for each in sorted(faces, key=lambda f: len(chains[f.face][0][0])):
-        start_group.setdefault(each.group, start[each.face] @ each.group_from_face.inverse())
+    for face_in_group in sorted(faces, key=lambda f: len(chains[f.face][0][0])):
+        start_group.setdefault(face_in_group.group, start[face_in_group.face] @ face_in_group.group_from_face.inverse())
     free = [face_id for face_id in start if face_id != reference]
-    roots = [np.linalg.cholesky(_pose_information(each) + 1e-12 * np.eye(6)).T for each in faces]
+    roots = [np.linalg.cholesky(_pose_information(face_in_group) + 1e-12 * np.eye(6)).T for face_in_group in faces]
 
     names = [("face", f) for f in free] + [("group", g) for g in groups]
     column = {name: slice(6 * i, 6 * i + 6) for i, name in enumerate(names)}
-    begin = {("face", f): start[f] for f in (reference, *free)} | {("group", g): start_group[g] for g in groups}
+    initial = {("face", f): start[f] for f in (reference, *free)} | {("group", g): start_group[g] for g in groups}
 
     def linearise(poses: dict[tuple[str, str], Rigid]) -> NormalEquations:
         jacobian, residual = np.zeros((6 * len(faces), 6 * len(column))), np.zeros(6 * len(faces))
-        for k, (each, root) in enumerate(zip(faces, roots, strict=True)):
-            rows, group, face = slice(6 * k, 6 * k + 6), ("group", each.group), ("face", each.face)
-            residual[rows] = root @ (poses[face].inverse() @ poses[group] @ each.group_from_face).log()
-            r, t = each.group_from_face.rotation.T, each.group_from_face.translation
+        for k, (face_in_group, root) in enumerate(zip(faces, roots, strict=True)):
+            rows, group, face = slice(6 * k, 6 * k + 6), ("group", face_in_group.group), ("face", face_in_group.face)
+            residual[rows] = root @ (poses[face].inverse() @ poses[group] @ face_in_group.group_from_face).log()
+            r, t = face_in_group.group_from_face.rotation.T, face_in_group.group_from_face.translation
             jacobian[rows, column[group]] = root @ np.block([[r, np.zeros((3, 3))], [-r @ skew(t), r]])
-            if each.face != reference:
+            if face_in_group.face != reference:
                 jacobian[rows, column[face]] = -root
         return NormalEquations.of(residual, jacobian)
 
     def moved(poses: dict[tuple[str, str], Rigid], step: np.ndarray) -> dict[tuple[str, str], Rigid]:
         return poses | {name: poses[name] @ Rigid.exp(step[at]) for name, at in column.items()}
 
-    found = minimise(begin, linearise, moved)
-    # Derivatives leave out how large residuals bend: where groups disagree, steps end where a damped one gains nothing.
+    found = minimise(initial, linearise, moved)
+    # Derivatives neglect the curvature of large residuals. If groups disagree, only damped steps lower the cost, and
+    # iteration ends when they gain nothing.
     poses = found.required("faces", "check that nothing but the camera moved in a group", accepted=UNKEPT).state
     return {f: poses["face", f] for f in (reference, *free)}, {g: poses["group", g] for g in groups}
 
 
 def _circles(faces: Sequence[FaceInGroup], target_from_face: dict[str, Rigid], target: TargetDesign) -> dict:
-    """Circle centres in the target frame: weighted means over the groups, in the face frame."""
+    """Returns circle centres in the target frame: weighted means over the groups, taken in the face frame."""
     weight: dict[CircleLabel, np.ndarray] = {}
     total: dict[CircleLabel, np.ndarray] = {}
-    for each in faces:
-        for label, xyz, information in zip(each.labels, each.xyz_face, each.information, strict=True):
+    for face_in_group in faces:
+        for label, xyz, information in zip(
+            face_in_group.labels, face_in_group.xyz_face, face_in_group.information, strict=True
+        ):
             weight[label] = weight.get(label, 0) + information
             total[label] = total.get(label, 0) + information @ xyz
     return {

@@ -1,7 +1,8 @@
-"""Normal equations of the joint adjustment over circles and intrinsics, the dots reduced away before the cameras.
+"""Normal equations of the joint adjustment over circles and intrinsics, with the dots eliminated before the cameras.
 
-For boards of many dots in few images: each dot, with its place in the common shape, is a handful of unknowns that no
-other dot shares; what is left are the cameras. (:mod:`stcal.sfm.adjust.equations` goes the other way, for many images.)
+This order suits boards of many dots in few images: each dot, with its place in the common shape, is a small set of
+unknowns that no other dot shares, and only the cameras remain. (:mod:`stcal.sfm.adjust.equations` uses the opposite
+order, for many images.)
 """
 
 from collections.abc import Sequence
@@ -16,14 +17,17 @@ from stcal.sfm.adjust.group import projection_jacobians
 
 
 def is_cheaper(blocks: Sequence[Block]) -> bool:
-    """Whether the cameras of all groups are fewer unknowns than the dots of one."""
+    """True if the cameras of all groups are fewer unknowns than the dots of the group that has most of them."""
     return 6 * sum(len(b.model.images) for b in blocks) < 3 * max(len(b.dots) for b in blocks)
 
 
 def circle_equations(blocks: Sequence[Block], shared: Shared, setting: Setting) -> np.ndarray:
-    """Normal matrix (3c + q, 3c + q) over circles and intrinsics, all else reduced away; no residual loses weight."""
-    kept = 3 * len(setting.labels) + shared.basis.shape[1]
-    ends = kept + np.cumsum([0, *(6 * len(b.model.images) + 6 for b in blocks)])
+    """Returns the normal matrix (3c + q, 3c + q) over circles and intrinsics, with all other unknowns eliminated.
+
+    No residual is down-weighted.
+    """
+    size = 3 * len(setting.labels) + shared.basis.shape[1]
+    ends = size + np.cumsum([0, *(6 * len(b.model.images) + 6 for b in blocks)])
     normal = np.zeros((ends[-1], ends[-1]))
     dots = len(shared.shape_mm) if setting.common else 0
     shape = np.zeros((dots, 3, 3)) + (np.eye(3) / setting.shape_sigma_mm() ** 2 if dots else 0.0)
@@ -33,29 +37,29 @@ def circle_equations(blocks: Sequence[Block], shared: Shared, setting: Setting) 
     if dots:
         root = np.linalg.solve(np.linalg.cholesky(shape), by_shape).reshape(3 * dots, -1)
         normal -= root.T @ root
-    add_knowledge(normal, None, shared, setting, slice(kept - shared.basis.shape[1], kept))
-    own, cross = normal[kept:, kept:], normal[kept:, :kept]
-    return normal[:kept, :kept] - cross.T @ np.linalg.solve(own, cross)
+    add_knowledge(normal, None, shared, setting, slice(size - shared.basis.shape[1], size))
+    inner, cross = normal[size:, size:], normal[size:, :size]
+    return normal[:size, :size] - cross.T @ np.linalg.solve(inner, cross)
 
 
 def _add_group(block: Block, shared: Shared, setting: Setting, start: int, normal, shape, by_shape) -> None:
-    """What one group says: its cameras and the board's pose from ``start`` on, its dots reduced away."""
+    """Adds the equations of one group: cameras and board pose from ``start`` on, with the dots eliminated."""
     model, q, d = block.model, shared.basis.shape[1], len(block.dots)
     m, first = len(model.images), 3 * len(setting.labels)
     width = 6 * m + 6 + q  # cameras, pose, intrinsics
     place = np.concatenate([np.arange(start, start + 6 * m + 6), np.arange(first, first + q)])
     local = np.zeros((width, width))
     cross = np.zeros((len(model.labels), 3, width))
-    by_pose, by_point = (model.whiten(each) for each in projection_jacobians(model, shared.camera))
-    none = np.zeros(by_point.shape[:2])
-    points, _ = blocks_of(by_point, none, model.point_index, len(model.labels))
-    cameras, _ = blocks_of(by_pose, none, model.image_index, m)
+    by_pose, by_point = (model.whiten(derivative) for derivative in projection_jacobians(model, shared.camera))
+    zeros = np.zeros(by_point.shape[:2])
+    points, _ = blocks_of(by_point, zeros, model.point_index, len(model.labels))
+    cameras, _ = blocks_of(by_pose, zeros, model.image_index, m)
     columns = 6 * model.image_index[:, None] + np.arange(6)
     cross[model.point_index[:, None, None], np.arange(3)[:, None], columns[:, None]] = (
         np.swapaxes(by_point, 1, 2) @ by_pose
     )
-    own = 6 * np.arange(m)[:, None] + np.arange(6)
-    local[own[:, :, None], own[:, None]] = cameras
+    index = 6 * np.arange(m)[:, None] + np.arange(6)
+    local[index[:, :, None], index[:, None]] = cameras
     if q:
         xyz, last = model.xyz_camera(), slice(6 * m + 6, width)
         by_intrinsics = model.whiten(shared.camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ shared.basis)
@@ -68,8 +72,8 @@ def _add_group(block: Block, shared: Shared, setting: Setting, start: int, norma
         local[last, last] = flat.T @ flat
 
     circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
-    own = 3 * block.circle_place[:, None] + np.arange(3)
-    normal[own[:, :, None], own[:, None]] += points[block.circles]
+    index = 3 * block.circle_place[:, None] + np.arange(3)
+    normal[index[:, :, None], index[:, None]] += points[block.circles]
     coupled = cross[block.circles].reshape(-1, width)
     normal[np.ix_(circles, place)] += coupled
     normal[np.ix_(place, circles)] += coupled.T
@@ -89,6 +93,6 @@ def _add_group(block: Block, shared: Shared, setting: Setting, start: int, norma
         shape[block.dot_place] += weight * np.eye(3) - to_shape.T @ np.linalg.solve(
             inner, np.broadcast_to(to_shape, (d, 3, 3))
         )
-        away = -to_shape.T @ from_outer
-        away[:, :, pose] -= weight * rotation.T @ by_board
-        by_shape[block.dot_place[:, None, None], np.arange(3)[:, None], place] += away
+        by_shape_reduced = -to_shape.T @ from_outer
+        by_shape_reduced[:, :, pose] -= weight * rotation.T @ by_board
+        by_shape[block.dot_place[:, None, None], np.arange(3)[:, None], place] += by_shape_reduced

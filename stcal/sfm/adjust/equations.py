@@ -1,4 +1,4 @@
-"""The equations of the joint adjustment over what all groups share, each group's own unknowns reduced away."""
+"""Equations of the joint adjustment over the shared unknowns, with each group's own unknowns eliminated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from stcal.labels import CircleLabel
 from stcal.sfm.adjust.blocks import Block, Reduced, Shared, moved, reduced, step_of
 
 FREE_DIRECTIONS = 6
-"""The world may be anywhere: a rigid motion of everything changes nothing."""
+"""Number of free directions: a rigid motion of the world changes nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Of circles, common shape and intrinsics among the unknowns that the groups share, and how many those are."""
+    """Places of circles, common shape and intrinsics among the shared unknowns, and the number of these."""
 
     circles: slice
     shape: slice
@@ -28,7 +28,7 @@ class Places:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """What stays the same in one minimisation; ``flatness_mm`` is infinite where nothing is known of it."""
+    """Constants of one minimisation; ``flatness_mm`` is infinite if it is unknown."""
 
     labels: tuple[CircleLabel, ...]
     board: BoardDesign
@@ -39,14 +39,14 @@ class Setting:
     huber: float
 
     def places(self, shared: Shared) -> "Places":
-        """Where the shared unknowns stand."""
+        """Returns the places of the shared unknowns."""
         c = 3 * len(self.labels)
         s = c + (3 * len(shared.shape_mm) if self.common else 0)
         count = s + shared.basis.shape[1]
         return Places(slice(0, c), slice(c, s), slice(s, count), count)
 
     def outer(self, block: Block, shared: Shared) -> np.ndarray:
-        """Places of a group's outer unknowns among all: circles, shape, intrinsics."""
+        """Returns the places of a group's outer unknowns among all: circles, shape, intrinsics."""
         places = self.places(shared)
         circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
         shape = places.shape.start + (3 * block.dot_place[:, None] + np.arange(3)).ravel()
@@ -62,13 +62,13 @@ class Setting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointState:
-    """All unknowns."""
+    """All unknowns of the joint adjustment."""
 
     blocks: tuple[Block, ...]
     shared: Shared
 
     def moved(self, step: np.ndarray, setting: Setting) -> "JointState":
-        """After a step of what the groups share, then of each group's own."""
+        """Returns the state after a step, which lists the shared unknowns and then each group's own."""
         shared, places = self.shared, setting.places(self.shared)
         ends = places.count + np.cumsum([0, *(_size(b) for b in self.blocks)])
         blocks = tuple(moved(b, step[i:j]) for b, i, j in zip(self.blocks, ends[:-1], ends[1:], strict=True))
@@ -81,13 +81,13 @@ class JointState:
 
 
 def _size(block: Block) -> int:
-    """Number of a group's own unknowns, points that it shares included."""
+    """Returns the number of a group's own unknowns, including points that it shares."""
     return 3 * len(block.model.labels) + 6 * len(block.model.images) + 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedEquations:
-    """Normal equations over what the groups share, each group's own unknowns reduced away."""
+    """Normal equations over the shared unknowns, with each group's own unknowns eliminated."""
 
     cost: float
     state: JointState
@@ -102,7 +102,7 @@ class SharedEquations:
         return cls(cost, state, setting, *normal_equations(state.blocks, state.shared, setting))
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Of what the groups share, then of each group's own."""
+        """Returns the step of the shared unknowns, then of each group's own, and its predicted gain."""
         setting, shared = self.setting, self.state.shared
         free = free_directions(len(self.normal), shared)
         held = self.normal + damping * np.diag(np.diag(self.normal))
@@ -110,22 +110,22 @@ class SharedEquations:
         outer = np.linalg.solve(held, self.right)
         gain = 2 * float(outer @ self.right) - float(outer @ self.normal @ outer) + sum(g.gain for g in self.groups)
         intrinsics = outer[setting.places(shared).intrinsics]
-        own = [
+        group_steps = [
             step_of(b, g, outer[setting.outer(b, shared)], intrinsics)
             for b, g in zip(self.state.blocks, self.groups, strict=True)
         ]
-        return np.concatenate([outer, *own]), gain
+        return np.concatenate([outer, *group_steps]), gain
 
 
 def normal_equations(blocks: Sequence[Block], shared: Shared, setting: Setting):
-    """Over circles, common shape and intrinsics: matrix and right-hand side; and the groups, reduced."""
+    """Returns matrix and right-hand side over circles, common shape and intrinsics, and the reduced groups."""
     places = setting.places(shared)
     normal, right = np.zeros((places.count, places.count)), np.zeros(places.count)
     groups = tuple(reduced(b, shared, setting.huber) for b in blocks)
-    for b, each in zip(blocks, groups, strict=True):
+    for b, group in zip(blocks, groups, strict=True):
         place = setting.outer(b, shared)
-        normal[np.ix_(place, place)] += each.normal
-        right[place] += each.right
+        normal[np.ix_(place, place)] += group.normal
+        right[place] += group.right
     if setting.common:
         shape = np.arange(places.shape.start, places.shape.stop)
         normal[shape, shape] += 1 / setting.shape_sigma_mm() ** 2
@@ -137,13 +137,15 @@ def normal_equations(blocks: Sequence[Block], shared: Shared, setting: Setting):
 def add_knowledge(
     normal: np.ndarray, right: np.ndarray | None, shared: Shared, setting: Setting, intrinsics: slice
 ) -> None:
-    """Add what is known besides photographs and board: the intrinsics' prior, the faces' flatness; ``right`` : None
-    where nothing is moved."""
+    """Adds the knowledge beside photographs and board: the intrinsics' prior, the faces' flatness.
+
+    ``right`` : None if nothing is moved.
+    """
     normal[intrinsics, intrinsics] += setting.prior
     if right is not None:
         right[intrinsics] -= setting.prior @ _away(shared, setting)
     for members, across, normal_model in planes(shared, setting):
-        jacobian = across[:, :, None] * normal_model  # distances from the plane by the circles
+        jacobian = across[:, :, None] * normal_model  # derivatives of distances from the plane by the circles
         flat = jacobian.reshape(len(members), -1)
         place = (3 * members[:, None] + np.arange(3)).ravel()
         normal[np.ix_(place, place)] += flat.T @ flat / setting.flatness_mm**2
@@ -153,24 +155,27 @@ def add_knowledge(
 
 
 def planes(shared: Shared, setting: Setting):
-    """For every face: its circles, the projector that takes heights to distances from the best plane, its normal."""
+    """Yields the circles of each face, the projector from heights to distances from the best plane, and its normal.
+
+    Faces with three circles or fewer have no such distances and are left out.
+    """
     if not np.isfinite(setting.flatness_mm):
         return
     faces: dict[str, list[int]] = {}
     for i, label in enumerate(setting.labels):
         faces.setdefault(label.face, []).append(i)
-    for own in faces.values():
-        if len(own) > 3:
-            members = np.array(own)
+    for indices in faces.values():
+        if len(indices) > 3:
+            members = np.array(indices)
             xyz = shared.xyz_model[members]
             normal = fit_plane(xyz).normal
             base = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
-            design = np.column_stack([np.ones(len(own)), (xyz - xyz.mean(0)) @ base])
-            yield members, np.eye(len(own)) - design @ np.linalg.pinv(design), normal
+            design = np.column_stack([np.ones(len(indices)), (xyz - xyz.mean(0)) @ base])
+            yield members, np.eye(len(indices)) - design @ np.linalg.pinv(design), normal
 
 
 def _away(shared: Shared, setting: Setting) -> np.ndarray:
-    """Adjusted minus given intrinsics, (q,)."""
+    """Returns adjusted minus given intrinsics, (q,)."""
     return np.linalg.pinv(shared.basis) @ (shared.camera.parameters() - setting.given.parameters())
 
 
@@ -187,7 +192,10 @@ def cost_of(blocks: Sequence[Block], shared: Shared, setting: Setting) -> float:
 
 
 def free_directions(count: int, shared: Shared) -> np.ndarray:
-    """Directions (count, 6) in which all circles move as one: the datum is that of smallest trace over them."""
+    """Returns the directions (count, 6) in which all circles move as one.
+
+    The datum is that of smallest trace over the circles.
+    """
     free = np.zeros((count, FREE_DIRECTIONS))
     free[: shared.xyz_model.size] = free_motions(shared.xyz_model, scale=False)
     return free

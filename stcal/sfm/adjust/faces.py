@@ -19,15 +19,17 @@ from stcal.sfm.data.model import MetricModel
 
 FrameKind = Literal["plane", "three-point"]
 MIN_PLACING = 4
-"""Mapped circles that place the others of their face: three fix it, one more shows how well."""
+"""Smallest number of mapped circles that can place the others of their face. Three determine the placement, a fourth
+shows how good it is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceInGroup:
     """One face in the metric frame of one group.
 
-    ``group_from_face`` ; ``labels`` : (n,) its mapped circles, ``xyz_face`` : (n, 3) mm, ``information`` : (n, 3, 3)
-    their inverse covariances in the face frame, given the cameras; ``images`` that show it.
+    ``group_from_face`` : pose of the face; ``labels`` : (n,) its mapped circles; ``xyz_face`` : (n, 3) mm;
+    ``information`` : (n, 3, 3) inverse covariances of the circles in the face frame, given the cameras; ``images`` :
+    number of images that show the face.
     """
 
     group: str
@@ -45,20 +47,22 @@ class FaceInGroup:
 
 
 def missing_frame_circles(face: FaceDesign, mapped: Collection[str]) -> tuple[str, ...]:
-    """Ids of the circles that define the face's frame and are not mapped."""
+    """Returns the ids of the circles that define the frame of the face but are not mapped."""
     return tuple(circle for circle in (face.origin, face.x, face.y) if circle not in mapped)
 
 
 def with_unmapped(
     face: FaceDesign, xyz: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] | None = None
 ) -> dict[str, np.ndarray]:
-    """The circles (3,) by id with those of the frame that are not mapped, where they are known to lie against the
-    others: by the design, or by ``known`` places (3,) in any frame of the face.
+    """Returns the circles (3,) by id, completed by the circles of the frame that are not mapped.
+
+    A rigid fit of the mapped circles to the design, or to ``known`` places (3,) in any frame of the face, gives the
+    positions of the missing circles.
 
     Raises
     ------
     DegenerateError
-        Fewer than four circles are common to both, or they are in line.
+        Fewer than four mapped circles have a known place, or they are collinear.
     """
     missing = missing_frame_circles(face, xyz)
     if not missing:
@@ -86,30 +90,32 @@ def _designed(face: FaceDesign, circle: str) -> np.ndarray:
 
 
 def placement_sigma_mm(target: TargetDesign, xyz: dict[CircleLabel, np.ndarray]) -> float:
-    """σ per axis, in the plane, of circles (3,) about the design: of rigid fits, pooled over the faces."""
+    """Returns the in-plane σ per axis of circles (3,) about the design, pooled over rigid fits of the faces."""
     square, redundancy = 0.0, 0
     for face in target.faces:
-        own = {label.circle: place for label, place in xyz.items() if label.face == face.id}
-        if len(own) < MIN_PLACING:
+        centres = {label.circle: place for label, place in xyz.items() if label.face == face.id}
+        if len(centres) < MIN_PLACING:
             continue
         try:
-            fit = align_rigid(np.array(list(own.values())), np.array([_designed(face, circle) for circle in own]))
+            fit = align_rigid(
+                np.array(list(centres.values())), np.array([_designed(face, circle) for circle in centres])
+            )
         except DegenerateError:
             continue
-        apart = [(fit.inverse() @ place - _designed(face, circle))[:2] for circle, place in own.items()]
-        square += float((np.array(apart) ** 2).sum())
-        redundancy += 2 * len(own) - 3
+        deviations = [(fit.inverse() @ place - _designed(face, circle))[:2] for circle, place in centres.items()]
+        square += float((np.array(deviations) ** 2).sum())
+        redundancy += 2 * len(centres) - 3
     return float(np.sqrt(square / redundancy)) if redundancy else 0.0
 
 
 def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, towards: np.ndarray) -> Rigid:
-    """model_from_face from circle centres, by Zhang & Wei's Gram–Schmidt (eqs. 8–10).
+    """Returns model_from_face, computed from circle centres by Gram–Schmidt (Zhang & Wei, eqs. 8–10).
 
     Parameters
     ----------
     xyz : centres (3,) by circle id, all that are mapped
-    kind : ``three-point`` as in the document; ``plane``: Z from the plane of all circles, and origin and X in it
-    towards : direction (3,) to the side the face is seen from
+    kind : ``three-point`` as in the paper; ``plane``: Z from the plane of all circles, and origin and X in it
+    towards : direction (3,) to the side from which the face is seen
 
     Raises
     ------
@@ -128,7 +134,10 @@ def face_frame(face: FaceDesign, xyz: dict[str, np.ndarray], kind: FrameKind, to
 def face_frames(
     face: FaceDesign, circles: Sequence[str], xyz: np.ndarray, kind: FrameKind, towards: np.ndarray
 ) -> Poses:
-    """:func:`face_frame` of k sets of centres, (k, n, 3), of the same ``circles``, the frame's among them."""
+    """Returns the result of :func:`face_frame` for k sets of centres, (k, n, 3), of the same ``circles``.
+
+    The circles of the frame must be among them.
+    """
     corners = np.stack([xyz[:, list(circles).index(circle)] for circle in (face.origin, face.x, face.y)])
     if kind == "plane":
         normal, offset, _ = fit_planes(xyz, towards)
@@ -152,9 +161,9 @@ def faces_of_group(
     kind: FrameKind,
     known: Mapping[str, Mapping[str, np.ndarray] | None] | None = None,
 ) -> tuple[list[FaceInGroup], list[str]]:
-    """Frames of all faces of one group, and why a face has none.
+    """Returns the frames of all faces of one group, and the reasons why other faces have none.
 
-    ``known`` : faces whose frame circles may be placed by their others, where they are not mapped, as of
+    ``known`` : faces whose frame circles may be placed by their other circles if they are not mapped, see
     :func:`with_unmapped`.
     """
     xyz = model.xyz_model
@@ -195,7 +204,7 @@ def faces_of_group(
 
 
 def _point_information(model: MetricModel, camera: Camera) -> np.ndarray:
-    """Inverse covariance (p, 3, 3) of each point, given the cameras, mm⁻²."""
+    """Returns the inverse covariance (p, 3, 3) of each point, given the cameras, mm⁻²."""
     jacobian = model.whiten(projection_jacobians(model, camera)[1])
     information = np.zeros((len(model.labels), 3, 3))
     np.add.at(information, model.point_index, np.swapaxes(jacobian, 1, 2) @ jacobian)

@@ -28,25 +28,25 @@ from stcal.sfm.adjust.options import AdjustOptions, Solve
 
 
 class FacePoses(Part):
-    """What of ``faces.json`` a plan needs."""
+    """Content of ``faces.json`` that a plan needs."""
 
     format: Literal["stcal faces 1"] = "stcal faces 1"
     unit: Literal["mm"] = "mm"
     target_from_face: dict[str, Pose]
 
     def poses(self) -> dict[str, Rigid]:
-        """target_from_face by face."""
+        """Returns target_from_face of every face, by face."""
         return {face: Rigid.from_matrix(matrix) for face, matrix in self.target_from_face.items()}
 
 
 class JointCovariance(Part):
-    """That of all circles together."""
+    """Joint covariance of all circles."""
 
     labels: list[str]
     upper_triangle: Vector
 
     def matrix(self) -> np.ndarray:
-        """(3c, 3c) in the order of ``labels``."""
+        """Returns the covariance matrix (3c, 3c) in the order of ``labels``."""
         size = 3 * len(self.labels)
         i, j = np.triu_indices(size)
         full = np.zeros((size, size))
@@ -68,7 +68,7 @@ class JointCovariance(Part):
 
 
 class FacesFile(ResultFile):
-    """The result of a run: mm and rad, target frame."""
+    """Result of a run: mm and rad, target frame."""
 
     format: Literal["stcal faces 1"] = Field("stcal faces 1", description="the file's form and its version")
     unit: Literal["mm"] = Field("mm", description="of all lengths")
@@ -109,7 +109,7 @@ class FacesFile(ResultFile):
     def of(
         cls, target: CalibratedTarget, design: TargetDesign, options: AdjustOptions, centre_sigma_factor: float
     ) -> "FacesFile":
-        """The file of a calibrated target; its covariances where it states them."""
+        """Returns the file of a calibrated target, with covariances if the target states them."""
         radius = design.radius_of()
         content: dict[str, Any] = {
             "format": "stcal faces 1",
@@ -138,5 +138,5 @@ class FacesFile(ResultFile):
         return cls.model_validate(content)
 
     def poses(self) -> dict[str, Rigid]:
-        """target_from_face by face."""
+        """Returns target_from_face of every face, by face."""
         return {face: Rigid.from_matrix(matrix) for face, matrix in self.target_from_face.items()}

@@ -1,8 +1,8 @@
-"""Weighted bundle adjustment of one group: Gauss–Newton over poses and points, the more numerous eliminated (Schur).
+"""Bundle adjustment of one group, weighted: Gauss–Newton over poses and points, the larger set eliminated (Schur).
 
-COLMAP's adjustment weighs all observations alike; centres differ in σ by a factor of ten, and that is worth a factor
-of two in the faces. Intrinsics are fixed. The seven free directions of the world (no board is used here) are left to
-a vanishing damping, so that the model stays where it is.
+COLMAP's adjustment gives all observations equal weight. The σ of centres differ by a factor of ten, and weighting them
+improves the faces by a factor of two. Intrinsics are fixed. No board is used here, and only a vanishing damping holds
+the seven free directions of the world, so that the model stays where it is.
 """
 
 from dataclasses import dataclass, replace
@@ -19,21 +19,21 @@ from stcal.geometry.rigid import Rigid, skew
 from stcal.sfm.data.model import GroupModel, M
 
 EXACTLY = 1e-15
-"""Share of χ² that the last step may promise: corrections of nanometres are to be seen."""
+"""Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
 MAX_STEPS = 50
 DAMPING = 1e-10
-"""What holds the seven free directions of the world."""
+"""Relative damping, which holds the seven free directions of the world."""
 
 
 def adjust(model: M, camera: Camera) -> M:
-    """Minimise the weighted reprojection error of the corrected centres over poses and points.
+    """Minimises the weighted reprojection error of the corrected centres over poses and points.
 
     Raises
     ------
     ConvergenceError
         No minimum after ``MAX_STEPS`` steps.
     """
-    found = minimise(
+    minimum = minimise(
         model,
         lambda state: _Normal.of(state, camera),
         _moved,
@@ -43,7 +43,7 @@ def adjust(model: M, camera: Camera) -> M:
         settled=EXACTLY,
         max_steps=MAX_STEPS,
     )
-    return found.required(f"group {model.group}: bundle adjustment", "check the camera file").state
+    return minimum.required(f"group {model.group}: bundle adjustment", "check the camera file").state
 
 
 def _cost(model: GroupModel, camera: Camera) -> float:
@@ -53,8 +53,11 @@ def _cost(model: GroupModel, camera: Camera) -> float:
 
 
 def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the projections (px) by the poses' left perturbation (rotation, translation), (n, 2, 6), and by
-    the points, (n, 2, 3), in the world's unit."""
+    """Returns the derivatives of the projections (px) by poses and by points.
+
+    Those by the poses' left perturbation (rotation, translation) are (n, 2, 6), those by the points (n, 2, 3), in the
+    world's unit.
+    """
     xyz = model.xyz_camera()
     ideal = xyz[:, :2] / xyz[:, 2:]
     by_ideal = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
@@ -67,8 +70,11 @@ def projection_jacobians(model: GroupModel, camera: Camera) -> tuple[np.ndarray,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Normal:
-    """Normal equations of m poses and p points: their blocks (m, 6, 6), (p, 3, 3) and right-hand sides (m, 6), (p, 3),
-    and ``cross`` (m, p, 6, 3) between them."""
+    """Normal equations of m poses and p points.
+
+    They are blocks (m, 6, 6), (p, 3, 3), right-hand sides (m, 6), (p, 3), and ``cross`` (m, p, 6, 3) between poses and
+    points.
+    """
 
     cost: float
     poses: np.ndarray
@@ -79,7 +85,7 @@ class _Normal:
 
     @classmethod
     def of(cls, model: GroupModel, camera: Camera) -> "_Normal":
-        by_pose, by_point = (model.whiten(each) for each in projection_jacobians(model, camera))
+        by_pose, by_point = (model.whiten(derivative) for derivative in projection_jacobians(model, camera))
         residual = model.whiten(model.residuals_px(camera))
         m, p = len(model.images), len(model.labels)
         cross = np.zeros((m, p, 6, 3))
@@ -92,7 +98,7 @@ class _Normal:
         )
 
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """(6m + 3p,) of poses, then points; of the two the more numerous are reduced away."""
+        """Returns the step (6m + 3p,) of poses, then points, and its gain; the larger of both sets is eliminated."""
         poses, points = (block + damping * block * np.eye(block.shape[1]) for block in (self.poses, self.points))
         if self.poses.size // 6 <= self.points.size // 3:
             pose_step, point_step = _solve(poses, self.pose_right, points, self.point_right, self.cross)
@@ -104,7 +110,7 @@ class _Normal:
 
 
 def _moved(model: M, step: np.ndarray) -> M:
-    """The model after steps of its poses and points."""
+    """Returns the model after steps of its poses and points."""
     poses, points = step[: 6 * len(model.images)].reshape(-1, 6), step[6 * len(model.images) :].reshape(-1, 3)
     return replace(
         model, camera_from_model=moved_poses(model.camera_from_model, poses), xyz_model=model.xyz_model + points
@@ -112,7 +118,7 @@ def _moved(model: M, step: np.ndarray) -> M:
 
 
 def moved_poses(poses: tuple[Rigid, ...], step: np.ndarray) -> tuple[Rigid, ...]:
-    """Poses after left perturbations (m, 6)."""
+    """Returns poses after left perturbations (m, 6)."""
     turned = Rotation.from_rotvec(step[:, :3]).as_matrix()
     return tuple(
         Rigid(turn @ pose.rotation, pose.translation + shift)
@@ -121,17 +127,17 @@ def moved_poses(poses: tuple[Rigid, ...], step: np.ndarray) -> tuple[Rigid, ...]
 
 
 def _solve(kept, kept_right, dropped, dropped_right, cross) -> tuple[np.ndarray, np.ndarray]:
-    """Steps of the kept blocks (a, i) and of the reduced ones (b, j); ``cross`` : (a, b, i, j)."""
+    """Returns the steps of the kept blocks (a, i) and of the eliminated ones (b, j); ``cross`` : (a, b, i, j)."""
     a, b, i, j = cross.shape
-    away = reduce(dropped, dropped_right, cross.transpose(1, 3, 0, 2).reshape(b, j, a * i))
-    normal = -away.normal
+    reduction = reduce(dropped, dropped_right, cross.transpose(1, 3, 0, 2).reshape(b, j, a * i))
+    normal = -reduction.normal
     normal.reshape(a, i, a, i)[np.arange(a), :, np.arange(a)] += kept
-    step = _solve_symmetric(normal, kept_right.ravel() - away.right)
-    return step.reshape(a, i), away.back(step)
+    step = _solve_symmetric(normal, kept_right.ravel() - reduction.right)
+    return step.reshape(a, i), reduction.back(step)
 
 
 def _solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """By Cholesky where the damping makes it possible, else the shortest solution."""
+    """Solves by Cholesky decomposition if the damping permits it; else returns the shortest solution."""
     try:
         return cho_solve(cho_factor(matrix), right)
     except LinAlgError:

@@ -1,8 +1,8 @@
-"""One adjustment over all groups: one target, one board with a pose for each group, all cameras, intrinsics if asked.
+"""Joint adjustment of all groups: one target, one board with a pose per group, all cameras, intrinsics if requested.
 
-Board positions are observations with their stated σ, so scale is part of the estimate. The circles of a face are
-coplanar within a stated σ. Residuals far beyond their σ weigh less (Huber). The inverse of the reduced normal matrix
-is the marginal covariance of the circles, everything else accounted for.
+Positions of the board's dots are observations with their stated σ, so that scale is part of the estimate. The circles
+of a face are coplanar within a stated σ. Residuals far beyond their σ get less weight (Huber). The inverse of the
+reduced normal matrix is the marginal covariance of the circles, which accounts for all other unknowns.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,32 +37,33 @@ from stcal.sfm.adjust.scale import MIN_DOTS
 from stcal.sfm.data.model import GroupModel, MetricModel
 
 EXACTLY = 1e-15
-"""Share of χ² that the last step may promise: corrections of nanometres are to be seen."""
+"""Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
 MAX_STEPS = 100
 MAX_MOVE_PX = 0.02
-"""Contradictory observations make the last steps slow; what still moves less than this has an answer for the checks."""
+"""Largest move of a projection, in px, at which a result is returned. Contradictory observations make the last steps
+slow; below this limit the result is good enough for the checks."""
 DAMPING = 1e-12
-"""Nothing that the datum leaves open is determined by less."""
+"""Relative damping, below the information of every direction that the datum does not leave open."""
 SETTLED_PX = 1e-6
-"""What moves less has settled, four orders below the σ of a centre: the share ``EXACTLY`` of a χ² of 1e5 is a step of
-1e-5 σ. What stops between the two limits is returned, and marked."""
+"""Largest move of a projection in a settled result, in px: four orders of magnitude below the σ of a centre. The share
+``EXACTLY`` of a χ² of 1e5 is a step of 1e-5 σ. Results between the two limits are returned, and marked."""
 MIN_COMMON = 0.1
 MAX_COMMON = 0.99
-"""Share of the board's variance that is common to all groups: below the first it is taken as none, above the second
-what is left to a single group would be smaller than anything a board does."""
+"""Limits of the share of the board's variance that is common to all groups. Below the first, the share is taken as
+zero. Above the second, the remainder of a single group would be smaller than on any real board."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointResult:
     """The adjusted models, in one frame, mm.
 
-    ``models`` : one for each group, mm; ``model_from_board`` by group; ``labels`` : (c,) of the target's circles;
+    ``models`` : one for each group, mm; ``model_from_board`` : by group; ``labels`` : (c,) of the target's circles;
     ``xyz_model`` : (c, 3) mm; ``covariance_mm2`` : (3c, 3c) marginal, in the datum of smallest trace, scaled by
-    ``sigma0``²; ``sigma0`` : residuals against the centres' own σ; ``board_residuals_mm`` by group: (n, 3), board
-    frame; ``board_common`` : share of the board's variance that all groups have in common; ``camera`` : adjusted where
-    asked, with ``camera_covariance`` (q, q) of the parameters of its COLMAP model, else empty; ``weights`` by group:
-    (n,) Huber's; ``redundancy`` : degrees of freedom; ``last_move_px`` : by how much the last whole step moves a
-    projection at most.
+    ``sigma0``²; ``sigma0`` : residuals over the centres' own σ; ``board_residuals_mm`` : by group, (n, 3), board frame;
+    ``board_common`` : share of the board's variance that all groups have in common; ``camera`` : adjusted if requested;
+    ``camera_covariance`` : (q, q) of the parameters of its COLMAP model, else empty; ``weights`` : by group, (n,)
+    Huber's; ``redundancy`` : degrees of freedom; ``last_move_px`` : largest move of a projection by the last whole
+    step.
     """
 
     models: tuple[MetricModel, ...]
@@ -86,14 +87,17 @@ class JointResult:
 
     @property
     def settled(self) -> bool:
-        """Whether the adjustment ended at its minimum, not merely on the way to it."""
+        """True if the adjustment reached its minimum and did not stop on the way to it."""
         return self.last_move_px < SETTLED_PX
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
-    """Groups and what they share at the minimum, the setting that they were weighed by, and by how much the next whole
-    step would still move a projection, px."""
+    """State of a joint adjustment at its minimum.
+
+    ``blocks`` : the groups; ``shared`` : what the groups share; ``setting`` : constants of the adjustment, weights
+    included; ``move_px`` : largest move of a projection by the next whole step, px.
+    """
 
     blocks: tuple[Block, ...]
     shared: Shared
@@ -101,7 +105,7 @@ class Adjusted:
     move_px: float
 
     def result(self) -> JointResult:
-        """With covariances."""
+        """Returns the result with its covariances."""
         return _result(list(self.blocks), self.shared, self.setting, self.move_px)
 
 
@@ -113,7 +117,7 @@ def adjust_jointly(
     prior: CameraPrior | None = None,
     start: Camera | None = None,
 ) -> JointResult:
-    """:func:`adjusted`, and the covariances at its minimum."""
+    """Returns the result of :func:`adjusted` with the covariances at its minimum."""
     return adjusted(models, board, camera, flatness_mm, prior, start).result()
 
 
@@ -126,16 +130,16 @@ def adjusted(
     start: Camera | None = None,
     common: float | None = None,
 ) -> Adjusted:
-    """Adjust metric models that share one frame, all observations weighted by their σ.
+    """Adjusts metric models that share one frame, with all observations weighted by their σ.
 
-    ``flatness_mm`` : σ of a circle's distance from the plane of its face, None for no such knowledge; ``prior`` : the
-    intrinsics of ``camera`` are observations with this covariance and are adjusted, from ``start``; fixed where None;
-    ``common`` : share of the board's variance that all groups have in common; where it is given, no residual loses
-    weight, so that the answer is linear in the observations.
+    ``flatness_mm`` : σ of a circle's distance from the plane of its face, None if it is unknown; ``prior`` : the
+    intrinsics of ``camera`` are observations with this covariance and are adjusted, beginning at ``start``; they are
+    fixed if None; ``common`` : share of the board's variance that all groups have in common. If it is given, no
+    residual is down-weighted, so that the result is linear in the observations.
 
-    Whether the board kept its shape between the groups (one plate) or not (a film, a screen) is estimated from its
-    dots where ``common`` is None: first every group has its own deviations from the design, and where these agree a
-    common shape follows.
+    If ``common`` is None, the dots tell whether the board kept its shape between the groups (one plate) or not
+    (a film, a screen). First every group has its own deviations from the design. If these deviations agree, a common
+    shape is estimated next.
 
     Raises
     ------
@@ -163,10 +167,10 @@ def covariance_of(
     common: float = 0.0,
     photographs: Mapping[str, np.ndarray] | None = None,
 ) -> JointResult:
-    """What :func:`adjust_jointly` is to report of models that are where they should be: nothing is moved, σ₀ is 1.
+    """Returns what :func:`adjust_jointly` would report of models at their true places: nothing is moved, σ₀ is 1.
 
-    Arguments as there; ``common`` : share of the board's variance that all groups have in common; ``photographs`` :
-    what :func:`photographs_of` has said of groups.
+    The arguments are those of :func:`adjusted`; ``common`` : share of the board's variance that all groups have in
+    common; ``photographs`` : results of :func:`photographs_of`, by group.
     """
     blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common, photographs)
     if photographs or not dots_first.is_cheaper(blocks):
@@ -177,25 +181,30 @@ def covariance_of(
 
 
 def basis_of(prior: CameraPrior | None) -> np.ndarray:
-    """Derivative (16, q) of a camera's parameters by those that are adjusted."""
+    """Returns the derivative (16, q) of a camera's parameters by those that are adjusted."""
     return intrinsic_basis(prior.colmap_model) if prior else np.zeros((len(PARAMETER_NAMES), 0))
 
 
 def photographs_of(
     models: Sequence[MetricModel], board: BoardDesign, camera: Camera, prior: CameraPrior | None
 ) -> dict[str, np.ndarray]:
-    """By group, normal matrix (3p + q, 3p + q) of its points and the intrinsics from all of its images, σ₀ = 1."""
+    """Returns the normal matrices of the photographs alone, by group.
+
+    Each matrix (3p + q, 3p + q) is over the points of the group and the intrinsics, from all of its images; σ₀ is 1.
+    """
     blocks, shared, _ = _start(models, board, camera, None, prior)
     return {b.model.group: without_cameras(b.model, camera, shared.basis, np.inf)[0] for b in blocks}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extensible:
-    """What :func:`covariance_of` gives of the circles, ready for one more view, however many images it rests on.
+    """The circle covariance of :func:`covariance_of`, prepared for one more view.
+
+    Its size does not grow with the number of images.
 
     ``camera`` ; ``basis`` : (16, q) derivative of its parameters by those that are adjusted; ``covariance_mm2`` :
-    (3c, 3c) of the circles; ``points`` by group: (3p + q, 3p + q) of its points and the intrinsics; ``to_circles`` by
-    group: (3p + q, 3c).
+    (3c, 3c) of the circles; ``points`` : by group, covariance (3p + q, 3p + q) of its points and the intrinsics;
+    ``to_circles`` : by group, covariance (3p + q, 3c) between these and the circles.
     """
 
     camera: Camera
@@ -205,9 +214,10 @@ class Extensible:
     to_circles: dict[str, np.ndarray]
 
     def with_view(self, view: MetricModel) -> np.ndarray:
-        """Covariance of the circles, (3c, 3c) mm², with a view: a model of one image and all points of its group.
+        """Returns the covariance of the circles, (3c, 3c) mm², with one more view.
 
-        The inverse of a matrix with a change of small rank (Woodbury 1950).
+        ``view`` : a model of one image and all points of its group. The inverse is that of a matrix with a change of
+        small rank (Woodbury 1950).
         """
         rows = rows_of_view(view, self.camera, self.basis)
         away = rows @ self.to_circles[view.group]
@@ -224,27 +234,30 @@ def extensible(
     common: float = 0.0,
     photographs: Mapping[str, np.ndarray] | None = None,
 ) -> Extensible:
-    """See there; arguments as of :func:`covariance_of`."""
+    """Returns the :class:`Extensible` covariance of models; arguments as of :func:`covariance_of`."""
     blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common, photographs)
     normal, _, groups = normal_equations(blocks, shared, setting)
     inverse = constrained_inverse(normal, free_directions(len(normal), shared))
     circles = inverse[setting.places(shared).circles]
     points, to_circles = {}, {}
-    for block, each in zip(blocks, groups, strict=True):
-        kept, inner = setting.outer(block, shared), each.inner
+    for block, group_equations in zip(blocks, groups, strict=True):
+        outer_index, inner = setting.outer(block, shared), group_equations.inner
         from_kept, d, q = inner.from_kept[0], 3 * len(block.dots), shared.basis.shape[1]
-        outer = inverse[np.ix_(kept, kept)]
-        # Rows: the dots, which are reduced away, then what the groups share.
+        outer = inverse[np.ix_(outer_index, outer_index)]
+        # Rows: the dots, which are eliminated, then the unknowns that the groups share.
         to_kept = np.concatenate([-from_kept[:d] @ outer, outer])
-        own = np.block(
+        covariance = np.block(
             [[inner.inverse[0, :d, :d] - to_kept[:d] @ from_kept[:d].T, to_kept[:d]], [to_kept[:d].T, outer]]
         )
-        every = np.concatenate([-from_kept[:d] @ circles[:, kept].T, circles[:, kept].T])
+        covariance_to_circles = np.concatenate([-from_kept[:d] @ circles[:, outer_index].T, circles[:, outer_index].T])
         row = np.empty(3 * len(block.model.labels) + q, int)
         row[(3 * block.dots[:, None] + np.arange(3)).ravel()] = np.arange(d)
         row[(3 * block.circles[:, None] + np.arange(3)).ravel()] = d + np.arange(3 * len(block.circles))
-        row[len(row) - q :] = len(own) - q + np.arange(q)
-        points[block.model.group], to_circles[block.model.group] = own[np.ix_(row, row)], every[row]
+        row[len(row) - q :] = len(covariance) - q + np.arange(q)
+        points[block.model.group], to_circles[block.model.group] = (
+            covariance[np.ix_(row, row)],
+            covariance_to_circles[row],
+        )
     c = circles.shape[0]
     return Extensible(shared.camera, shared.basis, circles[:, :c], points, to_circles)
 
@@ -258,7 +271,7 @@ def _start(
     common: float = 0.0,
     photographs: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[list[Block], Shared, Setting]:
-    """Groups, what they share, and the setting, no residual too long; ``common`` : see :func:`covariance_of`."""
+    """Returns groups, shared unknowns, and a setting without down-weighting; ``common`` : see :func:`covariance_of`."""
     labels = tuple(sorted({label for model in models for label in model.labels if isinstance(label, CircleLabel)}))
     basis = basis_of(prior)
     weight = np.linalg.inv(prior.covariance) if prior else np.zeros((0, 0))
@@ -274,15 +287,15 @@ def _start(
 
 
 def _with_common(blocks: list[Block], setting: Setting, common: float) -> tuple[list[Block], Setting]:
-    """The same with a shape of the board that the groups have in common."""
+    """Returns groups and setting with a shape of the board that all groups have in common."""
     setting = replace(setting, common=common)
-    own, board = setting.own_sigma_mm(), setting.board
-    return [replace(b, sigma_mm=own, dot_place=_dot_place(b.model, b.dots, board)) for b in blocks], setting
+    own_sigma, board = setting.own_sigma_mm(), setting.board
+    return [replace(b, sigma_mm=own_sigma, dot_place=_dot_place(b.model, b.dots, board)) for b in blocks], setting
 
 
 def _minimise(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[list[Block], Shared, float]:
-    """The state of least cost; and by how much the next whole step would still move a projection at most, px."""
-    found = minimise(
+    """Returns the state of least cost, and the largest move of a projection by the next whole step, px."""
+    minimum = minimise(
         JointState(tuple(blocks), shared),
         lambda state: SharedEquations.of(state, setting),
         lambda state, step: state.moved(step, setting),
@@ -292,9 +305,9 @@ def _minimise(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[li
         settled=EXACTLY,
         max_steps=MAX_STEPS,
     )
-    last, beyond = found.state, found.state.moved(found.linear.step(DAMPING)[0], setting)
+    last, beyond = minimum.state, minimum.state.moved(minimum.linear.step(DAMPING)[0], setting)
     move = max(_largest_move(a, last.shared, b, beyond.shared) for a, b in zip(last.blocks, beyond.blocks, strict=True))
-    if not move <= MAX_MOVE_PX:  # not a number either
+    if not move <= MAX_MOVE_PX:  # true of NaN, too
         raise ConvergenceError(
             "E-NO-MINIMUM",
             f"joint adjustment: projections still move by {move:.1g} px in the last of at most {MAX_STEPS} steps; "
@@ -332,13 +345,13 @@ def _dot_place(model: GroupModel, dots: np.ndarray, board: BoardDesign) -> np.nd
 
 
 def _robust_sigma(blocks: list[Block], camera: Camera) -> float:
-    """Robust σ of the normalised residuals per axis."""
+    """Returns the robust σ of the normalised residuals per axis."""
     length = np.concatenate([np.linalg.norm(normalised(b.model, camera), axis=1) for b in blocks])
     return max(robust_sigma(length, 2), 1e-6)
 
 
 def _common_share(blocks: list[Block], board: BoardDesign) -> float:
-    """Covariance between the groups' board residuals over their variance; 0 where it is no more than chance."""
+    """Returns the covariance between the groups' board residuals over their variance; 0 if it is not significant."""
     by_dot = np.full((len(blocks), board.rows * board.columns, 3), np.nan)
     for k, b in enumerate(blocks):
         by_dot[k, _dot_place(b.model, b.dots, board)] = b.board_residual()
@@ -356,12 +369,12 @@ def _common_share(blocks: list[Block], board: BoardDesign) -> float:
 
 
 def _shared_circles(blocks: list[Block], count: int) -> np.ndarray:
-    """Start values: the mean over the groups."""
-    total, seen = np.zeros((count, 3)), np.zeros(count)
+    """Returns start values of the circles: their means over the groups."""
+    total, group_count = np.zeros((count, 3)), np.zeros(count)
     for b in blocks:
         np.add.at(total, b.circle_place, b.model.xyz_model[b.circles])
-        np.add.at(seen, b.circle_place, 1)
-    return total / seen[:, None]
+        np.add.at(group_count, b.circle_place, 1)
+    return total / group_count[:, None]
 
 
 def _with_circles(block: Block, xyz: np.ndarray) -> MetricModel:
@@ -383,8 +396,11 @@ def _result(
     sigma0: float | None = None,
     equations: tuple[np.ndarray, slice, slice] | None = None,
 ) -> JointResult:
-    """``move_px`` : of the last step; ``sigma0`` : estimated from the residuals where None; ``equations`` : normal
-    matrix over circles, intrinsics and perhaps more, and the places of those two, where it is known."""
+    """Returns the result with its covariances.
+
+    ``move_px`` : move by the last step; ``sigma0`` : estimated from the residuals if None; ``equations`` : normal
+    matrix over circles, intrinsics and perhaps more, and the places of circles and intrinsics in it; computed if None.
+    """
     if equations is None:
         places = setting.places(shared)
         equations = normal_equations(blocks, shared, setting)[0], places.circles, places.intrinsics

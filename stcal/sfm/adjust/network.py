@@ -1,7 +1,7 @@
-"""The free network of one group with its cofactors: what residuals, circles and further parameters may do by chance.
+"""The free network of one group with its cofactors: random variation of residuals, circles and further parameters.
 
-A fault is a set of further parameters that the adjustment lacks: another camera, a face that moved in one image.
-Whether they are needed is told by the residuals alone, to first order and without another adjustment (score test, Rao
+A fault is modelled by further parameters that the adjustment lacks: another camera, a face that moved in one image. The
+residuals alone tell whether these parameters are needed, to first order and without another adjustment (score test, Rao
 1948; for one observation Baarda's data snooping, 1968).
 """
 
@@ -16,18 +16,19 @@ from stcal.sfm.adjust.group import projection_jacobians
 from stcal.sfm.data.model import GroupModel, MetricModel
 
 MIN_SHARE = 1e-6
-"""Of a parameter's information that poses and points leave to it; below, it cannot be told from them."""
+"""Smallest share of a parameter's information that poses and points leave to it. Below this share, the parameter cannot
+be separated from them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Network:
     """An adjusted group, mm, with n observations, m images, p points.
 
-    ``residual`` : (n, 2) over σ; ``by_pose`` (n, 2, 6), ``by_point`` (n, 2, 3) : derivatives of the projections over σ;
-    ``inverse`` : (m, 6, 6) of the poses' normal blocks; ``coupling`` : (m, 6, 3p) between poses and points;
-    ``pose_right`` : (m, 6), ``point_right`` : (3p,) what the adjustment left of its right-hand sides, all but zero;
-    ``covariance_mm2`` : (3p, 3p) of the points, in the datum of smallest trace (7 free directions);
-    ``redundancy`` : (n,) of each observation, between 0 and 2.
+    ``residual`` : (n, 2) over σ; ``by_pose`` : (n, 2, 6), ``by_point`` : (n, 2, 3), derivatives of the projections over
+    σ; ``inverse`` : (m, 6, 6) of the poses' normal blocks; ``coupling`` : (m, 6, 3p) between poses and points;
+    ``pose_right`` : (m, 6), ``point_right`` : (3p,) right-hand sides after the adjustment, almost zero;
+    ``covariance_mm2`` : (3p, 3p) of the points, in the datum of smallest trace (7 free directions); ``redundancy`` :
+    (n,) of each observation, between 0 and 2.
     """
 
     model: MetricModel
@@ -46,38 +47,47 @@ class Network:
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (p, p), "covariance"))
 
     def square_by_image(self) -> tuple[np.ndarray, np.ndarray]:
-        """Squared residuals over σ² and redundancy of each image, (m,)."""
+        """Returns squared residuals over σ² and redundancy of each image, (m,)."""
         square, redundancy = np.zeros((2, len(self.model.images)))
         np.add.at(square, self.model.image_index, (self.residual**2).sum(1))
         np.add.at(redundancy, self.model.image_index, self.redundancy)
         return square, redundancy
 
     def covariance_of(self, points: np.ndarray) -> np.ndarray:
-        """Of some of the points, (3k, 3k)."""
+        """Returns the covariance of some of the points, (3k, 3k)."""
         place = (3 * np.asarray(points)[:, None] + np.arange(3)).ravel()
         return self.covariance_mm2[np.ix_(place, place)]
 
     def pose_covariance(self) -> np.ndarray:
-        """Of the poses, (m, 6, 6) rad and mm, rotation perturbed from the left, in the datum of the points."""
+        """Returns the covariances of the poses, (m, 6, 6) rad and mm, in the datum of the points.
+
+        Rotations are perturbed on the left.
+        """
         to_points = self.inverse @ self.coupling
         return self.inverse + to_points @ self.covariance_mm2 @ np.swapaxes(to_points, 1, 2)
 
     def score(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normal matrix (q, q) and right-hand side (q,) of q further parameters of the whole group, all else
-        eliminated; ``columns`` : (n, 2, q) derivative of the projections by them, over σ."""
+        """Returns the normal equations (q, q), (q,) of q further parameters, with all other unknowns eliminated.
+
+        The parameters are common to the whole group; ``columns`` : (n, 2, q) derivatives of the projections by them,
+        over σ.
+        """
         normal, right, to_points = self._by_image(columns)
         coupled = to_points.sum(0)
         weighted = coupled @ self.covariance_mm2
         return normal.sum(0) - weighted @ coupled.T, right.sum(0) - weighted @ self.point_right
 
     def score_by_image(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same of parameters that every image has for itself: (m, q, q) and (m, q)."""
+        """Returns :meth:`score` of parameters that every image has for itself: (m, q, q) and (m, q)."""
         normal, right, to_points = self._by_image(columns)
         weighted = to_points @ self.covariance_mm2
         return normal - weighted @ np.swapaxes(to_points, 1, 2), right - weighted @ self.point_right
 
     def _by_image(self, e: np.ndarray):
-        """By image: normal (m, q, q) with the pose eliminated, right (m, q), coupling to the points (m, q, 3p)."""
+        """Returns the equations of each image with its pose eliminated.
+
+        They are the normal matrix (m, q, q), the right-hand side (m, q), and the coupling to the points (m, q, 3p).
+        """
         model = self.model
         m, q, p = len(model.images), e.shape[2], len(model.labels)
         et = np.swapaxes(e, 1, 2)
@@ -96,7 +106,7 @@ class Network:
 
 
 def free_network(model: MetricModel, camera: Camera, factor: float) -> Network:
-    """Of an adjusted metric model; ``factor`` : on the centres' own σ."""
+    """Returns the free network of an adjusted metric model; ``factor`` : factor on the centres' own σ."""
     model = replace(model, covariance_px2=factor**2 * model.covariance_px2)
     by_pose, by_point = projection_jacobians(model, camera)
     a, b = model.whiten(by_pose), model.whiten(by_point)
@@ -107,32 +117,37 @@ def free_network(model: MetricModel, camera: Camera, factor: float) -> Network:
     coupling = coupling.transpose(0, 2, 1, 3).reshape(m, 6, 3 * p)
     poses, pose_right = blocks_of(a, residual, model.image_index, m)
     points, point_right = blocks_of(b, residual, model.point_index, p)
-    away = reduce(poses, pose_right, coupling)
-    normal = -away.normal
+    reduction = reduce(poses, pose_right, coupling)
+    normal = -reduction.normal
     place = 3 * np.arange(p)[:, None] + np.arange(3)
     normal[place[:, :, None], place[:, None]] += points
     covariance = constrained_inverse(normal, free_motions(model.xyz_model, scale=True))
-    redundancy = 2 - _leverage(model, a, b, away.inverse, away.from_kept, covariance)
-    left = point_right.ravel() - away.right
-    return Network(model, residual, a, b, away.inverse, coupling, pose_right, left, covariance, redundancy)
+    redundancy = 2 - _leverage(model, a, b, reduction.inverse, reduction.from_kept, covariance)
+    right_of_points = point_right.ravel() - reduction.right
+    return Network(
+        model, residual, a, b, reduction.inverse, coupling, pose_right, right_of_points, covariance, redundancy
+    )
 
 
 def _leverage(model: GroupModel, a, b, inverse, eliminated, covariance) -> np.ndarray:
-    """Trace of the cofactors of the adjusted observations, (n,)."""
+    """Returns the trace of the cofactors of each adjusted observation, (n,)."""
     p = len(model.labels)
     weighted = eliminated @ covariance
     pose = inverse + weighted @ np.swapaxes(eliminated, 1, 2)
     mixed = weighted.reshape(len(model.images), 6, p, 3)[model.image_index, :, model.point_index]
     blocks = covariance.reshape(p, 3, p, 3)[np.arange(p), :, np.arange(p)]
-    own = np.einsum("nki,nij,nkj->n", a, pose[model.image_index], a, optimize=True)
-    own -= 2 * np.einsum("nki,nij,nkj->n", a, mixed, b, optimize=True)
-    return own + np.einsum("nki,nij,nkj->n", b, blocks[model.point_index], b, optimize=True)
+    trace = np.einsum("nki,nij,nkj->n", a, pose[model.image_index], a, optimize=True)
+    trace -= 2 * np.einsum("nki,nij,nkj->n", a, mixed, b, optimize=True)
+    return trace + np.einsum("nki,nij,nkj->n", b, blocks[model.point_index], b, optimize=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoreTest:
-    """``estimate`` : (q,) of the further parameters, with ``covariance`` (q, q); ``statistic`` : χ² distributed with
-    ``freedom`` degrees of freedom where no parameter is needed."""
+    """Result of a score test.
+
+    ``estimate`` : (q,) further parameters, with ``covariance`` (q, q); ``statistic`` : follows χ² with ``freedom``
+    degrees of freedom if no further parameter is needed.
+    """
 
     estimate: np.ndarray
     covariance: np.ndarray
@@ -141,7 +156,10 @@ class ScoreTest:
 
 
 def solve_score(normal: np.ndarray, right: np.ndarray) -> ScoreTest:
-    """The test of :meth:`Network.score`; directions that the normal matrix does not hold count for nothing."""
+    """Returns the test for the equations of :meth:`Network.score`.
+
+    Directions that the normal matrix does not determine are left out of it.
+    """
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     value, vector = np.linalg.eigh(normal / np.outer(scale, scale))
     held = value > MIN_SHARE

@@ -1,4 +1,4 @@
-"""What the adjustment is asked for."""
+"""Options of the adjustment."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -13,19 +13,21 @@ Solve = Literal["joint", "chain", "paper"]
 
 @dataclass(frozen=True, slots=True)
 class AdjustOptions:
-    """How models become a calibrated target; everything is decided.
+    """Options of the adjustment of models to a calibrated target, with every default decided.
 
     ``reference_face`` : id of the face whose frame is the target frame; ``solve`` : ``joint`` (one adjustment over all
-    groups), ``chain`` (group by group, every way to a face weighed) or ``paper`` (Zhang & Wei 2017: group by group, λ
-    by rows, faces by single transforms); ``frame`` : ``plane`` (Z from the plane of all circles of a face) or
+    groups), ``chain`` (group by group, weighted over all ways to a face) or ``paper`` (Zhang & Wei 2017: group by
+    group, λ by rows, faces by single transforms); ``frame`` : ``plane`` (Z from the plane of all circles of a face) or
     ``three-point`` (as in the paper); ``eccentricity`` : whether it is corrected; ``flatness_mm`` : σ of a circle about
-    the plane of its face, None for no such knowledge; ``refine_camera`` : adjust the intrinsics, the given ones being
+    the plane of its face, None if it is unknown; ``refine_camera`` : adjust the intrinsics, with the given ones as
     observations.
 
     Raises
     ------
     InputError
-        A choice that does not exist, a σ that is none, or refined intrinsics without the joint adjustment.
+        A choice does not exist, σ is out of range, an option contradicts ``paper``, or intrinsics are to be refined
+        without
+        the joint adjustment.
     """
 
     reference_face: str
@@ -36,12 +38,12 @@ class AdjustOptions:
     refine_camera: bool = False
 
     def __post_init__(self):
-        for what, value, choices in (
+        for option, value, choices in (
             ("solve", self.solve, get_args(Solve)),
             ("frame", self.frame, get_args(FrameKind)),
         ):
             if value not in choices:
-                raise InputError("E-OPTION-VALUE", f"{what} {value!r}: not a choice; use {' or '.join(choices)}")
+                raise InputError("E-OPTION-VALUE", f"{option} {value!r}: not a choice; use {' or '.join(choices)}")
         if self.flatness_mm is not None and not LEAST <= self.flatness_mm <= MOST_FLATNESS_MM:
             raise InputError(
                 "E-OPTION-RANGE",

@@ -1,4 +1,4 @@
-"""Eccentricity in the observation model, and bundle adjustment until it no longer changes."""
+"""Eccentricity in the observation model: alternates with bundle adjustment until it no longer changes."""
 
 from dataclasses import dataclass, replace
 
@@ -17,10 +17,10 @@ from stcal.sfm.data.model import GroupModel, Outlier, WorldModel
 
 MAX_ROUNDS = 20
 SETTLED_PX = 1e-5
-"""The corrections have settled when none moves by more than this: far below any centring noise."""
+"""Largest change of corrections that have settled, in px: far below any centring noise."""
 OUTLIER_RMS = 6.0
-"""Observations longer than this multiple of the residuals' robust RMS length, √2 σ, and than twice this multiple of
-their own σ are named and left out."""
+"""Limit of a residual, as a multiple of the residuals' robust RMS length, √2 σ. Observations that exceed it, and twice
+this multiple of their own σ, are named and left out."""
 MIN_OUTLIER_PX = 0.1
 WORST_SHARE = 0.5
 MAX_OUTLIER_SHARE = 0.1
@@ -28,7 +28,11 @@ MAX_OUTLIER_SHARE = 0.1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refined:
-    """``model`` with settled corrections; ``rounds`` it took; ``outliers`` left out on the way."""
+    """Result of :func:`refine`.
+
+    ``model`` : the model with settled corrections; ``rounds`` : number of rounds; ``outliers`` : observations that were
+    left out.
+    """
 
     model: WorldModel
     rounds: int
@@ -42,21 +46,21 @@ def refine(
     board: BoardDesign,
     eccentricity: bool = True,
 ) -> Refined:
-    """Alternate between the circles' eccentricity and bundle adjustment.
+    """Alternates between the eccentricity of the circles and bundle adjustment.
 
     Raises
     ------
     ConvergenceError
         The corrections did not settle.
     MappingError
-        A face has too few mapped circles to have a plane.
+        A face has too few mapped circles to have a plane, or too many observations are outliers.
     """
     radius = target.radius_of() | board.radius_of()
     model = adjust(model, camera)
     observations = len(model.image_index)
     outliers: list[Outlier] = []
     rounds = 0
-    while rounds < MAX_ROUNDS:  # rounds that name outliers do not count: these are limited on their own
+    while rounds < MAX_ROUNDS:  # rounds that find outliers do not count: their number is limited separately
         rounds += 1
         shift = np.zeros_like(model.shift_px)
         if eccentricity:
@@ -66,11 +70,11 @@ def refine(
         if change > SETTLED_PX:
             model = adjust(model, camera)
         if rounds >= 2 or not eccentricity:
-            off, named = _outliers(model, camera)
-            if len(named):
-                outliers += named
+            is_outlier, new_outliers = _outliers(model, camera)
+            if len(new_outliers):
+                outliers += new_outliers
                 _require_few(outliers, observations, model.group)
-                model = adjust(model.without(off), camera)
+                model = adjust(model.without(is_outlier), camera)
                 rounds -= 1
                 continue
         if change <= SETTLED_PX:
@@ -83,7 +87,7 @@ def refine(
 
 
 def _require_few(outliers: list[Outlier], observations: int, group: str) -> None:
-    """Outliers are few, or the model is wrong and not they."""
+    """Raises an error if the outliers are many: then the model is wrong, not the observations."""
     if len(outliers) > MAX_OUTLIER_SHARE * observations:
         raise MappingError(
             "E-GROUP-CONTRADICTS",
@@ -94,7 +98,7 @@ def _require_few(outliers: list[Outlier], observations: int, group: str) -> None
 
 
 def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, float], mm_per_unit: float) -> np.ndarray:
-    """Image of the ellipse's centre minus image of the circle's centre, (n, 2), for every observation.
+    """Returns the centre of the imaged ellipse minus the image of the circle's centre, (n, 2), for every observation.
 
     Raises
     ------
@@ -106,11 +110,11 @@ def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, fl
         try:
             normal[members] = fit_plane(model.xyz_model[members]).normal
         except DegenerateError as error:
-            what = "the board" if key == "board" else f"face {key}"
+            surface = "the board" if key == "board" else f"face {key}"
             raise MappingError(
                 "E-GROUP-FEW-CIRCLES",
-                f"group {model.group}: {what}: {len(members)} circles mapped, 3 off one line needed for its plane; "
-                f"add views that show {what}",
+                f"group {model.group}: {surface}: {len(members)} circles mapped, 3 off one line needed for its plane; "
+                f"add views that show {surface}",
             ) from error
     radius = np.array([radius_mm[label] for label in model.labels]) / mm_per_unit
     rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
@@ -121,18 +125,20 @@ def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, fl
 
 
 def _outliers(model: GroupModel, camera: Camera) -> tuple[np.ndarray, list[Outlier]]:
-    """The worst observation of every image that is beyond the limit, and not much better than the worst of all: one
-    bad observation pulls on all that share a point or a camera with it."""
+    """Returns the worst observation of each image if it is an outlier of comparable size to the worst of all.
+
+    One bad observation affects all observations that share a point or a camera with it.
+    """
     residual = np.linalg.norm(model.residuals_px(camera), axis=1)
     rms = np.sqrt(2) * robust_sigma(residual, 2)
     limit = np.maximum(np.maximum(OUTLIER_RMS * rms, 2 * OUTLIER_RMS * model.sigma_px()), MIN_OUTLIER_PX)
     least = max(1.0, WORST_SHARE * float((residual / limit).max(initial=0.0)))
-    off = np.zeros(len(residual), bool)
-    named = []
+    is_outlier = np.zeros(len(residual), bool)
+    outliers = []
     for name, rows in zip(model.images, model.rows_by_image(), strict=True):
         worst = rows[np.argmax(residual[rows] / limit[rows])]
         if residual[worst] > least * limit[worst]:
-            off[worst] = True
+            is_outlier[worst] = True
             label = model.labels[model.point_index[worst]]
-            named.append(Outlier(name, label, float(residual[worst]), float(limit[worst])))
-    return off, named
+            outliers.append(Outlier(name, label, float(residual[worst]), float(limit[worst])))
+    return is_outlier, outliers

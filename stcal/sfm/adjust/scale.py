@@ -1,4 +1,4 @@
-"""Scale: λ in mm per unit of the model's world, from the board."""
+"""Scale of a model: λ in mm per unit of the model's world, from the board."""
 
 from dataclasses import dataclass
 
@@ -19,11 +19,10 @@ MIN_DOTS = 4
 class Scale:
     """The scale of one group.
 
-    ``board_from_world`` : similarity over all dots, by least squares but for a λ that was asked for by rows; its scale
-    is λ (mm per unit);
-    ``rows_mm_per_unit`` : λ as in Zhang & Wei (2017) (first and last row, all pairs), ``rows`` those two rows;
-    ``labels`` : (n,) the dots; ``residuals_mm`` : (n, 3) reconstructed minus design, board frame;
-    ``sigma_mm_per_unit`` : of λ, from the stated σ of the dots' positions.
+    ``board_from_world`` : similarity over all dots by least squares, unless λ by rows was requested; its scale is λ
+    (mm per unit); ``rows_mm_per_unit`` : λ as in Zhang & Wei (2017) (first and last row, all pairs); ``rows`` : these
+    two rows; ``labels`` : (n,) the dots; ``residuals_mm`` : (n, 3) reconstructed minus design, board frame;
+    ``sigma_mm_per_unit`` : σ of λ, from the stated σ of the dots' positions.
     """
 
     board_from_world: Similarity
@@ -38,34 +37,36 @@ class Scale:
 
     @property
     def mm_per_unit(self) -> float:
-        """λ, by least squares or by rows as asked for."""
+        """λ, by least squares or by rows, as requested."""
         return self.board_from_world.scale
 
     def group_from_world(self) -> Similarity:
-        """To the group's metric frame: the world's, in mm."""
+        """Returns the similarity to the group's metric frame, which is the world in mm."""
         return Similarity(self.mm_per_unit, Rigid())
 
     def rms_mm(self) -> float:
-        """RMS of the residuals' lengths."""
+        """Returns the RMS of the residuals' lengths."""
         return float(np.sqrt((self.residuals_mm**2).sum(1).mean()))
 
     def mean_mm(self) -> float:
-        """Mean of the residuals' lengths: the first measure of Zhang & Wei's Table 1."""
+        """Returns the mean of the residuals' lengths: the first measure of Zhang & Wei's Table 1."""
         return float(np.linalg.norm(self.residuals_mm, axis=1).mean())
 
     def spread_mm(self) -> float:
-        """Standard deviation of the residuals' lengths: the second measure of that table, which it calls mean square
-        error; it is less than the first, as no root mean square can be."""
+        """Returns the standard deviation of the residuals' lengths: the second measure of Zhang & Wei's Table 1.
+
+        The table calls it mean square error. It is smaller than the mean there, which no root mean square can be.
+        """
         return float(np.linalg.norm(self.residuals_mm, axis=1).std())
 
 
 def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> Scale:
-    """Scale of a model from the dots of the board; ``by_rows`` : λ as in Zhang & Wei (2017).
+    """Returns the scale of a model from the dots of the board; ``by_rows`` : λ as in Zhang & Wei (2017).
 
     Raises
     ------
     ScaleError
-        Fewer than four dots are mapped, or all in one line.
+        Fewer than four dots are mapped, or all are collinear.
     """
     members = model.points_by_face().get("board", np.zeros(0, int))
     where = f"group {model.group}: scale"
@@ -100,10 +101,10 @@ def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> 
 
 
 def _by_rows(xyz_board, xyz_world, row) -> tuple[float, tuple[int, int]]:
-    """Zhang & Wei (2017), eq. 7, with the mean over pairs as it must be: 2/(n(n−1)), not 1/(n−1)!."""
+    """Computes λ by Zhang & Wei (2017), eq. 7, with the correct mean over pairs: 2/(n(n−1)), not 1/(n−1)!."""
     first, last = int(row.min()), int(row.max())
     chosen = (row == first) | (row == last)
     i, j = np.triu_indices(int(chosen.sum()), 1)
-    true = np.linalg.norm(xyz_board[chosen][i] - xyz_board[chosen][j], axis=1)
-    found = np.linalg.norm(xyz_world[chosen][i] - xyz_world[chosen][j], axis=1)
-    return float((true / found).mean()), (first, last)
+    designed = np.linalg.norm(xyz_board[chosen][i] - xyz_board[chosen][j], axis=1)
+    reconstructed = np.linalg.norm(xyz_world[chosen][i] - xyz_world[chosen][j], axis=1)
+    return float((designed / reconstructed).mean()), (first, last)

@@ -1,1 +1,1 @@
-"""Checks that residuals cannot fake; ``suite.py`` runs them all."""
+"""Checks that a wrong result with small residuals does not pass; ``suite.py`` runs them all."""

@@ -1,4 +1,4 @@
-"""Checks of the board and of the scale that it gives."""
+"""Checks of the board, and of the scale that it gives."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,14 +15,17 @@ from stcal.sfm.checks.radii import Radii, Size, size_by_radii
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
 
 DESIGN_SCALE = 1e-4
-"""σ of the target's size as a whole against its design: what 4 K do to aluminium, or a printer to a film."""
+"""Relative σ of the target's size against its design: the effect of 4 K on aluminium, or of a printer on a film."""
 MIN_DOTS = 4
 PITCH = "Scale of the board against the target's design"
 
 
 def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]:
-    """The dots of every group against the grid and its stated σ, as a whole; and the scale of each row and column
-    against the rest, where a board that is as a whole worse than stated is judged by its own measure."""
+    """Tests the dots of every group against the grid, and the scale of each row and column against the rest.
+
+    The grid is tested as a whole with its stated σ. If the whole board is worse than stated, its rows and columns are
+    judged by its actual deviations.
+    """
     whole, lines = [], []
     for network in networks:
         dots = np.array([i for i, label in enumerate(network.model.labels) if isinstance(label, DotLabel)])
@@ -46,7 +49,10 @@ def board_checks(networks: Sequence[Network], board: BoardDesign) -> list[Check]
 
 
 def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
-    """Dots less grid after a similarity, (3d,) mm, board frame; its inverse covariance (pseudo); cells (d, 2)."""
+    """Returns dots minus grid after a similarity, their weight matrix, and their cells (d, 2).
+
+    The differences are (3d,) mm, board frame. The weight matrix is the inverse of their covariance (pseudo).
+    """
     labels = [network.model.labels[i] for i in dots]
     cells = dot_cells(labels)
     design = board.places_mm(labels)
@@ -58,7 +64,7 @@ def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
     free = np.concatenate(
         [-skew(middle), np.broadcast_to(np.eye(3), (len(dots), 3, 3)), middle[:, :, None]], axis=2
     ).reshape(-1, 7)
-    # With the similarity as unknowns: what is left of the inverse covariance annihilates it.
+    # The similarity is eliminated as an unknown, so that the weights annihilate it.
     inverse = np.linalg.inv(covariance)
     along = inverse @ free
     weight = inverse - along @ np.linalg.solve(free.T @ along, along.T)
@@ -66,11 +72,11 @@ def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
 
 
 def _lines(name, gap, weight, cells, board: BoardDesign, inflation: float, redundancy: float) -> list[Trial]:
-    """A stretch of each row along X and each column along Y, in ppm."""
+    """Tests the stretch of each row along X and of each column along Y, in ppm."""
     trials = []
-    for what, own, along, axis in (("row", 0, 1, 0), ("column", 1, 0, 1)):
-        for line in np.unique(cells[:, own]):
-            members = np.flatnonzero(cells[:, own] == line)
+    for kind, across, along, axis in (("row", 0, 1, 0), ("column", 1, 0, 1)):
+        for line in np.unique(cells[:, across]):
+            members = np.flatnonzero(cells[:, across] == line)
             if len(members) < 3:
                 continue
             pattern = np.zeros((len(cells), 3))
@@ -79,17 +85,18 @@ def _lines(name, gap, weight, cells, board: BoardDesign, inflation: float, redun
             information = float(pattern.ravel() @ weight @ pattern.ravel())
             stretch = float(pattern.ravel() @ weight @ gap) / information
             statistic = stretch**2 * information / inflation
-            trials.append(Trial(f"{name} {what} {line}", 1e6 * stretch, "ppm", statistic, 1, redundancy))
+            trials.append(Trial(f"{name} {kind} {line}", 1e6 * stretch, "ppm", statistic, 1, redundancy))
     return trials
 
 
 def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii) -> Check:
-    """Size of the target as measured against its design: a board whose pitch is wrong as a whole makes everything else
-    too large or too small, and no residual shows it.
+    """Tests the measured size of the target against its design.
 
-    Positions: a similarity of the circles of each face to the design; their placement σ is what the fits leave. Radii:
-    the slope of measured over designed radii, which a constant bias of the edges does not touch. Their weighted mean is
-    tested, with the σ of the target's own size, 100 ppm.
+    If the pitch of the board is wrong as a whole, everything else is too large or too small, and no residual shows it.
+
+    Positions: a similarity maps the design to the circles of each face, and its residuals give the σ of their
+    placement. Radii: the slope of measured over designed radii, which a constant bias of the edges does not change. The
+    weighted mean of both is tested, with 100 ppm as σ of the target's own size.
     """
     measures = [m for m in (_size_by_positions(calibrated, target), size_by_radii(radii)) if m is not None]
     if not measures:
@@ -113,16 +120,16 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
 def _size_by_positions(calibrated: CalibratedTarget, target: TargetDesign) -> Size | None:
     weighted, weight, square, freedom = 0.0, 0.0, 0.0, 0
     for face in target.faces:
-        own = [i for i, label in enumerate(face.labels()) if label in calibrated.circles]
-        if len(own) < MIN_DOTS:
+        indices = [i for i, label in enumerate(face.labels()) if label in calibrated.circles]
+        if len(indices) < MIN_DOTS:
             continue
-        design = np.column_stack([face.xy_mm[own], np.zeros(len(own))])
-        xyz = np.array([calibrated.circles[face.labels()[i]] for i in own])
+        design = np.column_stack([face.xy_mm[indices], np.zeros(len(indices))])
+        xyz = np.array([calibrated.circles[face.labels()[i]] for i in indices])
         fit = align_similarity(xyz, design)
         spread = float(((design - design.mean(0)) ** 2).sum())
         weighted, weight = weighted + spread * (fit.scale - 1), weight + spread
-        left = fit.inverse() @ xyz - design
-        square, freedom = square + float((left[:, :2] ** 2).sum()), freedom + 2 * len(own) - 4
+        residuals = fit.inverse() @ xyz - design
+        square, freedom = square + float((residuals[:, :2] ** 2).sum()), freedom + 2 * len(indices) - 4
     if not freedom:
         return None
     return Size("by positions of circles", weighted / weight, float(np.sqrt(square / freedom / weight)), freedom)

@@ -23,15 +23,15 @@ from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import MetricModel
 
 MIN_HALF = 2
-"""Images of a group in each half."""
+"""Smallest number of images of a group in each half."""
 EXPLAINED = 0.05
-"""Directions in which a group adds less than this share of the variance are not tested: rounding would be."""
+"""Smallest share of the variance that a group must add in a tested direction; below it, rounding would be tested."""
 MICRO = 1e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Again:
-    """What it takes to adjust parts of a run again, from its ``joint`` result, at its intrinsics."""
+    """Input of further adjustments of parts of a run, which begin at its ``joint`` result and keep its intrinsics."""
 
     calibration: Calibration
     joint: JointResult
@@ -40,17 +40,19 @@ class Again:
     options: AdjustOptions
 
     def adjust(self, parts: Sequence[Sequence[MetricModel]]) -> list[JointResult | StcalError]:
-        """The same adjustment of parts of the models, or why there is none."""
+        """Adjusts parts of the models as the run did; returns the error of a part that has no result."""
         camera, flatness_mm = self.calibration.camera, self.options.flatness_mm
         return run_briefly(_adjusted, [(models, self.board, camera, flatness_mm) for models in parts])
 
     def posed(self, joint: JointResult | StcalError, faces: Sequence[str]) -> tuple[CalibratedTarget, JointResult]:
-        """Poses of ``faces`` by an adjustment of a part, in the frame of the first, and that adjustment.
+        """Returns the poses of ``faces`` by the adjustment of a part of the models, and that adjustment.
+
+        The poses are in the frame of the first face.
 
         Raises
         ------
         StcalError
-            There is none, or it does not hold the faces.
+            The adjustment has no result, or it does not determine the faces.
         """
         if isinstance(joint, StcalError):
             raise joint
@@ -76,13 +78,16 @@ def _unfixed(models: Sequence[MetricModel]) -> DegenerateError:
 
 
 def _difference(a: Rigid, b: Rigid) -> np.ndarray:
-    """Rotation (rad) and translation (mm) of a against b, in the frame of both: as covariances of faces are stated."""
+    """Returns rotation (rad) and translation (mm) of a against b, in the frame of both, as covariances of faces do."""
     return np.concatenate([Rotation.from_matrix(a.rotation @ b.rotation.T).as_rotvec(), a.translation - b.translation])
 
 
 def halves_check(again: Again) -> Check:
-    """Two results from two halves of the images of every group, taken in turn. Their difference against the sum of
-    their covariances; the board's own deviations are common to both, which makes the test a little milder."""
+    """Compares two results from two halves of the images of every group, taken in turn.
+
+    The difference is tested against the sum of both covariances. The board's own deviations are common to both halves,
+    which makes the test a little milder.
+    """
     key, title = "halves", "Two halves of the images against each other"
     models, reference = again.joint.models, again.calibration.target.reference_face
     fewest = min(models, key=lambda model: len(model.images))
@@ -92,15 +97,15 @@ def halves_check(again: Again) -> Check:
     faces = [reference, *(f for f in again.calibration.target.target_from_face if f != reference)]
     joints = again.adjust([[m.without(m.image_index % 2 != k) for m in models] for k in (0, 1)])
     try:
-        (first, joint), (second, other) = (again.posed(joint, faces) for joint in joints)
+        (first, joint), (second, second_joint) = (again.posed(joint, faces) for joint in joints)
     except StcalError as error:
         return impossible(key, title, f"half of the images do not hold the result ({error})", "add images")
-    redundancy = joint.redundancy + other.redundancy
+    redundancy = joint.redundancy + second_joint.redundancy
     trials = []
     for face in faces[1:]:
-        apart = _difference(first.target_from_face[face], second.target_from_face[face])
+        difference = _difference(first.target_from_face[face], second.target_from_face[face])
         covariance = first.face_covariance[face] + second.face_covariance[face]
-        trials.append(_face_trial(f"face {face}", apart, covariance, redundancy))
+        trials.append(_face_trial(f"face {face}", difference, covariance, redundancy))
     remedy = (
         "images of one group contradict one another more than their residuals show: look for images in which something "
         "moved, or that are blurred; trust no σ below this difference"
@@ -114,8 +119,10 @@ def _face_trial(name: str, apart: np.ndarray, covariance: np.ndarray, redundancy
 
 
 def groups_check(again: Again) -> Check:
-    """The result without one group against that with it, for groups that all faces can spare. The covariance of that
-    change is the difference of the two covariances, as that of a nested adjustment."""
+    """Compares the result without one group with the whole result, for each group that all faces can spare.
+
+    The covariance of the change is the difference of the two covariances, as of a nested adjustment.
+    """
     key, title = "groups", "The result without each group"
     calibration = again.calibration
     models, whole = again.joint.models, calibration.target
@@ -129,9 +136,9 @@ def groups_check(again: Again) -> Check:
     ]
     trials = []
     joints = again.adjust([[m for m in models if m.group != group] for group in removable])
-    for group, found in zip(removable, joints, strict=True):
+    for group, adjustment in zip(removable, joints, strict=True):
         try:
-            without, joint = again.posed(found, faces)
+            without, joint = again.posed(adjustment, faces)
         except StcalError:
             continue
         scale = (again.joint.sigma0 / joint.sigma0) ** 2
@@ -158,39 +165,41 @@ def _nested_trial(name: str, change, larger: np.ndarray, smaller: np.ndarray, re
 
 
 def _linked(members: list[set[str]], start: str) -> set[str]:
-    """Faces that groups link to one."""
+    """Returns the faces that the groups link to ``start``."""
     reached = {start}
     while True:
-        more = set().union(*(faces for faces in members if faces & reached)) - reached
-        if not more:
+        linked = set().union(*(faces for faces in members if faces & reached)) - reached
+        if not linked:
             return reached
-        reached |= more
+        reached |= linked
 
 
 def loops_check(again: Again) -> Check:
-    """Two ways to one face by different groups, each group adjusted alone with its board: their difference against the
-    covariances of the single steps."""
+    """Compares two ways to one face through different groups, with each group adjusted alone with its board.
+
+    The difference is tested against the covariances of the single steps.
+    """
     key, title = "loops", "Ways to a face through different groups"
     calibration = again.calibration
     pairs = [
-        (face, one, two)
-        for face, found in measure_chains(calibration.faces, calibration.target).items()
-        for one, two in combinations(found, 2)
-        if not set(one.groups) & set(two.groups)
+        (face, first, second)
+        for face, chains in measure_chains(calibration.faces, calibration.target).items()
+        for first, second in combinations(chains, 2)
+        if not set(first.groups) & set(second.groups)
     ]
     groups = sorted({group for _, *ways in pairs for way in ways for group in way.groups})
     alone = again.adjust([[m for m in again.joint.models if m.group == group] for group in groups])
     single = dict(zip(groups, alone, strict=True))
     trials = []
     redundancy = sum(2 * len(m.image_index) for m in again.joint.models)
-    for face, one, two in pairs:
+    for face, first, second in pairs:
         try:
-            ends = [_along(again, way, single) for way in (one, two)]
+            ends = [_along(again, way, single) for way in (first, second)]
         except StcalError:
             continue
-        apart = _difference(ends[0][0], ends[1][0])
-        name = f"face {face} by groups {' '.join(one.groups)} and {' '.join(two.groups)}"
-        trials.append(_face_trial(name, apart, ends[0][1] + ends[1][1], redundancy))
+        difference = _difference(ends[0][0], ends[1][0])
+        name = f"face {face} by groups {' '.join(first.groups)} and {' '.join(second.groups)}"
+        trials.append(_face_trial(name, difference, ends[0][1] + ends[1][1], redundancy))
     if not trials:
         reason = "no face is reached in two ways that share no group"
         return impossible(key, title, reason, "to be able to make it, add a group that closes a loop of faces")
@@ -199,23 +208,26 @@ def loops_check(again: Again) -> Check:
 
 
 def _along(again: Again, way: FaceChain, single: Mapping[str, JointResult | StcalError]) -> tuple[Rigid, np.ndarray]:
-    """reference_from_face along a way, each group adjusted alone, and its covariance (6, 6)."""
+    """Returns reference_from_face along a way, with each group adjusted alone, and its covariance (6, 6)."""
     pose, covariance = Rigid(), np.zeros((6, 6))
     for group, a, b in zip(way.groups, way.faces[:-1], way.faces[1:], strict=True):
         target, _ = again.posed(single[group], (a, b))
-        step, own = target.target_from_face[b], target.face_covariance[b]
-        # reference_from_b: turned by the way so far; an error of its rotation moves b on the arm from a to b.
+        step, step_covariance = target.target_from_face[b], target.face_covariance[b]
+        # The pose of face a turns the step to face b; an error of its rotation moves b by the lever arm from a to b.
         arm = np.block([[np.eye(3), np.zeros((3, 3))], [-skew(pose.rotation @ step.translation), np.eye(3)]])
         turn = block_diag(pose.rotation, pose.rotation)
-        covariance = arm @ covariance @ arm.T + turn @ own @ turn.T
+        covariance = arm @ covariance @ arm.T + turn @ step_covariance @ turn.T
         pose = pose @ step
     return pose, covariance
 
 
 def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
-    """σ₀ of the joint adjustment: what one target, the board's σ and flat faces add to the residuals of the free
-    networks, against what they should (F test of nested models). Suspicious at least where that adjustment has not
-    settled, which is no matter of chance: contradictory observations make its last steps slow."""
+    """Tests σ₀ of the joint adjustment: what one target, the board's σ and flat faces add to the residuals.
+
+    The increase over the free networks is compared with its expectation (F test of nested models). The verdict is at
+    least suspicious if the adjustment has not settled, which is no matter of chance: contradictory observations make
+    its last steps slow.
+    """
     key, title = "agreement", "Groups, board and faces against one another (σ₀)"
     free = float(sum(n.redundancy.sum() for n in networks))
     square = float(sum((n.residual**2).sum() for n in networks))
@@ -239,8 +251,11 @@ def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
 
 
 def flatness_check(networks: Sequence[Network], flatness_mm: float | None) -> Check:
-    """Distance of each circle from the plane of the others of its face, from the free networks of all groups that see
-    it, against its σ and the stated flatness."""
+    """Tests the distance of each circle from the plane of the other circles of its face.
+
+    It is taken from the free networks of all groups that see the circle, and tested against its σ and the stated
+    flatness.
+    """
     key, title = "flatness", "Each circle against the plane of its face"
     if flatness_mm is None:
         return impossible(key, title, "the run was asked not to use flatness", "state it with --flatness")
@@ -259,19 +274,22 @@ def flatness_check(networks: Sequence[Network], flatness_mm: float | None) -> Ch
             normal[np.ix_(place, place)] += weight
             right[place] += weight @ height
         covariance = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
-        away = covariance @ right
+        adjusted_heights = covariance @ right
         held = covariance @ normal
         weight = np.linalg.pinv(covariance + flatness_mm**2 * held @ held.T, rcond=1e-9, hermitian=True)
         for i, label in enumerate(labels):
             if weight[i, i] > 0:
-                height = float(weight[i] @ away / weight[i, i])
+                height = float(weight[i] @ adjusted_heights / weight[i, i])
                 trials.append(Trial(label, MICRO * height, "µm", height**2 * weight[i, i], 1, redundancy))
     remedy = "a circle out of its plane, or a face less flat than stated: press or glue it flat, or state --flatness"
     return judge(key, title, trials, "circles", remedy)
 
 
 def _heights(network: Network, members: np.ndarray) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """Labels, heights over any plane (k,), mm, seen from outside, and their weight matrix, that no plane touches."""
+    """Returns labels, heights (k,), mm, over any plane, positive outwards, and their weight matrix.
+
+    The weight matrix is the same for all planes.
+    """
     model = network.model
     xyz = model.xyz_model[members]
     towards = np.mean([pose.inverse().translation for pose in model.camera_from_model], axis=0) - xyz.mean(0)

@@ -1,4 +1,4 @@
-"""Checks of images, labels and camera, from the residuals of the free networks: no board, no design is believed."""
+"""Checks of images, labels and camera from the residuals of the free networks, without trust in board or design."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,40 +17,42 @@ from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, judge, 
 from stcal.sfm.data.observations import ImageObservations
 
 MIN_CIRCLES = 3
-"""Of the faces, and of the board, in an image that can tell whether the one moved against the other."""
+"""Smallest number of circles of the faces, and of the board, in an image that can show motion between both."""
 SIGMA_LIMITS = (2.0, 4.0)
-"""Residuals over the centres' own σ: twice is what light and lens add to a good image, four times is another model."""
+"""Limits of residuals over the centres' own σ: light and lens may add a factor of two, four is another model."""
 DULL = 1.5
-"""An image whose centres are less certain than its group's by this has lost more than half of its weight."""
+"""Ratio of an image's σ of centres to that of its group at which the image has lost more than half of its weight."""
 MAD_EFFICIENCY = 0.37
-"""Of the median absolute deviation: what a spread from n values is worth in degrees of freedom."""
+"""Efficiency of the median absolute deviation: degrees of freedom, per value, of a spread estimated by it."""
 UNEVEN_BY_CHANCE = 0.01
 """Share of even circles that noise or a compressed file may make look uneven."""
 FIELD_DEGREE = 3
 FIELD_FLOOR_PX = 0.002
-"""σ of a field that any centring leaves: the pixel raster, JPEG's blocks and light from one side do not average out."""
+"""σ of a field that any centring leaves: pixel raster, JPEG blocks and light from one side do not average out."""
 
 
 def camera_check(
     networks: Sequence[Network], camera: CalibratedCamera, calibration: Calibration, prior: CameraPrior | None
 ) -> Check:
-    """Are the intrinsics those of the images? Given ones: further intrinsics are tested, all at once, in the residuals
-    of all free networks (score test). Refined ones: their distance from the given ones against the stated σ.
+    """Tests whether the intrinsics are those of the images.
 
-    ``prior`` : where the intrinsics were refined. A camera file's stated σ does not excuse intrinsics that were held
-    fixed: the σ of the faces do not know of it.
+    If the intrinsics are as given, changes of them are tested in the residuals of all free networks, all at once
+    (score test). If they were refined, their distance from the given ones is tested against the stated σ.
+
+    ``prior`` : prior of the intrinsics if they were refined. The stated σ of a camera file does not excuse intrinsics
+    that were held fixed, as the σ of the faces do not include it.
     """
     key, title = "camera", "Intrinsics against the images"
     remedy = (
         "the camera file does not belong to these images (other focus, zoom, lens or size), or is too coarse: run with "
         "--refine-camera, or calibrate the camera anew"
     )
-    if prior is not None and calibration.joint is not None:  # which the options of a run see to
-        away = np.linalg.pinv(intrinsic_basis(prior.colmap_model))
-        away = away @ (calibration.camera.parameters() - camera.parameters())
+    if prior is not None and calibration.joint is not None:  # the options of a run ensure the latter
+        change = np.linalg.pinv(intrinsic_basis(prior.colmap_model))
+        change = change @ (calibration.camera.parameters() - camera.parameters())
         gained = prior.covariance - calibration.joint.camera_covariance
-        estimate, sigma = away, np.sqrt(np.diag(prior.covariance))
-        test = solve_score(np.linalg.pinv(gained, hermitian=True), np.linalg.pinv(gained) @ away)
+        estimate, sigma = change, np.sqrt(np.diag(prior.covariance))
+        test = solve_score(np.linalg.pinv(gained, hermitian=True), np.linalg.pinv(gained) @ change)
         names = _names(prior.colmap_model)
     else:
         tested = "FULL_OPENCV" if camera.colmap_model == "FULL_OPENCV" else "OPENCV"
@@ -82,23 +84,25 @@ def _by_intrinsics(network: Network, camera: Camera, colmap_model: str) -> np.nd
 
 
 def summed(networks: Sequence[Network], columns: Callable[[Network], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """:meth:`~stcal.sfm.adjust.network.Network.score` of parameters that all groups have in common."""
+    """Returns :meth:`~stcal.sfm.adjust.network.Network.score` of parameters that all groups have in common."""
     normal, right = zip(*(n.score(columns(n)) for n in networks), strict=True)
     return np.sum(normal, axis=0), np.sum(right, axis=0)
 
 
 def field_check(networks: Sequence[Network], camera: Camera) -> Check:
-    """A residual field that stays the same over all images: x and y each a cubic of the place in the image. Wrong
-    intrinsics make such a field too; what they do not explain is a lens or sensor that the camera model does not
-    describe. A field of 0.002 px RMS is allowed: there is one in any images."""
+    """Tests for a residual field that is the same in all images: x and y are each a cubic of the place in the image.
+
+    Wrong intrinsics cause such a field, too. A field that they do not explain is due to a lens or sensor that the
+    camera model does not describe. A field of 0.002 px RMS is allowed, as there is one in any images.
+    """
     key, title = "residual-field", "Residuals over the image"
 
     def columns(network: Network) -> np.ndarray:
         size = np.array([camera.width, camera.height])
         x, y = (2 * network.model.measured_px / size - 1).T
         terms = np.stack([x**i * y**j for i in range(FIELD_DEGREE + 1) for j in range(FIELD_DEGREE + 1 - i)], axis=1)
-        none = np.zeros_like(terms)
-        field = np.stack([np.hstack([terms, none]), np.hstack([none, terms])], axis=1)
+        zeros = np.zeros_like(terms)
+        field = np.stack([np.hstack([terms, zeros]), np.hstack([zeros, terms])], axis=1)
         return network.model.whiten(field)
 
     test = solve_score(*summed(networks, columns))
@@ -116,8 +120,11 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
 
 
 def sigma_check(networks: Sequence[Network], factor: float) -> Check:
-    """σ₀ of the images alone: residuals of the free networks over the centres' own σ. The σ of the result carry this
-    factor, so that only a large one is a fault: images that the model does not describe."""
+    """Tests σ₀ of the images alone: residuals of the free networks over the centres' own σ.
+
+    The σ of the result include this factor, so that only a large factor is a fault: the model does not describe the
+    images.
+    """
     key, title = "centres", "Residuals against the centres' own σ"
     low, high = SIGMA_LIMITS
     verdict = "passed" if factor < low else "suspicious" if factor < high else "failed"
@@ -130,18 +137,20 @@ def sigma_check(networks: Sequence[Network], factor: float) -> Check:
 
 
 def image_check(networks: Sequence[Network]) -> Check:
-    """Squared residuals of every image over their expectation, against those of its group's other images (F test with
-    exact redundancies)."""
+    """Tests the squared residuals of every image, over their expectation, against those of its group's other images.
+
+    The test is an F test with exact redundancies.
+    """
     trials = []
     for network in networks:
         square, redundancy = network.square_by_image()
         for i, name in enumerate(network.model.images):
-            rest = redundancy.sum() - redundancy[i]
-            if redundancy[i] < 1 or rest < 1:
+            others = redundancy.sum() - redundancy[i]
+            if redundancy[i] < 1 or others < 1:
                 continue
-            ratio = square[i] / redundancy[i] / max((square.sum() - square[i]) / rest, 1e-12)
+            ratio = square[i] / redundancy[i] / max((square.sum() - square[i]) / others, 1e-12)
             trials.append(
-                Trial(name, float(np.sqrt(ratio)), "×", ratio * round(redundancy[i]), round(redundancy[i]), rest)
+                Trial(name, float(np.sqrt(ratio)), "×", ratio * round(redundancy[i]), round(redundancy[i]), others)
             )
     check = judge("image-residuals", "Residuals of each image against its group", trials, "images", "")
     remedy = (
@@ -151,10 +160,13 @@ def image_check(networks: Sequence[Network]) -> Check:
 
 
 def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> Check:
-    """σ of the centres of every image against the same circles in its group's other images, and its blur likewise.
+    """Compares the σ of centres, and the blur, of every image with those of its group's other images.
 
-    Log ratios have no known spread: it is taken from the images themselves (robustly), with the size that would cost an
-    image half of its weight, 1.5, as the least that is called out. ``blur_px`` : by image, of the edges, may be empty.
+    The σ are compared circle by circle. The spread of the log ratios is not known and is estimated robustly from the
+    images themselves. It is at least so large that no ratio below 1.5, which costs an image half of its weight, is
+    reported.
+
+    ``blur_px`` : blur of the edges by image, may be empty.
     """
     sigma: dict[str, float] = {}
     blur: dict[str, float] = {}
@@ -163,27 +175,30 @@ def sharpness_check(networks: Sequence[Network], blur_px: dict[str, float]) -> C
         usual = np.array([np.median(log_sigma[model.point_index == p]) for p in range(len(model.labels))])
         away = log_sigma - usual[model.point_index]
         sigma |= {name: float(np.median(away[r])) for name, r in zip(model.images, model.rows_by_image(), strict=True)}
-        own = {name: np.log(blur_px[name]) for name in model.images if blur_px.get(name, 0) > 0}
-        blur |= {name: float(value - np.median(list(own.values()))) for name, value in own.items()}
+        log_blur = {name: np.log(blur_px[name]) for name in model.images if blur_px.get(name, 0) > 0}
+        blur |= {name: float(value - np.median(list(log_blur.values()))) for name, value in log_blur.items()}
     remedy = "blurred, out of focus or dark: take the image again; its centres have little weight, no harm is done"
     trials = [*_dull(sigma, "× σ"), *_dull(blur, "× blur")]
     return judge("sharpness", "Sharpness of each image against its group", trials, "values", remedy, "suspicious")
 
 
 def evenness_check(networks: Sequence[Network], images: Sequence[ImageObservations], camera: Camera) -> Check:
-    """Circles whose brightness varies around the rim more than two planes follow, in many images: their centres would
-    be off alike in all views, which no residual shows. Detection follows it, with a larger σ; what it would have cost
-    is said, in µm at the circle. One centre in a hundred may be uneven by chance (binomial tail)."""
+    """Finds circles whose brightness varies around the rim, in many images, by more than two planes describe.
+
+    Their centres would be off in the same way in all views, which no residual shows. Detection describes the variation
+    by a wider model, with a larger σ. The value of a trial is the error that this avoids, in µm at the circle. One
+    centre in a hundred may be uneven by chance (binomial tail).
+    """
     uneven = {image.name: image.uneven_px for image in images}
-    seen: dict[str, list[float]] = {}
+    shifts_of_label: dict[str, list[float]] = {}
     for network in networks:
         model = network.model
         depth = model.xyz_camera()[:, 2] / float(np.sqrt(camera.focal.prod()))
         for k, (i, p) in enumerate(zip(model.image_index, model.point_index, strict=True)):
             shift_px = float(np.linalg.norm(uneven[model.images[i]][model.keypoint[k]]))
-            seen.setdefault(model.labels[p], []).append(1e3 * depth[k] * shift_px)
+            shifts_of_label.setdefault(model.labels[p], []).append(1e3 * depth[k] * shift_px)
     trials = []
-    for label, shifts in seen.items():
+    for label, shifts in shifts_of_label.items():
         count = sum(shift > 0 for shift in shifts)
         chance = float(bdtrc(count - 1, len(shifts), UNEVEN_BY_CHANCE)) if count else 1.0
         trials.append(Trial(label, float(np.mean(shifts)), "µm", float(chdtri(1, chance)), 1))
@@ -197,10 +212,10 @@ def evenness_check(networks: Sequence[Network], images: Sequence[ImageObservatio
 def _dull(values: dict[str, float], unit: str) -> list[Trial]:
     if not values:
         return []
-    own = np.array(list(values.values()))
-    freedom = max(MAD_EFFICIENCY * len(own) - 1, 2.0)
-    least = np.log(DULL) / np.sqrt(ratio_limit(SUSPICIOUS / len(own), 1, freedom))
-    sigma = max(robust_sigma(np.abs(own - np.median(own))), least)
+    log_ratios = np.array(list(values.values()))
+    freedom = max(MAD_EFFICIENCY * len(log_ratios) - 1, 2.0)
+    least = np.log(DULL) / np.sqrt(ratio_limit(SUSPICIOUS / len(log_ratios), 1, freedom))
+    sigma = max(robust_sigma(np.abs(log_ratios - np.median(log_ratios))), least)
     return [
         Trial(name, float(np.exp(value)), unit, max(value / sigma, 0.0) ** 2, 1, freedom, True)
         for name, value in values.items()
@@ -208,8 +223,11 @@ def _dull(values: dict[str, float], unit: str) -> list[Trial]:
 
 
 def moved_check(networks: Sequence[Network]) -> Check:
-    """Did the target stand still against the board? In every image all faces together may be displaced and turned
-    against the board; whether that is needed is a test with six degrees of freedom. One image against all others."""
+    """Tests whether the target moved against the board, one image against all others.
+
+    In every image all faces together may be shifted and turned against the board. Whether this motion is needed is a
+    test with six degrees of freedom.
+    """
     trials = []
     for network in networks:
         model = network.model
@@ -238,5 +256,5 @@ def moved_check(networks: Sequence[Network]) -> Check:
 
 
 def _take_out(check: Check, remedy: str) -> Check:
-    """With the remedy and the option that takes out the worst image named, where there is one."""
+    """Returns the check with the remedy and the option that excludes the worst image, if it names one."""
     return replace(check, remedy=f"{remedy}: {without_image(check.names[0])}") if check.names else check

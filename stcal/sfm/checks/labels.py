@@ -1,4 +1,4 @@
-"""Checks of single observations: labels that were exchanged, centres that contradict all others."""
+"""Checks of single observations: exchanged labels, and centres that contradict all others."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -15,17 +15,21 @@ from stcal.sfm.data.model import Outlier
 from stcal.sfm.data.observations import ImageObservations
 
 EXCHANGED = 0.1
-"""Two labels are exchanged where each centre lies at the other's place within this share of their distance."""
+"""Largest deviation of exchanged labels: each centre lies at the place of the other to within this share of their
+distance."""
 MANY = 5
-"""Centres left out of one image: no longer single circles that were hidden or dirty."""
+"""Number of centres left out of one image at which they are no longer single hidden or dirty circles."""
 
 
 def labels_check(
     networks: Sequence[Network], outliers: Sequence[Outlier], images: Sequence[ImageObservations], camera: Camera
 ) -> Check:
-    """Every observation against all others. What was left out already does no harm and is named; so is what stayed and
-    is beyond chance (the squared residual over its own redundancy: Baarda's data snooping), whose weight is reduced.
-    Labels of one image that stand at each other's places are a fault: others may be wrong that stand there unseen."""
+    """Tests every observation against all others.
+
+    Observations that were left out already do no harm and are named. Observations that were kept but are beyond chance
+    (squared residual over its own redundancy: Baarda's data snooping) are named, too; their weight is reduced. Labels
+    of one image that are at each other's places are a fault: other labels may be exchanged without being noticed.
+    """
     remedy = "look at these circles in the overlays: hidden in part, dirty, a reflection, or a wrong label"
     check = judge("labels", "Each centre against all others", _trials(networks), "centres", remedy, "suspicious")
     swapped = _exchanged(networks, outliers, images, camera)
@@ -75,12 +79,12 @@ def _trials(networks: Sequence[Network]) -> list[Trial]:
 def _exchanged(
     networks: Sequence[Network], outliers: Sequence[Outlier], images: Sequence[ImageObservations], camera: Camera
 ) -> tuple[str, ...]:
-    """``image: label and label`` of every pair of outliers that stand at each other's places."""
+    """Returns ``image: label and label`` of every pair of outliers that are at each other's places."""
     by_image: dict[str, list[Label]] = {}
-    for each in outliers:
-        by_image.setdefault(each.image, []).append(each.label)
+    for outlier in outliers:
+        by_image.setdefault(outlier.image, []).append(outlier.label)
     observed = {image.name: image for image in images}
-    found = []
+    pairs = []
     for network in networks:
         model = network.model
         for name in set(model.images) & set(by_image):
@@ -92,5 +96,5 @@ def _exchanged(
                 apart = np.linalg.norm(place[a] - place[b])
                 off = max(np.linalg.norm(measured[a] - place[b]), np.linalg.norm(measured[b] - place[a]))
                 if off < EXCHANGED * apart:
-                    found.append(f"{name}: {a} and {b}")
-    return tuple(found)
+                    pairs.append(f"{name}: {a} and {b}")
+    return tuple(pairs)

@@ -1,4 +1,4 @@
-"""The radius of every circle as measured against its design: labels, radii and scale must agree with the ellipses."""
+"""Checks of the measured radius of every circle: labels, radii and scale must agree with the ellipses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,20 +15,20 @@ from stcal.sfm.checks.verdict import Check, Trial, judge
 from stcal.sfm.data.observations import ImageObservations
 
 EDGE_BIAS_PX = 0.05
-"""σ of what light, lens and threshold add to all radii alike; it moves no centre."""
+"""σ of the bias that light, lens and threshold add to all radii alike; it moves no centre."""
 EDGE_DIFFERENCE_PX = 0.01
-"""σ of what they add more to large circles than to small ones."""
+"""σ of the difference of this bias between large and small circles."""
 RADIUS_TOLERANCE = 2e-3
-"""Relative σ of a single radius in making; it moves the centre by 4·10⁻³ of its eccentricity, a nanometre's worth."""
+"""Relative σ of a single radius from manufacturing; it moves the centre by 4·10⁻³ of its eccentricity, about 1 nm."""
 MIN_PEERS = 5
-"""Circles of one design radius among which one can be odd."""
+"""Smallest number of circles of one design radius among which one can stand out."""
 MAD_EFFICIENCY = 0.37
-"""Of the median absolute deviation: what a spread from n values is worth in degrees of freedom."""
+"""Efficiency of the median absolute deviation: degrees of freedom, per value, of a spread estimated by it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Radii:
-    """Circles of the target and dots of the board, over all images and groups.
+    """Radii of the target's circles and the board's dots, over all images and groups.
 
     ``labels`` ; ``design_mm`` : (c,); ``ratio`` : (c,) measured over designed, median; ``size_px`` : (c,) designed
     radius in the images, geometric mean of the ellipse's axes, median.
@@ -44,17 +44,17 @@ class Radii:
             object.__setattr__(self, name, frozen(getattr(self, name), (len(self.labels),), name))
 
     def classes(self) -> dict[str, np.ndarray]:
-        """Places of circles that are made alike, by name."""
-        found: dict[str, list[int]] = {}
+        """Returns the indices of the circles of each kind and radius, by the name of the class."""
+        indices: dict[str, list[int]] = {}
         for i, (label, radius) in enumerate(zip(self.labels, self.design_mm, strict=True)):
             kind = "dots" if isinstance(label, DotLabel) else "circles"
-            found.setdefault(f"{kind} of radius {radius:g} mm", []).append(i)
-        return {name: np.array(members) for name, members in found.items()}
+            indices.setdefault(f"{kind} of radius {radius:g} mm", []).append(i)
+        return {name: np.array(members) for name, members in indices.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """The size of the target over that of its design, less 1, with its σ from so many degrees of freedom."""
+    """Size of the target over that of its design, minus 1, with its σ and the degrees of freedom of σ."""
 
     name: str
     size: float
@@ -65,7 +65,7 @@ class Size:
 def measure_radii(
     networks: Sequence[Network], images: Sequence[ImageObservations], design_mm: dict[Label, float], camera: Camera
 ) -> Radii:
-    """Radii from the ellipses' areas and the circles' places and planes."""
+    """Computes radii from the areas of the ellipses and the positions and planes of the circles."""
     shapes = {image.name: image.shape for image in images}
     ratio: dict[Label, list[np.ndarray]] = {}
     size: dict[Label, list[np.ndarray]] = {}
@@ -77,22 +77,25 @@ def measure_radii(
                                    for i, rows in enumerate(model.rows_by_image())])  # fmt: skip
         order = np.concatenate(model.rows_by_image())
         expected = _areas(network, designed)[order]
-        own = np.sqrt(np.maximum(np.linalg.det(measured), 0) / expected)
+        ratios = np.sqrt(np.maximum(np.linalg.det(measured), 0) / expected)
         point = model.point_index[order]
         for k, label in enumerate(model.labels):
-            ratio.setdefault(label, []).append(own[point == k])
+            ratio.setdefault(label, []).append(ratios[point == k])
             size.setdefault(label, []).append(focal * np.sqrt(expected[point == k]))
     return Radii(
         tuple(ratio),
         np.array([design_mm[label] for label in ratio]),
-        np.array([np.median(np.concatenate(each)) for each in ratio.values()]),
-        np.array([np.median(np.concatenate(each)) for each in size.values()]),
+        np.array([np.median(np.concatenate(values)) for values in ratio.values()]),
+        np.array([np.median(np.concatenate(values)) for values in size.values()]),
     )
 
 
 def _areas(network: Network, radius_mm: np.ndarray) -> np.ndarray:
-    """Areas over π of the circles' images in normalised coordinates, (n,): from the dual conic
-    r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3), with the planes of the faces as found."""
+    """Returns the areas over π of the circles' images in normalised coordinates, (n,).
+
+    They follow from the dual conic r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3), with the estimated planes of
+    the faces.
+    """
     model = network.model
     normal = np.zeros((len(model.labels), 3))
     for members in model.points_by_face().values():
@@ -108,7 +111,7 @@ def _areas(network: Network, radius_mm: np.ndarray) -> np.ndarray:
 
 
 def radius_checks(radii: Radii) -> list[Check]:
-    """Every circle against those made alike, and all that are made alike against their design."""
+    """Tests every circle against those of its kind and radius, and each such class against its design."""
     single, whole = [], []
     for name, members in radii.classes().items():
         ratio = radii.ratio[members]
@@ -124,29 +127,32 @@ def radius_checks(radii: Radii) -> list[Check]:
             single.append(
                 Trial(radii.labels[i], 1e3 * away * float(radii.design_mm[i]), "µm", (away / sigma) ** 2, 1, freedom)
             )
-    odd = (
+    single_remedy = (
         "a damaged or dirty circle, a wrong label, or another radius than the design's: look at it in the overlays, "
         "correct target.toml"
     )
-    other = (
+    class_remedy = (
         "all circles of a kind are larger or smaller than target.toml or board.toml says, or over-exposed: measure "
         "one, correct the file; a wrong radius makes a wrong eccentricity"
     )
     return [
-        judge("radius", "Radius of each circle against those made alike", single, "circles", odd),
-        judge("radius-design", "Radii against the design", whole, "kinds of circle", other),
+        judge("radius", "Radius of each circle against those made alike", single, "circles", single_remedy),
+        judge("radius-design", "Radii against the design", whole, "kinds of circle", class_remedy),
     ]
 
 
 def size_by_radii(radii: Radii) -> Size | None:
-    """Slope of measured over designed radii of the target's circles, less 1; None where all are alike."""
-    own = np.array([isinstance(label, CircleLabel) for label in radii.labels])
-    size = radii.size_px[own]
-    design = radii.design_mm[own]
+    """Returns the slope of measured over designed radii of the target's circles, minus 1.
+
+    The result is None if all radii are alike, or if there are fewer than ``MIN_PEERS`` circles.
+    """
+    is_circle = np.array([isinstance(label, CircleLabel) for label in radii.labels])
+    size = radii.size_px[is_circle]
+    design = radii.design_mm[is_circle]
     if len(size) < MIN_PEERS or np.ptp(design) == 0:
         return None
     design_matrix = np.column_stack([np.ones(len(size)), size])
-    excess = (radii.ratio[own] - 1) * size
+    excess = (radii.ratio[is_circle] - 1) * size
     fit, *_ = np.linalg.lstsq(design_matrix, excess, rcond=None)
     freedom = len(size) - 2
     variance = float(((excess - design_matrix @ fit) ** 2).sum()) / freedom

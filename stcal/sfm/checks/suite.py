@@ -52,11 +52,11 @@ MICRO = 1e3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What the checks look at.
+    """Input of the checks.
 
-    ``models`` : of the single groups, adjusted, without unit; ``outliers`` left out of them; ``images`` : all
-    observations; ``camera`` : as given; ``prior`` : of the intrinsics where they were refined; ``blur_px`` : of the
-    edges, by image, may be empty.
+    ``models`` : adjusted models of the single groups, without unit; ``outliers`` : observations left out of the models;
+    ``images`` : all observations; ``camera`` : as given; ``prior`` : of the intrinsics if they were refined;
+    ``blur_px`` : blur of the edges by image, may be empty.
     """
 
     models: tuple[WorldModel, ...]
@@ -71,7 +71,7 @@ class Evidence:
     blur_px: dict[str, float]
 
     def networks(self) -> list[Network]:
-        """Free networks of all groups, mm, at the intrinsics of the result."""
+        """Returns the free networks of all groups, mm, at the intrinsics of the result."""
         camera = self.calibration.camera
         models = self.models
         if not camera.same_as(self.camera):
@@ -82,11 +82,11 @@ class Evidence:
 
 
 def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
-    """All checks of a run, in the order of the report; ``progress`` is called with (``check``, done, total)."""
+    """Returns all checks of a run in the order of the report; ``progress`` is called with (``check``, done, total)."""
     networks, calibration = evidence.networks(), evidence.calibration
     camera, board, target = calibration.camera, evidence.board, evidence.target
     radii = measure_radii(networks, evidence.images, target.radius_of() | board.radius_of(), camera)
-    made: tuple[Callable[[], Check | Iterable[Check]], ...] = (
+    makers: tuple[Callable[[], Check | Iterable[Check]], ...] = (
         lambda: camera_check(networks, evidence.camera, calibration, evidence.prior),
         lambda: field_check(networks, camera),
         lambda: sigma_check(networks, calibration.sigma_factor),
@@ -102,11 +102,11 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: flatness_check(networks, evidence.options.flatness_mm),
         lambda: control_check(evidence, networks),
     )
-    step = counted(progress or (lambda *_: None), "check", len(made))
+    step = counted(progress or (lambda *_: None), "check", len(makers))
     checks: list[Check] = []
-    for make in made:
-        found = make()
-        checks += [found] if isinstance(found, Check) else found
+    for make in makers:
+        result = make()
+        checks += [result] if isinstance(result, Check) else result
         step(None)
     return tuple(checks)
 
@@ -120,9 +120,9 @@ def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[
         return [partial(impossible, key, title, reason, "run with --solve joint") for key, title in JOINT]
     again = Again(evidence.calibration, joint, evidence.target, evidence.board, evidence.options)
     linked = {model.group for model in joint.models}
-    own = [n for n in networks if n.model.group in linked]
+    linked_networks = [n for n in networks if n.model.group in linked]
     return [
-        partial(agreement_check, joint, own),
+        partial(agreement_check, joint, linked_networks),
         partial(halves_check, again),
         partial(groups_check, again),
         partial(loops_check, again),
@@ -130,9 +130,12 @@ def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[
 
 
 def control_check(evidence: Evidence, networks: list[Network]) -> Check:
-    """The same run without eccentricity, chained with three-point frames: how far faces are off that a program without
-    it delivers, and how little its residuals show it. And the test of the correction itself: it may be scaled by a
-    factor, all else free; by chance that is 1, and 0 where the centres are not those of ellipses."""
+    """Compares the run with a control without eccentricity, and tests the correction of the eccentricity.
+
+    The control is chained with three-point frames. It shows how far off the faces of a program without the correction
+    are, and how little the residuals of that program show it. In the test, the correction is scaled by a factor, with
+    all else free. The factor is 1 up to chance, and 0 if the centres are not those of ellipses.
+    """
     key = "control"
     if not evidence.options.eccentricity:
         return impossible(key, CONTROL, "this run is the control", "run with eccentricity")
@@ -148,10 +151,10 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
     check = judge(key, CONTROL, [trial], "corrections", remedy)
     try:
         whole = evidence.calibration.target.target_from_face
-        told, measured = _control(evidence) if whole else ("no face that it could move", ())
+        message, measured = _control(evidence) if whole else ("no face that it could move", ())
     except StcalError as error:
-        told, measured = f"no uncorrected result ({error})", ()
-    reason = f"{1 + test.estimate[0]:.3f} ± {np.sqrt(test.covariance[0, 0]):.3f} of the eccentricity found; {told}"
+        message, measured = f"no uncorrected result ({error})", ()
+    reason = f"{1 + test.estimate[0]:.3f} ± {np.sqrt(test.covariance[0, 0]):.3f} of the eccentricity found; {message}"
     return replace(check, reason=reason, measured=check.measured + measured)
 
 
@@ -160,14 +163,14 @@ def _control(evidence: Evidence) -> tuple[str, tuple[Measured, ...]]:
     models = [adjust(replace(m, shift_px=np.zeros_like(m.shift_px)), camera) for m in evidence.models]
     options = replace(evidence.options, solve="chain", frame="three-point", eccentricity=False)
     control = calibrate(models, camera, evidence.target, evidence.board, options).target
-    apart = {
+    shifts = {
         face: MICRO * float(np.linalg.norm(control.target_from_face[face].translation - pose.translation))
         for face, pose in whole.target_from_face.items()
         if face != whole.reference_face
     }
     rms = float(np.sqrt(np.concatenate([m.residuals_px(camera).ravel() ** 2 for m in models]).mean()))
     rows = tuple(
-        Measured(f"face {face}, without eccentricity", value, None, "µm", None) for face, value in apart.items()
+        Measured(f"face {face}, without eccentricity", value, None, "µm", None) for face, value in shifts.items()
     )
-    largest = max(apart.values(), default=0.0)
+    largest = max(shifts.values(), default=0.0)
     return f"without it faces are off by up to {largest:.0f} µm at residuals of {rms:.4f} px", rows

@@ -1,1 +1,1 @@
-"""The run's report for people, and the comparison with a known truth."""
+"""Report of a run for people, and comparison of a run with a known truth."""

@@ -1,4 +1,4 @@
-"""The report's section on the checks that residuals cannot fake."""
+"""Section of the report on the checks that residuals cannot fake."""
 
 from stcal.report.page import verdict
 from stcal.report.text import NONE, number
@@ -7,16 +7,16 @@ from stcal.sfm.report.judgement import CHANCE
 COLOURS = {"passed": "#1b7837", "suspicious": "#b26a00", "failed": "#b3261e", "not possible": "#556270"}
 ORDER = ("failed", "suspicious", "passed", "not possible")
 FIRST_NAMES = 6
-"""Names that a row has room for."""
+"""Number of names that a row has room for."""
 
 
 def count_verdicts(verdicts: list[str]) -> str:
-    """``2 failed, 13 passed``: the worst first."""
+    """Returns the number of checks with each verdict as ``2 failed, 13 passed``, the worst first."""
     return ", ".join(f"{verdicts.count(v)} {v}" for v in ORDER if v in verdicts) or "none"
 
 
 def checks_values(checks: list[dict]) -> dict:
-    """``report.json``'s ``checks`` as the template shows them."""
+    """Returns the section ``checks`` of ``report.json`` as the template shows it."""
     ranked = sorted(checks, key=lambda check: ORDER.index(check["verdict"]))
     rows = [
         [
@@ -39,17 +39,17 @@ def checks_values(checks: list[dict]) -> dict:
 
 
 def _number(measured: dict) -> list[str]:
-    """Value and limit with their unit."""
+    """Returns value and limit with their unit."""
     unit = f" {measured['unit']}" if measured["unit"] else ""
     return [_short(measured["value"]) + unit, NONE if measured["limit"] is None else _short(measured["limit"]) + unit]
 
 
 def _short(value: float) -> str:
-    """Three digits."""
+    """Returns the value with about three digits."""
     return f"{value:.3g}" if 1e-4 < abs(value) < 1e3 else number(value, 0) if abs(value) >= 1e3 else f"{value:.2g}"
 
 
 def _names(check: dict) -> str:
     names = check["names"]
-    more = f" and {len(names) - FIRST_NAMES} more" if len(names) > FIRST_NAMES else ""
-    return ", ".join(names[:FIRST_NAMES]) + more if names else NONE
+    surplus = f" and {len(names) - FIRST_NAMES} more" if len(names) > FIRST_NAMES else ""
+    return ", ".join(names[:FIRST_NAMES]) + surplus if names else NONE

@@ -22,15 +22,17 @@ from stcal.synthetic.truth import TrueGroup, TrueImage, TruthFile
 FACES = "faces.json"
 DETECTIONS = "detections.csv"
 NEAR_PX = 1.5
-"""A label is right when its ellipse centre is this near to the image of the circle's centre; eccentricity makes 0.2."""
+"""Largest distance of a label's ellipse centre from the image of the circle's centre, in px, at which the label is
+right. Eccentricity makes 0.2."""
 
 OF_A_UNIT = 0.1
-"""Distances in another unit are off by its factor to within this share: runs are off by a few per cent at worst."""
+"""Largest relative deviation of a ratio of distances from the factor of another unit. Runs are off by a few per cent at
+worst."""
 REMEDY = "give a finished run, and truth.json, as data_layout.md has them"
 
 
 class Answer(Part):
-    """What of ``faces.json`` is compared."""
+    """Content of ``faces.json`` that is compared."""
 
     format: Literal["stcal faces 1"] = "stcal faces 1"
     unit: Literal["mm"]
@@ -64,7 +66,7 @@ class LabelCounts(Part):
 
 
 class CompareFile(ResultFile):
-    """Of ``compare``."""
+    """Result of ``compare``."""
 
     reference_face: str = Field(description="face id, the same in both")
     faces: dict[ByFace, FaceErrors] = Field(
@@ -85,7 +87,7 @@ class CompareFile(ResultFile):
 
 
 def compare(run: str | Path, truth: str | Path) -> CompareFile:
-    """Errors of ``RUN/faces.json`` (or of the file itself) against a truth file.
+    """Returns the errors of ``RUN/faces.json`` (or of the file itself) against a truth file.
 
     Raises
     ------
@@ -93,25 +95,27 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
         A file is missing or has another form, the reference faces differ, or one of both is in another unit.
     """
     run = Path(run)
-    found = read_result(run / FACES if run.is_dir() else run, Answer, "run", REMEDY)
+    answer = read_result(run / FACES if run.is_dir() else run, Answer, "run", REMEDY)
     known = read_result(truth, TruthFile, "truth", REMEDY)
-    if found.reference_face != known.reference_face:
+    if answer.reference_face != known.reference_face:
         raise InputError(
             "E-COMPARE-REFERENCE",
-            f"reference face {found.reference_face} in the run, {known.reference_face} in the truth; "
+            f"reference face {answer.reference_face} in the run, {known.reference_face} in the truth; "
             f"run again with --reference-face {known.reference_face}",
         )
-    if not known.target_from_face.keys() & found.target_from_face.keys():
+    if not known.target_from_face.keys() & answer.target_from_face.keys():
         raise InputError(
             "E-COMPARE-NO-FACE", f"run {run}, truth {truth}: no face in common; give the truth of the same target"
         )
-    _require_one_unit(f"run {run}, truth {truth}", found, known)
+    _require_one_unit(f"run {run}, truth {truth}", answer, known)
     faces = {
-        face_id: _face(face_id, found, known) for face_id in known.target_from_face if face_id in found.target_from_face
+        face_id: _face(face_id, answer, known)
+        for face_id in known.target_from_face
+        if face_id in answer.target_from_face
     }
     labels = _labels(run / DETECTIONS, known.circles, known.groups) if run.is_dir() and known.groups else None
     worst = {
-        name: max((value for each in faces.values() if (value := getattr(each, name)) is not None), default=None)
+        name: max((value for errors in faces.values() if (value := getattr(errors, name)) is not None), default=None)
         for name in LargestErrors.model_fields
     }
     return CompareFile(
@@ -124,28 +128,30 @@ def compare(run: str | Path, truth: str | Path) -> CompareFile:
 
 
 def _require_one_unit(where: str, found: Answer, known: TruthFile) -> None:
-    """Refuse lengths of which one side's are in another unit than mm, as distances tell."""
+    """Refuses lengths if distances show that those of one side are in another unit than mm."""
     labels = [label for label in known.circles if label in found.circles]
     faces = [face_id for face_id in known.target_from_face if face_id in found.target_from_face]
     sides = (known, found)
-    for what, points in (
-        ("circles", [np.array([each.circles[label] for label in labels]) for each in sides]),
-        ("faces", [np.array([each.target_from_face[face_id][:3, 3] for face_id in faces]) for each in sides]),
+    for kind, points in (
+        ("circles", [np.array([side.circles[label] for label in labels]) for side in sides]),
+        ("faces", [np.array([side.target_from_face[face_id][:3, 3] for face_id in faces]) for side in sides]),
     ):
-        true, own = (float(np.linalg.norm(p - p.mean(axis=0))) if len(p) else 0.0 for p in points)
+        true, measured = (float(np.linalg.norm(p - p.mean(axis=0))) if len(p) else 0.0 for p in points)
         for unit, factor in LENGTHS.items():
-            for name, small, large in (("truth", true, own), ("run", own, true)):
+            for name, small, large in (("truth", true, measured), ("run", measured, true)):
                 if unit != "mm" and small > 0 and abs(large / small / factor - 1) < OF_A_UNIT:
                     raise InputError(
                         "E-COMPARE-UNITS",
-                        f"{where}: distances between {what} are {own / true:.4g} times those of the truth, 1 ± "
+                        f"{where}: distances between {kind} are {measured / true:.4g} times those of the truth, 1 ± "
                         f"{OF_A_UNIT:g} expected; if the {name} is in {unit}, multiply its lengths by {factor:g}",
                     )
 
 
 def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) -> LabelCounts | None:
-    """Labels of ``detections.csv`` against the truth; a board's numbers are known up to its own symmetry, but for a
-    whole group at once."""
+    """Counts the labels of ``detections.csv`` against the truth.
+
+    A board's numbers are known up to its own symmetry, but only for a whole group at once.
+    """
     try:
         rows = list(csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())))
         measured: dict[str, dict[str, tuple[float, float]]] = {}
@@ -170,14 +176,14 @@ def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) 
 
 
 def _columns(dots: np.ndarray) -> int:
-    """Columns of a board from its dots in row-major order: where the first step back to the row's begin is."""
+    """Returns the number of columns of a board from its dots in row-major order: the first step back ends a row."""
     steps = np.diff(dots, axis=0)
     turned = np.flatnonzero(steps @ steps[0] < 0)
     return int(turned[0]) + 1 if len(turned) else len(dots)
 
 
 def _count(measured: dict, images: dict[str, TrueImage], numbers: np.ndarray) -> tuple[int, int, int]:
-    """(wrong, found, visible) with the board's dots numbered as ``numbers``, (rows, columns), has them."""
+    """Returns (wrong, found, visible) if the board's dots have the ``numbers``, (rows, columns)."""
     wrong = found = visible = 0
     for name in images.keys() & measured.keys():
         circles = images[name].circles
@@ -195,9 +201,9 @@ def _count(measured: dict, images: dict[str, TrueImage], numbers: np.ndarray) ->
 
 
 def _face(face_id: str, found: Answer, known: TruthFile) -> FaceErrors:
-    estimate, true = (Rigid.from_matrix(each.target_from_face[face_id]) for each in (found, known))
+    estimate, true = (Rigid.from_matrix(source.target_from_face[face_id]) for source in (found, known))
     labels = [label for label in parse_labels(known.circles) if label.plane == face_id and label in found.circles]
-    a, b = (np.array([each.circles[label] for label in labels]).reshape(-1, 3) for each in (known, found))
+    a, b = (np.array([source.circles[label] for label in labels]).reshape(-1, 3) for source in (known, found))
     shift = estimate.translation - true.translation
     turn = Rigid(estimate.rotation @ true.rotation.T)
     row: dict[str, Any] = {
@@ -226,7 +232,7 @@ def _face(face_id: str, found: Answer, known: TruthFile) -> FaceErrors:
 
 
 def comparison_table(comparison: CompareFile) -> str:
-    """The comparison as a text table."""
+    """Returns the comparison as a text table."""
     rows = [
         ["face", "position", "rotation", "circles", "worst", "of", "error / σ"],
         ["", "µm", "mdeg", "mean µm", "µm", "", ""],

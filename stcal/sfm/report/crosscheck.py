@@ -1,4 +1,4 @@
-"""The report's section on the cross-check with the native COLMAP."""
+"""Section of the report on the cross-check with the native COLMAP."""
 
 from stcal.labels import parse_label
 from stcal.report.text import NONE, cells, number
@@ -16,9 +16,9 @@ COMPARISONS = ("mapping", "result", "plain")
 
 
 def crosscheck_values(check: dict) -> dict:
-    """``report.json``'s ``crosscheck`` as the template shows it."""
+    """Returns the section ``crosscheck`` of ``report.json`` as the template shows it."""
     limits = check["tolerances"]
-    allowed = [f"{limits[key]:g} {unit} {of}" for key, unit, of in LIMITS if limits[key] is not None]
+    allowed = [f"{limits[key]:g} {unit} {object_name}" for key, unit, object_name in LIMITS if limits[key] is not None]
     faces: dict[str, list[tuple[float, str]]] = {}
     for label, value in check["mapping"]["circles_um"].items():
         faces.setdefault(parse_label(label).plane, []).append((value, label))
@@ -35,8 +35,8 @@ def crosscheck_values(check: dict) -> dict:
         ],
         "faces": [_face_row(check, face) for face in check["mapping"]["faces"]],
         "circles": [
-            [face, len(own), number(sum(v for v, _ in own) / len(own), 3), number(max(own)[0], 3), max(own)[1]]
-            for face, own in sorted(faces.items())
+            [face, len(rows), number(sum(v for v, _ in rows) / len(rows), 3), number(max(rows)[0], 3), max(rows)[1]]
+            for face, rows in sorted(faces.items())
         ],
         "single": [
             [label, number(value, 3), number(sigmas.get(label), 2)]
@@ -47,9 +47,9 @@ def crosscheck_values(check: dict) -> dict:
 
 
 def _face_row(check: dict, face: str) -> list[str]:
-    """Position and rotation of each comparison."""
+    """Returns the row of a face: position, rotation and σ of each comparison."""
     row = [face]
     for key in COMPARISONS:
-        own = check[key]["faces"].get(face)
-        row += [*cells(own, "translation_um:3 rotation_mdeg:3"), number(own["sigmas"], 2)] if own else [NONE] * 3
+        entry = check[key]["faces"].get(face)
+        row += [*cells(entry, "translation_um:3 rotation_mdeg:3"), number(entry["sigmas"], 2)] if entry else [NONE] * 3
     return row

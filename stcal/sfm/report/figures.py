@@ -9,18 +9,18 @@ from stcal.report.figure import AXIS_COLOURS, COLOURS, FAINT, INK, SMALL, calm, 
 
 
 def group_colours(names: list[str]) -> dict[str, str]:
-    """A colour for each group, by its place in the list."""
+    """Returns a colour for each group, by its place in the list."""
     return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
 
 
 def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, height_um: float) -> str:
-    """Residual vectors of the board's dots on its grid, row 0 at the top; colour is the out-of-plane part.
+    """Draws residual vectors of the board's dots on its grid, row 0 at the top; colour is the out-of-plane part.
 
     Parameters
     ----------
     residuals_um : by ``board:row:column``, (3,) each
-    reach_um : the length drawn as the grid's pitch, and ``height_um`` the end of the colour scale for the out-of-plane
-        part: the same for all groups so that they can be compared
+    reach_um : residual that is drawn as long as the grid's pitch
+    height_um : end of the colour scale for the out-of-plane part; both are the same for all groups, to compare them
     """
     cells = dot_cells(parse_labels(residuals_um)).astype(float)
     vectors = np.array(list(residuals_um.values()), float).reshape(-1, 3)
@@ -52,8 +52,10 @@ def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, heigh
 
 
 def image_bars(rows: list[dict], colours: dict[str, str]) -> str:
-    """RMS residual of each image as a bar in its group's colour, its largest residual as a tick; all over their number
-    in the table."""
+    """Draws the RMS residual of each image as a bar in its group's colour, and its largest residual as a tick.
+
+    The horizontal axis is the number of the image in the table.
+    """
     figure = new_figure(10.5, 2.9)
     axes = figure.add_axes((0.055, 0.15, 0.935, 0.80))
     place = np.arange(1, len(rows) + 1)
@@ -71,20 +73,20 @@ def image_bars(rows: list[dict], colours: dict[str, str]) -> str:
 
 
 def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: float) -> str:
-    """Cameras, boards and the target's circles, in the target frame."""
+    """Draws cameras, boards and the target's circles in the target frame."""
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
     target = np.array(list(scene["circles"].values()), float).reshape(-1, 3)
-    positions = np.array([each["position_mm"] for each in scene["cameras"]], float).reshape(-1, 3)
+    positions = np.array([view["position_mm"] for view in scene["cameras"]], float).reshape(-1, 3)
     boards = {name: np.array(xyz, float).reshape(-1, 3) for name, xyz in scene["boards"].items()}
     everything = np.vstack([target, positions, *boards.values()])
     depth = 0.07 * float(np.ptp(everything, axis=0).max()) if len(everything) else 1.0
     figure, axes = _space(everything, 5.4, 4.9, elevation=22, azimuth=azimuth)
     lines, ink = [], []
-    for each in scene["cameras"]:
-        pyramid = frustum(each, camera, depth)
+    for view in scene["cameras"]:
+        pyramid = frustum(view, camera, depth)
         lines += pyramid
-        ink += [colours.get(each["group"], INK)] * len(pyramid)
+        ink += [colours.get(view["group"], INK)] * len(pyramid)
     axes.add_collection3d(Line3DCollection(lines, colors=ink, linewidths=0.9), autolim=False)
     for name, xyz in boards.items():
         axes.scatter(*xyz.T, s=2, color=colours.get(name, INK), depthshade=False)
@@ -93,19 +95,21 @@ def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: floa
 
 
 def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth: float) -> str:
-    """The target's circles, and the frame of each face with its name at the end of the normal."""
+    """Draws the target's circles, and the frame of each face with its name at the end of the normal."""
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     xyz = np.array(list(circles.values()), float).reshape(-1, 3)
     reach = 0.2 * float(np.ptp(xyz, axis=0).max()) if len(xyz) else 1.0
     lines, ink, names, sheets = [], [], [], []
     for name, face in faces.items():
-        own = np.array([p for label, p in circles.items() if parse_label(label).plane == name], float).reshape(-1, 3)
+        centres = np.array([p for label, p in circles.items() if parse_label(label).plane == name], float).reshape(
+            -1, 3
+        )
         pose = np.array(face["target_from_face"], float)
         lines += [np.array([pose[:3, 3], pose[:3, 3] + reach * pose[:3, i]]) for i in range(3)]
         ink += AXIS_COLOURS
-        sheets += outline(own, pose)
-        names.append((name, (own.mean(0) if len(own) else pose[:3, 3]) + 0.9 * reach * pose[:3, 2]))
+        sheets += outline(centres, pose)
+        names.append((name, (centres.mean(0) if len(centres) else pose[:3, 3]) + 0.9 * reach * pose[:3, 2]))
     figure, axes = _space(np.vstack([xyz, *lines, *[at for _, at in names]]), 5.4, 4.9, elevation=24, azimuth=azimuth)
     axes.add_collection3d(Poly3DCollection(sheets, facecolors="#7f93a8", alpha=0.16), autolim=False)
     axes.scatter(*xyz.T, s=9, color=INK, depthshade=False)
@@ -116,7 +120,7 @@ def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth
 
 
 def outline(xyz: np.ndarray, target_from_face: np.ndarray) -> list[np.ndarray]:
-    """The convex hull of a face's circles in its plane, or nothing where they span none."""
+    """Returns the convex hull of a face's circles in its plane, or nothing if they do not span the plane."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
@@ -126,7 +130,7 @@ def outline(xyz: np.ndarray, target_from_face: np.ndarray) -> list[np.ndarray]:
 
 
 def frustum(pose: dict, camera: dict, depth: float) -> list[np.ndarray]:
-    """Lines of a camera's pyramid; rows of ``axes`` are the camera's axes, Z the way it looks."""
+    """Returns the lines of a camera's pyramid; rows of ``axes`` are the camera's axes, with Z as viewing direction."""
     at, axes = np.array(pose["position_mm"], float), np.array(pose["axes"], float)
     half = depth * np.array(camera["size_px"]) / (2 * np.array(camera["focal_px"]))
     around = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
@@ -136,7 +140,7 @@ def frustum(pose: dict, camera: dict, depth: float) -> list[np.ndarray]:
 
 
 def _space(xyz: np.ndarray, width: float, height: float, elevation: float, azimuth: float):
-    """Figure and axes in space, one scale for X, Y and Z, just large enough for the points."""
+    """Returns figure and axes in space, with one scale for X, Y and Z, just large enough for the points."""
     from mpl_toolkits.mplot3d import Axes3D
 
     low, high = (xyz.min(0), xyz.max(0)) if len(xyz) else (-np.ones(3), np.ones(3))

@@ -1,7 +1,7 @@
 """The report in four sentences: may I use it, how good is it, what limits it, what to do next.
 
-The rules are those of ``docs/reference/files/run.md`` (Judgement); they look at nothing but the content of
-``report.json``, so that everyone can follow them.
+The rules are those of ``docs/reference/files/run.md`` (Judgement). They use nothing but the content of ``report.json``,
+so that everyone can follow them.
 """
 
 import math
@@ -15,12 +15,12 @@ from stcal.io.json import Part
 from stcal.report.text import join, number
 
 CHANCE = "'Suspicious' happens by chance in one run in 1,000, 'failed' in one in 100,000."
-"""Of one check; the limits are those of ``stcal.sfm.checks.verdict``."""
+"""Text on the false alarms of one check; the limits are those of ``stcal.sfm.checks.verdict``."""
 TESTS_OF_CHANCE = 1000
 TAIL = 2.0
-"""A face with a σ so many times the median of the others limits the result by itself."""
+"""Ratio of a face's σ to the median of the others above which this face limits the result by itself."""
 SHARE_OF_SCALE = 0.5
-"""Of the variance of the worst face: with more, the board's σ limit the result, not the photographs."""
+"""Share of the worst face's variance above which the board's σ limit the result, not the photographs."""
 QUESTIONS = {
     "use": "May I use it?",
     "quality": "How good is it?",
@@ -31,7 +31,7 @@ Use = Literal["yes", "with care", "no"]
 
 
 class Judgement(Part):
-    """``judgement`` of ``report.json``."""
+    """Section ``judgement`` of ``report.json``."""
 
     verdict: Use = Field(description="`yes`; `with care`; `no`")
     use: str = Field(description="may I use it, in words")
@@ -46,25 +46,25 @@ class Judgement(Part):
     rotation_face: str | None = Field(description="face that it is of")
 
     def answers(self) -> list[tuple[str, str]]:
-        """Question and answer, in order."""
+        """Returns the questions with their answers, in order."""
         return [(question, getattr(self, key)) for key, question in QUESTIONS.items()]
 
 
 @dataclass(frozen=True, slots=True)
 class _Cause:
-    """What limits a result and what to do about it."""
+    """Cause that limits a result, and its remedy."""
 
     limit: str
     remedy: str
 
 
 def judged(report: dict) -> dict:
-    """The content of ``report.json`` with its judgement made anew."""
+    """Returns the content of ``report.json`` with its judgement made anew."""
     return report | {"judgement": judgement_of(report).model_dump()}
 
 
 def judgement_of(report: dict) -> Judgement:
-    """The judgement of a run.
+    """Returns the judgement of a run.
 
     Parameters
     ----------
@@ -102,9 +102,9 @@ def _use(report: dict) -> tuple[Use, str]:
     if different := report.get("crosscheck", {}).get("differences"):
         return "with care", f"With care: the native COLMAP comes to other faces ({different[0]})."
     if n := counts["suspicious"]:
-        told = f"{n} of {made} checks {'is' if n == 1 else 'are'} suspicious, the first: "
+        message = f"{n} of {made} checks {'is' if n == 1 else 'are'} suspicious, the first: "
         by_chance = f"one sound run in {round(TESTS_OF_CHANCE / made)} has such a check by chance"
-        return "with care", f"With care: {told}{_first(report, 'suspicious')['title']}; {by_chance}."
+        return "with care", f"With care: {message}{_first(report, 'suspicious')['title']}; {by_chance}."
     if report["summary"]["sigma0"] is None:
         return (
             "with care",
@@ -117,11 +117,11 @@ def _use(report: dict) -> tuple[Use, str]:
 
 
 def _first(report: dict, verdict: str) -> dict:
-    """Of the checks with this verdict, the first that names an image, which can be looked at, or else the first."""
+    """Returns the first check with this verdict that names an image, which can be looked at, else the first one."""
     images = {image["name"] for image in report["images"]}
-    own = [check for check in report.get("checks", []) if check["verdict"] == verdict]
-    naming = [check for check in own if any(name in images for name in check["names"])]
-    return [*naming, *own][0]
+    matching = [check for check in report.get("checks", []) if check["verdict"] == verdict]
+    naming = [check for check in matching if any(name in images for name in check["names"])]
+    return [*naming, *matching][0]
 
 
 # --- how good ---------------------------------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
 
 
 def _largest(report: dict, key: str) -> tuple[float, str] | None:
-    """(largest over the axes, face) of the worst face."""
+    """Returns (largest value over the axes, face) of the worst face."""
     others = {name: face for name, face in report["faces"].items() if name != report["reference_face"]}
     return max(((max(f[key]), name) for name, f in others.items() if f[key] is not None), default=None)
 
@@ -161,7 +161,7 @@ def _largest(report: dict, key: str) -> tuple[float, str] | None:
 
 
 def _control(report: dict) -> _Cause | None:
-    """Results that are made for comparison."""
+    """Returns the cause of a result without faces, or of one made for comparison; None for other results."""
     options = report["options"]
     if not report["faces"]:
         return _Cause(
@@ -177,7 +177,7 @@ def _control(report: dict) -> _Cause | None:
 
 
 def _by_checks(report: dict) -> _Cause | None:
-    """The first of the worst checks."""
+    """Returns the cause that the first of the worst checks names, or else the cross-check; None without either."""
     verdicts = {check["verdict"] for check in report.get("checks", [])}
     for verdict in ("failed", "suspicious"):
         if verdict in verdicts:
@@ -190,7 +190,7 @@ def _by_checks(report: dict) -> _Cause | None:
 
 
 def _by_sigma(report: dict) -> _Cause:
-    """The board, one face, or all of the photographs."""
+    """Returns the cause that the σ show: the board, one face, or the photographs as a whole."""
     spread = {
         name: math.hypot(*face["translation_sigma_um"])
         for name, face in report["faces"].items()
@@ -224,13 +224,13 @@ def _by_sigma(report: dict) -> _Cause:
 
 
 def _more(report: dict, verdict: Use) -> list[str]:
-    """What goes beyond the limit: faces that are missing, checks that could not be made."""
-    told = []
+    """Returns what to do beyond the limit: about missing faces, and about checks that could not be made."""
+    advice = []
     if report["faces"] and (missing := report["summary"]["faces_not_seen"]):
-        told.append(f"Photograph face {join(missing)} together with one of the others: not seen in any image.")
+        advice.append(f"Photograph face {join(missing)} together with one of the others: not seen in any image.")
     open_ = [c for c in report.get("checks", []) if c["verdict"] == "not possible" and c["remedy"]]
     if verdict == "yes" and open_:
         remedy = open_[0]["remedy"].removeprefix("to be able to make it, ")
         same = sum(check["remedy"] == open_[0]["remedy"] for check in open_)
-        told.append(f"For {same} more check{'s' * (same > 1)}: {remedy}.")
-    return told
+        advice.append(f"For {same} more check{'s' * (same > 1)}: {remedy}.")
+    return advice

@@ -1,4 +1,4 @@
-"""``report.html``: the report as one page that opens off line, for people; ``report.json`` is the same for programs."""
+"""The report as one page that opens off line, ``report.html``, for people; ``report.json`` is the same for programs."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -18,14 +18,14 @@ from stcal.sfm.report.space import space_parts
 SIDES = {-58: "", 122: ", from the other side"}
 """Azimuths from which target and cameras are drawn."""
 FIRST_PAIRS = 15
-"""Rows that the page has room for."""
+"""Number of rows that the page has room for."""
 SOLVES = {
     "joint": "joint: one adjustment over all groups",
     "chain": "chain: group by group, then combined",
     "paper": "paper: as published by Zhang & Wei (2017), for comparison",
 }
 VERDICTS = {"yes": "passed", "with care": "suspicious", "no": "failed"}
-"""Verdict of the checks whose colour a judgement has."""
+"""Verdict of a check that has the colour of each judgement."""
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
@@ -36,15 +36,15 @@ def report_html(
     reload_s: int | None = None,
     gone: int = 0,
 ) -> str:
-    """The page.
+    """Returns the page.
 
     Parameters
     ----------
-    report : what :func:`stcal.sfm.runs.output.report_of` made
+    report : result of :func:`stcal.sfm.runs.output.report_of`
     overlays : JPEG by image name
-    residuals : centres and their residuals by image name, px; none are drawn where None
-    reload_s : the page loads itself anew so often; never where None
-    gone : overlays that are no longer in the run's folder
+    residuals : centres and their residuals by image name, px; none are drawn if None
+    reload_s : seconds after which the page reloads itself; never if None
+    gone : number of overlays that are no longer in the run's folder
     """
     colours = figures.group_colours([group["name"] for group in report["groups"]])
     boards, views, bars = _drawn(report, colours)
@@ -81,10 +81,13 @@ def report_html(
 
 
 def _drawn(report: dict, colours: dict[str, str]) -> tuple[dict[str, str], list[tuple[str, str, str]], str]:
-    """Plots of the boards' residuals by group, (cameras, target, from where) from two sides, and bars of the images."""
+    """Returns the plots: the boards' residuals by group, views from two sides, and bars of the images.
+
+    A view is (cameras, target, words for its side).
+    """
     scene = report["scene"]
     boards, jobs = _boards(report), []
-    jobs += [(figures.board_residuals, *own) for own in boards.values()]
+    jobs += [(figures.board_residuals, *board) for board in boards.values()]
     for azimuth in SIDES:
         jobs.append((figures.scene_view, scene, report["camera"], colours, azimuth))
         jobs.append((figures.target_view, scene["circles"], report["faces"], azimuth))
@@ -102,7 +105,7 @@ def _draw(figure: Callable[..., str], *arguments) -> str:
 
 
 def _size_mm(report: dict) -> float:
-    """The diagonal of the box about the target's circles."""
+    """Returns the diagonal of the box around the target's circles."""
     circles = list(report["scene"]["circles"].values())
     return math.dist(*[[pick(axis) for axis in zip(*circles, strict=True)] for pick in (min, max)]) if circles else 0.0
 
@@ -114,7 +117,7 @@ def _factor_in_words(factor: float) -> str:
 
 
 def _worst(found) -> tuple[float, str] | None:
-    return max(found, key=lambda each: each[0], default=None)
+    return max(found, key=lambda candidate: candidate[0], default=None)
 
 
 def _largest_sigma(report: dict, key: str) -> tuple[float, str] | None:
@@ -131,13 +134,13 @@ def _worst_chain(report: dict, key: str) -> tuple[float, str] | None:
 
 
 def _judgement(report: dict) -> dict:
-    """Colour and sentences; made anew for a report of a version that had none."""
-    found = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
-    return {"colour": COLOURS[VERDICTS[found.verdict]], "answers": found.answers()}
+    """Returns colour and sentences; they are made anew if the report is of a version that had none."""
+    judgement = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
+    return {"colour": COLOURS[VERDICTS[judgement.verdict]], "answers": judgement.answers()}
 
 
 def _headline(report: dict) -> list[tuple[str, str, str]]:
-    """(value, unit, what it is) of the tiles."""
+    """Returns (value, unit, description) of the tiles."""
     summary = report["summary"]
     sigma, chain = _largest_sigma(report, "translation_sigma_um"), _worst_chain(report, "translation_um")
     ppm = max((abs(group["scale"]["difference_ppm"]) for group in report["groups"]), default=None)
@@ -153,7 +156,7 @@ def _headline(report: dict) -> list[tuple[str, str, str]]:
 
 def _settings(report: dict) -> list[list[str]]:
     summary, options, camera = report["summary"], report["options"], report["camera"]
-    left, last = report["left_out"], summary["last_move_px"]
+    left_out, last_move = report["left_out"], summary["last_move_px"]
     sizes = " × ".join(str(size) for size in camera["size_px"])
     solve, frame = str(options["solve"]), str(options["frame"])
     return [
@@ -163,8 +166,11 @@ def _settings(report: dict) -> list[list[str]]:
         ["Reference face", report["reference_face"]],
         ["Faces not seen", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
         ["Centres observed", f"{summary['observations']}, redundancy {summary['redundancy'] or NONE}"],
-        ["Last step of the joint adjustment", NONE if last is None else f"{last:.1g} px"],
-        ["Left out", f"{len(left['files'])} files, {len(left['images'])} images, {len(left['circles'])} circles"],
+        ["Last step of the joint adjustment", NONE if last_move is None else f"{last_move:.1g} px"],
+        [
+            "Left out",
+            f"{len(left_out['files'])} files, {len(left_out['images'])} images, {len(left_out['circles'])} circles",
+        ],
         ["Camera, as given", f"{camera['model']}, {sizes} px"],
         ["Focal lengths (px)", ", ".join(number(v, 4) for v in camera["focal_px"])],
         ["Principal point (px)", ", ".join(number(v, 4) for v in camera["centre_px"]) + " (pixel centres integer)"],
@@ -174,7 +180,7 @@ def _settings(report: dict) -> list[list[str]]:
 
 
 def _worst_values(report: dict) -> list[list[str]]:
-    """Rows of check, worst value, where, remark."""
+    """Returns rows of check, worst value, its place, remark."""
     board = _worst((g["scale"]["board_rms_um"], f"group {g['name']}") for g in report["groups"])
     ppm = _worst((abs(g["scale"]["difference_ppm"]), f"group {g['name']}") for g in report["groups"])
     flat = _worst((face["plane_rms_um"], f"face {name}") for name, face in report["faces"].items())
@@ -182,8 +188,8 @@ def _worst_values(report: dict) -> list[list[str]]:
     over = f"{number(1e-3 * ppm[0] * _size_mm(report), 1)} µm over the target's diagonal" if ppm else ""
     parts = "each way uses a part of the images only, so it scatters more than the result"
     return [
-        [name, number(found and found[0], digits), found[1] if found else NONE, remark if found else "not computed"]
-        for name, found, digits, remark in (
+        [name, number(worst and worst[0], digits), worst[1] if worst else NONE, remark if worst else "not computed"]
+        for name, worst, digits, remark in (
             ("σ of a face's position (µm)", _largest_sigma(report, "translation_sigma_um"), 1, "largest of X, Y, Z"),
             ("σ of a face's rotation (mdeg)", _largest_sigma(report, "rotation_sigma_mdeg"), 2, "largest of X, Y, Z"),
             ("Disagreement of chains, position (µm)", _worst_chain(report, "translation_um"), 1, parts),
@@ -200,7 +206,7 @@ def _worst_values(report: dict) -> list[list[str]]:
 
 
 def _faces(report: dict) -> dict[str, list]:
-    """Rows of the poses, of their axes, of distances between faces, and of the ways to each face."""
+    """Returns rows of the poses, of their axes, of distances between faces, and of the ways to each face."""
     poses, axes = [], []
     for name, face in report["faces"].items():
         datum = name == report["reference_face"]
@@ -244,19 +250,19 @@ def _scales(report: dict) -> list[list]:
 
 
 def _boards(report: dict) -> dict[str, tuple]:
-    """What is drawn of the boards' residuals, by group."""
+    """Returns the input of the plots of the boards' residuals, by group."""
     residuals = {group["name"]: group["scale"]["board_residuals_um"] for group in report["groups"]}
-    vectors = [vector for own in residuals.values() for vector in own.values()]
+    vectors = [vector for board_residuals in residuals.values() for vector in board_residuals.values()]
     reach = max((math.hypot(*vector[:2]) for vector in vectors), default=0.0)
     height = max((abs(vector[2]) for vector in vectors), default=0.0)
-    return {name: (own, reach, height) for name, own in residuals.items()}
+    return {name: (board_residuals, reach, height) for name, board_residuals in residuals.items()}
 
 
 # --- residuals, pairs, left out ---------------------------------------------------------------------------------------
 
 
 def _residuals(report: dict, colours: dict[str, str]) -> dict:
-    """By image as rows; by label, face by face and board by board."""
+    """Returns the residuals: rows by image; by label, grouped face by face and board by board."""
     images, labels = report["residuals_by_image"], report["residuals_by_label"]
     target: dict[str, list] = {}
     board: dict[str, list] = {}
@@ -284,7 +290,7 @@ def _residuals(report: dict, colours: dict[str, str]) -> dict:
 
 
 def _starts(report: dict) -> list[list]:
-    """How the mapping of each group began."""
+    """Returns rows on the start of the mapping of each group."""
     return [
         [
             group["name"],
@@ -302,6 +308,6 @@ def _starts(report: dict) -> list[list]:
 
 def _circles_left_out(report: dict) -> list[list]:
     circles: dict[tuple[str, str], list[str]] = {}
-    for each in report["left_out"]["circles"]:
-        circles.setdefault((each["image"], each["reason"]), []).append(each["label"])
+    for circle in report["left_out"]["circles"]:
+        circles.setdefault((circle["image"], circle["reason"]), []).append(circle["label"])
     return [[image, len(labels), join(labels), reason] for (image, reason), labels in circles.items()]

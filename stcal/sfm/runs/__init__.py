@@ -1,1 +1,1 @@
-"""What a run is asked for and answers, and its folder: written, kept, and read back."""
+"""Options and result of a run, and its folder: written, kept, and read back."""

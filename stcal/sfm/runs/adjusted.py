@@ -1,4 +1,4 @@
-"""A finished run's final adjustment, made again from its folder for what its files do not say."""
+"""The final adjustment of a finished run, repeated from its folder for what its files do not hold."""
 
 from dataclasses import dataclass
 
@@ -15,8 +15,11 @@ from stcal.sfm.runs.saved import SavedRun
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedRun:
-    """``state`` : groups in mm in the target frame, σ as in the run's adjustment, at the minimum; ``start`` : the
-    run's answer; ``prior`` : of the intrinsics where they were adjusted."""
+    """The final adjustment of a run.
+
+    ``state`` : groups in mm in the target frame, at the minimum, with σ as in the run; ``start`` : result of the run;
+    ``prior`` : of the intrinsics if they were adjusted.
+    """
 
     state: Adjusted
     start: CalibratedTarget
@@ -24,7 +27,7 @@ class AdjustedRun:
 
 
 def adjusted_run(run: SavedRun) -> AdjustedRun:
-    """The final adjustment of a run once more, which moves nothing.
+    """Repeats the final adjustment of a run, which moves nothing.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What ``report.json`` holds of the comparison with the published method."""
+"""Content of ``report.json`` about the comparison with the published method."""
 
 from pydantic import Field
 
@@ -26,7 +26,7 @@ class SigmaRow(Part):
 
 
 class Comparison(Part):
-    """What ``--compare paper`` adds to ``report.json``."""
+    """Content that ``--compare paper`` adds to ``report.json``."""
 
     method: str = Field(alias="with", description="`paper`")
     rows: list[ComparedRow] = Field(

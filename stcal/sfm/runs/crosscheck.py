@@ -1,4 +1,4 @@
-"""What ``report.json`` holds of a cross-check with the native COLMAP."""
+"""Content of ``report.json`` about a cross-check with the native COLMAP."""
 
 from dataclasses import asdict, dataclass, replace
 
@@ -13,10 +13,10 @@ from stcal.io.json import ByFace, ByLabel, Part
 class Tolerances:
     """Largest differences allowed: faces and circles in the target frame, cameras against the target.
 
-    ``sigma`` : of our answer from the native models, faces and circles in their own σ: half a σ, added to it, makes
-    1.12 of it; ``mapped_sigma`` : of the two programs' own answers, group by group and with looser ends of iterations,
-    which noise does not explain beyond 3 σ. The others are in force where they are given, and ``face_um``,
-    ``face_mdeg``, ``circle_um`` for a run without σ, by default 2, 1, 2.
+    ``sigma`` : limit for our result from the native models, faces and circles in units of their own σ: half a σ, added
+    to σ, makes 1.12 σ; ``mapped_sigma`` : limit for the two programs' own results, which are computed group by group
+    with iterations that end earlier: noise does not explain differences beyond 3 σ. The other limits apply if they are
+    given. For a run without σ, ``face_um``, ``face_mdeg``, ``circle_um`` apply, too, by default 2, 1, 2.
     """
 
     face_um: float | None = None
@@ -28,7 +28,7 @@ class Tolerances:
     mapped_sigma: float = 3.0
 
     def without_sigma(self) -> "Tolerances":
-        """For a run that states no σ."""
+        """Returns the tolerances for a run that states no σ."""
         defaults = {"face_um": 2.0, "face_mdeg": 1.0, "circle_um": 2.0}
         return replace(self, **{name: value for name, value in defaults.items() if getattr(self, name) is None})
 
@@ -41,15 +41,15 @@ class Tolerances:
 
 
 def allowed_text(tolerances: Tolerances) -> str:
-    """The limits in force, in words."""
+    """Returns the limits in force as text."""
     parts = [f"faces and circles {tolerances.mapped_sigma:g} σ between the programs, {tolerances.sigma:g} σ adjusted"]
-    for what, values in (
+    for kind, values in (
         ("faces", ((tolerances.face_um, "µm"), (tolerances.face_mdeg, "mdeg"))),
         ("circles", ((tolerances.circle_um, "µm"),)),
         ("cameras", ((tolerances.camera_um, "µm"), (tolerances.camera_mdeg, "mdeg"))),
     ):
-        known = [f"{value:g} {unit}" for value, unit in values if value is not None]
-        parts += [f"{what} {' and '.join(known)}"] if known else []
+        given = [f"{value:g} {unit}" for value, unit in values if value is not None]
+        parts += [f"{kind} {' and '.join(given)}"] if given else []
     return ", ".join(parts)
 
 
@@ -94,7 +94,7 @@ class MappingCompared(ResultCompared):
 
 
 class Crosscheck(Part):
-    """``crosscheck`` of ``report.json``."""
+    """Section ``crosscheck`` of ``report.json``."""
 
     native: str = Field(description="version of the native program")
     pycolmap: str = Field(description="version of ours")

@@ -1,4 +1,4 @@
-"""What a run writes into its folder: overlays, results, report."""
+"""Files that a run writes into its folder: overlays, results, report."""
 
 import contextlib
 import csv
@@ -39,7 +39,8 @@ from stcal.sfm.runs.saved import SavedRun
 from stcal.sfm.runs.transaction import added_results, complete_interrupted
 
 LONGEST_NAME = 200
-"""Bytes of an image's name in that of its overlay; file systems take 255, with what is added while it is written."""
+"""Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix
+during writing."""
 HASH_DIGITS = 12
 
 
@@ -47,7 +48,7 @@ HASH_DIGITS = 12
 def overlays_beside(
     detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, folder: Path, progress: Progress
 ) -> Iterator[None]:
-    """Draw into every image what was found in it while other work goes on; all are there at the end."""
+    """Draws the detections into every image while other work goes on; all overlays exist at the end of the block."""
     face_ids = [face.id for face in target.faces]
 
     def draw(image, each: LabelledImage) -> None:
@@ -69,7 +70,7 @@ def overlays_beside(
             yield
         except Exception:
             raise
-        except BaseException:  # asked to end
+        except BaseException:  # interrupted or exiting
             pool.shutdown(wait=False, cancel_futures=True)
             raise
         for i, _ in enumerate(drawn):
@@ -78,21 +79,23 @@ def overlays_beside(
 
 def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):
     by_name = {image.file.name: image for image in detection.images}
-    return [by_name[each.observations.name] for each in labelled]
+    return [by_name[labelled_image.observations.name] for labelled_image in labelled]
 
 
 def overlay_path(out: Path, name: str) -> Path:
-    """The overlay of an image; a long name is cut, and ends in its hash."""
-    group, slash, own = name.rpartition("/")
-    if len(own.encode()) > LONGEST_NAME:
-        cut = own.encode()[: LONGEST_NAME - HASH_DIGITS - 1].decode(errors="ignore")
-        own = f"{cut}-{hashlib.sha256(name.encode()).hexdigest()[:HASH_DIGITS]}"
-    return out / "overlays" / f"{group}{slash}{own}.jpg"
+    """Returns the path of an image's overlay; a long name is cut, and ends in its hash."""
+    group, slash, file_name = name.rpartition("/")
+    if len(file_name.encode()) > LONGEST_NAME:
+        cut = file_name.encode()[: LONGEST_NAME - HASH_DIGITS - 1].decode(errors="ignore")
+        file_name = f"{cut}-{hashlib.sha256(name.encode()).hexdigest()[:HASH_DIGITS]}"
+    return out / "overlays" / f"{group}{slash}{file_name}.jpg"
 
 
 def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | None = None) -> Judgement:
-    """The database with corrected centres, models, faces and report, into a folder that holds the overlays; the report
-    loads itself anew every ``reload_s`` seconds. Returns what the report says in words."""
+    """Writes database, models, faces and report into a folder that holds the overlays; returns the judgement.
+
+    The database has corrected centres. The page of the report reloads itself every ``reload_s`` seconds.
+    """
     observations = result.observations()
     ids = image_ids(observations)
     models = {s.model.group: s.model for s in result.solutions}
@@ -110,7 +113,7 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
     save(out / TARGET, target_toml(result.target_design))
     save(out / BOARD, board_toml(result.board_design))
     report = judged(report_of(result).content())
-    if result.target.target_from_face:  # none of the board alone
+    if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factor
         faces = FacesFile.of(result.target, result.target_design, options, factor)
         save(out / "faces.json", json_text(faces.content()))
@@ -120,7 +123,7 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
 
 
 def write_report(out: Path, report: dict, run: Path, reload_s: int | None = None) -> None:
-    """``report.json`` and ``report.html``, into a folder; ``run`` : that of the overlays."""
+    """Writes ``report.json`` and ``report.html`` into a folder; ``run`` : folder of the overlays."""
     page = _report_page(run, report, reload_s)
     save(out / "report.json", json_text(report))
     save(out / "report.html", page)
@@ -128,26 +131,31 @@ def write_report(out: Path, report: dict, run: Path, reload_s: int | None = None
 
 @dataclass(frozen=True, slots=True)
 class ReportAgain:
-    """``files`` : page and PDF that were written; ``gone`` : overlays that the folder no longer holds, so that the page
-    is without them."""
+    """Result of :func:`report_again`.
+
+    ``files`` : page and PDF that were written; ``gone`` : number of overlays that the folder no longer holds, so that
+    the page lacks them.
+    """
 
     files: tuple[Path, ...]
     gone: int
 
     def text(self) -> str:
-        """For the terminal."""
-        told = [f"{self.gone} overlays are no longer in the folder: the report is without them"] if self.gone else []
-        return "\n".join([*told, *(f"report: {path}" for path in self.files)])
+        """Returns the text for the terminal."""
+        warnings = (
+            [f"{self.gone} overlays are no longer in the folder: the report is without them"] if self.gone else []
+        )
+        return "\n".join([*warnings, *(f"report: {path}" for path in self.files)])
 
 
 def report_again(run: Path, pdf: bool, out: Path | None = None) -> ReportAgain:
-    """Make the page of a finished run anew from its ``report.json`` and its overlays, and a PDF of it.
+    """Makes the page of a finished run anew from its ``report.json`` and its overlays, and a PDF if requested.
 
     Parameters
     ----------
     run : the run's folder
-    pdf : whether to make the PDF too
-    out : file for the page, the PDF beside it; where None, those in the folder are replaced
+    pdf : whether to make the PDF
+    out : file for the page, the PDF beside it; if None, those in the folder are replaced
 
     Raises
     ------
@@ -175,7 +183,7 @@ def report_again(run: Path, pdf: bool, out: Path | None = None) -> ReportAgain:
 
 
 def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], int]:
-    """Files, and how many overlays are gone."""
+    """Writes page and PDF; returns their paths, and the number of overlays that are gone."""
     path = run / "report.json"
     report = read_json(path, "run", "run it again")
     try:
@@ -184,16 +192,16 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
         raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again") from error
     with _as_written(path):
         shown = shown_overlays(report)
-        overlays = {name: there.read_bytes() for name in shown if (there := overlay_path(run, name)).is_file()}
+        overlays = {name: overlay.read_bytes() for name in shown if (overlay := overlay_path(run, name)).is_file()}
     gone, residuals = len(shown) - len(overlays), _residuals(run, list(overlays))
     with _as_written(path):
         page = report_html(report, overlays, residuals, gone=gone)
-    made: list[tuple[Path, bytes]] = [(out, page.encode())]
+    outputs: list[tuple[Path, bytes]] = [(out, page.encode())]
     if pdf:
-        made.append((out.with_suffix(".pdf"), pdf_of(page)))
-    for file, content in made:
+        outputs.append((out.with_suffix(".pdf"), pdf_of(page)))
+    for file, content in outputs:
         save(file, content)
-    return tuple(file for file, _ in made), gone
+    return tuple(file for file, _ in outputs), gone
 
 
 def _report_page(run: Path, report: dict, reload_s: int | None = None) -> bytes:
@@ -202,22 +210,22 @@ def _report_page(run: Path, report: dict, reload_s: int | None = None) -> bytes:
 
 
 def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
-    """Centres and residuals of these images, by ``labels.csv``; none of a version that kept none."""
+    """Returns centres and residuals of these images from ``labels.csv``; empty if an older version kept none."""
     path = run / "labels.csv"
     rows: dict[str, list[list[float]]] = {name: [] for name in names}
     try:
         for row in csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())):
             if row["image"] in rows and row.get("residual_x_px"):
-                own = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
-                rows[row["image"]].append(own)
+                values = [float(row[key]) for key in ("x_px", "y_px", "residual_x_px", "residual_y_px")]
+                rows[row["image"]].append(values)
     except (LookupError, TypeError, ValueError, csv.Error) as error:
         raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again") from error
-    return {name: np.array(own).reshape(-1, 4) for name, own in rows.items()}
+    return {name: np.array(values).reshape(-1, 4) for name, values in rows.items()}
 
 
 @contextlib.contextmanager
 def _as_written(path: Path) -> Iterator[None]:
-    """InputError for a report that a page cannot be made of, or a file that it needs."""
+    """Raises InputError for a report of which no page can be made, or for a file that it needs."""
     try:
         yield
     except OSError as error:
@@ -230,7 +238,7 @@ def _as_written(path: Path) -> Iterator[None]:
 
 
 def require_report(saved: SavedRun) -> None:
-    """Refuse a run whose report cannot be added to: of another version, without its overlays, or read-only."""
+    """Refuses a run whose report cannot be extended: of another version, without its overlays, or read-only."""
     with _as_written(saved.folder / "report.json"):
         _report_page(saved.folder, {key: value for key, value in saved.report.items() if key != "crosscheck"})
     if not os.access(saved.folder, os.W_OK):
@@ -241,7 +249,10 @@ def require_report(saved: SavedRun) -> None:
 
 
 def _corrected_px(models: Mapping[str, GroupModel], observations: list[ImageObservations]) -> list[np.ndarray]:
-    """All keypoints of every image as the models of the groups correct them; as measured in groups without one."""
+    """Returns all keypoints of every image as the models of the groups correct them.
+
+    In groups without a model the keypoints are as measured.
+    """
     rows = {name: rows for m in models.values() for name, rows in zip(m.images, m.rows_by_image(), strict=True)}
     none = np.zeros(0, int)
     return [

@@ -1,4 +1,4 @@
-"""``stcal-run.json``: the marker of a run's folder, with the hashes of all that the run made."""
+"""The marker of a run's folder, ``stcal-run.json``, with the hashes of all files that the run made."""
 
 import hashlib
 import json
@@ -20,7 +20,7 @@ ByFile = Annotated[str, "file"]
 
 
 class MarkerFile(ResultFile):
-    """Of a run's folder: what it was given."""
+    """Marker of a run's folder: the input of the run, and the hashes of its files."""
 
     program: Literal["stcal-sfm"] = Field(description="that made the folder")
     version: str = Field(description="of stcal")
@@ -34,7 +34,7 @@ class MarkerFile(ResultFile):
 
     @classmethod
     def of(cls, images: str | Path, options: RunOptions | None) -> "MarkerFile":
-        """The marker of a run, or of a detection alone, that begins."""
+        """Returns the marker of a run, or of a detection alone, that begins."""
         return cls(
             program="stcal-sfm",
             version=stcal.__version__,
@@ -43,27 +43,27 @@ class MarkerFile(ResultFile):
         )
 
     def sealed(self, digests: dict[str, str]) -> "MarkerFile":
-        """The marker of results with these hashes, its own among them."""
+        """Returns the marker of results with these hashes, which include its own."""
         others = {name: value for name, value in digests.items() if name != RUN_MARKER}
         content = self.model_copy(update={"sha256": others}).content()
         return self.model_copy(update={"sha256": {RUN_MARKER: own_digest(content), **others}})
 
 
 def own_digest(content: dict[str, Any]) -> str:
-    """SHA-256 of a marker's content, less its own entry among the hashes."""
+    """Returns the SHA-256 of a marker's content without its own entry among the hashes."""
     others = {name: value for name, value in content["sha256"].items() if name != RUN_MARKER}
     return hashlib.sha256(json.dumps(content | {"sha256": others}, sort_keys=True).encode()).hexdigest()
 
 
 def files_below(folder: Path) -> Iterator[str]:
-    """Paths of all files and links below a folder, with forward slashes; links are not followed."""
+    """Yields the paths of all files and links below a folder, with forward slashes; links are not followed."""
     for place, folders, files in os.walk(folder):
-        for name in (*files, *(each for each in folders if os.path.islink(os.path.join(place, each)))):
+        for name in (*files, *(subfolder for subfolder in folders if os.path.islink(os.path.join(place, subfolder)))):
             yield (Path(place) / name).relative_to(folder).as_posix()
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a file, read piece by piece; empty of what is no file but a link, a folder, a pipe or nothing."""
+    """Returns the SHA-256 of a file, read piece by piece; empty for a link, a folder, a pipe, or nothing."""
     if not (os.path.lexists(path) and stat.S_ISREG(path.lstat().st_mode)):
         return ""
     with open(path, "rb") as stream:

@@ -1,4 +1,4 @@
-"""What a run is asked for."""
+"""Options of a run."""
 
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal, get_args
@@ -16,37 +16,37 @@ Compare = Literal["paper"]
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """What to do, the defaults of which some depend on others.
+    """Options of a run; some defaults depend on other options.
 
     Parameters
     ----------
     solve : {"joint", "chain", "paper"}, optional
         One adjustment over all groups; or group by group; or Zhang & Wei (2017) as published, from detection on, which
-        settles ``frame`` and ``eccentricity`` too. Where None ``joint``, but for the uncorrected control, which is
-        chained.
+        also decides ``frame`` and ``eccentricity``. If None, ``joint``, or ``chain`` for the uncorrected control.
     frame : {"plane", "three-point"}, optional
-        Frame of a face: Z from the plane of all its circles, or as in Zhang & Wei (2017). Where None ``plane``, but for
-        the uncorrected control.
+        Frame of a face: Z from the plane of all its circles, or as in Zhang & Wei (2017). If None, ``plane``, or
+        ``three-point`` for the uncorrected control.
     eccentricity : bool
-        Whether it is corrected; the uncorrected control where not.
+        Whether it is corrected; if not, the run is the uncorrected control.
     reference_face : str, optional
-        Id of the face whose frame is the target frame; the design's first one where None.
+        Id of the face whose frame is the target frame; the first face of the design if None.
     graph : {"all", "sparse"}, optional
-        Which pairs of images are matched, see :func:`stcal.sfm.mapping.graph.image_graph`; by their number where None.
+        Which pairs of images are matched, see :func:`stcal.sfm.mapping.graph.image_graph`. If None, the number of
+        images decides.
     pairs : PairOptions
-        Of the initial pair.
+        Options of the initial pair.
     ellipses : EllipseOptions
-        Of detection.
+        Options of detection.
     workers : int, optional
-        Processes; one per core where None.
+        Number of processes; one per core if None.
     flatness_mm : float, optional
-        σ of a circle about the plane of its face, mm; None for no such knowledge.
+        σ of a circle about the plane of its face, mm; None if it is unknown.
     refine_camera : bool
-        Adjust the intrinsics too, the given ones being observations.
+        Whether to adjust the intrinsics, with the given ones as observations.
     board_only : bool
-        The board alone was photographed: λ and its residuals are the answer. Where not, it is found out.
+        Whether the board alone was photographed, so that λ and its residuals are the result. If False, the images tell.
     compare : {"paper"}, optional
-        Solve the same photographs as published too, and step by step from there, for the report.
+        Also solve the same photographs as published, and step by step from there, for the report.
     exclude : tuple of str
         Images that are not used, by their names in results, such as ``12/IMG_1003.jpg``.
 
@@ -77,7 +77,7 @@ class RunOptions:
             )
 
     def adjustment(self, target: TargetDesign) -> AdjustOptions:
-        """What of it the adjustment is asked for, decided.
+        """Returns the options of the adjustment, with every default decided.
 
         Raises
         ------
@@ -95,7 +95,7 @@ class RunOptions:
         )
 
     def settled(self, target: TargetDesign) -> "RunOptions":
-        """The same options with every default decided.
+        """Returns the same options with every default decided.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""``report.json``: everything that tells how far to trust the result."""
+"""Content of ``report.json``: everything that tells how far to trust the result."""
 
 from itertools import combinations
 
@@ -17,10 +17,10 @@ MICRO = 1e3
 
 
 def report_of(result: RunResult) -> ReportFile:
-    """The report of a run."""
+    """Returns the report of a run."""
     models = _final_models(result)
     residual = {name: model.residuals_px(result.calibration.camera) for name, model in models.items()}
-    everything = np.concatenate(list(residual.values()))
+    all_residuals = np.concatenate(list(residual.values()))
     return ReportFile.model_validate(
         {
             "format": "stcal report 1",
@@ -49,8 +49,8 @@ def report_of(result: RunResult) -> ReportFile:
                 "faces_not_seen": [
                     f.id for f in result.target_design.faces if f.id not in result.target.target_from_face
                 ],
-                "observations": len(everything),
-                "residual_rms_px": float(np.sqrt((everything**2).mean())),
+                "observations": len(all_residuals),
+                "residual_rms_px": float(np.sqrt((all_residuals**2).mean())),
                 "centre_sigma_rms_px": float(
                     np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models.values()]).mean())
                 ),
@@ -91,18 +91,18 @@ def report_of(result: RunResult) -> ReportFile:
 
 
 def residuals_px(result: RunResult) -> list[np.ndarray]:
-    """Of every keypoint of every image, (k, 2), corrected minus projected; nan where it is not in the answer."""
+    """Returns corrected minus projected keypoints of every image, (k, 2); NaN for keypoints not in the result."""
     models = _final_models(result)
-    found = {each.name: np.full((len(each), 2), np.nan) for each in result.observations()}
+    by_image = {image.name: np.full((len(image), 2), np.nan) for image in result.observations()}
     for model in models.values():
         residual = model.residuals_px(result.calibration.camera)
         for name, rows in zip(model.images, model.rows_by_image(), strict=True):
-            found[name][model.keypoint[rows]] = residual[rows]
-    return list(found.values())
+            by_image[name][model.keypoint[rows]] = residual[rows]
+    return list(by_image.values())
 
 
 def _final_models(result: RunResult) -> dict[str, GroupModel]:
-    """The models that the answer rests on."""
+    """Returns the models that the result rests on, by group."""
     if result.calibration.joint:
         return {model.group: model for model in result.calibration.joint.models}
     return {solution.model.group: solution.model for solution in result.solutions}
@@ -111,7 +111,7 @@ def _final_models(result: RunResult) -> dict[str, GroupModel]:
 def _face(result: RunResult, face_id: str) -> dict:
     pose = result.target.target_from_face[face_id]
     labels = [label for label in result.target.circles if label.face == face_id]
-    members = [each for each in result.calibration.faces if each.face == face_id]
+    members = [member for member in result.calibration.faces if member.face == face_id]
     covariance = result.target.face_covariance.get(face_id)
     sigma = None if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
     return {
@@ -123,8 +123,8 @@ def _face(result: RunResult, face_id: str) -> dict:
         "circles": len(labels),
         "circles_of_design": len(result.target_design.face(face_id).ids),
         "plane_rms_um": MICRO * fit_plane(np.array([result.target.circles[label] for label in labels])).rms,
-        "groups": [each.group for each in members],
-        "images": sum(each.images for each in members),
+        "groups": [member.group for member in members],
+        "images": sum(member.images for member in members),
     }
 
 
@@ -151,7 +151,7 @@ def _group(result: RunResult, solution) -> dict:
     return {
         "name": name,
         "images": list(solution.model.images),
-        "faces": [each.face for each in result.calibration.faces if each.group == name],
+        "faces": [face.face for face in result.calibration.faces if face.group == name],
         "points": len(solution.model.labels),
         "seeded": solution.seeded,
         "rounds": solution.rounds,
@@ -189,14 +189,14 @@ def _by_image(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) ->
     for name, model in models.items():
         length = np.linalg.norm(residual[name], axis=1)
         for i, image in enumerate(model.images):
-            own = np.flatnonzero(model.image_index == i)
-            worst = own[np.argmax(length[own])]
+            indices = np.flatnonzero(model.image_index == i)
+            worst = indices[np.argmax(length[indices])]
             rows.append(
                 {
                     "image": image,
                     "group": name,
-                    "observations": len(own),
-                    "rms_px": float(np.sqrt((residual[name][own] ** 2).mean())),
+                    "observations": len(indices),
+                    "rms_px": float(np.sqrt((residual[name][indices] ** 2).mean())),
                     "max_px": float(length[worst]),
                     "worst": model.labels[model.point_index[worst]],
                 }
@@ -205,7 +205,7 @@ def _by_image(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) ->
 
 
 def _by_label(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) -> list[dict]:
-    """Circles of the target over all groups; dots of the board group by group."""
+    """Returns residuals by label: of the target's circles over all groups, of the board's dots group by group."""
     gathered: dict[tuple[str, str], list[np.ndarray]] = {}
     for name, model in models.items():
         for k, r in zip(model.point_index, residual[name], strict=True):
@@ -224,7 +224,7 @@ def _by_label(models: dict[str, GroupModel], residual: dict[str, np.ndarray]) ->
 
 
 def _left_out(result: RunResult) -> dict:
-    observed = {(each.observations.name): each for each in result.labelled}
+    observed = {(labelled_image.observations.name): labelled_image for labelled_image in result.labelled}
     images, circles = [], []
     for solution in result.solutions:
         mapped = set(solution.model.labels)
@@ -252,18 +252,20 @@ def _left_out(result: RunResult) -> dict:
             }
             for o in solution.outliers
         ]
-        own = [observed[name].observations for name in solution.model.images]
-        circles += _without_point(solution.model, own, {(o.image, o.label) for o in solution.outliers})
+        mapped_images = [observed[name].observations for name in solution.model.images]
+        circles += _without_point(solution.model, mapped_images, {(o.image, o.label) for o in solution.outliers})
     return {
         "files": result.detection.skipped,
         "images": images,
         "circles": circles,
-        "notes": [{"image": name, "note": note} for name, each in observed.items() for note in each.notes],
+        "notes": [
+            {"image": name, "note": note} for name, labelled_image in observed.items() for note in labelled_image.notes
+        ],
     }
 
 
 def _without_point(model: GroupModel, images: list[ImageObservations], outliers: set[tuple[str, str]]) -> list[dict]:
-    """Circles labelled in mapped images that are no points of the model: seen once, or from one direction."""
+    """Returns labelled circles of mapped images that are no points of the model: seen once, or from one direction."""
     rays: dict[str, list[tuple[str, np.ndarray]]] = {}
     for image, pose in zip(images, model.camera_from_model, strict=True):
         for k in range(len(image)):
@@ -271,22 +273,24 @@ def _without_point(model: GroupModel, images: list[ImageObservations], outliers:
                 ray = pose.rotation.T @ np.append(image.centre[k], 1.0)
                 rays.setdefault(image.labels[k], []).append((image.name, ray / np.linalg.norm(ray)))
     circles = []
-    for label, own in rays.items():
-        direction = np.array([ray for _, ray in own])
+    for label, sightings in rays.items():
+        direction = np.array([ray for _, ray in sightings])
         angle = float(np.degrees(np.arccos(np.clip(direction @ direction.T, -1, 1)).max()))
         needed = float(np.degrees(MIN_RAY_ANGLE_RAD))
-        if len(own) == 1:
+        if len(sightings) == 1:
             gate = {"gate": "views", "value": 1, "limit": 2, "unit": "images"}
             reason = "seen in one mapped image only; 2 needed"
         else:
             gate = {"gate": "ray_angle", "value": angle, "limit": needed, "unit": "deg"}
-            reason = f"{len(own)} images see it within {angle:.2f}°, {needed:g}° needed; add views from further apart"
-        circles += [{"image": name, "label": label, "reason": reason} | gate for name, _ in own]
+            reason = (
+                f"{len(sightings)} images see it within {angle:.2f}°, {needed:g}° needed; add views from further apart"
+            )
+        circles += [{"image": name, "label": label, "reason": reason} | gate for name, _ in sightings]
     return circles
 
 
 def _scene(result: RunResult) -> dict:
-    """Cameras, board outlines and circles in the target frame, for the picture in space."""
+    """Returns cameras, board dots and circles in the target frame, for the picture in space."""
     cameras, boards = [], {}
     for model in result.calibration.models:
         for image, pose in zip(model.images, model.camera_from_model, strict=True):

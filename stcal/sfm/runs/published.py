@@ -1,4 +1,4 @@
-"""What each step from the method of Zhang & Wei (2017) to the run's own is worth, on the same photographs."""
+"""Effect of each step from the method of Zhang & Wei (2017) to the run's own, on the same photographs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,12 +21,15 @@ from stcal.sfm.runs.result import RunResult
 MICRO = 1e3
 AS_PUBLISHED = "as published"
 STEPS = ("centres of blurred edges", "eccentricity", "weights", "joint adjustment")
-"""In the order in which they are added."""
+"""Steps in the order in which they are added to the published method."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """Of one method: the target, and by group the models without unit that it rests on, and their scales."""
+    """Result of one method.
+
+    ``target`` ; ``models`` : models without unit that it rests on, one per group; ``scales`` : by group.
+    """
 
     target: CalibratedTarget
     models: tuple[WorldModel, ...]
@@ -34,12 +37,12 @@ class Answer:
 
 
 def require_comparable(options: AdjustOptions) -> None:
-    """Refuse to compare what is itself a part of the published method.
+    """Refuses to compare a run that is itself a part of the published method.
 
     Raises
     ------
     InputError
-        Not the joint adjustment with eccentricity.
+        The solve is not the joint adjustment with eccentricity.
     """
     if options.solve != "joint" or not options.eccentricity:
         raise InputError(
@@ -50,14 +53,14 @@ def require_comparable(options: AdjustOptions) -> None:
 
 
 def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> Comparison:
-    """Faces, board and residuals by the published method, and with each step of this package added in turn.
+    """Compares faces, board and residuals of the published method, and of each step of this package added in turn.
 
     Parameters
     ----------
     result
-        Of the joint adjustment.
+        Result of the joint adjustment.
     published
-        Of the same photographs by ``--solve paper``, or why there is none.
+        Result of ``--solve paper`` on the same photographs, or the error that prevents it.
 
     Returns
     -------
@@ -66,7 +69,7 @@ def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> 
     """
     whole = _jointly(result)
     steps = {AS_PUBLISHED: published if isinstance(published, StcalError) else answer_of(published), **in_steps(result)}
-    rows = [_row(name, each, whole, result.camera) for name, each in steps.items()]
+    rows = [_row(name, answer, whole, result.camera) for name, answer in steps.items()]
     rows.append(_last_row(f"+ {STEPS[-1]}", result))
     sigma = {
         face: SigmaRow(
@@ -80,25 +83,30 @@ def compare_with_paper(result: RunResult, published: RunResult | StcalError) -> 
 
 
 def in_steps(result: RunResult) -> dict[str, Answer | StcalError]:
-    """With the run's own circles, by the step added last, all but the joint adjustment; or why there is none."""
-    alike = [_alike(each.model) for each in result.solutions]
-    own = [each.model for each in result.solutions]
-    found: dict[str, Answer | StcalError] = {}
-    for step, models, eccentricity in zip(STEPS[:-1], (alike, alike, own), (False, True, True), strict=True):
+    """Returns the answers from the run's own circles after each added step, without the joint adjustment.
+
+    Keys are the steps added last. If a step has no answer, the value is its error.
+    """
+    equal_models = [_alike(solution.model) for solution in result.solutions]
+    weighted_models = [solution.model for solution in result.solutions]
+    answers: dict[str, Answer | StcalError] = {}
+    for step, models, eccentricity in zip(
+        STEPS[:-1], (equal_models, equal_models, weighted_models), (False, True, True), strict=True
+    ):
         try:
-            found[f"+ {step}"] = _chained(result, models, eccentricity)
+            answers[f"+ {step}"] = _chained(result, models, eccentricity)
         except StcalError as error:
-            found[f"+ {step}"] = error
-    return found
+            answers[f"+ {step}"] = error
+    return answers
 
 
 def answer_of(run: RunResult) -> Answer:
-    """What a run answers, group by group."""
-    return Answer(run.target, tuple(each.model for each in run.solutions), run.calibration.scales)
+    """Returns the answer of a run, group by group."""
+    return Answer(run.target, tuple(solution.model for solution in run.solutions), run.calibration.scales)
 
 
 def _jointly(result: RunResult) -> CalibratedTarget:
-    """The run's own target with three-point frames."""
+    """Returns the run's own target with three-point frames."""
     joint = result.calibration.joint
     if joint is None:
         raise InputError("E-OPTION-CONFLICT", "--compare paper: no joint adjustment to compare with; leave --solve out")
@@ -106,16 +114,16 @@ def _jointly(result: RunResult) -> CalibratedTarget:
 
 
 def _alike(model: WorldModel) -> WorldModel:
-    """With centres of one σ."""
+    """Returns the model with the same σ for all centres."""
     n = len(model.measured_px)
     return replace(model, covariance_px2=np.tile(EQUAL_SIGMA_PX**2 * np.eye(2), (n, 1, 1)))
 
 
 def _chained(result: RunResult, models: Sequence[WorldModel], eccentricity: bool) -> Answer:
-    """λ by rows, three-point frames, single transforms."""
+    """Returns the answer with λ by rows, three-point frames, and single transforms."""
     designs = result.target_design, result.board_design
     models = tuple(refine(model, result.camera, *designs, eccentricity).model for model in models)
-    # The corrections are in the models; this step of the calibration knows nothing of them.
+    # The models hold the corrections already; the calibration itself works without eccentricity.
     options = replace(
         result.options.adjustment(result.target_design),
         solve="paper",
@@ -134,17 +142,17 @@ def _row(name: str, found: Answer | StcalError, whole: CalibratedTarget, camera:
     faces = {}
     for face in others:
         if face in found.target.target_from_face:
-            pose, own = found.target.target_from_face[face], whole.target_from_face[face]
+            pose, reference_pose = found.target.target_from_face[face], whole.target_from_face[face]
             faces[face] = FaceOff(
-                translation_um=MICRO * float(np.linalg.norm(pose.translation - own.translation)),
-                rotation_mdeg=MICRO * float(np.degrees((pose @ own.inverse()).angle_rad())),
+                translation_um=MICRO * float(np.linalg.norm(pose.translation - reference_pose.translation)),
+                rotation_mdeg=MICRO * float(np.degrees((pose @ reference_pose.inverse()).angle_rad())),
             )
     missing = [face for face in others if face not in faces]
     return _compared(name, faces, missing, found.scales, residual_rms_px(found.models, camera), None)
 
 
 def _last_row(name: str, result: RunResult) -> ComparedRow:
-    """The run's own: the board by least squares in each group."""
+    """Returns the row of the run's own method, with the board's least-squares residuals in each group."""
     joint = result.calibration.joint
     models = () if joint is None else joint.models
     rms = residual_rms_px(models, result.calibration.camera)
@@ -152,7 +160,7 @@ def _last_row(name: str, result: RunResult) -> ComparedRow:
 
 
 def residual_rms_px(models: Sequence[GroupModel], camera: Camera) -> float:
-    """Per coordinate."""
+    """Returns the RMS of the residuals per coordinate."""
     return float(np.sqrt(np.concatenate([model.residuals_px(camera).ravel() ** 2 for model in models]).mean()))
 
 
@@ -164,7 +172,7 @@ def _compared(
     rms_px: float | None,
     reason: str | None,
 ) -> ComparedRow:
-    lengths = [np.linalg.norm(each.residuals_mm, axis=1) for each in scales.values()] if scales else []
+    lengths = [np.linalg.norm(scale.residuals_mm, axis=1) for scale in scales.values()] if scales else []
     board = MICRO * np.concatenate(lengths) if lengths else None
     return ComparedRow(
         method=name,

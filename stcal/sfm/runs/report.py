@@ -1,4 +1,4 @@
-"""What ``report.json`` holds. Fields without a description are named in that of the object that holds them."""
+"""Content of ``report.json``. A field without a description is described at the object that holds it."""
 
 from typing import Literal
 
@@ -14,7 +14,7 @@ from stcal.sfm.runs.comparison import Comparison
 from stcal.sfm.runs.crosscheck import Crosscheck
 
 Number = int | float
-"""An integer stays one."""
+"""Number that remains an integer if it is one."""
 
 
 class ReportOptions(Part):
@@ -212,7 +212,7 @@ class Space(Part):
 
 
 class ReportFile(ResultFile):
-    """Everything that the report of a run shows."""
+    """Content of the report of a run."""
 
     format: Literal["stcal report 1"] = Field(description="the file's form and its version")
     version: str = Field(description="of stcal")
@@ -293,7 +293,7 @@ class SummaryRead(Part):
 
 
 class ReportRead(Part):
-    """What of ``report.json`` every command on a run needs, of whatever version."""
+    """Content of ``report.json`` that every command on a run needs, of whatever version."""
 
     format: Literal["stcal report 1"] = "stcal report 1"
     images: list[ImageRow]
@@ -301,7 +301,7 @@ class ReportRead(Part):
     summary: SummaryRead
 
     def names(self) -> list[tuple[str, str, int]]:
-        """(name, group, circles) of the images in the database's order.
+        """Returns (name, group, circles) of the images in the database's order.
 
         Raises
         ------
@@ -310,13 +310,13 @@ class ReportRead(Part):
         ValueError
             A group's initial pair is not of its images, or a name leads out of the folder of images.
         """
-        pairs = {each.name: each.pairs[0] for each in self.groups}
-        names = [(each.name, each.group, each.circles) for each in self.images]
+        pairs = {entry.name: entry.pairs[0] for entry in self.groups}
+        names = [(entry.name, entry.group, entry.circles) for entry in self.images]
         for name, _, _ in names:
             if fault := name_fault(name):
                 raise ValueError(f"image {name!r}: its name {fault}")
         for group in {group for _, group, _ in names}:
-            own = {name for name, of, _ in names if of == group}
-            if not {pairs[group].first, pairs[group].second} <= own:
+            images_of_group = {name for name, group_of_image, _ in names if group_of_image == group}
+            if not {pairs[group].first, pairs[group].second} <= images_of_group:
                 raise ValueError(f"group {group}: its initial pair is not of its images")
         return names

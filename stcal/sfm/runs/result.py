@@ -1,4 +1,4 @@
-"""What a run answers."""
+"""Result of a run."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,26 +23,26 @@ from stcal.sfm.runs.solve import GroupSolution
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """Everything a run found; :attr:`target` is the answer.
+    """All results of a run; :attr:`target` is the calibrated target.
 
     Parameters
     ----------
     out : Path
         The run's folder.
     camera : CalibratedCamera
-        As its file states it; refined intrinsics are ``calibration.camera``.
+        The camera as its file states it; refined intrinsics are ``calibration.camera``.
     target_design, board_design : TargetDesign, BoardDesign
-        As given.
+        The designs as given.
     options : RunOptions
-        With every default decided.
+        Options with every default decided.
     detection : DetectionResult
-        What was found in each image, and the images skipped.
+        Detections of each image, and the images skipped.
     labelled : tuple of LabelledImage
         Labelled centres of all images, px, in the database's order.
     graph : ImageGraph
-        Which pairs of images were matched.
+        Pairs of images that were matched.
     solutions : tuple of GroupSolution
-        Of the single groups, worlds without unit.
+        Solutions of the single groups, in worlds without unit.
     calibration : Calibration
         Target and models in mm, target frame.
     chains : dict of tuple of FaceChain
@@ -50,9 +50,9 @@ class RunResult:
     notes : tuple of str
         What was left out or did not settle, and what to do.
     checks : tuple of Check
-        In the order of the report.
+        Checks in the order of the report.
     comparison : Comparison, optional
-        With the published method, where it was asked for.
+        Comparison with the published method, if requested.
     judgement : Judgement, optional
         The report in words, once it is made.
     """
@@ -80,18 +80,18 @@ class RunResult:
 
     @property
     def refined_camera(self) -> CalibratedCamera | None:
-        """As adjusted, with covariance; None where the intrinsics were held."""
+        """Camera as adjusted, with covariance; None if the intrinsics were held fixed."""
         joint = self.calibration.joint
         if joint is None or not joint.camera_covariance.size:
             return None
         return CalibratedCamera.of(joint.camera, self.camera.colmap_model, joint.camera_covariance)
 
     def observations(self) -> list[ImageObservations]:
-        """Labelled centres of all images, in the database's order."""
-        return [each.observations for each in self.labelled]
+        """Returns labelled centres of all images, in the database's order."""
+        return [image.observations for image in self.labelled]
 
     def evidence(self, prior: CameraPrior) -> Evidence:
-        """What the checks look at; ``prior`` : of the intrinsics, where they were refined."""
+        """Returns the input of the checks; ``prior`` : of the intrinsics, used if they were refined."""
         blur = {i.file.name: i.detection.centres.blur_px for i in self.detection.images}
         return Evidence(
             models=tuple(s.model for s in self.solutions),
@@ -103,5 +103,5 @@ class RunResult:
             options=self.options.adjustment(self.target_design),
             calibration=self.calibration,
             prior=prior if self.options.refine_camera else None,
-            blur_px={name: float(np.median(each)) for name, each in blur.items() if len(each)},
+            blur_px={name: float(np.median(edge_blur)) for name, edge_blur in blur.items() if len(edge_blur)},
         )

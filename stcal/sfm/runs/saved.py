@@ -1,4 +1,4 @@
-"""A finished run read back from its folder, for every command that goes on from it."""
+"""A finished run read back from its folder, for every command that continues from it."""
 
 import csv
 import io
@@ -37,12 +37,12 @@ COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedRun:
-    """What a run's folder holds.
+    """Content of a run's folder.
 
-    ``images`` : the folder of photographs as the run was given it; ``observations`` : of all images, in the database's
-    order, without the shapes of the ellipses (zero); ``corrected_px`` : by image, (n, 2), what the database holds;
-    ``faces``, ``report`` : ``faces.json``, and the content of ``report.json``; ``sha256`` : hashes of its files by path
-    below the folder, as the run left them.
+    ``images`` : the folder of photographs as given to the run; ``observations`` : of all images, in the database's
+    order, without the shapes of the ellipses (zero); ``corrected_px`` : by image, (n, 2), centres in the database;
+    ``faces`` : ``faces.json``; ``report`` : content of ``report.json``; ``sha256`` : hashes of the folder's files at
+    the end of the run, by path below the folder.
     """
 
     folder: Path
@@ -59,15 +59,15 @@ class SavedRun:
 
     @property
     def database(self) -> Path:
-        """COLMAP's database."""
+        """Path of COLMAP's database."""
         return self.folder / "database.db"
 
     def groups(self) -> dict[str, list[ImageObservations]]:
-        """Observations by group, in order."""
+        """Returns the observations by group, in order."""
         return by_group(self.observations)
 
     def report_as(self, part: type[ReportPart]) -> ReportPart:
-        """What of ``report.json`` a command needs.
+        """Returns the part of ``report.json`` that a command needs.
 
         Raises
         ------
@@ -83,7 +83,7 @@ class SavedRun:
             ) from error
 
     def adjusted_camera(self, own: ReportCamera) -> CalibratedCamera:
-        """The camera of the run's final model: as refined where it was, else as given; ``own`` : the report's."""
+        """Returns the camera of the final model, refined if it was, else as given; ``own`` : that of the report."""
         if not self.options.refine_camera:
             return self.camera
         camera = Camera(self.camera.width, self.camera.height, own.focal_px, own.centre_px, own.distortion)
@@ -91,22 +91,22 @@ class SavedRun:
 
 
 def load_run(folder: str | Path) -> SavedRun:
-    """Read a finished run.
+    """Reads a finished run.
 
     Parameters
     ----------
     folder : path
-        What the run was given as ``out``.
+        Folder that was given to the run as ``out``.
 
     Returns
     -------
     SavedRun
-        Its inputs, labelled centres and results.
+        Inputs, labelled centres and results of the run.
 
     Raises
     ------
     InputError
-        Not a run's folder, an unfinished one, or a damaged file in it.
+        Not a run's folder, an unfinished run, or a damaged file in the folder.
     """
     folder = Path(folder)
     if not (folder / RUN_MARKER).is_file():
@@ -131,8 +131,8 @@ def load_run(folder: str | Path) -> SavedRun:
     camera = read_camera(folder / CAMERA).calibrated(0, 0)
     target, board = load_target(folder / TARGET), load_board(folder / BOARD)
     with _as_written(folder / RUN_MARKER):
-        own = checked(marker, MarkerFile)
-        options, images = _options(own.options or {}).settled(target), Path(own.images)
+        marker_file = checked(marker, MarkerFile)
+        options, images = _options(marker_file.options or {}).settled(target), Path(marker_file.images)
     with _as_written(folder / "report.json"):
         names = checked(report, ReportRead).names()
     with _as_written(folder / "faces.json"):
@@ -151,7 +151,7 @@ def load_run(folder: str | Path) -> SavedRun:
         corrected_px=corrected,
         faces=result,
         report=report,
-        sha256=own.sha256 or {},
+        sha256=marker_file.sha256 or {},
     )
 
 
@@ -169,7 +169,7 @@ def _options(stored: dict) -> RunOptions:
 
 @contextmanager
 def _as_written(path: Path) -> Iterator[None]:
-    """InputError that names the file for whatever is not as a run of this version writes it."""
+    """Raises InputError that names the file if it is not as a run of this version writes it."""
     try:
         yield
     except (OSError, LookupError, TypeError, ValueError, AttributeError, csv.Error, StcalError) as error:
@@ -178,7 +178,10 @@ def _as_written(path: Path) -> Iterator[None]:
 
 
 def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known: Collection[str]):
-    """Observations and corrected centres of ``labels.csv`` for the images (name, group, circles) of the database."""
+    """Returns observations and corrected centres from ``labels.csv``.
+
+    ``names`` : (name, group, circles) of the images of the database; ``known`` : all labels of the designs.
+    """
     rows: dict[str, list[dict]] = {name: [] for name, _, _ in names}
     for row in csv.DictReader(io.StringIO(read_bytes(path, TABLE_BYTES).decode())):
         if None in row.values():
@@ -186,15 +189,17 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
         rows[row["image"]].append(row)
     observations, corrected = [], []
     for name, group, circles in names:
-        own = rows[name]
-        if [int(row["keypoint"]) for row in own] != list(range(circles)):
+        image_rows = rows[name]
+        if [int(row["keypoint"]) for row in image_rows] != list(range(circles)):
             raise ValueError(f"image {name}: its keypoints are not 0 to {circles - 1} in the order of the database")
-        labels = tuple(row["label"] for row in own)
+        labels = tuple(row["label"] for row in image_rows)
         unknown = [label for label in labels if label not in known]
         if unknown or len(set(labels)) < len(labels):
             raise ValueError(f"image {name}: {f'no circle {unknown[0]}' if unknown else 'a label twice'}")
         columns = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", *COVARIANCE)
-        values = frozen([[row[column] for column in columns] for row in own] or np.zeros((0, 7)), (None, 7), name)
+        values = frozen(
+            [[row[column] for column in columns] for row in image_rows] or np.zeros((0, 7)), (None, 7), name
+        )
         covariance = values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
         fault = first_fault(covariance, OF_PIXEL, definite=True)
         if fault is not None:
@@ -206,7 +211,7 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
                 labels=labels,
                 centre_px=values[:, :2],
                 centre=camera.normalised_from_pixel(values[:, :2]),
-                shape=np.zeros((len(own), 2, 2)),
+                shape=np.zeros((len(image_rows), 2, 2)),
                 covariance_px2=covariance,
             )
         )

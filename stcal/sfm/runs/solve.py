@@ -1,4 +1,4 @@
-"""One group from labels to a corrected model: pairs, mapping, refinement; kept by its inputs."""
+"""Solution of one group, from labels to a corrected model: pairs, mapping, refinement. It is cached by its inputs."""
 
 import hashlib
 import json
@@ -36,10 +36,10 @@ _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px",
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroupSolution:
-    """One group solved in a world without unit.
+    """Solution of one group in a world without unit.
 
-    ``pairs`` : the ranking, the chosen pair first; ``model`` ; ``seeded`` : how the pair was registered; ``rounds`` of
-    refinement; ``left_out`` : image → reason; ``outliers`` : observations left out.
+    ``pairs`` : the ranking, the chosen pair first; ``model`` ; ``seeded`` : how the pair was registered; ``rounds`` :
+    number of rounds of refinement; ``left_out`` : image → reason; ``outliers`` : observations left out.
     """
 
     pairs: tuple[PairScore, ...]
@@ -53,20 +53,21 @@ class GroupSolution:
 def usable_groups(
     groups: dict[str, list[ImageObservations]], skipped: Sequence[Skipped], board_alone: bool = False
 ) -> tuple[dict[str, list[ImageObservations]], list[str]]:
-    """Groups that can be solved, and why others cannot, those of which every image was skipped included; before
-    anything is mapped. With ``board_alone`` they need no face.
+    """Returns the groups that can be solved, and the reasons why others cannot, before anything is mapped.
+
+    The others include groups of which every image was skipped. With ``board_alone``, groups need no face.
 
     Raises
     ------
     MappingError
-        None can: no image or one, no board, or no face in a whole group.
+        No group can be solved: no image or one, no board, or no face in a whole group.
     """
     lost: dict[str, list[Skipped]] = {}
-    for each in skipped:
-        # A folder of mere copies is no group of its own.
-        group = each.name.rpartition("/")[0] or TOP_GROUP
-        if each.name.lower().endswith(SUFFIXES) and (group in groups or not each.reason.startswith("the same image")):
-            lost.setdefault(group, []).append(each)
+    for file in skipped:
+        # A folder that holds only copies is not a group.
+        group = file.name.rpartition("/")[0] or TOP_GROUP
+        if file.name.lower().endswith(SUFFIXES) and (group in groups or not file.reason.startswith("the same image")):
+            lost.setdefault(group, []).append(file)
     usable: dict[str, list[ImageObservations]] = {}
     errors: list[MappingError] = []
     for name in sorted(groups.keys() | lost.keys()):
@@ -89,33 +90,33 @@ def usable_groups(
         else:
             usable[name] = group
     if not usable:
-        deeper = [f"; {each.name}: {each.reason}" for each in skipped if HOLDS_IMAGES in each.reason]
+        deeper = [f"; {file.name}: {file.reason}" for file in skipped if HOLDS_IMAGES in file.reason]
         errors[0].append("".join(deeper[:1]))
         raise errors[0]
     return usable, [_left_out(error) for error in errors]
 
 
 def ungrouped(labelled: Sequence[LabelledImage]) -> list[str]:
-    """What is taken for granted of images that lie in no folder of a group."""
-    own = [each for each in labelled if each.observations.group == TOP_GROUP]
-    if not own:
+    """Returns a note on the assumption about images that lie in no folder of a group, if there are any."""
+    images = [image for image in labelled if image.observations.group == TOP_GROUP]
+    if not images:
         return []
-    dropped = [each.observations.name for each in own if any(map(leaves_a_board_out, each.notes))]
-    found = (
+    dropped = [image.observations.name for image in images if any(map(leaves_a_board_out, image.notes))]
+    remark = (
         f"; the board of {len(dropped)} of them ({_listed(dropped)}) is elsewhere and was left out, so that they are "
         "more than one group"
         if dropped
         else ""
     )
     return [
-        f"assumed: {len(own)} images that lie in no folder of a group are one group, in which only the camera "
-        f"moved{found}; put the images of each setting of target and board into a folder of its own, IMAGES/<group>/"
+        f"assumed: {len(images)} images that lie in no folder of a group are one group, in which only the camera "
+        f"moved{remark}; put the images of each setting of target and board into a folder of its own, IMAGES/<group>/"
     ]
 
 
 def _listed(names: Iterable[str], most: int = 4) -> str:
-    every = list(names)
-    return ", ".join(every[:most]) + (", …" if len(every) > most else "")
+    all_names = list(names)
+    return ", ".join(all_names[:most]) + (", …" if len(all_names) > most else "")
 
 
 def _left_out(error: StcalError) -> str:
@@ -123,12 +124,12 @@ def _left_out(error: StcalError) -> str:
 
 
 def require_usable(group: list[ImageObservations], board_alone: bool = False) -> None:
-    """Refuse a group that cannot be solved, before anything is mapped; with ``board_alone`` it needs no face.
+    """Refuses a group that cannot be solved, before anything is mapped; with ``board_alone`` it needs no face.
 
     Raises
     ------
     MappingError
-        One image, no board, or no face in the whole group.
+        The group has one image, no board, or no face at all.
     """
     where = f"group {group[0].group}"
     if len(group) < 2:
@@ -163,7 +164,7 @@ def solve_group(
     eccentricity: bool,
     cache: Path,
 ) -> GroupSolution:
-    """Solve one group, or take the solution of an earlier run with the same inputs.
+    """Solves one group, or takes the solution of an earlier run with the same inputs.
 
     The initial pair is chosen among the images of the ``skeleton``, which are mapped first.
 
@@ -173,9 +174,9 @@ def solve_group(
     """
     key = _key(group, skeleton, ids, camera, target, board, pair_options, eccentricity)
     path = cache / f"group-{key}.npz"
-    known = kept(path, _stored)
-    if known is not None:
-        return known
+    cached = kept(path, _stored)
+    if cached is not None:
+        return cached
     pairs = rank_pairs([image for image in group if image.name in skeleton], camera, pair_options, board)
     mapping = map_group(database, scratch, group, skeleton, ids, pairs, camera)
     refined = refine(mapping.model, camera, target, board, eccentricity)
@@ -234,7 +235,7 @@ def _save(path: Path, solution: GroupSolution) -> None:
 
 
 def _stored(stored, meta) -> GroupSolution:
-    """Of what was kept."""
+    """Returns the solution that is kept in arrays and metadata."""
     model = WorldModel(
         meta["group"],
         tuple(meta["images"]),
@@ -251,13 +252,13 @@ def _stored(stored, meta) -> GroupSolution:
 
 
 def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str]:
-    """Rows and columns of the board that no image shows: hidden everywhere, or not there at all."""
-    seen = dot_cells(label for s in solutions for label in s.model.labels if isinstance(label, DotLabel))
+    """Returns notes on rows and columns of the board that no image shows: hidden everywhere, or nonexistent."""
+    cells = dot_cells(label for s in solutions for label in s.model.labels if isinstance(label, DotLabel))
     notes = []
-    for what, count, own in (("row", board.rows, seen[:, 0]), ("column", board.columns, seen[:, 1])):
-        missing = [str(i) for i in range(count) if i not in own]
+    for line, count, numbers in (("row", board.rows, cells[:, 0]), ("column", board.columns, cells[:, 1])):
+        missing = [str(i) for i in range(count) if i not in numbers]
         if missing:
-            notes.append(f"board {what} {', '.join(missing)}: not seen in any image; check {what}s in the board file")
+            notes.append(f"board {line} {', '.join(missing)}: not seen in any image; check {line}s in the board file")
     return notes
 
 
@@ -273,14 +274,15 @@ def solve_groups(
     progress: Progress,
     names: Collection[str] | None = None,
 ) -> tuple[list[GroupSolution], list[str]]:
-    """Map and refine group by group, or those of the ``names``; and why groups have no solution.
+    """Maps and refines group by group; returns the solutions, and the reasons why groups have none.
 
-    ``scratch`` : a folder that is made and removed again; ``cache`` : for what later runs take up.
+    ``names`` : groups to solve, all if None; ``scratch`` : a folder that is made and removed again; ``cache`` : folder
+    for what later runs take up.
 
     Raises
     ------
     MappingError, ScaleError, ConvergenceError, DegenerateError
-        No group has one; that of the first.
+        No group has a solution; the error of the first group is raised.
     """
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()

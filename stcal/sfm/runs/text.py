@@ -1,4 +1,4 @@
-"""What a run and a detection found, in a few lines for the terminal."""
+"""Text for the terminal: the findings of a run or a detection in a few lines."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -20,11 +20,11 @@ from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.solve import GroupSolution
 
 NOTED, NAMED = 4, 6
-"""Images whose notes are printed; further ones that are named."""
+"""Number of images whose notes are printed, and number of further images that are named."""
 
 
 def run_text(result: RunResult) -> str:
-    """The answer: groups, what was left out, faces with σ and checks that did not pass."""
+    """Returns the result of a run: groups, what was left out, faces with σ, and checks that did not pass."""
     lines = [*_skipped(result.detection.skipped)]
     for solution in result.solutions:
         lines += _group(solution, result.calibration.scales[solution.model.group].rms_mm())
@@ -60,7 +60,7 @@ def run_text(result: RunResult) -> str:
 
 
 def _camera_taken_as_exact(camera: CalibratedCamera) -> str:
-    """Of a camera file that states σ."""
+    """Returns the note on a camera file that states σ which the run does not use."""
     assert camera.covariance is not None
     focal = float(np.sqrt(camera.covariance[0, 0]))
     return (
@@ -70,23 +70,23 @@ def _camera_taken_as_exact(camera: CalibratedCamera) -> str:
 
 
 def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:
-    """Faces and dots of each image, and what was left out."""
+    """Returns faces and dots of each image, and what was left out."""
     return "\n".join([*found_lines(labelled), *_skipped(detection.skipped)])
 
 
 def found_lines(labelled: Sequence[LabelledImage], blur_px: Mapping[str, float] | None = None) -> Iterator[str]:
-    """Faces and dots of each image, its blur where that is known, and what was left out in it."""
-    for each in labelled:
-        image = each.observations
+    """Yields faces and dots of each image, its blur if that is known, and what was left out in it."""
+    for labelled_image in labelled:
+        image = labelled_image.observations
         dots = sum(isinstance(label, DotLabel) for label in image.labels)
         faces = ", ".join(sorted(image.face_ids())) or "none"
         blur = f", edges blurred by {blur_px[image.name]:.2f} px" if blur_px and image.name in blur_px else ""
         yield f"{image.name}: faces {faces} ({len(image) - dots} circles), board {dots} dots{blur}"
-        yield from (f"  {note}" for note in each.notes)
+        yield from (f"  {note}" for note in labelled_image.notes)
 
 
 def so_far_text(result: RunResult) -> str:
-    """One line on a run that goes on: its images, its worst face, its checks."""
+    """Returns one line on a run that is not finished: its images, its worst face, its checks."""
     target = result.target
     sigma = {
         face: (float(np.sqrt(np.trace(c[3:, 3:]))), float(np.degrees(np.sqrt(np.trace(c[:3, :3])))))
@@ -97,23 +97,23 @@ def so_far_text(result: RunResult) -> str:
     if sigma:
         worst = max(sigma, key=lambda face: sigma[face])
         faces += f", worst is face {worst}: σ {1e3 * sigma[worst][0]:.1f} µm, {1e3 * sigma[worst][1]:.1f} mdeg"
-    mapped = sum(len(each.model.images) for each in result.solutions)
+    mapped = sum(len(solution.model.images) for solution in result.solutions)
     checks = count_verdicts([check.verdict for check in result.checks])
     return f"{mapped} images mapped, {faces}; checks: {checks}"
 
 
 def _skipped(skipped: Sequence[Skipped]) -> Iterator[str]:
-    return (f"skipped {each.name}: {each.reason}" for each in skipped)
+    return (f"skipped {file.name}: {file.reason}" for file in skipped)
 
 
 def _noted(labelled: Sequence[LabelledImage]) -> Iterator[str]:
-    """What was left out within images, of the first ones; names of the others."""
-    noted = {each.observations.name: each.notes for each in labelled if each.notes}
+    """Yields what was left out within images: notes of the first images, names of the others."""
+    noted = {image.observations.name: image.notes for image in labelled if image.notes}
     for name in list(noted)[:NOTED]:
         yield from (f"{name}: {note}" for note in noted[name])
     if others := list(noted)[NOTED:]:
-        more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
-        yield f"something was left out in {', '.join(others[:NAMED])}{more} too; the report says what and why"
+        surplus = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
+        yield f"something was left out in {', '.join(others[:NAMED])}{surplus} too; the report says what and why"
 
 
 def _group(solution: GroupSolution, board_rms_mm: float) -> Iterator[str]:
@@ -151,7 +151,7 @@ def _faces(result: RunResult) -> Iterator[str]:
 
 
 def _boards(result: RunResult) -> Iterator[str]:
-    """λ and residuals of the board alone."""
+    """Yields λ and residuals of the board alone."""
     images = len(result.labelled)
     yield (
         f"the board alone: no face of the target in {images} images, so that there is no faces.json; length of the "
@@ -166,7 +166,7 @@ def _boards(result: RunResult) -> Iterator[str]:
 
 
 def _checks(checks: Sequence[Check], images: frozenset[str]) -> Iterator[str]:
-    """How many checks came out how, and those that did not pass, the worst first."""
+    """Yields the number of checks with each verdict, and the checks that did not pass, the worst first."""
     yield f"checks: {count_verdicts([check.verdict for check in checks])}"
     if any(check.verdict in ("failed", "suspicious") for check in checks):
         yield f"  ({BY_CHANCE})"

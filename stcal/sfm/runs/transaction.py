@@ -1,8 +1,8 @@
-"""A run's folder as a transaction: it holds the results of one run, the earlier or the new one, each complete.
+"""The folder of a run as a transaction: it holds the complete results of one run, the earlier or the new one.
 
-A run writes beside the earlier results, in ``unfinished/``; when all is there, that folder is renamed to ``ready/``,
-which is the moment that counts, and its entries take their places. A run that is killed before leaves the earlier
-results, one that is killed after is completed by whoever opens the folder next.
+A run writes beside the earlier results, in ``unfinished/``. When all results are there, that folder is renamed to
+``ready/``, which is the decisive moment, and its entries take their places. A run that is killed before this moment
+leaves the earlier results. A run that is killed after it is completed by whoever opens the folder next.
 """
 
 import os
@@ -33,15 +33,18 @@ from stcal.sfm.runs.marker import MarkerFile, digest_of, files_below
 
 COMPARISON = "compare.json"
 RESULTS = (*RUN_ENTRIES, COMPARISON)
-"""What new results replace, or take away where they have none of it."""
+"""Entries that new results replace, or remove if the new results lack them."""
 HOLDER, ENTRIES, LOCK = "holder.txt", "entries.txt", "lock"
 DATABASE_SIDES = ("-wal", "-shm", "-journal")
 
 
 @dataclass(frozen=True, slots=True)
 class RunFolder:
-    """The folder of a run that is going on: ``out`` as it was asked for; ``stage`` : where results are written;
-    ``cache`` : what later runs take up."""
+    """Folder of a run in progress.
+
+    ``out`` : the folder as requested; ``stage`` : folder to which results are written; ``cache`` : folder of what later
+    runs take up.
+    """
 
     out: Path
     stage: Path
@@ -50,21 +53,21 @@ class RunFolder:
 
 @contextmanager
 def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object]) -> Iterator[RunFolder]:
-    """Claim a run's folder; at the end of the block its results take the earlier ones' place.
+    """Claims a run's folder; at the end of the block its results take the place of the earlier ones.
 
-    Where the block raises, earlier results stay, and what it made is left in ``unfinished/``; without earlier results
-    it takes its place all the same, to be looked at.
+    If the block raises, earlier results stay, and the files that it made are left in ``unfinished/``. If there are no
+    earlier results, these files take their places all the same, to be looked at.
 
     Parameters
     ----------
-    out : new, empty, or of an earlier run
+    out : folder that is new, empty, or of an earlier run
     content : the marker
-    inputs : what the run reads, by the word for it; what is no path is let pass
+    inputs : what the run reads, by the word for it; values that are no paths are ignored
 
     Raises
     ------
     InputError
-        The folder holds something else, an input, or a run that is going on.
+        The folder holds something else, an input, or a run in progress.
     """
     out = Path(out)
     folder = RunFolder(out, out / UNFINISHED, out / CACHE)
@@ -87,10 +90,10 @@ def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object
 
 @contextmanager
 def added_results(out: Path) -> Iterator[Path]:
-    """A folder for files that are added to a finished run, or that replace some of its own.
+    """Provides a folder for files that are added to a finished run, or that replace some of its own.
 
-    At the end of the block they take their places, and the marker has their hashes. No other command writes meanwhile.
-    The PDF of a report that is replaced goes with it.
+    At the end of the block the files take their places, and the marker gets their hashes. No other command writes
+    meanwhile. The PDF of a report that is replaced is removed.
 
     Raises
     ------
@@ -106,18 +109,18 @@ def added_results(out: Path) -> Iterator[Path]:
             yield stage
             marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")
             gone = {REPORT_PDF} if (stage / "report.html").exists() else set()
-            if marker.sha256 is not None:  # of a version that kept none
+            if marker.sha256 is not None:  # None in a version that kept no hashes
                 others = {name: digest for name, digest in marker.sha256.items() if name not in gone}
                 marker = marker.sealed(others | _digests(stage))
             with _writable(out):
-                kept = [name for name in RESULTS if name not in gone and os.path.lexists(out / name)]
-                _exchange(stage, out, marker, kept)
+                kept_names = [name for name in RESULTS if name not in gone and os.path.lexists(out / name)]
+                _exchange(stage, out, marker, kept_names)
         finally:
             remove(stage)
 
 
 def _exchange(stage: Path, out: Path, marker: MarkerFile, kept: Sequence[str]) -> None:
-    """Let what is ready in a folder take its place; ``kept`` : earlier results that stay where there is no new one."""
+    """Moves the files of a complete folder to their places; ``kept`` : earlier results that stay if not replaced."""
     save(stage / RUN_MARKER, json_text(marker))
     save(stage / ENTRIES, "\n".join([*kept, *(path.name for path in stage.iterdir())]))
     os.replace(stage, out / READY)
@@ -125,7 +128,7 @@ def _exchange(stage: Path, out: Path, marker: MarkerFile, kept: Sequence[str]) -
 
 
 def _digests(stage: Path) -> dict[str, str]:
-    """Of all results in a folder."""
+    """Returns the hashes of all results in a folder."""
     names = sorted(name for name in files_below(stage) if name.split("/")[0] in RESULTS)
     return {name: digest_of(stage / name) for name in names}
 
@@ -143,7 +146,7 @@ def _unwritable(out: Path, error: OSError) -> InputError:
 
 
 def complete_interrupted(out: Path) -> None:
-    """Before a finished run is read: complete one that was ended from outside while its results took their places.
+    """Completes a finished run that was killed while its results took their places; call it before the run is read.
 
     Raises
     ------
@@ -156,7 +159,7 @@ def complete_interrupted(out: Path) -> None:
 
 
 def complete(out: Path) -> None:
-    """Put results that are ready into their places, with the folder locked."""
+    """Moves results that are ready to their places; the folder must be locked."""
     ready = out / READY
     if ready.is_symlink() or not (ready / ENTRIES).is_file():
         return
@@ -174,7 +177,7 @@ def complete(out: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, a folder with all in it, or a link, never what the link leads to."""
+    """Removes a file, a folder with all its content, or a link, but never the target of a link."""
     if path.is_symlink() or path.is_file():
         path.unlink()
     elif path.is_dir():
@@ -184,7 +187,7 @@ def remove(path: Path) -> None:
 def _require_ours(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"output {out}: not a folder; give a new folder with --out")
-    ours = (CACHE, UNFINISHED)  # of a run that was ended while it claimed the folder
+    ours = (CACHE, UNFINISHED)  # left by a run that was killed while it claimed the folder
     if (
         out.is_dir()
         and not (out / RUN_MARKER).exists()
@@ -205,7 +208,7 @@ def _require_no_links(out: Path) -> None:
 
 
 def _require_no_inputs(out: Path, inputs: Mapping[str, object]) -> None:
-    """What a run reads must not lie where it writes."""
+    """Refuses inputs that lie where the run writes."""
     place = real_place(out)
     for word, given in inputs.items():
         if isinstance(given, str | Path) and place in (own := real_place(given), *own.parents):
@@ -218,7 +221,7 @@ def _require_no_inputs(out: Path, inputs: Mapping[str, object]) -> None:
 
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
-    """Hold the folder against other commands; the system lets go of the lock with the process."""
+    """Locks the folder against other commands; the system releases the lock when the process ends."""
     _require_no_links(out)
     cache = out / CACHE
     lock = filelock.FileLock(cache / LOCK)
@@ -253,7 +256,7 @@ def _me() -> str:
 
 
 def _finished(out: Path) -> bool:
-    """Whether the folder holds results of a run, or of a detection alone, that came to its end."""
+    """True if the folder holds the results of a run, or of a detection alone, that came to its end."""
     try:
         marker = read_result(out / RUN_MARKER, MarkerFile, "run", "run it again")
     except InputError:
@@ -262,7 +265,7 @@ def _finished(out: Path) -> bool:
 
 
 def _leave(folder: RunFolder, content: MarkerFile, error: BaseException) -> None:
-    """What a run that failed has made: in place where no earlier run's result is, else beside it."""
+    """Moves the files of a failed run to their places if there are no earlier results; else leaves them aside."""
     remove(folder.stage / "scratch")
     if not _finished(folder.out):
         save(folder.stage / RUN_MARKER, json_text(content.content()))

@@ -1,4 +1,4 @@
-"""Whether a run's folder holds what the run wrote: ``verify``."""
+"""Verification that a run's folder holds what the run wrote: ``verify``."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,15 +14,15 @@ from stcal.sfm.runs.marker import MarkerFile, digest_of, files_below, own_digest
 from stcal.sfm.runs.transaction import DATABASE_SIDES, RESULTS, complete_interrupted
 
 SHOWN = 20
-"""Files of a kind that are listed on the terminal."""
+"""Number of files of a kind that are listed on the terminal."""
 NO_RESULTS = (CACHE, UNFINISHED, ADDED, READY)
 OWN = (*RESULTS, *(f"database.db{side}" for side in DATABASE_SIDES))
-"""Entries of the folder in which a file that no run made would be taken for a result, or change one."""
+"""Entries of the folder in which a foreign file would be taken for a result, or would change one."""
 AGAIN = "run it again"
 
 
 class VerifyFile(ResultFile):
-    """Of ``verify``."""
+    """Result of ``verify``."""
 
     format: Literal["stcal verify 1"] = Field(description="the file's form and its version")
     run: str = Field(description="the folder")
@@ -36,14 +36,16 @@ class VerifyFile(ResultFile):
     whole: bool = Field(description="whether nothing is missing, changed or added")
 
     def faults(self) -> list[str]:
-        """In a clause each, what is wrong; none of a whole run of this version."""
+        """Returns the faults, one clause each; none for a whole run of this version."""
         kinds = {"missing": self.missing, "changed": self.changed, "added": self.added}
-        found = [f"{len(names)} {kind} ({names[0]}{' …' * (len(names) > 1)})" for kind, names in kinds.items() if names]
-        return found + [f"made by stcal {self.version}, this is {self.stcal}"] * (self.version != self.stcal)
+        clauses = [
+            f"{len(names)} {kind} ({names[0]}{' …' * (len(names) > 1)})" for kind, names in kinds.items() if names
+        ]
+        return clauses + [f"made by stcal {self.version}, this is {self.stcal}"] * (self.version != self.stcal)
 
 
 def verify(run: str | Path) -> VerifyFile:
-    """Compare the hashes of all files of a finished run with those that were kept when it ended; nothing is written.
+    """Compares the hashes of all files of a finished run with those that were kept when it ended; nothing is written.
 
     Raises
     ------
@@ -70,16 +72,16 @@ def verify(run: str | Path) -> VerifyFile:
             f"run {run}: no hashes in {RUN_MARKER}, it is unfinished or of a version that kept none "
             f"(stcal {marker.version}); {AGAIN}",
         )
-    found = {name for name in files_below(run) if name.split("/")[0] not in NO_RESULTS}
-    missing = sorted(marker.sha256.keys() - found)
+    present = {name for name in files_below(run) if name.split("/")[0] not in NO_RESULTS}
+    missing = sorted(marker.sha256.keys() - present)
     changed = sorted(
         name
         for name, known in marker.sha256.items()
-        if name in found and known != (own_digest(content) if name == RUN_MARKER else digest_of(run / name))
+        if name in present and known != (own_digest(content) if name == RUN_MARKER else digest_of(run / name))
     )
     if digest_of(run / RUN_MARKER) != before:
         raise InputError("E-RUN-REPLACED", f"run {run}: other results took their place meanwhile; verify it again")
-    others = sorted(_printable(name) for name in found - marker.sha256.keys())
+    others = sorted(_printable(name) for name in present - marker.sha256.keys())
     added = [name for name in others if name.split("/")[0] in OWN]
     return VerifyFile(
         format="stcal verify 1",
@@ -96,7 +98,7 @@ def verify(run: str | Path) -> VerifyFile:
 
 
 def verified_text(result: VerifyFile) -> str:
-    """What was found, a file on a line."""
+    """Returns the result as text, one file per line."""
     lines = [f"{result.files} files by stcal {result.version}: {'whole' if result.whole else 'not whole'}"]
     for kind in ("missing", "changed", "added", "beside"):
         lines += _listed(kind, getattr(result, kind))
@@ -104,12 +106,12 @@ def verified_text(result: VerifyFile) -> str:
 
 
 def require_whole(result: VerifyFile) -> None:
-    """Refuse what is not as the run left it, or was made by another version.
+    """Refuses a run that is not as it ended, or that was made by another version.
 
     Raises
     ------
     InputError
-        What is wrong, in one line.
+        The run has faults; the message names them in one line.
     """
     if faults := result.faults():
         remedy = "verify it with that version" if result.whole else "take a copy that is whole"
@@ -117,10 +119,10 @@ def require_whole(result: VerifyFile) -> None:
 
 
 def _listed(kind: str, names: Sequence[str]) -> list[str]:
-    more = [f"{kind}: and {len(names) - SHOWN} more"] if len(names) > SHOWN else []
-    return [f"{kind}: {name}" for name in names[:SHOWN]] + more
+    surplus = [f"{kind}: and {len(names) - SHOWN} more"] if len(names) > SHOWN else []
+    return [f"{kind}: {name}" for name in names[:SHOWN]] + surplus
 
 
 def _printable(name: str) -> str:
-    """A name that is not UTF-8 as a text that is."""
+    """Returns a name that may not be UTF-8 as text that is."""
     return name.encode("utf-8", "backslashreplace").decode()
