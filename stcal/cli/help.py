@@ -16,7 +16,7 @@ PLAIN: dict[str, Any] = {
 PANELS = {
     "Input": ("setup", "dry_run"),
     "Method": (),
-    "Output": ("out", "overwrite", "quiet", "verbose", "strict", "help"),
+    "Output": ("out", "strict"),
     "Performance": ("workers", "scheduler", "send_images"),
     "Input in other forms": (
         *("rotation", "length_unit", "poses_are", "first", "second", "key", "quaternions", "columns"),
@@ -36,7 +36,8 @@ PANELS = {
     ),
 }
 """Panels of the help text in their order, each with the names of its parameters. All other parameters are Input where
-they are paths to read, Output where they are paths to write, and Method else."""
+they are paths to read, Output where they are paths to write, and Method else. Options that all commands have, such as
+``--quiet`` and ``--help``, are added without a panel; they are Output."""
 
 
 def panel_of(name: str, reads: bool, writes: bool) -> str:

@@ -328,8 +328,6 @@ def _protected(command: Callable) -> Callable:
             _replacing.reset(token)
 
     checked.outputs = frozenset(outputs)  # type: ignore[attr-defined]
-    for option in (Overwrite, Quiet, Verbose):
-        get_args(option)[1].rich_help_panel = "Output"
     more = {"quiet": Quiet, "verbose": Verbose}
     if outputs and command.__name__ not in ALWAYS_NEW:
         more = {"overwrite": Overwrite, **more}
