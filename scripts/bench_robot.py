@@ -15,7 +15,7 @@ import numpy as np
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot import IdentifyOptions, forward, identify
-from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 
 JOINTS, PARAMETERS, PER_POSE = 6, 30, 6

@@ -23,8 +23,7 @@ from stcal.geometry.conic import circle_image_offset, circle_images
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.report.figure import COLOURS, FAINT, INK, calm, new_figure
 from stcal.sfm.adjust.calibration import calibrate
-from stcal.sfm.adjust.group import adjust
-from stcal.sfm.adjust.refine import eccentricity_px
+from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.simulated import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene, nominal_target_from_face

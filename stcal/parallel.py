@@ -170,11 +170,12 @@ class _Processes:
         if self._pool is None:
             return
         asked_to_end = kind is not None and not issubclass(kind, Exception)  # half-done work is of no use
-        self._pool.shutdown(wait=not asked_to_end, cancel_futures=True)
         if asked_to_end:
             for process in multiprocessing.active_children():
                 if process not in self._others:
                     process.terminate()
+        # also after that: at the end of the interpreter the pool's thread must not be closing what is woken there
+        self._pool.shutdown(wait=True, cancel_futures=True)
 
 
 def load_in_processes(*modules: str) -> None:

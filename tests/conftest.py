@@ -22,9 +22,8 @@ from hypothesis import HealthCheck, settings
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.sfm.adjust.chain import chain_faces
 from stcal.sfm.adjust.faces import faces_of_group
-from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.joint import adjust_jointly
-from stcal.sfm.adjust.refine import eccentricity_px
+from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.model import WorldModel

@@ -16,9 +16,9 @@ MOST_ENTRIES = 16
 """Of ``sfm/``, folders and files."""
 
 LAYERS = (
-    ("errors", "parallel", "held_out"),
+    ("errors", "parallel", "cross_validation"),
     ("geometry",),
-    ("design", "labels", "likeness"),
+    ("design", "labels", "lookalikes"),
     ("io",),
     ("boards", "report"),
     ("synthetic", "drawing"),

@@ -18,9 +18,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 from stcal.io.table import POSE, pose_cells, read_table
 from stcal.locate.data.layout import layout_toml
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.model import mh80
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions
 from stcal.synthetic.scene import SceneOptions, make_scene

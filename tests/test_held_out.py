@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from stcal.cross_validation import dealt, held_out_errors, repeated_splits
 from stcal.errors import DegenerateError
-from stcal.held_out import dealt, held_out_errors, repeated_splits
 
 
 def rng(seed=0):

@@ -32,10 +32,9 @@ from stcal.register.workspace.field import residual_field
 from stcal.report.figure import save
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.damped import InverseProblem, solve
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import made
 from stcal.workflows.register_robot import grown, positions
 

@@ -28,17 +28,15 @@ from stcal.robot.identification.residuals import jacobian as jacobian_of
 from stcal.robot.identification.residuals import observed, residuals
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Joint, Robot
+from stcal.robot.kinematics.model import Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, placed
 from stcal.robot.use.compensation import compensate
 from stcal.robot.use.targets import Targets
 from stcal.robot.use.verification import MeasuredPoses, SetResult, verify
-from stcal.sfm.measurement.common_errors import common_errors
-from stcal.sfm.measurement.pose import pose_from_circles
+from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.sfm.measurement.target import TargetCircles
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of

@@ -31,14 +31,11 @@ from stcal.labels import CircleLabel
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.contributions import contributions_of
-from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.joint import JointResult, adjusted
-from stcal.sfm.adjust.refine import eccentricity_px
-from stcal.sfm.adjust.uncertainty import derivatives
+from stcal.sfm.adjust.refine import adjust, eccentricity_px
+from stcal.sfm.adjust.uncertainty import contributions_of, derivatives
 from stcal.sfm.budget.combine import Budget, budget
-from stcal.sfm.budget.sources import correction
-from stcal.sfm.budget.statement import FIELDS, Statement
+from stcal.sfm.budget.sources import FIELDS, Statement, correction
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.planning.simulated import observe, true_models
 from stcal.sfm.runs.options import RunOptions

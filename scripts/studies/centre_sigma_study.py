@@ -19,7 +19,7 @@ import numpy as np
 from stcal.geometry.camera import Camera
 from stcal.io.images import decode
 from stcal.parallel import one_thread
-from stcal.sfm.data.centres import Centres
+from stcal.sfm.data.observations import Centres
 from stcal.sfm.detect.circles.centres import measure_centres
 from stcal.sfm.detect.circles.ellipses import Ellipses
 from tests.support import degrade

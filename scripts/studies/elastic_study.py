@@ -34,9 +34,8 @@ from stcal.robot.identification.residuals import State, jacobian, observed, tip_
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import USUAL, Conditions
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.workflows.cluster import executor_of
 from tests.support.arms import MARKERS, elastic, two_arms

@@ -22,8 +22,7 @@ from stcal.geometry.rigid import Rigid, Similarity
 from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.sfm.adjust.calibration import Calibration, calibrate
-from stcal.sfm.adjust.group import adjust
-from stcal.sfm.adjust.refine import eccentricity_px
+from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.simulated import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, nominal_target_from_face

@@ -24,9 +24,9 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from stcal.cross_validation import dealt, held_out_errors
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
-from stcal.held_out import dealt, held_out_errors
 from stcal.register import register
 from stcal.register.core.liu2017 import affine_least_squares
 from stcal.robot.identification.result import IdentifyOptions

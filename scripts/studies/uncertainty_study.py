@@ -17,8 +17,7 @@ from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.model import CameraPrior, intrinsic_basis
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import calibrate
-from stcal.sfm.adjust.group import adjust
-from stcal.sfm.adjust.refine import eccentricity_px
+from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.simulated import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene

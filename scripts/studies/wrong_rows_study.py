@@ -19,9 +19,8 @@ from stcal.parallel import one_thread
 from stcal.robot.identification.residuals import State, observed, residuals, tips
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.workflows.cluster import executor_of
 

@@ -78,8 +78,7 @@ def capture(
 ) -> None:
     """Take an exposure series with a camera of this machine, for run: SCENES/<scene>/<exposure>.png."""
     from stcal.io.device import OpenCVSource, SimulatedSource
-    from stcal.locate.data.capture import Settings, capture, scene_folder
-    from stcal.locate.data.exposures import exposure_times
+    from stcal.locate.data.exposures import Settings, capture, exposure_times, scene_folder
 
     settings, folder = Settings(gain, settle), scene_folder(out, scene)
     exposures = exposure_times(shortest, longest, count)
@@ -234,8 +233,8 @@ def run(
     from stcal.locate.pose.verdict import VerdictOptions
     from stcal.locate.report.chain import read_chain, read_registered
     from stcal.locate.report.located import LocatedFile
+    from stcal.locate.report.page import accepted, poses_csv, run_text, uncertain
     from stcal.locate.report.plausible import on_chain
-    from stcal.locate.report.tables import accepted, poses_csv, run_text, uncertain
 
     if hand_eye and registration:
         raise InputError(

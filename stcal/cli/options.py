@@ -1,9 +1,9 @@
-"""Options that several commands share."""
+"""Options that several commands share, and what they tell of designs."""
 
 import inspect
 import os
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from enum import StrEnum
 from functools import wraps
@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import typer
 
 from stcal.cli.help import Command, panel_of
-from stcal.cli.terminal import STANDARD_OUTPUT, manner, print_each, said_apart
-from stcal.errors import ChecksFailed, InputError
+from stcal.cli.terminal import STANDARD_OUTPUT, manner, print_each, said_apart, say
+from stcal.errors import ChecksFailed, InputError, StcalError
 from stcal.io.saving import keep_apart
 
 if TYPE_CHECKING:
     from stcal.io.quaternions import Order
     from stcal.io.table import Table
     from stcal.sfm.detect.circles.ellipses import EllipseOptions
+
 
 Images = Annotated[Path, typer.Argument(help="Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.")]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Read the finished run in this folder.")]
@@ -196,7 +197,7 @@ def several_tables(
     if given is not None:
         if columns is None:
             return given
-        from stcal.io.poses.mapped import read_mapped
+        from stcal.io.poses.columns import read_mapped
 
         return read_mapped(given, columns, what, quaternions)
     from stcal.io.join import join
@@ -336,3 +337,48 @@ def _protected(command: Callable) -> Callable:
     checked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore[attr-defined]
     checked.__annotations__ = {**command.__annotations__, **more}
     return checked
+
+
+@contextmanager
+def designs_told(
+    target: Path | None, board: Path | None, with_target: bool = True, with_board: bool = True
+) -> Iterator[None]:
+    """Say which reference designs are assumed, and name them in what goes wrong meanwhile; say which faces of the
+    target's file are nearly alike.
+
+    Parameters
+    ----------
+    target, board : path, optional
+        Files that were given.
+    with_target, with_board : bool
+        Whether the reference design stands in for a file that was not.
+    """
+    from stcal.io.design import target_of
+    from stcal.sfm.detect.ambiguity import likeness_notes
+
+    if target is not None:
+        print_each("note", likeness_notes(target_of(target)))
+    assumed = assumed_designs(target is None and with_target, board is None and with_board)
+    for each in assumed:
+        say(f"assumed: {each}")
+    try:
+        yield
+    except StcalError as error:
+        if assumed and not isinstance(error, InputError):
+            error.append(f"; assumed: {' and '.join(assumed)}")
+        raise
+
+
+def assumed_designs(target: bool, board: bool) -> list[str]:
+    """The reference target and board in a few words, with the options that name others."""
+    from stcal.design import reference_board, reference_target
+
+    own, grid, words = reference_target(), reference_board(), []
+    if target:
+        words.append(f"the reference target, {len(own.faces)} faces of {len(own.faces[0].ids)} circles (no --target)")
+    if board:
+        words.append(
+            f"the reference board, {grid.rows}×{grid.columns} dots of radius {grid.radius_mm:g} mm, "
+            f"pitch {grid.pitch_mm:g} mm (no --board)"
+        )
+    return words

@@ -10,9 +10,6 @@ from .methods.evolution import EvolutionOptions as EvolutionOptions
 from .methods.noise import Noise as Noise
 from .plan import NextPoses as NextPoses
 from .plan import plan_poses as plan_poses
-from .predict import HeldOutMotions as HeldOutMotions
-from .predict import motion_errors as motion_errors
-from .predict import predict_motions as predict_motions
 from .result import HandEye as HandEye
 from .rig.result import Rig as Rig
 from .rig.solve import RigOptions as RigOptions
@@ -21,7 +18,10 @@ from .solve import METHODS as METHODS
 from .solve import HandEyeOptions as HandEyeOptions
 from .solve import handeye as handeye
 from .validate import Compared as Compared
+from .validate import HeldOutMotions as HeldOutMotions
 from .validate import HeldOutPoses as HeldOutPoses
 from .validate import compare as compare
 from .validate import cross_validate as cross_validate
+from .validate import motion_errors as motion_errors
+from .validate import predict_motions as predict_motions
 from .validate import splits as splits

@@ -13,9 +13,8 @@ from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.result import HandEye
-from stcal.handeye.scatter import widened_by_scatter
 from stcal.handeye.solve import HandEyeOptions, handeye
-from stcal.handeye.validate import HeldOutPoses, errors_without
+from stcal.handeye.validate import HeldOutPoses, errors_without, widened_by_scatter
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread, run_parallel
 

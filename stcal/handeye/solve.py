@@ -11,14 +11,13 @@ from scipy.stats import chi2
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.loop import FRAMES, Loop, Setup
-from stcal.handeye.data.motions import Motions, poses_with_log
+from stcal.handeye.data.loop import FRAMES, Loop, Motions, Setup, poses_with_log
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge import remarks
 from stcal.handeye.judge.conventions import Guess, check_conventions
-from stcal.handeye.judge.notes import Aside
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
+from stcal.handeye.judge.remarks import Aside
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods import start
 from stcal.handeye.methods.arm import ArmModel

@@ -20,7 +20,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.toml import Finite, Positive, Strict, load_toml, toml_string
 from stcal.labels import BOARD
-from stcal.likeness import MAX_GAP, MAX_RADIUS_RATIO, whole_likeness
+from stcal.lookalikes import MAX_GAP, MAX_RADIUS_RATIO, whole_likeness
 
 REMEDY = "`stcal-sfm init DIR` writes one"
 ROUGH_KEYS = "rough_pose = { origin_mm, x, normal }"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.io.poses.mapped import read_mapped
+from stcal.io.poses.columns import read_mapped
 from stcal.io.quaternions import Order
 from stcal.io.table import COVARIANCE, LENGTHS, POSE, Table, read_table
 
@@ -46,7 +46,7 @@ def join(
     quaternions
         See :func:`~stcal.io.table.read_table`.
     columns
-        Map of the columns of ``b``, see :func:`~stcal.io.poses.mapped.read_mapped`.
+        Map of the columns of ``b``, see :func:`~stcal.io.poses.columns.read_mapped`.
 
     Returns
     -------

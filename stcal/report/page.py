@@ -1,15 +1,13 @@
-"""Report pages: single files that open offline, from jinja2 templates beside the code whose results they show.
+"""Pages as HTML and PDF."""
 
-A template's name is its path below ``stcal/``. All templates have the macros of ``templates/macros.html.jinja``, and
-the filters ``number``, ``cells`` and ``listed`` (``join``) of :mod:`stcal.report.text`.
-"""
-
+import io
 from collections.abc import Sequence
 from functools import cache
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
 from markupsafe import Markup
 
+from stcal.errors import InputError
 from stcal.report.text import cells, join, number
 
 Sections = Sequence[tuple[str, str, Markup]]
@@ -55,3 +53,45 @@ def swatch(name: str, colour: str) -> Markup:
 def verdict(text: str, colour: str) -> Markup:
     """Return a word in its colour, for a cell of a table."""
     return environment().globals["verdict"](text, colour)
+
+
+NEEDED = 'PDF: needs WeasyPrint, which is not installed; pip install "stcal[pdf]"'
+NO_PANGO = (
+    "PDF: WeasyPrint does not find a library of the system ({reason}); install Pango, as with `apt-get install "
+    "libpango-1.0-0 libpangoft2-1.0-0`"
+)
+
+
+def pdf_of(page: str) -> bytes:
+    """Return the PDF of a page as its style sheet prints it, A4 with page numbers; equal pages give equal bytes.
+
+    Parameters
+    ----------
+    page : HTML with all of its content embedded; external resources are not loaded
+
+    Raises
+    ------
+    InputError
+        WeasyPrint, or Pango, which it uses, is not installed.
+    """
+    try:
+        from weasyprint import HTML
+        from weasyprint.urls import URLFetcher
+    except ImportError as error:
+        raise InputError("E-EXTRA-MISSING", NEEDED) from error
+    except OSError as error:
+        raise InputError("E-EXTRA-MISSING", NO_PANGO.format(reason=str(error).splitlines()[0])) from error
+    stream = io.BytesIO()
+    HTML(string=page, url_fetcher=URLFetcher(allowed_protocols=["data"])).write_pdf(stream)
+    return stream.getvalue()
+
+
+def require_pdf() -> None:
+    """Refuse, before the work, if no PDF can be made.
+
+    Raises
+    ------
+    InputError
+        The message names the missing library, and how to install it.
+    """
+    pdf_of("<p></p>")

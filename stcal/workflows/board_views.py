@@ -13,8 +13,8 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
+from stcal.io.image_jobs import run_on_images
 from stcal.io.images import ImageFile, Skipped, decode
-from stcal.io.spread import run_on_images
 from stcal.workflows.board_in_image import Board, find_board, symmetries
 
 

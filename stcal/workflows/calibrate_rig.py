@@ -14,9 +14,8 @@ from stcal.io.json import ResultFile
 from stcal.io.saving import json_text
 from stcal.parallel import Progress
 from stcal.sfm.camera.calibrate import CameraCalibration, calibrate_camera
-from stcal.sfm.camera.file import CalibrationFile
+from stcal.sfm.camera.file import CalibrationFile, RigCalibrationFile
 from stcal.sfm.camera.rig import RigCalibration, calibrate_rig
-from stcal.sfm.camera.rig_file import RigCalibrationFile
 from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
 
 RIG_FILE, CHAIN_FILE = "rig.json", "camchain.yaml"

@@ -15,7 +15,7 @@ from typing import Any
 
 import stcal
 from stcal.errors import InputError
-from stcal.io.spread import spread
+from stcal.io.image_jobs import spread
 
 ANSWER_S = 10
 """Longest time that a scheduler, and the first worker, may take to answer, in s."""

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
+from stcal.cross_validation import dealt, held_out_errors
 from stcal.errors import InputError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.robust import length_limit
-from stcal.held_out import dealt, held_out_errors
 from stcal.io.table import Table, read_table
 from stcal.parallel import one_thread
 from stcal.register import register

@@ -17,11 +17,10 @@ from stcal.io.design import target_toml
 from stcal.io.table import POSE, pose_cells
 from stcal.locate.data.layout import layout_toml
 from stcal.robot.kinematics.conditions import Conditions
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import inverse
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.make.box import sides_of

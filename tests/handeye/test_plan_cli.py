@@ -11,8 +11,8 @@ import pytest
 from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot import Joint, forward, inverse, load_robot
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import save_robot
+from stcal.robot.kinematics.model import mh80
 from tests.handeye.test_cli import NOISE, poses_file
 from tests.outcome import ended
 from tests.support.handeye import simulated

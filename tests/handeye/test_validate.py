@@ -19,10 +19,8 @@ from stcal.handeye import (
     predict_motions,
     splits,
 )
-from stcal.handeye.data.loop import Loop
-from stcal.handeye.data.motions import Motions
-from stcal.handeye.scatter import scatter, widened_by_scatter
-from stcal.handeye.validate import predicted
+from stcal.handeye.data.loop import Loop, Motions
+from stcal.handeye.validate import predicted, scatter, widened_by_scatter
 from tests.outcome import fails_with
 from tests.support.handeye import simulated, simulated_views
 

@@ -8,9 +8,9 @@ import pytest
 
 from stcal.cli.main import main
 from stcal.geometry.rigid import Rigid
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, made, placed
 from tests.outcome import ended
 from tests.support.arms import elastic

@@ -13,13 +13,12 @@ from stcal.io.images import Skipped
 from stcal.io.saving import require_new_folder, save_folder
 from stcal.io.table import Table, pose_cells, read_table
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import made
 from stcal.robot.use.targets import Targets
-from stcal.sfm.measurement.common_errors import common_errors
 from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
-from stcal.sfm.measurement.pose import pose_from_circles
+from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows.from_photos import run as work
 from stcal.workflows.from_photos.output import files_of

@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.model import DHRow, Elasticity, Joint, Robot
+from stcal.robot.kinematics.model import DHRow, Elasticity, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors
 from stcal.robot.urdf.read import load_urdf
 from stcal.robot.urdf.write import require_same_poses, robot_urdf

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from stcal.sfm import RunOptions, run
-from stcal.sfm.adjust.group import adjust
+from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.mapping.database import from_colmap_px, image_ids
 from stcal.sfm.mapping.incremental import map_group

@@ -10,8 +10,7 @@ from stcal.sfm.camera.calibrate import calibrate_camera
 from stcal.sfm.report.compare import compare
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions
-from stcal.synthetic.scene import SceneOptions, make_scene
-from stcal.synthetic.wide import seen_wide, wide_options
+from stcal.synthetic.scene import SceneOptions, make_scene, seen_wide, wide_options
 
 pytestmark = pytest.mark.slow
 FIELD_DEG = 150.0

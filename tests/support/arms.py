@@ -8,10 +8,9 @@ from stcal.errors import ConvergenceError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identification.elastic import DOWN, MOMENT, usual
 from stcal.robot.identification.nominal import Deviations
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain, with_values
 from stcal.robot.kinematics.inverse import inverse
-from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, Robot, Tree
+from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, Robot, Tree, mh80
 
 MARKERS = ("left", "right", "elbow")
 """Of :func:`two_arms`."""

@@ -8,10 +8,9 @@ import pytest
 
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import load_board, load_target
-from stcal.synthetic.dataset import write_dataset
+from stcal.synthetic.dataset import TruthFile, write_dataset
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene, second_design
-from stcal.synthetic.truth import TruthFile
 from tests.outcome import fails_with
 
 OPTIONS = SceneOptions(seed=5, width=324, height=216, images_per_group=2)

@@ -250,8 +250,8 @@ def handeye(
     from stcal.handeye.data.formats.record import Said
     from stcal.handeye.report.export import exported, opencv_yaml, require_form, ros_yaml, urdf_joint
     from stcal.handeye.report.file import HandEyeFile
+    from stcal.handeye.report.outcome import judged
     from stcal.handeye.report.page import outcome_page, outcome_text
-    from stcal.handeye.report.verdict import judged
     from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye.calibrate import AUTO, Splits, calibrate
     from stcal.workflows.handeye.inputs import dry_run as understood

@@ -63,13 +63,12 @@ def rig(
 ) -> None:
     """Find where several cameras sit on one flange, or in one base, and in each other, from one adjustment."""
     from stcal.handeye.data.formats.record import Said
-    from stcal.handeye.data.rig_file import read_rig_file
+    from stcal.handeye.data.rig import read_rig_file
+    from stcal.handeye.report.file import HandEyeRigFile
+    from stcal.handeye.report.outcome import rig_judged
     from stcal.handeye.report.rig import rig_page, rig_text
-    from stcal.handeye.report.rig_file import HandEyeRigFile
-    from stcal.handeye.report.rig_outcome import rig_judged
     from stcal.workflows.handeye.calibrate import Splits
-    from stcal.workflows.handeye.rig import calibrate_rig
-    from stcal.workflows.handeye.rig_inputs import read_rig
+    from stcal.workflows.handeye.rig import calibrate_rig, read_rig
 
     files = read_rig_file(rig_file)
     written = {"--out": out, "--json": json_file, "--report": report}

@@ -3,7 +3,7 @@
 import typer
 
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.robot import axes, compensate, convert, design, evaluate, from_photos, identify, init, verify
+from stcal.cli.robot import axes, compensate, convert, design, evaluate, from_photos, identify, verify
 
 app = typer.Typer(
     name="stcal robot",
@@ -12,7 +12,7 @@ app = typer.Typer(
     **PLAIN,
 )
 COMMANDS = (
-    init.init,
+    convert.init,
     axes.axes,
     identify.identify,
     evaluate.evaluate,

@@ -1,4 +1,4 @@
-"""``stcal robot convert``: robot files and URDF."""
+"""Commands `robot init` and `robot convert`: robot files."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -82,3 +82,18 @@ def _is_xml(path: Path) -> bool:
             return file.read(200).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error
+
+
+def init(
+    file: Annotated[Path, typer.Argument(writable=True, help="Write the robot file here.")] = Path("robot.toml"),
+) -> None:
+    """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
+    from stcal.robot.kinematics.file import robot_toml
+    from stcal.robot.kinematics.model import mh80
+
+    comments = (
+        "One [[joint]] for each joint, from the base; of type revolute or prismatic (then min_mm and max_mm).",
+        "Optional: min_deg, max_deg, beta_deg, base, tool, [[target]] for more tools, and coupling, which makes",
+        "kinematic joint values of the controller's (Fanuc: its third row is [0, 1, 1, 0, 0, 0]).",
+    )
+    write(file, robot_toml(mh80(), comments))

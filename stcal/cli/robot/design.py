@@ -59,7 +59,7 @@ def design(
     if json_file:
         write(json_file, stage.design_file(result))
     if report:
-        from stcal.robot.use.design_report import design_page
+        from stcal.robot.use.report import design_page
 
         write(report, design_page(result, robot))
 

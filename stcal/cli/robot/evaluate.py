@@ -55,7 +55,7 @@ def evaluate(
     """Compare robot files on new measurements, and tell what their residuals go with."""
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.kinematics.measurements import read_measurements
-    from stcal.robot.use import evaluation_report as shown
+    from stcal.robot.use import report as shown
     from stcal.robot.use.evaluation import evaluate as evaluated
 
     robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))

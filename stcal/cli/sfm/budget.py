@@ -51,13 +51,12 @@ def budget(
     out: JsonFile = None,
 ) -> None:
     """Compute the uncertainty budget of faces and of the target's longest distances (GUM), each contribution apart."""
-    from stcal.report.pdf import pdf_of
+    from stcal.report.page import pdf_of
     from stcal.sfm.budget.combine import budget_of_run
     from stcal.sfm.budget.file import BudgetFile
     from stcal.sfm.budget.lengths import against_run, against_stated
-    from stcal.sfm.budget.page import budget_page
-    from stcal.sfm.budget.statement import statement_of
-    from stcal.sfm.budget.text import budget_text
+    from stcal.sfm.budget.page import budget_page, budget_text
+    from stcal.sfm.budget.sources import statement_of
     from stcal.sfm.runs.saved import load_run
     from stcal.sfm.runs.verify import verify
 
@@ -96,7 +95,7 @@ def _require_pdf(page: Path | None, run: Path) -> None:
     InputError
         Which, and what to do.
     """
-    from stcal.report.pdf import require_pdf
+    from stcal.report.page import require_pdf
 
     if page is None:
         raise InputError("E-OPTION-NEEDS", "--pdf: the PDF stands beside the page; give that with --report FILE.html")

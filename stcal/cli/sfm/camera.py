@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.designs import designs_told
-from stcal.cli.options import ReportFile, Strict, TargetFile, Workers, require_new, require_passed
+from stcal.cli.options import ReportFile, Strict, TargetFile, Workers, designs_told, require_new, require_passed
 from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, write
 from stcal.errors import InputError
 
@@ -100,7 +99,7 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
     from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.file import CalibrationFile
-    from stcal.sfm.camera.text import calibration_text
+    from stcal.sfm.camera.report import calibration_text
     from stcal.workflows.calibrate_camera import calibrate_camera_by_corners
 
     json_file = json_file or out.with_suffix(".json")
@@ -126,8 +125,8 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
 def _rig(images: Path, out: Path, target, board, models, json_file, report, workers) -> list[str]:
     """What failed."""
     from stcal.io.saving import require_new_folder, save_folder
-    from stcal.sfm.camera.rig_file import RigCalibrationFile
-    from stcal.sfm.camera.rig_report import rig_page, rig_text
+    from stcal.sfm.camera.file import RigCalibrationFile
+    from stcal.sfm.camera.report import rig_page, rig_text
     from stcal.workflows.calibrate_rig import calibrate_rig_from_photographs, files_of
 
     require_new_folder(out, images)

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.designs import designs_told
 from stcal.cli.options import (
     MOST_SEED,
     BoardFile,
@@ -17,6 +16,7 @@ from stcal.cli.options import (
     Run,
     TargetFile,
     Workers,
+    designs_told,
     ellipse_options,
     load_ahead,
 )
@@ -65,12 +65,11 @@ def plan(
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import board_of, target_of
-    from stcal.sfm.planning.file import PlanFile
+    from stcal.sfm.planning.file import PlanFile, plan_text
     from stcal.sfm.planning.noise import expected_noise, noise_of_run, stated_noise
     from stcal.sfm.planning.nominal import nominal_poses
     from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
     from stcal.sfm.planning.session import plan as planned
-    from stcal.sfm.planning.tables import plan_text
     from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.saved import load_run
 
@@ -112,8 +111,7 @@ def advise(
     load_ahead(None)
     from stcal.sfm.planning.advise import advise as advice_for
     from stcal.sfm.planning.advise import doubts, known_of
-    from stcal.sfm.planning.file import AdviceFile
-    from stcal.sfm.planning.tables import advice_text
+    from stcal.sfm.planning.file import AdviceFile, advice_text
     from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
@@ -169,7 +167,7 @@ def watch(
 
 def _say_update(update: "Update") -> None:
     """What was found in what came, σ so far, and what would help most."""
-    from stcal.sfm.planning.tables import next_text
+    from stcal.sfm.planning.file import next_text
     from stcal.sfm.runs.text import found_lines, so_far_text
 
     print_each("gone", update.gone)

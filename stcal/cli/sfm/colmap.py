@@ -41,7 +41,7 @@ def export_database(
 ) -> None:
     """Copy the run's database for another version of COLMAP to open; ids, orders and values stay."""
     from stcal.sfm.interop.export_database import export_database as export
-    from stcal.sfm.interop.text import database_text
+    from stcal.sfm.interop.file import database_text
     from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
@@ -65,7 +65,7 @@ def export_model(
 ) -> None:
     """Write the run's final model, mm, target frame, for other programs; labels beside it."""
     from stcal.sfm.interop.export_model import export_model as export
-    from stcal.sfm.interop.text import model_text
+    from stcal.sfm.interop.file import model_text
 
     written = export(run, out, kind)
     say(model_text(written, kind))
@@ -96,7 +96,7 @@ def export_run(
 ) -> None:
     """Write faces and circles, with σ and cameras where the form holds them, for robots, drawings and viewers."""
     from stcal.sfm.interop.export import export_run as export
-    from stcal.sfm.interop.text import export_text
+    from stcal.sfm.interop.file import export_text
 
     say(export_text(export(run, out, form, name)))
 
@@ -177,7 +177,7 @@ def faces(
 ) -> None:
     """Find scale and faces from a COLMAP model made or edited elsewhere; labels come by (image, keypoint)."""
     from stcal.sfm.interop.external import calibrate_models, write_faces
-    from stcal.sfm.interop.text import faces_text
+    from stcal.sfm.interop.file import faces_text
     from stcal.sfm.runs.saved import load_run
 
     if out is not None and not out.parent.is_dir():
@@ -228,7 +228,7 @@ def doctor(
     """Explain every image and circle left out: the threshold that stopped it, its value, and what would let it in."""
     from stcal.sfm.diagnose import findings
     from stcal.sfm.diagnose.doctor import diagnose
-    from stcal.sfm.diagnose.file import DoctorFile
+    from stcal.sfm.diagnose.findings import DoctorFile
     from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)

@@ -83,9 +83,9 @@ def design(
     from stcal.io.design import board_toml, load_board, target_toml
     from stcal.sfm.make.box import size_of
     from stcal.sfm.make.design import MakeOptions, made_text, make_target
+    from stcal.sfm.planning.file import plan_text
     from stcal.sfm.planning.noise import expected_noise
     from stcal.sfm.planning.session import PlanOptions, plan
-    from stcal.sfm.planning.tables import plan_text
 
     target_file, board_file = folder / TARGET, folder / BOARD
     if os.path.lexists(target_file):

@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.designs import designs_told
 from stcal.cli.options import (
     CameraFile,
     MaxDiameter,
@@ -19,6 +18,7 @@ from stcal.cli.options import (
     Strict,
     TargetFile,
     Workers,
+    designs_told,
     ellipse_options,
     handed_over,
     load_ahead,

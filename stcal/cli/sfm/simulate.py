@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.designs import designs_told
-from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, TargetFile, Workers
+from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, TargetFile, Workers, designs_told
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
 from stcal.io.saving import RUN_MARKER, json_text, real_place, save
@@ -120,8 +119,7 @@ def _scene(
     from stcal.io.cameras.read import read_camera
     from stcal.sfm.planning.nominal import nominal_poses
     from stcal.sfm.planning.session import pairs_of_faces
-    from stcal.synthetic.scene import make_scene, seen_by
-    from stcal.synthetic.wide import seen_wide, wide_options
+    from stcal.synthetic.scene import make_scene, seen_by, seen_wide, wide_options
 
     target, board = designs
     poses = nominal_poses(target, None)

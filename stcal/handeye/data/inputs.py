@@ -10,8 +10,8 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.formats.columns import read_columns
+from stcal.handeye.data.formats.recognise import read_content
 from stcal.handeye.data.formats.record import FRAMES, Content, Frames, Role, Said, Side
-from stcal.handeye.data.formats.tell import read_content
 from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance
 from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.files import TABLE_BYTES, read_bytes

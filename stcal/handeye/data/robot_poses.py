@@ -8,8 +8,8 @@ import yaml
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
+from stcal.handeye.data.formats.recognise import SUFFIXES, NotToldError
 from stcal.handeye.data.formats.record import Said, require_each_once
-from stcal.handeye.data.formats.tell import SUFFIXES, NotToldError
 from stcal.handeye.data.inputs import partners, read_robot, trailing_number
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.io.files import SETTINGS_BYTES, read_bytes

@@ -13,7 +13,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.loop import Loop, Setup
 from stcal.handeye.data.pairs import HandEyePoses
-from stcal.handeye.judge.notes import Grave
+from stcal.handeye.judge.remarks import Grave
 from stcal.handeye.methods.start import mean_pose
 from stcal.io.quaternions import INVERTED as CONJUGATED
 from stcal.io.quaternions import ORDERS, Reading

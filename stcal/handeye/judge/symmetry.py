@@ -10,7 +10,7 @@ from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.loop import Loop, Setup
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.views import View, Views
-from stcal.handeye.judge.notes import Aside
+from stcal.handeye.judge.remarks import Aside
 from stcal.handeye.methods import start
 
 ROUNDS = 20

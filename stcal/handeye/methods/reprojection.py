@@ -20,7 +20,7 @@ from stcal.handeye.methods.bundle import Bundle, Corners
 from stcal.handeye.methods.camera_error import CameraError, of_corners
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
-from stcal.handeye.methods.rounds import LEAST, Problem, adjust
+from stcal.handeye.methods.variance_rounds import LEAST, Problem, adjust
 from stcal.io.cameras.model import PARAMETER_NAMES, CameraPrior, intrinsic_basis
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2

@@ -10,6 +10,7 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import Loop, Setup
 from stcal.handeye.data.rig import RigPoses
+from stcal.handeye.methods.bundle import RigBundle, RigCorners
 from stcal.handeye.methods.camera_error import CameraError, considered
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
@@ -26,8 +27,7 @@ from stcal.handeye.methods.reprojection import (
     problem,
     scale_hint,
 )
-from stcal.handeye.methods.rig_bundle import RigBundle, RigCorners
-from stcal.handeye.methods.rounds import adjust
+from stcal.handeye.methods.variance_rounds import adjust
 from stcal.io.cameras.model import intrinsic_basis
 
 LEAST_VIEWS = 1

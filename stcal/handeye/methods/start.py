@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.loop import Loop
-from stcal.handeye.data.motions import Motions
+from stcal.handeye.data.loop import Loop, Motions
 
 SUBSETS = 200
 """Number of subsets of three or four poses. With a third of all poses bad, enough subsets are clean on average."""

@@ -1,15 +1,111 @@
-"""Plots of the report of a hand-eye calibration."""
+"""Figures of a hand-eye calibration: residuals, coverage of the poses, and views with their reprojected boards."""
 
+import base64
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
+from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.views import Views
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.methods.reprojection import Reprojection
-from stcal.handeye.report.coverage import LEAST_TURN, ImageCoverage, equal_area
+from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.result import HandEye
+from stcal.io.files import IMAGE_BYTES, read_bytes
+from stcal.io.images import decode, grey_8bit, thumbnail
 from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below
 from stcal.report.text import number, telling_names
+
+CELLS = 60
+"""Number of cells along the longer side of the image, in which views of the board are counted."""
+MOST_TURNS = 1000
+"""Largest number of pairs of poses whose turn is drawn; of more pairs, a random sample."""
+LEAST_TURN = np.radians(2)
+"""Smallest turn whose axis is drawn, in rad; the axes of smaller turns are noise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageCoverage:
+    """Coverage of the image by the board.
+
+    ``counts`` : (rows, columns) number of photographs in which the board covers a cell; ``share`` : share of the cells
+    that the board covers at least once.
+    """
+
+    counts: np.ndarray
+    share: float
+
+    def __post_init__(self):
+        object.__setattr__(self, "counts", frozen(self.counts, (None, None), "counts", int))
+
+
+def image_coverage(views: Views) -> ImageCoverage:
+    """Returns the coverage of the image by the convex hulls of each view's corners."""
+    width, height = views.camera.width, views.camera.height
+    cell = max(width, height) / CELLS
+    columns, rows = max(1, round(width / cell)), max(1, round(height / cell))
+    # Pixel centres are integers: the image reaches from -0.5 on.
+    x = (np.arange(columns) + 0.5) * width / columns - 0.5
+    y = (np.arange(rows) + 0.5) * height / rows - 0.5
+    middle = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    counts = np.zeros(len(middle), int)
+    for view in views.views:
+        try:
+            sides = ConvexHull(view.xy_px).equations
+        except QhullError:  # all corners on a line
+            continue
+        counts += (middle @ sides[:, :2].T + sides[:, 2] <= 0).all(1)
+    return ImageCoverage(counts.reshape(rows, columns), float((counts > 0).mean()))
+
+
+def turns_between(pairs: HandEyePoses) -> np.ndarray:
+    """Returns rotation vectors (n, 3) of the flange between poses, in its axes, rad.
+
+    A turn and its inverse count as one, with Z ≥ 0.
+    """
+    rotation = pairs.base_from_flange.rotation
+    i, j = np.triu_indices(len(rotation), 1)
+    if len(i) > MOST_TURNS:
+        sample = np.random.default_rng(0).choice(len(i), MOST_TURNS, replace=False)
+        i, j = i[sample], j[sample]
+    turn = Rotation.from_matrix(np.swapaxes(rotation[j], 1, 2) @ rotation[i]).as_rotvec()
+    return np.where(turn[:, 2:] < 0, -turn, turn)
+
+
+def equal_area(directions: np.ndarray) -> np.ndarray:
+    """Projects unit vectors with Z ≥ 0 by Lambert's azimuthal projection, (n, 2), onto a disc of radius 1."""
+    return directions[:, :2] / np.sqrt(1 + np.abs(directions[:, 2:]))
+
+
+def by_robot(result: HandEye, pairs: HandEyePoses, views: Views) -> list[np.ndarray]:
+    """Predicts the corners of each view from the robot's reported pose and the transforms, (k, 2) px.
+
+    Corners behind the camera are NaN.
+    """
+    loop, board = Loop.of(pairs, result.setup), result.reprojection
+    camera = views.camera if board is None else board.camera
+    predicted = []
+    poses = result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
+    for view, pose in zip(views.views, poses, strict=True):
+        xyz = pose @ (result.scale * view.xyz_board if board is None else board.board(view.xyz_board))
+        in_front = xyz[:, 2] > 0
+        px = np.full((len(xyz), 2), np.nan)
+        px[in_front] = camera.project(xyz[in_front])
+        predicted.append(px)
+    return predicted
+
+
+def rms_px(predicted: np.ndarray, seen: np.ndarray) -> float:
+    """Returns the RMS distance over all corners that could be predicted, or infinity if none could."""
+    squared = ((predicted - seen) ** 2).sum(1)
+    known = np.isfinite(squared)
+    return float(np.sqrt(squared[known].mean())) if known.any() else float("inf")
+
 
 GOOD, BAD = COLOURS[0], COLOURS[1]
 MOST_NAMED = 40
@@ -190,3 +286,66 @@ def _finish(axes, x: str, y: str) -> None:
     axes.set_axisbelow(True)
     axes.set_xlabel(x, fontsize=SMALL + 1, color=INK)
     axes.set_ylabel(y, fontsize=SMALL + 1, color=INK)
+
+
+WIDTH_PX = 800
+"""Width of an image in the page, in px. The page holds three images of some 100 kB each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """One image with its corners.
+
+    ``corners`` : (x, y, x and y of the end of the enlarged residual, title); ``factor`` : enlargement of the residuals;
+    ``dot`` : radius of the dots in px of the image.
+    """
+
+    title: str
+    says: str
+    width: int
+    height: int
+    jpeg: str
+    factor: float
+    dot: float
+    corners: list[tuple[float, float, float, float, str]]
+
+
+def overlays(outcome: Outcome) -> tuple[list[Overlay], list[str]]:
+    """Returns the overlays of the worst, the median and the best image, and a message for each unreadable image.
+
+    Both lists are empty if the poses did not come from images.
+    """
+    result, pairs, views = outcome.result, outcome.pairs, outcome.views
+    if pairs is None or views is None or outcome.folder is None:
+        return [], []
+    predicted = by_robot(result, pairs, views)
+    rms = np.array([rms_px(p, view.xy_px) for p, view in zip(predicted, views.views, strict=True)])
+    order = np.argsort(rms, kind="stable")[::-1]
+    chosen: dict[int, str] = {}
+    for i, word in ((order[0], "worst"), (order[len(order) // 2], "usual"), (order[-1], "best")):
+        chosen.setdefault(int(i), word)
+    shown, missing = [], []
+    for i, word in chosen.items():
+        name = pairs.names[i]
+        try:
+            grey = grey_8bit(decode(read_bytes(outcome.folder / name, IMAGE_BYTES), name))
+        except (OSError, InputError) as error:
+            reason = error.strerror or error if isinstance(error, OSError) else error
+            missing.append(f"{name} cannot be shown: {reason}")
+            continue
+        text = f"{rms[i]:.3g} px RMS by the robot's pose{', left out' if result.outliers[i] else ''}"
+        shown.append(_overlay(f"{word}: {name}", text, grey, views.views[i].xy_px, predicted[i]))
+    return shown, missing
+
+
+def _overlay(title: str, says: str, grey: np.ndarray, seen: np.ndarray, predicted: np.ndarray) -> Overlay:
+    height, width = grey.shape
+    residuals = predicted - seen
+    factor = enlargement(residuals, width)
+    corners = []
+    for (x, y), (right, down) in zip(seen.tolist(), residuals.tolist(), strict=True):
+        if np.isfinite(right):
+            text = f"x {right:+.2f} px, y {down:+.2f} px, {np.hypot(right, down):.2f} px"
+            corners.append((x, y, x + factor * right, y + factor * down, text))
+    jpeg = base64.b64encode(thumbnail(grey, WIDTH_PX)[0].tobytes()).decode()
+    return Overlay(title, says, width, height, f"data:image/jpeg;base64,{jpeg}", factor, 0.005 * width, corners)

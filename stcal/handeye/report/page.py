@@ -4,22 +4,29 @@ import numpy as np
 
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.loop import FRAMES
-from stcal.handeye.judge.notes import Aside
 from stcal.handeye.judge.observability import Observability
-from stcal.handeye.report.coverage import by_robot, image_coverage, turns_between
-from stcal.handeye.report.figures import BAD, GOOD, corner_figure, image_figure, pose_bars, turns_figure
+from stcal.handeye.judge.remarks import Aside
+from stcal.handeye.report.figures import (
+    BAD,
+    GOOD,
+    by_robot,
+    corner_figure,
+    image_coverage,
+    image_figure,
+    overlays,
+    pose_bars,
+    turns_between,
+    turns_figure,
+)
 from stcal.handeye.report.file import why_out
-from stcal.handeye.report.outcome import ArmFound, Outcome
-from stcal.handeye.report.overlays import overlays
-from stcal.handeye.report.verdict import Verdict, judged
+from stcal.handeye.report.outcome import ArmFound, Outcome, Verdict, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared
 from stcal.io.cameras.model import PARAMETER_NAMES, parameter_names
 from stcal.report.figure import uri
 from stcal.report.page import render, verdict
-from stcal.report.poses import HEADS, transform_rows
-from stcal.report.text import NONE, number, text_table
+from stcal.report.text import HEADS, NONE, number, text_table, transform_rows
 
 ERRORS = {
     "rotation_rad": ("rotation °", np.degrees(1.0), 4),

@@ -6,6 +6,7 @@ import numpy as np
 
 from stcal.handeye.data.loop import FRAMES
 from stcal.handeye.report.figures import BAD, GOOD, pose_bars
+from stcal.handeye.report.outcome import RigOutcome, asides, rig_judged
 from stcal.handeye.report.page import (
     adjusted,
     coverage,
@@ -17,11 +18,9 @@ from stcal.handeye.report.page import (
     turns_text,
     verdict_parts,
 )
-from stcal.handeye.report.rig_outcome import RigOutcome, asides, rig_judged
 from stcal.handeye.result import HandEye
 from stcal.report.page import render
-from stcal.report.poses import HEADS, transform_rows
-from stcal.report.text import NONE, number, text_table
+from stcal.report.text import HEADS, NONE, number, text_table, transform_rows
 
 
 def rig_text(outcome: RigOutcome) -> str:

@@ -12,14 +12,14 @@ from stcal.handeye.data.rig import RigPoses
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge import remarks
 from stcal.handeye.judge.conventions import check_conventions
-from stcal.handeye.judge.notes import Aside, Grave
 from stcal.handeye.judge.observability import LEAST_POSES, Observability, check, require_scale
+from stcal.handeye.judge.remarks import Aside, Grave
 from stcal.handeye.judge.symmetry import repair, turned_view
 from stcal.handeye.methods import start
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.reprojection import GROSS_RAD, GROSS_SHARE, resected
 from stcal.handeye.methods.rig import AdjustedRig, adjust_rig
-from stcal.handeye.methods.rounds import kind
+from stcal.handeye.methods.variance_rounds import kind
 from stcal.handeye.result import HandEye
 from stcal.handeye.rig.result import Rig
 from stcal.handeye.solve import HandEyeOptions, handeye, of_camera_file

@@ -14,8 +14,7 @@ from stcal.handeye.data.loop import Setup
 from stcal.handeye.data.rig import RigPoses
 from stcal.handeye.rig.result import POSE, Rig
 from stcal.handeye.rig.solve import RigOptions, alone, handeye_rig
-from stcal.handeye.scatter import SCATTERED
-from stcal.handeye.validate import HeldOutPoses, predicted
+from stcal.handeye.validate import SCATTERED, HeldOutPoses, predicted
 from stcal.parallel import one_thread, run_parallel
 
 ERRORS = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
@@ -163,7 +162,7 @@ def _errors_without(
 def rig_scatter(rig: Rig, held_out: RigHeldOut) -> float:
     """Returns the scatter of solutions without some of the robot's poses, relative to what σ predict.
 
-    The formula is that of :func:`~stcal.handeye.scatter.scatter`, applied to all cameras at once.
+    The formula is that of :func:`~stcal.handeye.validate.scatter`, applied to all cameras at once.
     """
     (s, k), c = held_out.rows.shape, len(rig.names)
     differences = []

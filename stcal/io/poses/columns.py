@@ -1,12 +1,17 @@
-"""Rotations in the columns of a table: quaternions, rotation vectors, Euler angles, matrices."""
+"""Poses in the columns of a table: names, conventions, and mappings for tables of other programs."""
 
+import csv
 import re
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
+from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.poses.rotations import (
     ROTATION_VECTOR,
     Convention,
@@ -18,7 +23,9 @@ from stcal.io.poses.rotations import (
     turned_values,
 )
 from stcal.io.quaternions import COLUMNS as QUATERNION
+from stcal.io.quaternions import Order
 from stcal.io.table import ANGLES, Table
+from stcal.io.toml import Strict, load_toml
 
 TRIPLES = {
     ("rx", "ry", "rz"): {"rad": "ur-rotvec"},
@@ -148,3 +155,121 @@ def _four(table: Table, prefix: str, rotation: str | None) -> Turned | None:
 def _own_unit(rotation: str | None) -> bool:
     """Return True if the option states a unit itself, instead of a robot's name that implies one."""
     return (rotation or "").endswith(tuple(f"-{unit}" for unit in ANGLES))
+
+
+def fixed(value: float, digits: int) -> str:
+    """Return a number with a fixed number of digits, and no minus before zero."""
+    text = f"{value:.{digits}f}"
+    return text.lstrip("-") if not text.strip("-0.") else text
+
+
+def joined(values, digits: int, between: str = ",") -> str:
+    """Return numbers with a fixed number of digits, joined by ``between``."""
+    return between.join(fixed(v, digits) for v in values)
+
+
+def ascii_text(text: str) -> str:
+    """Return the text for a comment, with ``?`` for characters outside ASCII."""
+    return "".join(c if " " <= c <= "~" else "?" for c in text)
+
+
+def without_comments(text: str) -> str:
+    """Return the lines that are no comments of a controller."""
+    return "\n".join(line for line in text.splitlines() if not line.lstrip().startswith((";", "!", "#", "'")))
+
+
+def program_name(stem: str) -> str:
+    """Return a valid name of a controller's module from a file's name.
+
+    It has at most 24 letters, digits and ``_``, and begins with a letter.
+    """
+    word = re.sub(r"\W", "_", stem, flags=re.ASCII)[:24]
+    return word if re.match(r"[A-Za-z]", word) else f"stcal_{word}"[:24].rstrip("_")
+
+
+WHAT = "column map"
+DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t"}
+
+
+class _ColumnsFile(Strict):
+    delimiter: Literal["comma", "semicolon", "tab", "space"] = "comma"
+    skip_lines: int = Field(default=0, ge=0, le=100_000)
+    header: bool = True
+    decimal_comma: bool = False
+    encoding: Literal["utf-8", "utf-16", "latin-1"] = "utf-8"
+    columns: dict[str, str | Annotated[int, Field(ge=1, le=10_000)]] = Field(min_length=1)
+
+
+def read_mapped(path: str | Path, columns: str | Path, what: str, quaternions: Order = "wxyz") -> Table:
+    """Read a table with another header, delimiter or decimal point; columns that are not mapped keep their names.
+
+    ``columns`` : the map (TOML; form: ``data_layout.md``); ``quaternions`` : see
+    :func:`~stcal.io.table.read_table`.
+
+    Raises
+    ------
+    InputError
+        The file is unreadable, a column is missing, or a row has another length.
+    """
+    form, where = load_toml(columns, _ColumnsFile, WHAT, "give its path"), f"{what} {path}"
+    try:
+        text = read_bytes(path, TABLE_BYTES).decode("utf-8-sig" if form.encoding == "utf-8" else form.encoding)
+    except OSError as error:
+        raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
+    except UnicodeDecodeError as error:
+        raise InputError(
+            "E-TABLE-ENCODING", f"{where}: not {form.encoding} text; give `encoding` in {columns}"
+        ) from error
+    used = [(i, line) for i, line in enumerate(text.splitlines(), 1) if i > form.skip_lines and line.strip()]
+    used = [(i, line) for i, line in used if not line.lstrip().startswith(("#", "//"))]
+    if len(used) < 1 + form.header:
+        raise InputError(
+            "E-TABLE-EMPTY", f"{where}: no rows below {form.skip_lines} lines; check skip_lines in {columns}"
+        )
+    cells = [(i, _cells(line, form.delimiter, f"{where}: line {i}")) for i, line in used]
+    names = cells[0][1] if form.header else [str(k) for k in range(1, len(cells[0][1]) + 1)]
+    rows = cells[1:] if form.header else cells
+    for line, row in rows:
+        if len(row) != len(names):
+            wrong = f"{len(row)} cells, {len(names)} needed"
+            raise InputError("E-COLUMNS-FILE", f"{where}: line {line}: {wrong}; check delimiter in {columns}")
+    at = {
+        ours: _place(theirs, names, f"{where}: {ours} = {theirs!r} of {columns}")
+        for ours, theirs in form.columns.items()
+    }
+    taken = {*at.values(), *(k for k, name in enumerate(names) if not form.header or not name or name in at)}
+    unmapped = {name: k for k, name in enumerate(names) if k not in taken}
+    cells_of = {name: [row[k] for _, row in rows] for name, k in (at | unmapped).items()}
+    if form.decimal_comma:
+        cells_of = {
+            name: [v.replace(",", ".") if _is_decimal(v) else v for v in theirs] for name, theirs in cells_of.items()
+        }
+    return Table(where, dict(cells_of), [line for line, _ in rows], quaternions)
+
+
+def _cells(line: str, delimiter: str, where: str) -> list[str]:
+    if delimiter == "space":
+        return line.split()
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=DELIMITERS[delimiter]))]
+    except csv.Error as error:
+        raise InputError("E-TABLE-CELLS", f"{where}: {error}; correct it") from error
+
+
+def _place(theirs: str | int, names: list[str], where: str) -> int:
+    """Return the index of a column by its name, or by its number from 1."""
+    if isinstance(theirs, int):
+        if theirs > len(names):
+            raise InputError("E-COLUMNS-FILE", f"{where}: there are {len(names)} columns; correct the number")
+        return theirs - 1
+    if names.count(theirs) != 1:
+        shown = ", ".join(names)[:100]
+        raise InputError(
+            "E-COLUMNS-FILE",
+            f"{where}: {names.count(theirs)} columns of this name, one needed, or its number; there are {shown}",
+        )
+    return names.index(theirs)
+
+
+def _is_decimal(text: str) -> bool:
+    return text.count(",") == 1 and all(c.isdigit() or c in "+-,eE" for c in text)

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.poses.text import fixed, joined, without_comments
+from stcal.io.poses.columns import fixed, joined, without_comments
 
 METRE_MM = 1000.0
 """Millimetres per metre, the unit of ROS, URDF and Universal Robots."""

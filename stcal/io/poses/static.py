@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.poses.columns import fixed
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw, roll_pitch_yaw
-from stcal.io.poses.text import fixed
 
 ARGUMENTS = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
 """Arguments of ROS 2's ``static_transform_publisher``."""

@@ -13,12 +13,12 @@ from stcal.boards.edges import corners_by_edges
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.ippe import poses_of_plane
 from stcal.geometry.plane_poses import (
     MAX_OUTLIER_SHARE,
     MAX_SIGMA_RAD,
     Weighed,
     covariance_of_both,
+    poses_of_plane,
     step_between,
     two_minima,
     weights_of,

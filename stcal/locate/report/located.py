@@ -13,7 +13,7 @@ from stcal.locate.pose.estimate import ObjPose
 from stcal.locate.pose.merge import Shift
 from stcal.locate.pose.patent import ASSUMED, PatentPose
 from stcal.locate.report.chain import GoalChain
-from stcal.locate.report.tables import camera_from_obj, uncertain
+from stcal.locate.report.page import camera_from_obj, uncertain
 
 
 class LimitRow(Part):

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stcal.held_out import dealt, held_out_errors
+from stcal.cross_validation import dealt, held_out_errors
 from stcal.register.core.models import Transform
 from stcal.register.core.result import ErrorFigures, HeldOutPoints
 

@@ -9,13 +9,11 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
-from stcal.robot.axes.checks import require_like_nominal
-from stcal.robot.axes.fit import TINY, AxisFit
+from stcal.robot.axes.checks import off_mm, remarks, require_like_nominal
+from stcal.robot.axes.fit import TINY, AxisFit, fit_axes
 from stcal.robot.axes.orientations import virtual_reflectors
 from stcal.robot.axes.pairs import Pair, chain_through, jacobian_by_axes, pairs_of, sigma_of
-from stcal.robot.axes.remarks import off_mm, remarks
 from stcal.robot.axes.sweeps import STILL_RAD, find_arcs
-from stcal.robot.axes.unwinding import fit_axes
 from stcal.robot.axes.without_one import LeaveOneOut, leave_one_out
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.measurements import Measurements

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.errors import ConvergenceError, DegenerateError
-from stcal.robot.axes.fit import AxisFit, refit_axis
+from stcal.robot.axes.fit import AxisFit, refit_axis, unwound_by
 from stcal.robot.axes.pairs import jacobian_by_axes, pair_values
-from stcal.robot.axes.unwinding import unwound_by
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 

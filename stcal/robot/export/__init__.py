@@ -10,8 +10,8 @@ import numpy as np
 import stcal
 from stcal.errors import InputError, StcalError
 from stcal.geometry.rigid import Poses
+from stcal.io.poses.columns import ascii_text, program_name
 from stcal.io.poses.controllers import MM_DIGITS, YASKAWA_MM_DIGITS
-from stcal.io.poses.text import ascii_text, program_name
 from stcal.robot.export.files import FORMS, Points
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import Compensated

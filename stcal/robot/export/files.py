@@ -11,8 +11,8 @@ from datetime import datetime
 import numpy as np
 
 from stcal.geometry.rigid import Poses
+from stcal.io.poses.columns import fixed, joined, without_comments
 from stcal.io.poses.controllers import ABB, DEG_DIGITS, FANUC, KUKA, NUMBER, UNIT_DIGITS, UR, YASKAWA, PoseText
-from stcal.io.poses.text import fixed, joined, without_comments
 
 REMARK = 32
 """Largest number of characters of a remark, in a FANUC program and in a JBI file."""

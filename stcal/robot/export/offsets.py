@@ -5,7 +5,7 @@ import io
 
 import numpy as np
 
-from stcal.io.poses.text import fixed
+from stcal.io.poses.columns import fixed
 from stcal.robot.identification.nominal import dh_values
 from stcal.robot.identification.report import DH, SHOWN, UNITS
 from stcal.robot.identification.result import Identified

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.left import Finding
 from stcal.robot.identification.observability import directions_named
 from stcal.robot.identification.residuals import WIDTH, Kind, Observed, State, tip_jacobian
+from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.conditions import USUAL, Conditions
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.model import Robot

@@ -11,7 +11,6 @@ from stcal.robot.identification.adjustment import (
     Solution,
     Weighting,
 )
-from stcal.robot.identification.left import Finding
 from stcal.robot.identification.nominal import Adjusted, Deviations, NominalRows, Placed
 from stcal.robot.identification.observability import ObservabilityIndices
 from stcal.robot.identification.predicted import Predicted
@@ -20,6 +19,7 @@ from stcal.robot.identification.residuals import (
     Observed,
     State,
 )
+from stcal.robot.identification.unexplained import Finding
 from stcal.robot.identification.variances import Components
 from stcal.robot.kinematics.model import Elasticity, Robot
 

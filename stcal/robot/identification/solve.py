@@ -5,10 +5,10 @@ from typing import get_args
 
 import numpy as np
 
+from stcal.cross_validation import dealt
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import huber_weights
-from stcal.held_out import dealt
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import (
     Solution,
@@ -21,7 +21,6 @@ from stcal.robot.identification.adjustment import (
 )
 from stcal.robot.identification.consensus import agreeing
 from stcal.robot.identification.elastic import bending, carries
-from stcal.robot.identification.left import left
 from stcal.robot.identification.nominal import Deviations, NominalRows, placed
 from stcal.robot.identification.observability import ObservabilityIndices, directions_named, parameter_scale
 from stcal.robot.identification.predicted import doubts, predicted, widened
@@ -47,6 +46,7 @@ from stcal.robot.identification.result import (
     position_errors,
 )
 from stcal.robot.identification.start import start
+from stcal.robot.identification.unexplained import left
 from stcal.robot.identification.variances import GROSS, Relaxation, components, estimated
 from stcal.robot.kinematics.dh import robot_from_chain
 from stcal.robot.kinematics.forward import with_values

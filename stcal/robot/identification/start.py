@@ -16,7 +16,7 @@ from stcal.io.quaternions import EXPLAINS
 from stcal.robot.identification.adjustment import USELESS_MM
 from stcal.robot.identification.residuals import State, observed, residuals, tips_of
 from stcal.robot.kinematics.damped import reach_mm
-from stcal.robot.kinematics.fit import FITS, require_convention
+from stcal.robot.kinematics.dh import FITS, require_convention
 from stcal.robot.kinematics.forward import carried_poses
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot

@@ -11,8 +11,15 @@ from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Poses
 from stcal.io.quaternions import Order
 from stcal.io.table import ANGLES, LENGTHS, Table, read_table
-from stcal.robot.kinematics.columns import oriented, unread
-from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, approach_columns, read_conditions
+from stcal.robot.kinematics.conditions import (
+    PAYLOAD,
+    USUAL,
+    Conditions,
+    approach_columns,
+    oriented,
+    read_conditions,
+    unread,
+)
 from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.model import Robot
 

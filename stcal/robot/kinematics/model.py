@@ -1,8 +1,4 @@
-"""What a robot is: Denavit–Hartenberg rows, joints with limits and coupling, base and tools.
-
-Both conventions and Hayati's extension are one chain: a fixed transform to the frame of each joint, in which the
-joint turns about z or moves along it, and a fixed transform from the last joint to the flange.
-"""
+"""The model of a robot arm: Denavit-Hartenberg rows, joints, elasticity, tools; and an example."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -415,3 +411,16 @@ def across(row: DHRow) -> Rigid:
     tilt = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
     turn = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
     return Rigid(tilt @ turn, [row.a, 0.0, 0.0])
+
+
+def mh80() -> Robot:
+    """Returns an arm with the size, reach (2061 mm) and joint ranges of Yaskawa's Motoman MH80, from its data sheet; J3
+    is not coupled, and the tool is at the flange."""
+    rows = ((145, -90, 540, 0), (870, 0, 0, -90), (210, -90, 0, 0), (0, 90, 1025, 0), (0, -90, 0, 0), (0, 0, 175, 0))
+    ranges = ((-180, 180), (-90, 155), (-80, 90), (-360, 360), (-125, 125), (-360, 360))
+    return Robot(
+        "MH80",
+        "standard",
+        tuple(DHRow(a, float(np.radians(alpha)), d, float(np.radians(theta))) for a, alpha, d, theta in rows),
+        tuple(Joint("revolute", *np.radians(r).tolist()) for r in ranges),
+    )

@@ -1,4 +1,4 @@
-"""Reading of a robot from a URDF: the joints from one link to one or several others. The rest of a file is ignored."""
+"""Reads a robot from URDF."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -13,16 +13,25 @@ from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain
 from stcal.robot.kinematics.forward import carried_poses, flange_poses, forward
-from stcal.robot.kinematics.model import Chain, Convention, DHRow, Grown, Joint, Robot, Tree
-from stcal.robot.urdf.names import (
-    FLANGE,
-    MOVING,
-    TOOL,
-    TOOL0,
-    UNLIMITED,
-    WHAT,
-    WORLD,
-)
+from stcal.robot.kinematics.model import Chain, Convention, DHRow, Grown, Joint, JointType, Robot, Tree
+
+WHAT = "URDF"
+WORLD, BASE, FLANGE, TOOL, TOOL0 = "world", "base_link", "flange", "tool", "tool0"
+"""Names of links; other tools are ``tool_NAME``."""
+UNLIMITED = 1e6
+"""Value in rad or m beyond which a limit counts as unlimited; URDF cannot state only one of two limits."""
+MOVING: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+
+
+def link_of(tool: str) -> str:
+    """Name of a tool's link."""
+    return f"{TOOL}_{tool}" if tool else TOOL
+
+
+def joint_name(i: int) -> str:
+    """Returns the name of joint ``i``, counted from 0."""
+    return f"joint_{i + 1}"
+
 
 SAME_MM, SAME_RAD = 1e-9, 1e-12
 """Largest difference between the poses of the Denavit–Hartenberg rows and those of the URDF's joints."""

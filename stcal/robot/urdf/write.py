@@ -10,16 +10,18 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.poses.controllers import METRE_MM, roll_pitch_yaw
 from stcal.robot.kinematics.forward import flange_poses, forward
 from stcal.robot.kinematics.model import Robot
-from stcal.robot.urdf.names import (
+from stcal.robot.urdf.read import (
     BASE,
     FLANGE,
     UNLIMITED,
     WHAT,
     WORLD,
+    fixed_values,
     joint_name,
     link_of,
+    read_urdf,
+    require_near,
 )
-from stcal.robot.urdf.read import fixed_values, read_urdf, require_near
 
 
 def robot_urdf(robot: Robot) -> str:

@@ -11,7 +11,6 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import length_limit, robust_sigma
 from stcal.robot.identification.adjustment import Weighting
-from stcal.robot.identification.left import LEAST_FREEDOM, Finding, left
 from stcal.robot.identification.nominal import Placed, base_name, tool_name
 from stcal.robot.identification.residuals import (
     WIDTH,
@@ -27,6 +26,7 @@ from stcal.robot.identification.residuals import (
 )
 from stcal.robot.identification.result import position_errors
 from stcal.robot.identification.start import Fit, start
+from stcal.robot.identification.unexplained import LEAST_FREEDOM, Finding, left
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from stcal.io.json import Part, ResultFile, Vector, Vector3
-from stcal.robot.identification.files import FoundLeft, PlacedPart
+from stcal.robot.identification.report import FoundLeft, PlacedPart
 
 ByStatus = Annotated[str, "status"]
 BySet = Annotated[str, "set"]

@@ -14,7 +14,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.quaternions import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS
 from stcal.robot.kinematics.damped import reach_mm
-from stcal.robot.kinematics.fit import FITS, TURNED_RAD, require_convention
+from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_convention
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot

@@ -1,15 +1,29 @@
-"""Pages and plots of compensation and verification."""
+"""Text and pages of compensation, verification, evaluation and pose design."""
 
+import csv
 import io
+import re
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
-from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, uri
+from stcal.errors import InputError
+from stcal.geometry.rigid import Poses
+from stcal.io.quaternions import COLUMNS
+from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, plane, uri
 from stcal.report.page import render
-from stcal.report.text import NONE, number
+from stcal.report.text import NONE, number, text_table
+from stcal.robot.identification.drawings import Drawn, joints_figure, space_picture
+from stcal.robot.identification.observability import MEANING
+from stcal.robot.identification.report import placed_cells, placed_parts
+from stcal.robot.identification.residuals import tips_of
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot
-from stcal.robot.use.compensation import Compensated, compensated_summary, joint_columns
+from stcal.robot.use.compensation import Compensated, compensated_summary, joint_cells, joint_columns
+from stcal.robot.use.design import PoseDesign
+from stcal.robot.use.evaluation import Evaluated, Evaluation, Figures
+from stcal.robot.use.files import EvaluationFile
 from stcal.robot.use.verification import Verification
 
 MOST_ROWS = 500
@@ -128,3 +142,373 @@ def _colours(count: int) -> list[str]:
     """Returns the colours: warm for before, cool for after, then the rest of the palette."""
     order = [COLOURS[1], COLOURS[0], *COLOURS[2:]]
     return [order[i % len(order)] for i in range(count)]
+
+
+def design_page(result: PoseDesign, robot: Robot) -> str:
+    """The report of ``design``."""
+    known = np.isfinite(result.random_sigma_mm)
+    return render(
+        "robot/use/design.html.jinja",
+        robot=robot.name,
+        result=result,
+        times=(result.random_sigma_mm / result.sigma_mm) ** 2 if known else None,
+        indices=_indices(result),
+        index_plot=uri(_index_figure(result)),
+        views=[(_places(result, 1), "from above"), (_places(result, 2), "from the side")],
+        joints=[name.replace("_", " ") for name in joint_columns(robot)],
+        poses=[
+            [str(i), *(number(float(v), 3) for v in joint_cells(robot, q)), *(number(v, 2) for v in pose.translation)]
+            for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1)
+        ],
+    )
+
+
+def _indices(result: PoseDesign) -> list[list[str]]:
+    median = result.median()
+    rows = []
+    for name, value in result.chosen.values().items():
+        every = [each.values()[name] for each in result.random]
+        ratio = number(value / median[name], 2) if median[name] > 0 else NONE
+        unit = "" if name == "O2" else "1/mm"
+        rows.append([name, *(f"{v:.4g}" for v in (value, median[name], min(every), max(every)))])
+        rows[-1] += [ratio, unit, MEANING[name]]
+    return rows
+
+
+def _index_figure(result: PoseDesign):
+    figure = new_figure(5, 2.9)
+    axes = figure.add_axes((0.12, 0.12, 0.86, 0.82))
+    chosen, median = result.chosen.values(), result.median()
+    for i, (name, value) in enumerate(chosen.items()):
+        if median[name] <= 0:
+            continue
+        every = np.array([each.values()[name] for each in result.random]) / median[name]
+        axes.plot(i + np.linspace(-0.15, 0.15, len(every)), every, "o", ms=3, color="#9aa0a8", mew=0)
+        axes.plot(i, value / median[name], "D", ms=6, color=COLOURS[0], mew=0, clip_on=False)
+    axes.axhline(1, color=INK, lw=0.6)
+    axes.set_xticks(range(len(chosen)), list(chosen))
+    axes.set_xlim(-0.5, len(chosen) - 0.5)
+    axes.set_ylim(0, None)
+    axes.yaxis.set_major_locator(locator())
+    axes.set_ylabel("over the median of random sets", fontsize=SMALL + 1, color=INK)
+    calm(axes)
+    axes.grid(axis="y", color=FAINT, lw=0.6)
+    axes.set_axisbelow(True)
+    return figure
+
+
+def _places(result: PoseDesign, up: int) -> str:
+    """Plot of the tool's positions and z axes: x against the coordinate ``up``."""
+    at, z = result.poses.translation[:, [0, up]], result.poses.rotation[:, [0, up], 2]
+    length = 0.12 * float(np.ptp(result.poses.translation, axis=0).max())
+    figure = new_figure(5, 4.2)
+    axes = figure.add_axes((0.15, 0.12, 0.83, 0.86))
+    axes.quiver(
+        *at.T, *(z * length).T, angles="xy", scale_units="xy", scale=1,
+        color=COLOURS[2], width=0.003, headwidth=4, headlength=5, clip_on=False,
+    )  # fmt: skip
+    axes.plot(*at.T, "o", ms=4, color=COLOURS[0], mew=0)
+    axes.plot(0, 0, "s", ms=6, color=INK, mew=0)
+    plane(axes, "x, mm", f"{'xyz'[up]}, mm", 0.16)
+    return uri(figure)
+
+
+MOST_WRONG = 10
+"""Wrong rows that are named in the terminal."""
+FAR_APART = 5
+"""Ratio of robots' median errors from which they are drawn on a logarithmic axis."""
+FITTED = {
+    "none": "base and tool as the files have them",
+    "base": "base fitted, tool as the files have it",
+    "tool": "tool fitted, base as the files have it",
+    "base-tool": "base and tool fitted by each robot's own axes",
+}
+FIGURES = ("mean", "median", "rms", "p95", "max")
+HEADS = ("rows", "mean", "median", "RMS", "95 %", "max")
+
+
+def names_of(files: Sequence[Path]) -> list[str]:
+    """Names of robots by their files: an identified robot keeps the name of the nominal one."""
+    stems, whole = [file.stem for file in files], [str(file) for file in files]
+    if len(set(whole)) < len(whole):
+        again = next(name for name in whole if whole.count(name) > 1)
+        raise InputError("E-OPTION-REPEATED", f"--robot {again}: given twice; give each file once")
+    return stems if len(set(stems)) == len(stems) else whole
+
+
+def evaluated_text(result: Evaluation) -> str:
+    """Tables and sentences for the terminal."""
+    lines = [f"{observations(result)}; {FITTED[result.refit]}", "", *text_table(_table(result), gap=2), ""]
+    return "\n".join(lines + notes(result))
+
+
+def observations(result: Evaluation) -> str:
+    """How many of what."""
+    kind = "pose" if result.seen.data.rotations is not None else result.seen.kind
+    return f"{result.seen.data.where}: {len(result.seen)} {kind}s"
+
+
+def _table(result: Evaluation) -> list[list[str]]:
+    """Heads, and lines of the robots with all rows, and without the wrong ones where there are any."""
+    turned = len(result.robots[0].rotation_rad) > 0
+    rows = [["<error, mm", *HEADS, *(("orientation, deg: RMS", "max") if turned else ())]]
+    parts = {"": np.ones(len(result.wrong), bool)}
+    if result.wrong.any():
+        parts[", without unexplained"] = ~result.wrong
+    for each in result.robots:
+        for said, among in parts.items():
+            figures = Figures.of(each.errors_mm[among])
+            cells = [each.robot.name + said, str(figures.rows), *(number(getattr(figures, f), 4) for f in FIGURES)]
+            if turned:
+                rotation = Figures.of(np.degrees(each.rotation_rad[among]))
+                cells += [number(rotation.rms, 4), number(rotation.max, 4)]
+            rows.append(cells)
+    return rows
+
+
+def notes(result: Evaluation) -> list[str]:
+    """Which robot is better, which rows no robot explains, and what residuals go with."""
+    return [
+        *_verdicts(result),
+        *_wrong(result),
+        *_rigid(result),
+        *(f"{each.robot.name}: {said}" for each in result.robots for said in left_lines(each)),
+    ]
+
+
+def _verdicts(result: Evaluation) -> list[str]:
+    found = []
+    for each in result.differences:
+        size = f"{each.mm:.3g} ± {each.sigma_mm:.2g} mm"
+        if each.real:
+            found.append(f"{each.better} is better than {each.worse}: mean error {size} less, on the same rows")
+        else:
+            found.append(f"{each.better} and {each.worse} differ by no more than chance: mean error {size}")
+    return [*found, *([f"best: {result.best}"] if result.best and len(result.robots) > 2 else [])]
+
+
+def _rigid(result: Evaluation) -> list[str]:
+    """Robots that know nothing of what loads do."""
+    rigid = (each.robot.name for each in result.robots if each.robot.elasticity is None)
+    return [note for name in rigid for note in result.seen.data.conditions.ignored(f"robot {name}")]
+
+
+def _wrong(result: Evaluation) -> list[str]:
+    at = np.flatnonzero(result.wrong)
+    if not len(at):
+        return []
+    least = np.min([each.errors_mm for each in result.robots], axis=0)
+    at = at[np.argsort(-least[at])]
+    named = ", ".join(f"line {result.line(i)} ({least[i]:.3g} mm)" for i in at[:MOST_WRONG].tolist())
+    more = f" and {len(at) - MOST_WRONG} more" if len(at) > MOST_WRONG else ""
+    fitted = "" if result.refit == "none" or result.seen.kind == "distance" else "; nothing is fitted to them"
+    return [
+        f"no robot explains, with the least error that one leaves: {named}{more}{fitted}; wrong, or all models lack it"
+    ]
+
+
+def left_lines(each: Evaluated) -> list[str]:
+    """What the residuals of a robot go with."""
+    if each.left is None:
+        return ["too few rows to tell what the residuals go with"]
+    if not each.left:
+        return ["nothing is seen that the residuals go with (joints, gravity, place)"]
+    lines = [finding.sentence() for finding in each.left]
+    if each.beyond is not None and not each.beyond:
+        lines.append("parameters identified from these rows would leave nothing of that to be seen")
+    elif each.beyond:
+        beyond = "; ".join(finding.what for finding in each.beyond)
+        lines.append(f"no parameters of the kinematics take up all of it; left is what goes with {beyond}")
+    return lines
+
+
+def evaluated_csv(result: Evaluation) -> str:
+    """The table of ``--out`` (form: ``data_layout.md``)."""
+    data, robots = result.seen.data, result.robots
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    turned, points = len(robots[0].rotation_rad) > 0, data.positions is not None
+    head = ["line", "target", *joint_columns(robots[0].robot)]
+    head += ["x_mm", "y_mm", "z_mm"] if points else ["distance_mm", "from_row"]
+    head += [*(COLUMNS if turned else ()), "wrong"]
+    modelled = []
+    for each in robots:
+        name = re.sub(r"\W+", "_", each.robot.name)
+        place = "commanded" if len(robots) == 1 else name
+        if points:
+            head += [*(f"{place}_{c}_mm" for c in "xyz"), *(f"{name}_residual_{c}_mm" for c in "xyz")]
+        else:
+            head.append(f"{name}_residual_mm")
+        head += [f"{name}_error_mm", *([f"{name}_error_deg"] if turned else [])]
+        modelled.append(tips_of(each.state, data).translation)
+    writer.writerow(head)
+    turns = Poses(data.rotations, data.points()).quaternions() if data.rotations is not None else None
+    place_of = {int(row): i for i, row in enumerate(result.seen.first)}
+    for row in range(len(data)):
+        at = place_of.get(row)  # none where a distance starts from itself
+        cells: list = [data.lines[row], data.targets[row], *joint_cells(robots[0].robot, data.q[row])]
+        if data.positions is not None:
+            cells += _cells(data.positions[row])
+        else:
+            distances, from_row = data.lengths()
+            cells += [*_cells(distances[[row]]), from_row[row] + 1]
+        cells += [f"{v:.12f}" for v in turns[row]] if turns is not None else []
+        cells.append("" if at is None else int(result.wrong[at]))
+        for each, there in zip(robots, modelled, strict=True):
+            left = each.residuals[at] if at is not None else np.zeros(each.residuals.shape[1])
+            cells += [*(_cells(there[row]) if points else ()), *_cells(left), *_cells([np.linalg.norm(left)])]
+            cells += _cells(np.degrees(each.rotation_rad[[row]])) if turned else []
+        writer.writerow(cells)
+    return stream.getvalue()
+
+
+def _cells(values) -> list[str]:
+    return [f"{v:.6f}" for v in values]
+
+
+def evaluation_file(result: Evaluation) -> EvaluationFile:
+    """Returns the complete result in machine-readable form (keys: ``data_layout.md``)."""
+    robots = []
+    for each in result.robots:
+        robots.append(
+            {
+                "name": each.robot.name,
+                "position_mm": Figures.of(each.errors_mm),
+                "good_mm": Figures.of(each.errors_mm[~result.wrong]),
+                "orientation_rad": Figures.of(each.rotation_rad) if len(each.rotation_rad) else None,
+                "placed": placed_parts(each.placed),
+                "left": each.left,
+                "beyond": each.beyond,
+                "residuals": list(each.residuals),
+            }
+        )
+    content = {
+        "format": "stcal evaluation 1",
+        "refit": result.refit,
+        "observed": f"{result.seen.kind}s",
+        "lines": [result.line(i) for i in range(len(result.wrong))],
+        "wrong": [result.line(i) for i in np.flatnonzero(result.wrong).tolist()],
+        "best": result.best or None,
+        "robots": robots,
+        "differences": result.differences,
+    }
+    return EvaluationFile.model_validate(content)
+
+
+def evaluation_page(result: Evaluation) -> str:
+    """The report page."""
+    points = result.seen.kind != "distance"
+    heads, *rows = _table(result)
+    return render(
+        "robot/use/evaluation.html.jinja",
+        observations=observations(result),
+        fitted=FITTED[result.refit],
+        heads=heads,
+        rows=rows,
+        notes=[*_verdicts(result), *_wrong(result), *_rigid(result)],
+        drawn_by_row=uri(_row_figure(result)),
+        by_place=uri(_place_figure(result)) if points else "",
+        robots=[
+            {
+                "name": each.robot.name,
+                "left": left_lines(each),
+                "joints": uri(joints_figure(drawn, each.left or ())),
+                "space": space_picture(drawn) if points else None,
+                "directions": _directions(result, each) if points else [],
+                "placed": [placed_cells(p) for p in each.placed],
+            }
+            for each, drawn in ((each, _drawn(result, each)) for each in result.robots)
+        ],
+    )
+
+
+def _drawn(result: Evaluation, each: Evaluated) -> Drawn:
+    """What pictures are of."""
+    base = each.robot.world_from_base
+    found = each.residuals @ base.rotation.T if each.residuals.shape[1] == 3 else each.residuals
+    return Drawn(each.state, base, result.seen, found, ~result.wrong, _colour(result, each))
+
+
+def _directions(result: Evaluation, each: Evaluated) -> list[list[str]]:
+    """Mean with its standard error, RMS and largest residual along directions of the base."""
+    good, place = ~result.wrong, _place(result, each)
+    out = place[:, :2] / np.maximum(np.linalg.norm(place[:, :2], axis=1), 1e-9)[:, None]
+    x, y, z = each.residuals.T
+    found = {"x of the base": x, "y of the base": y, "z of the base, up": z}
+    found["outwards from the base's axis"] = out[:, 0] * x + out[:, 1] * y
+    found["around the base's axis"] = out[:, 0] * y - out[:, 1] * x
+    rows = []
+    for name, values in found.items():
+        own = values[good]
+        error = own.std(ddof=1) / np.sqrt(len(own)) if len(own) > 1 else np.nan
+        sizes = (own.mean(), error, np.sqrt((own**2).mean()), np.abs(own).max())
+        rows.append([name, *(number(v, 4) for v in sizes)])
+    return rows
+
+
+def _place(result: Evaluation, each: Evaluated) -> np.ndarray:
+    """(r, 3) of the tool in the robot's base, mm."""
+    data = result.seen.data
+    return each.robot.world_from_base.inverse() @ tips_of(each.state, data).translation
+
+
+def _colour(result: Evaluation, each: Evaluated) -> str:
+    return COLOURS[list(result.robots).index(each) % len(COLOURS)]
+
+
+def _errors(axes, result: Evaluation, at: dict[int, np.ndarray], label: str) -> None:
+    """Errors of all robots over ``at`` (by the robot's place), unexplained rows ringed; logarithmic where needed."""
+    every = np.concatenate([each.errors_mm for each in result.robots])
+    few = len(result.wrong) <= 200
+    for k, each in enumerate(result.robots):
+        axes.plot(at[k], each.errors_mm, "o", color=_colour(result, each), ms=3.6 if few else 1.6, mew=0, alpha=0.85)
+        axes.plot(at[k][result.wrong], each.errors_mm[result.wrong], "o", mfc="none", mec=INK, ms=7, mew=0.8)
+    calm(axes)
+    middle = [float(np.median(each.errors_mm)) for each in result.robots]
+    if min(middle) > 0 and (max(middle) > FAR_APART * min(middle) or every.max() > 4 * FAR_APART * max(middle)):
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+    else:
+        axes.set_ylim(bottom=0)
+    axes.grid(axis="y", color=FAINT, lw=0.6)
+    axes.set_axisbelow(True)
+    axes.set_xlabel(label, fontsize=SMALL + 1, color=INK)
+
+
+def _row_figure(result: Evaluation):
+    figure = new_figure(9, 2.8)
+    axes = figure.add_axes((0.07, 0.18, 0.92, 0.68))
+    at = result.seen.first + 1
+    _errors(axes, result, dict.fromkeys(range(len(result.robots)), at), "row, in order of the file")
+    axes.set_ylabel("error, mm", fontsize=SMALL + 1, color=INK)
+    _legend(figure, result)
+    return figure
+
+
+def _legend(figure, result: Evaluation) -> None:
+    from matplotlib.lines import Line2D
+
+    marks = [
+        Line2D([], [], marker="o", ls="", ms=4, color=_colour(result, e), label=e.robot.name) for e in result.robots
+    ]
+    if result.wrong.any():
+        marks.append(Line2D([], [], marker="o", ls="", ms=7, mfc="none", mec=INK, label="no robot explains"))
+    place = {"loc": "upper left", "bbox_to_anchor": (0.06, 1), "ncols": 6}
+    figure.legend(handles=marks, fontsize=SMALL + 0.5, frameon=False, **place)
+
+
+def _place_figure(result: Evaluation):
+    figure = new_figure(9, 2.8)
+    places = [_place(result, each) for each in result.robots]
+    for k, (label, of) in enumerate(
+        (
+            ("distance from the base's axis, mm", lambda p: np.linalg.norm(p[:, :2], axis=1)),
+            ("height above the base, mm", lambda p: p[:, 2]),
+        )
+    ):
+        axes = figure.add_axes((0.07 + 0.49 * k, 0.18, 0.43, 0.68))
+        _errors(axes, result, {i: of(place) for i, place in enumerate(places)}, label)
+        if k == 0:
+            axes.set_ylabel("error, mm", fontsize=SMALL + 1, color=INK)
+    _legend(figure, result)
+    return figure

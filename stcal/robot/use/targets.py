@@ -11,8 +11,7 @@ from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
 from stcal.io.quaternions import Order
 from stcal.io.table import LENGTHS, Table, read_table
-from stcal.robot.kinematics.columns import oriented, unread
-from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, read_conditions
+from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, oriented, read_conditions, unread
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.inverse import Inverse, inverse
 from stcal.robot.kinematics.measurements import ORIENTATION, joint_values, targets_of, within

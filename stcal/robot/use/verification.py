@@ -14,7 +14,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.io.table import Table, read_table
 from stcal.report.text import number, text_table
-from stcal.robot.kinematics.columns import unread
+from stcal.robot.kinematics.conditions import unread
 from stcal.robot.kinematics.measurements import within
 from stcal.robot.use.files import VerificationFile
 

@@ -14,7 +14,7 @@ from stcal.geometry.least_squares import perturbed
 from stcal.geometry.normal_equations import Reduction, blocks_of, reduce
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights
-from stcal.sfm.adjust.group import moved_poses, projection_jacobians
+from stcal.sfm.adjust.refine import moved_poses, projection_jacobians
 from stcal.sfm.data.model import GroupModel, MetricModel
 
 

@@ -13,10 +13,9 @@ from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
 from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group, missing_frame_circles
-from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
 from stcal.sfm.adjust.options import AdjustOptions
-from stcal.sfm.adjust.refine import eccentricity_px
+from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import Scale, find_scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.model import GroupModel, M, MetricModel, WorldModel

@@ -1,4 +1,4 @@
-"""Equations of the joint adjustment over the shared unknowns, with each group's own unknowns eliminated."""
+"""Normal equations of the joint adjustment, reduced by cameras or by dots first."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,10 +7,12 @@ import numpy as np
 
 from stcal.design import BoardDesign
 from stcal.geometry.camera import Camera
-from stcal.geometry.normal_equations import free_motions
+from stcal.geometry.normal_equations import blocks_of, free_motions
 from stcal.geometry.plane import fit_plane
+from stcal.geometry.rigid import skew
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.blocks import Block, Reduced, Shared, moved, reduced, step_of
+from stcal.sfm.adjust.refine import projection_jacobians
 
 FREE_DIRECTIONS = 6
 """Number of free directions: a rigid motion of the world changes nothing."""
@@ -199,3 +201,85 @@ def free_directions(count: int, shared: Shared) -> np.ndarray:
     free = np.zeros((count, FREE_DIRECTIONS))
     free[: shared.xyz_model.size] = free_motions(shared.xyz_model, scale=False)
     return free
+
+
+def is_dots_first_cheaper(blocks: Sequence[Block]) -> bool:
+    """True if the cameras of all groups are fewer unknowns than the dots of the group that has most of them."""
+    return 6 * sum(len(b.model.images) for b in blocks) < 3 * max(len(b.dots) for b in blocks)
+
+
+def circle_equations(blocks: Sequence[Block], shared: Shared, setting: Setting) -> np.ndarray:
+    """Returns the normal matrix (3c + q, 3c + q) over circles and intrinsics, with all other unknowns eliminated.
+
+    No residual is down-weighted.
+    """
+    size = 3 * len(setting.labels) + shared.basis.shape[1]
+    ends = size + np.cumsum([0, *(6 * len(b.model.images) + 6 for b in blocks)])
+    normal = np.zeros((ends[-1], ends[-1]))
+    dots = len(shared.shape_mm) if setting.common else 0
+    shape = np.zeros((dots, 3, 3)) + (np.eye(3) / setting.shape_sigma_mm() ** 2 if dots else 0.0)
+    by_shape = np.zeros((dots, 3, ends[-1]))
+    for block, start in zip(blocks, ends[:-1].tolist(), strict=True):
+        _add_group(block, shared, setting, start, normal, shape, by_shape)
+    if dots:
+        root = np.linalg.solve(np.linalg.cholesky(shape), by_shape).reshape(3 * dots, -1)
+        normal -= root.T @ root
+    add_knowledge(normal, None, shared, setting, slice(size - shared.basis.shape[1], size))
+    inner, cross = normal[size:, size:], normal[size:, :size]
+    return normal[:size, :size] - cross.T @ np.linalg.solve(inner, cross)
+
+
+def _add_group(block: Block, shared: Shared, setting: Setting, start: int, normal, shape, by_shape) -> None:
+    """Adds the equations of one group: cameras and board pose from ``start`` on, with the dots eliminated."""
+    model, q, d = block.model, shared.basis.shape[1], len(block.dots)
+    m, first = len(model.images), 3 * len(setting.labels)
+    width = 6 * m + 6 + q  # cameras, pose, intrinsics
+    place = np.concatenate([np.arange(start, start + 6 * m + 6), np.arange(first, first + q)])
+    local = np.zeros((width, width))
+    cross = np.zeros((len(model.labels), 3, width))
+    by_pose, by_point = (model.whiten(derivative) for derivative in projection_jacobians(model, shared.camera))
+    zeros = np.zeros(by_point.shape[:2])
+    points, _ = blocks_of(by_point, zeros, model.point_index, len(model.labels))
+    cameras, _ = blocks_of(by_pose, zeros, model.image_index, m)
+    columns = 6 * model.image_index[:, None] + np.arange(6)
+    cross[model.point_index[:, None, None], np.arange(3)[:, None], columns[:, None]] = (
+        np.swapaxes(by_point, 1, 2) @ by_pose
+    )
+    index = 6 * np.arange(m)[:, None] + np.arange(6)
+    local[index[:, :, None], index[:, None]] = cameras
+    if q:
+        xyz, last = model.xyz_camera(), slice(6 * m + 6, width)
+        by_intrinsics = model.whiten(shared.camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ shared.basis)
+        np.add.at(cross[:, :, last], model.point_index, np.swapaxes(by_point, 1, 2) @ by_intrinsics)
+        coupled = np.zeros((m, 6, q))
+        np.add.at(coupled, model.image_index, np.swapaxes(by_pose, 1, 2) @ by_intrinsics)
+        local[: 6 * m, last] = coupled.reshape(6 * m, q)
+        local[last, : 6 * m] = local[: 6 * m, last].T
+        flat = by_intrinsics.reshape(-1, q)
+        local[last, last] = flat.T @ flat
+
+    circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
+    index = 3 * block.circle_place[:, None] + np.arange(3)
+    normal[index[:, :, None], index[:, None]] += points[block.circles]
+    coupled = cross[block.circles].reshape(-1, width)
+    normal[np.ix_(circles, place)] += coupled
+    normal[np.ix_(place, circles)] += coupled.T
+
+    rotation, weight = block.model_from_board.rotation, 1 / block.sigma_mm**2
+    turned = block.expected_dots(shared) @ rotation.T
+    by_board = np.concatenate([skew(turned), -np.broadcast_to(np.eye(3), (d, 3, 3))], axis=2)
+    pose = slice(6 * m, 6 * m + 6)
+    local[pose, pose] += weight * by_board.reshape(3 * d, 6).T @ by_board.reshape(3 * d, 6)
+    inner, outer = points[block.dots] + weight * np.eye(3), cross[block.dots]
+    outer[:, :, pose] += weight * by_board
+    from_outer = np.linalg.solve(inner, outer)
+    local -= outer.reshape(3 * d, width).T @ from_outer.reshape(3 * d, width)
+    normal[np.ix_(place, place)] += local
+    if len(block.dot_place):
+        to_shape = -weight * rotation
+        shape[block.dot_place] += weight * np.eye(3) - to_shape.T @ np.linalg.solve(
+            inner, np.broadcast_to(to_shape, (d, 3, 3))
+        )
+        by_shape_reduced = -to_shape.T @ from_outer
+        by_shape_reduced[:, :, pose] -= weight * rotation.T @ by_board
+        by_shape[block.dot_place[:, None, None], np.arange(3)[:, None], place] += by_shape_reduced

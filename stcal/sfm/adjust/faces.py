@@ -14,7 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_planes
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.labels import CircleLabel
-from stcal.sfm.adjust.group import projection_jacobians
+from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.data.model import MetricModel
 
 FrameKind = Literal["plane", "three-point"]

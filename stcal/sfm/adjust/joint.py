@@ -21,7 +21,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.cameras.model import PARAMETER_NAMES, CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, DotLabel, dot_cells
-from stcal.sfm.adjust import dots_first
+from stcal.sfm.adjust import equations
 from stcal.sfm.adjust.blocks import Block, Shared, normalised, robust_weights, rows_of_view, without_cameras
 from stcal.sfm.adjust.equations import (
     FREE_DIRECTIONS,
@@ -173,9 +173,9 @@ def covariance_of(
     common; ``photographs`` : results of :func:`photographs_of`, by group.
     """
     blocks, shared, setting = _start(models, board, camera, flatness_mm, prior, common, photographs)
-    if photographs or not dots_first.is_cheaper(blocks):
+    if photographs or not equations.is_dots_first_cheaper(blocks):
         return _result(blocks, shared, setting, 0.0, 1.0)
-    normal = dots_first.circle_equations(blocks, shared, setting)
+    normal = equations.circle_equations(blocks, shared, setting)
     c = 3 * len(setting.labels)
     return _result(blocks, shared, setting, 0.0, 1.0, (normal, slice(0, c), slice(c, len(normal))))
 

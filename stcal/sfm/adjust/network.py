@@ -12,7 +12,7 @@ import numpy as np
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import blocks_of, constrained_inverse, free_motions, reduce
-from stcal.sfm.adjust.group import projection_jacobians
+from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.data.model import GroupModel, MetricModel
 
 MIN_SHARE = 1e-6

@@ -11,11 +11,9 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.io.cameras.model import CalibratedCamera
 from stcal.labels import CircleLabel
-from stcal.sfm.adjust.contributions import Contributions, contributions_of
 from stcal.sfm.adjust.joint import JointResult
-from stcal.sfm.adjust.uncertainty import Derivatives, derivatives
-from stcal.sfm.budget.sources import Source, correction, sources_of
-from stcal.sfm.budget.statement import Statement, statement_of
+from stcal.sfm.adjust.uncertainty import Contributions, Derivatives, contributions_of, derivatives
+from stcal.sfm.budget.sources import Source, Statement, correction, sources_of, statement_of
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.runs.adjusted import adjusted_run
 from stcal.sfm.runs.saved import SavedRun

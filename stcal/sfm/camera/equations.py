@@ -15,7 +15,7 @@ from stcal.geometry.least_squares import minimise
 from stcal.geometry.normal_equations import Reduction, reduce
 from stcal.geometry.rigid import Rigid, skew
 from stcal.sfm.adjust.blocks import equations_of_poses, image_cost, normalised, robust_weights
-from stcal.sfm.adjust.group import moved_poses, projection_jacobians
+from stcal.sfm.adjust.refine import moved_poses, projection_jacobians
 from stcal.sfm.camera.shape import BoardShape
 from stcal.sfm.data.model import MetricModel
 

@@ -14,8 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import FISHEYE, intrinsic_basis, parameter_names
 from stcal.labels import Label
 from stcal.parallel import run_parallel
-from stcal.sfm.adjust.group import moved_poses
-from stcal.sfm.adjust.refine import eccentricity_px
+from stcal.sfm.adjust.refine import eccentricity_px, moved_poses
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_of_views, model_parameters
 from stcal.sfm.camera.views import closed_form, start_camera
 from stcal.sfm.data.observations import ImageObservations, by_group

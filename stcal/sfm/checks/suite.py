@@ -11,9 +11,9 @@ from stcal.errors import StcalError
 from stcal.io.cameras.model import CalibratedCamera, CameraPrior
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factor
-from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.network import Network, free_network, solve_score
 from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.checks.board import board_checks, pitch_check
 from stcal.sfm.checks.faces import (
     Again,

@@ -1,4 +1,4 @@
-"""Circles of the faces and the board by plane, and their visibility in an image for a given pose of the plane."""
+"""Patterns of the faces and the board, their projection into an image, and the pitch of a board's dots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,11 +8,14 @@ from typing import Literal
 import numpy as np
 
 from stcal.design import BoardDesign, Polarity, TargetDesign
+from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_images, shape_of_square
-from stcal.geometry.rigid import Rigid
-from stcal.labels import BOARD, Label
+from stcal.geometry.conic import circle_image_offset, circle_images, shape_of_square
+from stcal.geometry.plane import fit_homography, homography_jacobian
+from stcal.geometry.rigid import Rigid, skew
+from stcal.labels import BOARD, DotLabel, Label, dot_cells
+from stcal.sfm.data.observations import ImageObservations
 
 MAX_TILT_RAD = np.radians(70.0)
 """Largest angle between a circle's normal and the line of sight. Circles seen more obliquely need not be found."""
@@ -95,3 +98,99 @@ def ideal_border(camera: Camera) -> np.ndarray:
     sides = [(x, zero), (x, zero + camera.height - 1), (zero, y), (zero + camera.width - 1, y)]
     ideal = camera.normalised_from_pixel(np.concatenate([np.column_stack(side) for side in sides]))
     return frozen(np.stack([ideal.min(0), ideal.max(0)]))
+
+
+NEAREST_MM = 1e-6
+"""Lower bound of the depth. Behind the camera the numbers only have to be finite."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CircleImages:
+    """n circles in h poses, seen by an ideal camera of focal length 1.
+
+    ``centre`` : (h, n, 2) centres of the ellipses, normalised coordinates; ``depth`` : (h, n) depth of the circles'
+    centres, mm, zero or negative behind the camera, where all other values are meaningless; ``by_pose`` : (h, n, 2, 6)
+    derivative of ``centre`` by the left perturbation of camera_from_target (rad, mm); ``by_circle`` : (h, n, 2, 3)
+    derivative by the circles' centres in the target frame, per mm, normals fixed.
+    """
+
+    centre: np.ndarray
+    depth: np.ndarray
+    by_pose: np.ndarray
+    by_circle: np.ndarray
+
+    def of(self, rows) -> "CircleImages":
+        """Returns the images in the poses of the indices or mask ``rows``."""
+        return CircleImages(*(getattr(self, name)[rows] for name in self.__slots__))
+
+
+def project_circles(
+    xyz: np.ndarray, normal: np.ndarray, radius_mm: np.ndarray, rotation: np.ndarray, translation: np.ndarray
+) -> CircleImages:
+    """Project circles, centres (n, 3), normals (n, 3), radii (n,), target frame, mm, by h poses camera_from_target.
+
+    ``rotation`` : (h, 3, 3); ``translation`` : (h, 3). The derivatives include the eccentricity of
+    :func:`stcal.geometry.conic.circle_image_offset`.
+    """
+    back = np.swapaxes(rotation, 1, 2)
+    rotated, axis = xyz @ back, normal @ back
+    centre = rotated + translation[:, None]
+    depth = centre[..., 2].copy()
+    np.maximum(centre[..., 2], NEAREST_MM, out=centre[..., 2])
+    point = circle_image_offset(centre, axis, radius_mm)
+    per_depth = 1 / np.maximum(point[..., 2], NEAREST_MM)
+    image = point[..., :2] * per_depth[..., None]
+    by_point = np.zeros((*depth.shape, 2, 3))
+    by_point[..., 0, 0] = by_point[..., 1, 1] = per_depth
+    by_point[..., 2] = -image * per_depth[..., None]
+
+    # point = C + q (n_z n − e_z) with q = r² / C_z
+    per_z = 1 / centre[..., 2:]
+    q = radius_mm[:, None] ** 2 * per_z
+    by_centre = by_point.copy()
+    by_centre[..., 2] -= (by_point @ ((point - centre) * per_z)[..., None])[..., 0]
+    by_axis = (q * axis[..., 2:])[..., None] * by_point
+    by_axis[..., 2] += q * (by_point @ axis[..., None])[..., 0]
+    by_pose = np.empty((*depth.shape, 2, 6))
+    by_pose[..., :3] = -(by_centre @ skew(rotated) + by_axis @ skew(axis))
+    by_pose[..., 3:] = by_centre
+    return CircleImages(image, depth, by_pose, by_centre @ rotation[:, None])
+
+
+MIN_DOTS = 9
+"""Smallest number of dots in an image that is used."""
+MOST_OFF = 0.05
+"""Largest relative deviation of the pitch that is tolerated. Blur enlarges dots by less than this."""
+
+
+def measured_pitch_mm(images: Sequence[ImageObservations], board: BoardDesign) -> float | None:
+    """Returns the distance of neighbouring dots, mm, if their radius in the board file is right.
+
+    The homography of each image's grid gives the step between neighbours in units of the dot's ellipse radius; the
+    result is the median over all dots. None if no image shows enough dots.
+    """
+    radius, pitches = board.radius_of(), []
+    for image in images:
+        dots = [i for i, label in enumerate(image.labels) if isinstance(label, DotLabel)]
+        if len(dots) < MIN_DOTS:
+            continue
+        labels = [label for label in image.labels if isinstance(label, DotLabel)]
+        cells = dot_cells(labels)[:, ::-1].astype(float)
+        try:
+            local = homography_jacobian(fit_homography(cells, image.centre[dots]), cells)
+        except DegenerateError:
+            continue
+        steps = np.sqrt(np.abs(np.linalg.det(local) / np.linalg.det(image.shape[dots])))
+        pitches.append(steps * [radius[label] for label in labels])
+    return float(np.median(np.concatenate(pitches))) if pitches else None
+
+
+def pitch_hint(images: Sequence[ImageObservations], board: BoardDesign) -> str:
+    """Returns a hint on what to correct in the board file, empty if its pitch agrees with the images."""
+    pitch = measured_pitch_mm(images, board)
+    if pitch is None or abs(pitch / board.pitch_mm - 1) < MOST_OFF:
+        return ""
+    return (
+        f"; dots of radius_mm {board.radius_mm:g} are {pitch:.3g} mm apart in the images, the board file says pitch_mm "
+        f"{board.pitch_mm:g}: correct pitch_mm, or radius_mm"
+    )

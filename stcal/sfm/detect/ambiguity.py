@@ -5,7 +5,7 @@ from functools import lru_cache
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
-from stcal.likeness import common_circles, whole_likeness
+from stcal.lookalikes import common_circles, whole_likeness
 
 
 def confusable(target: TargetDesign) -> dict[str, tuple[frozenset[int], ...]]:

@@ -10,7 +10,7 @@ from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_8bit, grey_fine
 from stcal.labels import Label
-from stcal.sfm.data.centres import Centres
+from stcal.sfm.data.observations import Centres
 from stcal.sfm.detect.board import BoardReading, find_boards
 from stcal.sfm.detect.circles.candidates import Candidates
 from stcal.sfm.detect.circles.centres import measure_centres

@@ -10,19 +10,18 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.centres import Centres
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.observations import Centres, ImageObservations
 from stcal.sfm.data.patterns import Pattern, patterns_of
-from stcal.sfm.detect.arrangement import (
+from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
+from stcal.sfm.detect.group_geometry import (
     MAX_SHIFT_PITCHES,
     Arrangement,
     across_groups,
     arrange,
     mirrored_images,
 )
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
-from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
-from stcal.sfm.detect.outlying import outlying_circles
+from stcal.sfm.detect.outliers import outlying_circles
 from stcal.sfm.detect.predict import (
     PredictedCircles,
     SecondLook,

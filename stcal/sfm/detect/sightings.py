@@ -12,7 +12,7 @@ from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label
-from stcal.sfm.data.centres import Centres
+from stcal.sfm.data.observations import Centres
 
 SECOND_BOARD_SHARE = 0.8
 """Smallest number of dots of a second board, as a share of the dots of the first."""

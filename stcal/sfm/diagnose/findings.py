@@ -1,11 +1,15 @@
-"""The findings of the doctor in words: advice for every gate, order of findings, and the table."""
+"""Findings of the doctor: causes, texts and result file."""
 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import groupby
 from numbers import Real
+from typing import Annotated, Literal
 
+from pydantic import Field
+
+from stcal.io.json import Part, ResultFile
 from stcal.labels import BOARD, DotLabel, parse_label, parse_labels
 
 AT_MOST = ("max_diameter", "outline_area", "outline_deviation", "position", "shape", "face_readings", "residual")
@@ -246,3 +250,42 @@ def _listed(labels: list[str]) -> str:
             parts.append(f"{row}:{first}" if first == last else f"{row}:{first}–{last}")
     shown = ", ".join(parts[:MAX_LABELS])
     return shown if len(parts) <= MAX_LABELS else f"{shown} … ({len(labels)} circles)"
+
+
+ByGate = Annotated[str, "gate"]
+
+
+class Counts(Part):
+    files: int
+    images: int
+    mapped: int
+    circles: int
+
+
+class DoctorFile(ResultFile):
+    """The JSON file of ``doctor``."""
+
+    format: Literal["stcal doctor 1"] = Field(description="the file's form and its version")
+    summary: Counts = Field(
+        description="`files` given, `images` of them that could be used, `mapped` images, `circles` observed in the "
+        "model"
+    )
+    gates: dict[ByGate, GateCount] = Field(
+        description="`circles` and `images` that it stopped, `by_option` circles that an option lets in"
+    )
+    findings: tuple[Finding, ...] = Field(
+        description="in the order of the table: `image`, empty for the whole run; `labels`, none for a whole file or "
+        "image; `gate`, `value`, `limit`, `unit`, null without a number; `remedy`, what to do with the scene; "
+        "`options`, each of which lets it in: detection was run with it on this image, for `views` on those of the "
+        "group that lack circles. `EllipseOptions(…)` is an option of Python, `RunOptions(ellipses=…)`"
+    )
+
+    @classmethod
+    def of(cls, diagnosis: Diagnosis) -> "DoctorFile":
+        """Returns the file of a diagnosis."""
+        return cls(
+            format="stcal doctor 1",
+            summary=Counts.model_validate(diagnosis),
+            gates=by_gate(diagnosis.findings),
+            findings=diagnosis.findings,
+        )

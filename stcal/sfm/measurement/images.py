@@ -13,15 +13,14 @@ from stcal.errors import ConvergenceError, DetectionError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, CameraPrior
+from stcal.io.image_jobs import run_on_images
 from stcal.io.images import ImageFile, Skipped, find_images
-from stcal.io.spread import run_on_images
 from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.data.observations import ImageObservations, by_group
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.labels import label_single
-from stcal.sfm.measurement.common_errors import common_errors
-from stcal.sfm.measurement.pose import PoseOptions, TargetPose, measured_pose, resolved
+from stcal.sfm.measurement.pose import PoseOptions, TargetPose, common_errors, measured_pose, resolved
 from stcal.sfm.measurement.target import TargetCircles
 from stcal.sfm.measurement.tracker import Tracker
 
@@ -67,7 +66,7 @@ class MeasureResult:
     """``images`` that have a pose, in order of name; ``left_out`` : the others, with reasons; ``notes`` : what the
     covariances lack; ``sigma_factor`` : on the centres' own σ; ``intrinsics_held`` : whether they were taken as exact;
     ``common`` : (m, 6, r) what the poses' errors have in common, see
-    :func:`stcal.sfm.measurement.common_errors.common_errors`; ``searched`` : images of a sequence that were searched as
+    :func:`stcal.sfm.measurement.pose.common_errors`; ``searched`` : images of a sequence that were searched as
     a whole, None where each stands for itself.
     """
 

@@ -1,9 +1,4 @@
-"""camera_from_target of one image of a calibrated target, with both poses where a plane leaves two.
-
-A face seen alone is a plane, and a plane seen from afar looks the same tilted to either side of the line of sight
-(Oberkampf et al. 1996; Schweighofer & Pinz 2006): the reprojection error has two minima. Both are found, and one is
-certain only where the circles speak clearly for it.
-"""
+"""Pose of the target in one image, its covariance, and the errors that all poses have in common."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +9,16 @@ import numpy as np
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane_poses import MAX_SIGMA_RAD, OUTLIER, deciding_delta, distinct, weigh, weights_of
+from stcal.geometry.plane_poses import (
+    MAX_SIGMA_RAD,
+    OUTLIER,
+    deciding_delta,
+    distinct,
+    mirrored,
+    step_between,
+    weigh,
+    weights_of,
+)
 from stcal.geometry.pose_descent import Minima, PoseStack, block_diagonal
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import ImageFit
@@ -23,11 +27,112 @@ from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.data.model import Outlier
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.data.projection import CircleImages
-from stcal.sfm.measurement.likelihood import covariance_of_likelihood
-from stcal.sfm.measurement.minima import MIN_CIRCLES, minima_without_outliers, start_pose
-from stcal.sfm.measurement.problem import HOPELESS, PoseProblem, covariance_of_centres
+from stcal.sfm.data.patterns import CircleImages
+from stcal.sfm.measurement.minima import (
+    HOPELESS,
+    MIN_CIRCLES,
+    PoseProblem,
+    covariance_of_centres,
+    minima_without_outliers,
+    start_pose,
+)
 from stcal.sfm.measurement.target import TargetCircles
+
+CURVED = 0.2
+"""χ² two σ away that differs from its parabola by more than this share: the covariance is then taken from samples."""
+SAMPLES = 1000
+SAMPLED_WIDER = 1.5
+"""Samples are drawn with σ so much larger, or their tails would rest on a few of them."""
+SAMPLE_ROUNDS = 2
+MIN_EFFECTIVE = 20
+"""Effective number of samples (Kong 1992) below which they say less than what they were drawn from."""
+OTHER_SIDE = 3.0
+"""A pose mirrored at the line of sight is another one from this distance on, in σ; nearer, the covariance covers it."""
+
+
+def covariance_of_likelihood(
+    problem: PoseProblem,
+    pose: PoseStack,
+    full: np.ndarray,
+    least: float,
+    covariance: np.ndarray,
+    second: PoseStack | None,
+    plane: Rigid | None,
+    plausible: float,
+) -> tuple[np.ndarray, float]:
+    """Covariance of a pose (6, 6), and by how much χ² its mirror image is worse, infinite where that is no matter.
+
+    The covariance is the given one where the likelihood is Gaussian. Else it is the second moment about the pose of all
+    poses by their likelihood: importance sampling with fixed numbers (Bishop 2006, Pattern Recognition and Machine
+    Learning, sec. 11.1.4); poses nearer to the ``second`` solution are that one's.
+
+    Parameters
+    ----------
+    full : (2n, 2n) covariance of the centres
+    least : χ² of the pose
+    covariance : (6, 6) of the linearised problem
+    second : the second solution, or None
+    plane : target_from_plane of a face seen alone and without a second minimum, else None. The two may have grown
+        together: a valley of which the linearised problem sees one side. The mirror image matters where it is
+        ``plausible``, some σ off, and far more probable than these say.
+    plausible : what χ² of the mirror image may be worse by
+    """
+    whiten = np.linalg.inv(np.linalg.cholesky(full))
+
+    def excess(step: np.ndarray) -> np.ndarray:
+        near = PoseStack(np.repeat(pose.rotation, len(step), 0), np.repeat(pose.translation, len(step), 0)).moved(step)
+        residual, image = problem.seen(near)
+        square = ((residual.reshape(len(step), -1) @ whiten.T) ** 2).sum(1)
+        return np.where((image.depth > 0).all(1), square, np.inf)
+
+    axes = _principal(covariance)
+    curved = np.abs((excess(2 * np.vstack([axes, -axes])) - least) / 4 - 1).max() >= CURVED
+    other_side, first = np.inf, covariance
+    if plane is not None:
+        image_pose = mirrored(pose, plane)
+        away = step_between(pose, image_pose)
+        square = float(away @ np.linalg.solve(covariance, away))
+        worse = _best_of_tilt(problem, image_pose, plane, whiten) - least
+        if worse < min(plausible, square / 2) and square > OTHER_SIDE**2:
+            other_side, first, curved = float(worse), covariance + np.outer(away, away) / 4, True
+    return (_sampled(excess, least, pose, first, second) if curved else covariance), other_side
+
+
+def _best_of_tilt(problem: PoseProblem, pose: PoseStack, plane: Rigid, whiten: np.ndarray) -> float:
+    """χ² of a pose when everything but the tilt of the plane may follow, to first order."""
+    residual, image = problem.seen(pose)
+    free = np.zeros((6, 4))
+    free[:3, 0] = pose.rotation[0] @ plane.rotation[:, 2]
+    free[3:, 1:] = np.eye(3)
+    a, r = whiten @ image.by_pose.reshape(-1, 6) @ free, whiten @ residual.ravel()
+    rest = r - a @ np.linalg.lstsq(a, r)[0]
+    return float(rest @ rest)
+
+
+def _sampled(excess, least: float, pose: PoseStack, covariance: np.ndarray, second: PoseStack | None) -> np.ndarray:
+    """Second moment (6, 6) of exp(−(excess − least)/2) about the pose; ``covariance`` : about what it will be."""
+    normal = np.random.default_rng(0).standard_normal((SAMPLES, 6))
+    precision = np.linalg.inv(covariance)
+    for _ in range(SAMPLE_ROUNDS):
+        step = SAMPLED_WIDER * normal @ _principal(covariance)
+        log = (normal**2).sum(1) / 2 - (excess(step) - least) / 2
+        if second is not None:
+            away = step_between(pose, second)
+            log[(step - away / 2) @ precision @ away > 0] = -np.inf
+        weight = np.exp(log - log.max())
+        weight /= weight.sum()
+        if 1 / (weight**2).sum() < MIN_EFFECTIVE:
+            break
+        covariance = np.einsum("k,ki,kj->ij", weight, step, step)
+    return covariance
+
+
+def _principal(covariance: np.ndarray) -> np.ndarray:
+    """Rows whose summed outer products are the covariance: principal axes in units of σ."""
+    sigma = np.sqrt(np.diag(covariance))
+    value, vector = np.linalg.eigh(covariance / sigma / sigma[:, None])
+    return (vector * np.sqrt(np.maximum(value, 0))).T * sigma
+
 
 NEAR_PREVIOUS = 1 / 3
 """The pose nearer to the previous image's is taken where its turn from there is at most this share of the other's."""
@@ -286,7 +391,7 @@ def _solution(
 ) -> _Solution:
     """One minimum weighed.
 
-    ``second``, ``plane`` : see :func:`stcal.sfm.measurement.likelihood.covariance_of_likelihood`
+    ``second``, ``plane`` : see :func:`stcal.sfm.measurement.pose.covariance_of_likelihood`
 
     Two steps: what the first leaves is of second order.
     """
@@ -366,3 +471,43 @@ def fit_verdict(pose: TargetPose) -> str:
     """``passed``, ``suspicious`` or ``failed`` of the χ² of the residuals."""
     p = pose.p_value()
     return "failed" if p < FAILED else "suspicious" if p < SUSPICIOUS else "passed"
+
+
+FELT = 0.5
+"""Variance, in units of their noise, that a common error may have in the direction in which all poses together feel it
+most, and still pass for independent: a result that feels nothing but this has a σ that is 20 % too small."""
+MOST = 24
+"""Largest number of directions."""
+LARGEST_SHARE = 0.999
+"""Largest common share of a pose's variance in any direction. The remainder must stay positive definite, even after
+rounding or if the likelihood of a pose is narrower than its linearisation."""
+
+
+def common_errors(poses: Sequence[TargetPose], target: TargetCircles, prior: CameraPrior | None) -> np.ndarray:
+    """Returns the common errors (m, 6, r): pose i has the common error ``common[i] @ z``.
+
+    The vector z, r independent normal numbers of σ 1, is the same for all poses. The errors are those of the circles
+    and of the intrinsics as far as they matter (:data:`FELT`): the largest directions over all poses, each pose in
+    units of its covariance. rad and mm, left perturbation in the camera frame.
+    """
+    if not poses:
+        return np.zeros((0, 6, 0))
+    circles, intrinsics = _root(target.covariance), _root(np.zeros((0, 0)) if prior is None else prior.covariance)
+    effects = []
+    for pose in poses:
+        place = np.array([target.place[label] for label in pose.labels])
+        rows = (3 * place[:, None] + np.arange(3)).ravel()
+        effects.append(np.hstack([pose.by_circles @ circles[rows], pose.by_intrinsics @ intrinsics]))
+    full = np.array(effects)
+    pose_roots = np.linalg.cholesky(np.array([pose.covariance for pose in poses]))
+    white = np.linalg.solve(pose_roots, full)
+    _, s, vt = np.linalg.svd(white.reshape(-1, full.shape[2]), full_matrices=False)
+    white = white @ vt[: min(int((s**2 > FELT).sum()), MOST)].T
+    u, s, vt = np.linalg.svd(white, full_matrices=False)
+    return pose_roots @ (u * np.minimum(s, np.sqrt(LARGEST_SHARE))[:, None]) @ vt
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """Returns a square root (n, n) of the covariance. Its product with its transpose is the covariance."""
+    value, vector = np.linalg.eigh(covariance)
+    return vector * np.sqrt(np.maximum(value, 0))

@@ -16,15 +16,16 @@ from stcal.io.images import grey_8bit, grey_fine
 from stcal.labels import Label
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.data.patterns import MAX_TILT_RAD
-from stcal.sfm.detect.arrangement import Arrangement
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.group_geometry import Arrangement
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import LabelledImage, label_single, labelled_image
-from stcal.sfm.detect.near import common_shift, measure_near
 from stcal.sfm.detect.predict import (
     PredictedCircles,
+    common_shift,
     contradicted_notes,
     contradictions,
+    measure_near,
     measure_predicted,
     missed_notes,
     predict_circles,

@@ -17,8 +17,8 @@ from stcal.io.cameras.model import CameraPrior
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.adjust.group import projection_jacobians
 from stcal.sfm.adjust.joint import Extensible, covariance_of, extensible
+from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.adjust.uncertainty import Derivatives, derivatives, scale_sigma
 from stcal.sfm.data.model import MetricModel
 

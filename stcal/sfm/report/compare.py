@@ -1,4 +1,4 @@
-"""Errors of a run against a known truth: ``truth.json`` and ``compare.json`` (``data_layout.md``)."""
+"""Comparison of a result with the truth, or with another result."""
 
 import csv
 import io
@@ -16,8 +16,8 @@ from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.json import ByFace, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
 from stcal.io.table import LENGTHS
 from stcal.labels import BOARD, CircleLabel, DotLabel, parse_label, parse_labels
-from stcal.report.text import number, text_table
-from stcal.synthetic.truth import TrueGroup, TrueImage, TruthFile
+from stcal.report.text import NONE, number, text_table
+from stcal.synthetic.dataset import TrueGroup, TrueImage, TruthFile
 
 FACES = "faces.json"
 DETECTIONS = "detections.csv"
@@ -248,3 +248,21 @@ def comparison_table(comparison: CompareFile) -> str:
     if comparison.missing:
         lines.append(f"not in the run: face {', '.join(comparison.missing)}")
     return "\n".join(lines)
+
+
+def comparison_cells(comparison: dict) -> tuple[list[str], list[list[str]]]:
+    """Returns heads and rows of the table; ``comparison`` : its content in ``report.json``."""
+    faces = list(comparison["sigma"])
+    heads = ["<Method", *(f"Face {face} (µm)" for face in faces), "Rotation, largest (mdeg)", "Board, mean (µm)",
+             "± (µm)", "Residual (px)"]  # fmt: skip
+    rows = []
+    for row in comparison["rows"]:
+        differences, last = row["faces"], row is comparison["rows"][-1]
+        shown = [number(differences[face]["translation_um"], 2) if face in differences else NONE for face in faces]
+        turned = number(max((difference["rotation_mdeg"] for difference in differences.values()), default=None), 2)
+        if last:
+            shown = [f"σ {number(comparison['sigma'][face]['translation_um'], 2)}" for face in faces]
+            turned = f"σ {number(max(difference['rotation_mdeg'] for difference in comparison['sigma'].values()), 2)}"
+        board = [number(row[key], 1) for key in ("board_mean_um", "board_spread_um")]
+        rows.append([row["method"], *shown, turned, *board, number(row["residual_rms_px"], 4)])
+    return heads, rows

@@ -1,11 +1,16 @@
-"""Plots of the report of a run."""
+"""Figures of a run's report: residuals, the target in space, photographs with overlays."""
 
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
 from stcal.labels import dot_cells, parse_label, parse_labels
 from stcal.report.figure import AXIS_COLOURS, COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below, uri
+from stcal.report.text import number
 
 
 def group_colours(names: list[str]) -> dict[str, str]:
@@ -160,3 +165,155 @@ def _space(xyz: np.ndarray, width: float, height: float, elevation: float, azimu
     axes.tick_params(labelsize=SMALL - 0.5, pad=0)
     axes.grid(False)
     return figure, axes
+
+
+DIGITS = 2
+"""Number of decimals of coordinates in mm: far finer than a screen shows."""
+AXIS = 0.2
+"""Length of the faces' axes, as a share of the target's extent."""
+CAMERA = 0.07
+"""Depth of a camera's pyramid, as a share of the scene's extent."""
+SHEET = "#7f93a8"
+
+
+def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
+    """Returns the parts to be drawn, in the target frame.
+
+    Parameters
+    ----------
+    report : content of ``report.json``
+    colours : by group
+
+    Returns
+    -------
+    list of dict
+        ``kind`` (``line``, ``sheet``, ``point``, ``text``), ``xyz`` (points, mm), ``colour``, and for some parts
+        ``name``, ``size`` (px) and ``target``: whether the part belongs to the target.
+    """
+    scene = report["scene"]
+    parts = _faces(scene["circles"], report["faces"])
+    for label, xyz in scene["circles"].items():
+        parts.append(_part("point", [xyz], "#000000", name=label, size=2.2, target=True))
+    for group, dots in scene["boards"].items():
+        parts += [_part("point", [xyz], colours.get(group, INK), size=1.2) for xyz in dots]
+    places = [view["position_mm"] for view in scene["cameras"]]
+    everything = np.array([*scene["circles"].values(), *chain.from_iterable(scene["boards"].values()), *places])
+    depth = CAMERA * float(np.ptp(everything, axis=0).max()) if len(everything) else 1.0
+    for camera in scene["cameras"]:
+        path = _traced(frustum(camera, report["camera"], depth))
+        parts.append(_part("line", path, colours.get(camera["group"], INK), name=camera["image"], size=1.1))
+    return parts
+
+
+def _faces(circles: dict[str, list[float]], faces: dict[str, dict]) -> list[dict]:
+    """Returns sheet, axes and name of each face."""
+    xyz = np.array(list(circles.values()), float).reshape(-1, 3)
+    reach = AXIS * float(np.ptp(xyz, axis=0).max()) if len(xyz) else 1.0
+    parts = []
+    for name, face in faces.items():
+        centres = np.array([p for label, p in circles.items() if parse_label(label).plane == name], float).reshape(
+            -1, 3
+        )
+        pose = np.array(face["target_from_face"], float)
+        parts += [_part("sheet", corners, SHEET, target=True) for corners in outline(centres, pose)]
+        origin = pose[:3, 3]
+        for axis, colour in enumerate(AXIS_COLOURS):
+            parts.append(_part("line", [origin, origin + reach * pose[:3, axis]], colour, size=1.6, target=True))
+        middle = centres.mean(0) if len(centres) else origin
+        parts.append(_part("text", [middle + 0.9 * reach * pose[:3, 2]], "#1c2733", name=name, target=True))
+    return parts
+
+
+def _traced(lines: list[np.ndarray]) -> np.ndarray:
+    """Returns the pyramid's lines as one path from its tip, which goes back to the tip after each line."""
+    tip = lines[0][:1]
+    return np.vstack([section for line in lines for section in (tip, line)])
+
+
+def _part(kind: str, xyz, colour: str, **more) -> dict:
+    return {"kind": kind, "xyz": np.round(np.asarray(xyz, float), DIGITS).tolist(), "colour": colour, **more}
+
+
+FIRST_IMAGES = 100
+"""Number of rows and overlays that the page has room for."""
+LONGEST = 0.04
+"""Length of the vector that nineteen of twenty residuals do not exceed, as a share of the image's width."""
+Residuals = np.ndarray
+"""Array (n, 4) of circles: centre x, y and residual x, y, px."""
+
+
+@dataclass(frozen=True, slots=True)
+class Photograph:
+    """One photograph.
+
+    ``says`` : what was found in it; ``jpeg`` : as a data URI; ``vectors`` : path of an SVG in px of the image.
+    """
+
+    name: str
+    says: str
+    jpeg: str
+    vectors: str
+
+
+@dataclass(frozen=True, slots=True)
+class Photographs:
+    """All photographs that the page shows, with the common scale of their vectors.
+
+    ``box`` : the images' place in px, pixel centres integer; ``aspect`` : width by height; ``factor`` : by which all
+    vectors are lengthened, 0 if there are none; ``stroke`` : width of their lines, px; ``bar`` : path of a bar, as long
+    as the vector of a residual of ``bar_px``.
+    """
+
+    each: tuple[Photograph, ...]
+    box: str
+    aspect: float
+    factor: float
+    stroke: float
+    bar: str
+    bar_px: float
+
+
+def photographs(report: dict, overlays: dict[str, bytes], residuals: Mapping[str, Residuals]) -> Photographs:
+    """Returns all photographs that the page shows, with vectors on one scale.
+
+    Parameters
+    ----------
+    report : content of ``report.json``
+    overlays : JPEG by image name
+    residuals : by image name
+    """
+    width, height = report["camera"]["size_px"]
+    mapped = {row["image"]: row for row in report["residuals_by_image"]}
+    lengths = np.concatenate([np.zeros(0), *(np.hypot(*entry[:, 2:].T) for entry in residuals.values())])
+    usual = float(np.quantile(lengths, 0.95)) if len(lengths) else 0.0
+    factor = round_below(LONGEST * width / usual) if usual > 0 else 0.0
+    bar_px = round_below(LONGEST * width / factor) if factor else 0.0
+    shown = []
+    for name, jpeg in overlays.items():
+        entry = mapped.get(name)
+        says = f"{entry['observations']} centres, {number(entry['rms_px'], 4)} px RMS" if entry else "not mapped"
+        uri = "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+        shown.append(Photograph(name, says, uri, _path(residuals.get(name, np.zeros((0, 4))), factor)))
+    box = f"-0.5 -0.5 {width} {height}"
+    bar = f"M{0.98 * width:.1f} {0.97 * height:.1f}h{-factor * bar_px:.1f}"
+    return Photographs(tuple(shown), box, round(width / height, 5), factor, round(width / 450, 2), bar, bar_px)
+
+
+def _path(residuals: Residuals, factor: float) -> str:
+    """Returns a path of lines from each centre along its residual."""
+    return "".join(f"M{x:.1f} {y:.1f}l{factor * dx:.1f} {factor * dy:.1f}" for x, y, dx, dy in residuals.tolist())
+
+
+def shown_overlays(report: dict) -> list[str]:
+    """Returns the names of the images whose overlays the page shows.
+
+    These are all images, or in a large set those that most deserve a look.
+    """
+    names = [image["name"] for image in report["images"]]
+    if len(names) <= FIRST_IMAGES:
+        return names
+    worst = {row["image"]: row["max_px"] for row in report["residuals_by_image"]}
+    noted = {note["image"] for note in report["left_out"]["notes"]}
+    ranked = sorted(names, key=lambda name: (name in worst, name not in noted, -worst.get(name, 0.0)))
+    chosen = set(ranked[:FIRST_IMAGES])
+    return [name for name in names if name in chosen]

@@ -1,19 +1,119 @@
-"""The report as one page that opens off line, ``report.html``, for people; ``report.json`` is the same for programs."""
+"""The page of a run."""
 
 import math
 from collections.abc import Callable, Mapping
 
 from stcal.labels import BOARD, parse_label
 from stcal.parallel import run_briefly
-from stcal.report.page import render, swatch
+from stcal.report.page import render, swatch, verdict
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report import figures
-from stcal.sfm.report.checks import COLOURS, checks_values
-from stcal.sfm.report.comparison import comparison_cells
-from stcal.sfm.report.crosscheck import crosscheck_values
-from stcal.sfm.report.judgement import Judgement, judgement_of
-from stcal.sfm.report.photographs import FIRST_IMAGES, Residuals, photographs
-from stcal.sfm.report.space import space_parts
+from stcal.sfm.report.compare import comparison_cells
+from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, photographs, space_parts
+from stcal.sfm.report.judgement import CHANCE, Judgement, judgement_of
+
+LIMITS = (
+    ("mapped_sigma", "σ", "of faces and circles between the programs"),
+    ("sigma", "σ", "of these adjusted"),
+    ("face_um", "µm", "of faces"),
+    ("face_mdeg", "mdeg", "of faces"),
+    ("circle_um", "µm", "of circles"),
+    ("camera_um", "µm", "of cameras"),
+    ("camera_mdeg", "mdeg", "of cameras"),
+)
+COMPARISONS = ("mapping", "result", "plain")
+
+
+def crosscheck_values(check: dict) -> dict:
+    """Returns the section ``crosscheck`` of ``report.json`` as the template shows it."""
+    limits = check["tolerances"]
+    allowed = [f"{limits[key]:g} {unit} {object_name}" for key, unit, object_name in LIMITS if limits[key] is not None]
+    faces: dict[str, list[tuple[float, str]]] = {}
+    for label, value in check["mapping"]["circles_um"].items():
+        faces.setdefault(parse_label(label).plane, []).append((value, label))
+    sigmas = check["mapping"]["circles_sigmas"]
+    programs = {
+        "native": f"COLMAP {check['native']}",
+        "pycolmap": f"pycolmap {check['pycolmap']}",
+        "run": "this result",
+    }
+    return {
+        "allowed": allowed,
+        "models": [
+            [name, check["images"][key], number(check["residual_rms_px"][key], 4)] for key, name in programs.items()
+        ],
+        "faces": [_face_row(check, face) for face in check["mapping"]["faces"]],
+        "circles": [
+            [face, len(rows), number(sum(v for v, _ in rows) / len(rows), 3), number(max(rows)[0], 3), max(rows)[1]]
+            for face, rows in sorted(faces.items())
+        ],
+        "single": [
+            [label, number(value, 3), number(sigmas.get(label), 2)]
+            for label, value in check["mapping"]["circles_um"].items()
+        ],
+        "worst_camera": max(check["mapping"]["cameras"], key=lambda row: row["sigmas"], default=None),
+    }
+
+
+def _face_row(check: dict, face: str) -> list[str]:
+    """Returns the row of a face: position, rotation and σ of each comparison."""
+    row = [face]
+    for key in COMPARISONS:
+        entry = check[key]["faces"].get(face)
+        row += [*cells(entry, "translation_um:3 rotation_mdeg:3"), number(entry["sigmas"], 2)] if entry else [NONE] * 3
+    return row
+
+
+COLOURS = {"passed": "#1b7837", "suspicious": "#b26a00", "failed": "#b3261e", "not possible": "#556270"}
+ORDER = ("failed", "suspicious", "passed", "not possible")
+FIRST_NAMES = 6
+"""Number of names that a row has room for."""
+
+
+def count_verdicts(verdicts: list[str]) -> str:
+    """Returns the number of checks with each verdict as ``2 failed, 13 passed``, the worst first."""
+    return ", ".join(f"{verdicts.count(v)} {v}" for v in ORDER if v in verdicts) or "none"
+
+
+def checks_values(checks: list[dict]) -> dict:
+    """Returns the section ``checks`` of ``report.json`` as the template shows it."""
+    ranked = sorted(checks, key=lambda check: ORDER.index(check["verdict"]))
+    rows = [
+        [
+            check["title"],
+            verdict(check["verdict"], COLOURS[check["verdict"]]),
+            *(_number(check["measured"][0]) if check["measured"] else [NONE, NONE]),
+            _names(check),
+            check["reason"],
+            check["remedy"],
+        ]
+        for check in ranked
+    ]
+    measured = [
+        [check["title"], m["name"], *_number(m), NONE if m["probability"] is None else f"{m['probability']:.1g}"]
+        for check in ranked
+        for m in check["measured"]
+    ]
+    verdicts = count_verdicts([check["verdict"] for check in checks])
+    return {"verdicts": verdicts, "check_rows": rows, "measured": measured, "chance": CHANCE}
+
+
+def _number(measured: dict) -> list[str]:
+    """Returns value and limit with their unit."""
+    unit = f" {measured['unit']}" if measured["unit"] else ""
+    return [_short(measured["value"]) + unit, NONE if measured["limit"] is None else _short(measured["limit"]) + unit]
+
+
+def _short(value: float) -> str:
+    """Returns the value with about three digits."""
+    return f"{value:.3g}" if 1e-4 < abs(value) < 1e3 else number(value, 0) if abs(value) >= 1e3 else f"{value:.2g}"
+
+
+def _names(check: dict) -> str:
+    names = check["names"]
+    surplus = f" and {len(names) - FIRST_NAMES} more" if len(names) > FIRST_NAMES else ""
+    return ", ".join(names[:FIRST_NAMES]) + surplus if names else NONE
+
 
 SIDES = {-58: "", 122: ", from the other side"}
 """Azimuths from which target and cameras are drawn."""

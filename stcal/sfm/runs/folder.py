@@ -20,7 +20,7 @@ from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.json import checked, read_json
 from stcal.io.saving import BOARD, CAMERA, REFINED_CAMERA, RUN_MARKER, TARGET, json_text, save
 from stcal.parallel import Progress
-from stcal.report.pdf import pdf_of, require_pdf
+from stcal.report.page import pdf_of, require_pdf
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.data.model import GroupModel
 from stcal.sfm.data.observations import ImageObservations
@@ -29,9 +29,9 @@ from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.detect.overlay import draw_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
+from stcal.sfm.report.figures import Residuals, shown_overlays
 from stcal.sfm.report.judgement import Judgement, judged
 from stcal.sfm.report.page import report_html
-from stcal.sfm.report.photographs import Residuals, shown_overlays
 from stcal.sfm.runs.output import report_of, residuals_px
 from stcal.sfm.runs.report import ReportFile
 from stcal.sfm.runs.result import RunResult

@@ -15,8 +15,7 @@ from stcal.sfm.adjust.scale import Scale
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.data.model import GroupModel, WorldModel
 from stcal.sfm.detect.published import EQUAL_SIGMA_PX
-from stcal.sfm.runs.comparison import ComparedRow, Comparison, FaceOff, SigmaRow
-from stcal.sfm.runs.result import RunResult
+from stcal.sfm.runs.result import ComparedRow, Comparison, FaceOff, RunResult, SigmaRow
 
 MICRO = 1e3
 AS_PUBLISHED = "as published"

@@ -10,8 +10,8 @@ from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import Solve
 from stcal.sfm.checks.verdict import Verdict
 from stcal.sfm.report.judgement import Judgement
-from stcal.sfm.runs.comparison import Comparison
 from stcal.sfm.runs.crosscheck import Crosscheck
+from stcal.sfm.runs.result import Comparison
 
 Number = int | float
 """Number that remains an integer if it is one."""

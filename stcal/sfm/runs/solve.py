@@ -22,7 +22,7 @@ from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.data.model import Outlier, WorldModel
 from stcal.sfm.data.observations import ImageObservations, by_group
-from stcal.sfm.data.pitch import pitch_hint
+from stcal.sfm.data.patterns import pitch_hint
 from stcal.sfm.detect.labels import LabelledImage, leaves_a_board_out
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.graph import ImageGraph

@@ -13,10 +13,9 @@ from stcal.report.text import text_table
 from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
-from stcal.sfm.report.checks import count_verdicts
-from stcal.sfm.report.comparison import comparison_cells
-from stcal.sfm.runs.comparison import Comparison
-from stcal.sfm.runs.result import RunResult
+from stcal.sfm.report.compare import comparison_cells
+from stcal.sfm.report.page import count_verdicts
+from stcal.sfm.runs.result import Comparison, RunResult
 from stcal.sfm.runs.solve import GroupSolution
 
 NOTED, NAMED = 4, 6

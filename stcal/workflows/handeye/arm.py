@@ -13,8 +13,7 @@ from stcal.handeye.data.formats.record import require_each_once
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.handeye.data.robot_poses import RobotPoses
 from stcal.handeye.report.outcome import ArmFound, Outcome
-from stcal.handeye.scatter import widened_by_scatter
-from stcal.handeye.validate import cross_validate
+from stcal.handeye.validate import cross_validate, widened_by_scatter
 from stcal.io.cameras.model import CameraPrior
 from stcal.io.quaternions import Order
 from stcal.io.table import read_table

@@ -11,15 +11,15 @@ from stcal.handeye import HandEyeOptions, handeye
 from stcal.handeye.choose import choose
 from stcal.handeye.data.loop import Setup
 from stcal.handeye.judge.symmetry import repair
-from stcal.handeye.predict import predict_motions
 from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.scatter import widened_by_scatter
 from stcal.handeye.validate import (
     LEAST_LEFT,
     better_setup,
     compare,
     cross_validate,
+    predict_motions,
     splits,
+    widened_by_scatter,
 )
 from stcal.parallel import Progress
 from stcal.workflows.handeye.arm import with_arm

@@ -15,7 +15,7 @@ from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two
 from stcal.handeye.data.loop import SETUPS, Loop, Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import Timed
-from stcal.handeye.judge.spread import spread_text
+from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.methods import start
 from stcal.io.cameras.model import CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera

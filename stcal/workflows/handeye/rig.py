@@ -1,19 +1,143 @@
-"""Hand-eye calibration of several cameras together, from images of one board: ``stcal handeye rig``."""
+"""Hand-eye calibration of several cameras: inputs and solution."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
-from stcal.errors import DegenerateError, StcalError
-from stcal.handeye.data.rig import RigPoses
-from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.report.rig_outcome import RigOutcome
+import numpy as np
+
+from stcal.boards.several import load_boards
+from stcal.errors import DegenerateError, InputError, StcalError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye.data.formats.record import Said
+from stcal.handeye.data.rig import RigCamera, RigFiles, RigPoses
+from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
+from stcal.handeye.data.stream import TOLERANCE_S
+from stcal.handeye.report.outcome import Outcome, RigOutcome
 from stcal.handeye.rig.result import Rig
 from stcal.handeye.rig.solve import RigOptions, alone_or_none, handeye_rig, of_places, same_numbering
 from stcal.handeye.rig.validate import RigHeldOut, cross_validate_rig, widened_by_scatter
 from stcal.handeye.validate import LEAST_LEFT, splits
-from stcal.parallel import Progress
+from stcal.io.quaternions import Order
+from stcal.parallel import Progress, one_thread
 from stcal.workflows.handeye.calibrate import Splits
-from stcal.workflows.handeye.rig_inputs import RigInput
+from stcal.workflows.handeye.inputs import Photographed, photographed, pitch_of
+from stcal.workflows.handeye.times import Timing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigInput:
+    """``files``; ``given``; ``symmetries`` of the board and its ``pitch_mm``; ``left_out`` : (image or row, why) of
+    each camera; ``understood`` : a line on each file of poses, and on the poses that cameras share; ``notes``."""
+
+    files: RigFiles
+    given: RigPoses
+    symmetries: tuple[Rigid, ...]
+    pitch_mm: float | None
+    left_out: tuple[tuple[tuple[str, str], ...], ...]
+    understood: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+@one_thread()
+def read_rig(
+    files: RigFiles,
+    workers: int | None = None,
+    progress: Progress = lambda *_: None,
+    quaternions: Order = "wxyz",
+    said: Said | None = None,
+    tolerance_s: float = TOLERANCE_S,
+) -> RigInput:
+    """Returns the board in all images of all cameras, with the robot's poses.
+
+    Raises
+    ------
+    InputError
+        The message says what is wrong with a file, and names the camera.
+    """
+    design, cameras = load_boards(files.board), []
+    by_file = {
+        camera_files.poses: read_robot_poses(camera_files.poses, quaternions, said) for camera_files in files.cameras
+    }
+    robots = [_of_camera(by_file[camera_files.poses], camera_files.images, files) for camera_files in files.cameras]
+    for camera_files, robot in zip(files.cameras, robots, strict=True):
+        named, timing = partial(_named, progress, camera_files.name), Timing(tolerance_s, camera_files.times)
+        try:
+            photos = photographed(camera_files.images, robot, camera_files.camera, design, workers, named, timing)
+        except InputError as error:
+            raise InputError(error.code, f"camera {camera_files.name}: {error}") from error
+        cameras.append(photos)
+    flange, names, rows = _shared([(photos.robot, photos) for photos in cameras])
+    every = tuple(
+        RigCamera(camera_files.name, photos.seen, camera_rows, photos.names, photos.prior)
+        for camera_files, photos, camera_rows in zip(files.cameras, cameras, rows, strict=True)
+    )
+    rig_poses = RigPoses(flange, every, names, files.file.name)
+    understood = [f"robot: {robot.understood}" for robot in by_file.values()]
+    for camera_files, photos in zip(files.cameras, cameras, strict=True):
+        understood += [f"{camera_files.name}: images matched {photos.how}"] if photos.how else []
+        if photos.timed is not None:
+            understood.append(f"{camera_files.name}: {photos.robot.understood}")
+    shared = np.bincount(np.concatenate(rows), minlength=len(names)) > 1
+    if len(every) > 1:
+        understood.append(f"{int(shared.sum())} of {len(names)} poses of the robot are of several cameras' images")
+    notes: tuple[str, ...] = ()
+    if len(every) > 1 and not shared.any():
+        notes += ("no pose of the robot is of two cameras' images: they share the board alone",)
+    if any(robot.covariance is not None for robot in by_file.values()):
+        notes += ("covariances of the robot's poses are not used for a rig: σ of the robot are estimated",)
+    left_out = tuple(photos.left_out for photos in cameras)
+    return RigInput(files, rig_poses, cameras[0].symmetries, pitch_of(design), left_out, tuple(understood), notes)
+
+
+def _named(progress: Progress, name: str, stage: str, done: int, total: int) -> None:
+    progress(f"{stage}, {name}", done, total)
+
+
+def _of_camera(robot: RobotPoses, images: Path, files: RigFiles) -> RobotPoses:
+    """Returns the rows of one camera, where a file names the images of all cameras with their folders."""
+    folders = {camera_files.images.name for camera_files in files.cameras}
+    prefixed = [image.partition("/")[0] in folders and "/" in image for image in robot.images]
+    if not all(prefixed) or not prefixed:
+        return robot
+    rows = [i for i, image in enumerate(robot.images) if image.partition("/")[0] == images.name]
+    if not rows:
+        raise InputError(
+            "E-POSES-UNMATCHED",
+            f"{robot.where}: no row is of an image in {images}: {robot.images[0]} … there; correct them",
+        )
+    return replace(
+        robot,
+        images=tuple(robot.images[i].partition("/")[2] for i in rows),
+        base_from_flange=robot.base_from_flange[rows],
+        covariance=None if robot.covariance is None else robot.covariance[rows],
+        places=tuple(robot.places[i] for i in rows),
+    )
+
+
+def _shared(cameras: list[tuple[RobotPoses, Photographed]]) -> tuple[Poses, tuple[str, ...], list[np.ndarray]]:
+    """Returns the poses of the robot at which any image was taken, their names, and the poses of each camera's images.
+
+    Measured values are never equal to the last digit, so equal poses are one pose, whatever the row or the file. If one
+    camera has a pose twice, the poses are commanded ones, and each row of a file counts as a pose of its own.
+    """
+    keys = []
+    for _, photos in cameras:
+        taken = photos.base_from_flange[photos.rows]
+        both = zip(taken.rotation, taken.translation, strict=True)
+        keys.append([turn.tobytes() + place.tobytes() for turn, place in both])
+    if any(len(set(camera_keys)) < len(camera_keys) for camera_keys in keys):
+        keys = [[f"{robot.where}: {robot.places[r]}".encode() for r in photos.rows] for robot, photos in cameras]
+    number: dict[bytes, int] = {}
+    flange, names, rows = [], [], []
+    for (robot, photos), camera_keys in zip(cameras, keys, strict=True):
+        for name, row, key in zip(photos.names, photos.rows, camera_keys, strict=True):
+            if key not in number:
+                number[key] = len(number)
+                flange.append(photos.base_from_flange[int(row)])
+                names.append(robot.images[row] if robot.images else name)
+        rows.append(np.array([number[key] for key in camera_keys]))
+    return Poses.of(flange), tuple(names), rows
 
 
 def calibrate_rig(

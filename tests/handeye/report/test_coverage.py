@@ -9,10 +9,17 @@ import pytest
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, handeye
 from stcal.handeye.data.views import View, Views, pairs_of_views
-from stcal.handeye.report.coverage import by_robot, equal_area, image_coverage, turns_between
-from stcal.handeye.report.figures import MOST_NAMED, enlargement, pose_bars
+from stcal.handeye.report.figures import (
+    MOST_NAMED,
+    by_robot,
+    enlargement,
+    equal_area,
+    image_coverage,
+    overlays,
+    pose_bars,
+    turns_between,
+)
 from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.report.overlays import overlays
 from stcal.handeye.report.page import outcome_page
 from tests.support.handeye import simulated, simulated_views
 

@@ -7,9 +7,8 @@ import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, handeye
-from stcal.handeye.judge.notes import Aside, Grave
-from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.report.verdict import judged, share_of_variance
+from stcal.handeye.judge.remarks import Aside, Grave
+from stcal.handeye.report.outcome import Outcome, judged, share_of_variance
 from stcal.handeye.validate import cross_validate, splits
 from tests.support.handeye import simulated
 

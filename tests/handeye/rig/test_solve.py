@@ -9,8 +9,8 @@ from scipy.stats import chi2
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import Noise, RigCamera, RigOptions, RigPoses, View, Views, handeye_rig
 from stcal.handeye.data.loop import Loop
+from stcal.handeye.methods.bundle import RigBundle, RigCorners
 from stcal.handeye.methods.reprojection import board_of, problem
-from stcal.handeye.methods.rig_bundle import RigBundle, RigCorners
 from stcal.handeye.rig.solve import alone, of_places
 from stcal.io.cameras.model import CalibratedCamera, camera_prior, intrinsic_basis
 from tests.outcome import fails_with

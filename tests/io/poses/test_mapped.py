@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stcal.io.join import join
-from stcal.io.poses.mapped import read_mapped
+from stcal.io.poses.columns import read_mapped
 from stcal.io.table import LENGTHS
 from tests.outcome import fails_with
 

@@ -11,8 +11,7 @@ from stcal.cli.main import app
 from stcal.errors import InputError
 from stcal.io import device as module
 from stcal.io.device import OpenCVSource, SimulatedSource
-from stcal.locate.data.capture import Settings, capture, scene_folder
-from stcal.locate.data.exposures import find_scenes
+from stcal.locate.data.exposures import Settings, capture, find_scenes, scene_folder
 from tests.outcome import fails_with
 
 

@@ -11,17 +11,16 @@ from typer.testing import CliRunner
 from stcal.cli.robot import app
 from stcal.geometry.rigid import Rigid
 from stcal.robot.axes.checks import _shape
+from stcal.robot.axes.fit import fit_axes
 from stcal.robot.axes.model import robot_from_sweeps
 from stcal.robot.axes.orientations import length_of, ring
 from stcal.robot.axes.pairs import pairs_of
 from stcal.robot.axes.report import axes_file
 from stcal.robot.axes.sweeps import find_arcs
-from stcal.robot.axes.unwinding import fit_axes
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses, forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, placed
 from tests.outcome import fails_with
 from tests.support.arms import two_arms

@@ -10,8 +10,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.export.offsets import HEAD, offsets_csv, zeros
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, measured, placed
 
 COUPLING = np.eye(6)

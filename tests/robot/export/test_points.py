@@ -11,10 +11,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.export import exported
 from stcal.robot.export.files import FORMS
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import compensate, joint_cells, joint_columns
 from stcal.robot.use.targets import read_targets

@@ -9,8 +9,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.nominal import adjusted, dh_values
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
+from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
 

@@ -11,7 +11,7 @@ from stcal.robot.identification.adjustment import Weighting, huber_limit, solve
 from stcal.robot.identification.residuals import jacobian, moved, observed, residuals
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
 

@@ -12,11 +12,10 @@ from stcal.robot.identification.report import identified_file, identified_text
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import USUAL, Conditions
-from stcal.robot.kinematics.example import mh80
-from stcal.robot.kinematics.model import Elasticity, Robot
+from stcal.robot.kinematics.model import Elasticity, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import evaluate
-from stcal.robot.use.evaluation_report import notes
+from stcal.robot.use.report import notes
 from tests.outcome import fails_with
 from tests.support.arms import elastic
 

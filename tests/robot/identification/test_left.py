@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from stcal.robot.identification.adjustment import Weighting
-from stcal.robot.identification.left import left
 from stcal.robot.identification.report import identified_file, identified_page, identified_text
 from stcal.robot.identification.residuals import State, jacobian, observed
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
+from stcal.robot.identification.unexplained import left
 from stcal.robot.kinematics.forward import forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, measured
 from tests.robot.identification.test_solve import simulated
 

@@ -10,7 +10,7 @@ from stcal.robot import inverse
 from stcal.robot.identification.residuals import State, tips
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import made, measured, placed
 from tests.outcome import fails_with
 

@@ -9,7 +9,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.residuals import State, tips
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
+from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 
 

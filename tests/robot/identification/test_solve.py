@@ -17,11 +17,10 @@ from stcal.robot.identification.report import identified_file, identified_page, 
 from stcal.robot.identification.residuals import jacobian, moved, observed, residuals, tips
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.scripts import load_script
 

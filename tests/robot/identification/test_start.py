@@ -9,8 +9,8 @@ from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.table import POSE, pose_cells
 from stcal.robot.identification.start import start
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
+from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
 

@@ -8,8 +8,8 @@ import pytest
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
+from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from tests.outcome import fails_with
 

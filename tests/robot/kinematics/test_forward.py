@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.dh import robot_from_chain
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import (
     CHUNK,
     chain_jacobian,
@@ -21,7 +20,7 @@ from stcal.robot.kinematics.forward import (
     jacobian,
     moved_chain,
 )
-from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
 
 

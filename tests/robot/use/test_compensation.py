@@ -13,10 +13,9 @@ from stcal.cli.main import main
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.model import Joint
+from stcal.robot.kinematics.model import Joint, mh80
 from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import compensate, compensated_csv, compensation_file
 from stcal.robot.use.targets import read_targets

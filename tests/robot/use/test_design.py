@@ -12,10 +12,9 @@ from stcal.io.table import read_table
 from stcal.robot.identification.observability import ObservabilityIndices, identification_jacobian, parameter_scale
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, forward, moved_chain
-from stcal.robot.kinematics.model import Joint
+from stcal.robot.kinematics.model import Joint, mh80
 from stcal.robot.simulated import joint_vectors, made, measured
 from stcal.robot.use.design import DesignOptions, choose, design
 from tests.outcome import fails_with

@@ -10,13 +10,12 @@ import pytest
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
-from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import Figures, evaluate
-from stcal.robot.use.evaluation_report import evaluated_csv, evaluated_text, evaluation_file, evaluation_page, names_of
+from stcal.robot.use.report import evaluated_csv, evaluated_text, evaluation_file, evaluation_page, names_of
 from stcal.robot.use.verification import read_measured, verify
 from tests.outcome import fails_with
 from tests.robot.identification.test_solve import rokae

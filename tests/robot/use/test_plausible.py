@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.quaternions import INVERTED
-from stcal.robot.kinematics.example import mh80
 from stcal.robot.kinematics.forward import forward
-from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made
 from stcal.robot.use.compensation import compensate
 from stcal.robot.use.plausible import on_targets, robots_apart

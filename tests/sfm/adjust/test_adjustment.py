@@ -8,8 +8,7 @@ import pytest
 from stcal.design import reference_board
 from stcal.geometry.align import align_similarity
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.sfm.adjust.group import adjust
-from stcal.sfm.adjust.refine import eccentricity_px, refine
+from stcal.sfm.adjust.refine import adjust, eccentricity_px, refine
 from stcal.synthetic.scene import SceneOptions, make_scene
 
 NOISE_PX = 0.005

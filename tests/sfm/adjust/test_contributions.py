@@ -7,8 +7,8 @@ import pytest
 
 from stcal.geometry.normal_equations import free_motions
 from stcal.io.cameras.model import CameraPrior
-from stcal.sfm.adjust.contributions import OBSERVED, contributions_of
 from stcal.sfm.adjust.joint import adjusted
+from stcal.sfm.adjust.uncertainty import OBSERVED, contributions_of
 from stcal.synthetic.scene import SceneOptions, make_scene
 
 FLATNESS_MM = 0.02

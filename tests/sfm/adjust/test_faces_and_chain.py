@@ -8,8 +8,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.chain import chain_faces, measure_chains
 from stcal.sfm.adjust.faces import FaceInGroup, face_frame
-from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.adjust.refine import adjust
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 

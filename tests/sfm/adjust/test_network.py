@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import skew
-from stcal.sfm.adjust.group import adjust
 from stcal.sfm.adjust.network import free_network, solve_score
-from stcal.sfm.adjust.refine import eccentricity_px
+from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.sfm.adjust import dense
 

@@ -9,8 +9,7 @@ import pytest
 from stcal.design import StatedSize
 from stcal.io.design import board_toml, load_board
 from stcal.sfm.budget.combine import budget_of_run, longest_of
-from stcal.sfm.budget.sources import correction
-from stcal.sfm.budget.statement import FIELDS, statement_of
+from stcal.sfm.budget.sources import FIELDS, correction, statement_of
 from stcal.sfm.runs.saved import load_run
 from tests.outcome import INPUT, assert_error
 from tests.shared import own_copy

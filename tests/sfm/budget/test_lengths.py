@@ -8,7 +8,7 @@ import pytest
 
 from stcal.sfm.budget.combine import budget_of_run, longest_of
 from stcal.sfm.budget.lengths import SHARED, against_run, against_stated
-from stcal.sfm.budget.statement import statement_of
+from stcal.sfm.budget.sources import statement_of
 from stcal.sfm.runs.saved import load_run
 from tests.outcome import INPUT, assert_error
 

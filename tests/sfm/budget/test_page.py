@@ -2,7 +2,7 @@
 
 import re
 
-from stcal.report import pdf
+from stcal.report import page as pdf
 from tests.outcome import INPUT, assert_error
 
 STATED = "[board]\nexpansion_ppm_per_k = 8\ntemperature_c = 25\ntemperature_sigma_k = 0.5\n"

@@ -12,8 +12,7 @@ from stcal.sfm.camera.calibrate import judged, of_chosen_model, require_model
 from stcal.sfm.camera.file import CalibrationFile
 from stcal.sfm.camera.held_out import choose_model, held_out
 from stcal.sfm.camera.intrinsics import adjust_intrinsics
-from stcal.sfm.camera.report import calibration_page
-from stcal.sfm.camera.text import calibration_text
+from stcal.sfm.camera.report import calibration_page, calibration_text
 from stcal.sfm.camera.views import closed_form, start_camera
 from tests.levels import sampled
 from tests.outcome import fails_with

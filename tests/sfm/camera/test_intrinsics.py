@@ -22,8 +22,7 @@ from stcal.sfm.camera.calibrate import require_determined
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, model_parameters
 from stcal.sfm.camera.trust import projection_sigma, split_half
 from stcal.sfm.camera.views import board_views, closed_form, start_camera
-from stcal.sfm.data.centres import Centres
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.observations import Centres, ImageObservations
 from stcal.sfm.detect.sightings import BoardSighting, ImageDetection
 from tests.outcome import fails_with
 

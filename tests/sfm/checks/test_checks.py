@@ -18,7 +18,7 @@ from stcal.sfm.adjust.refine import refine
 from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS, Trial, judge
 from stcal.sfm.pipeline import run
-from stcal.sfm.report.checks import checks_values, count_verdicts
+from stcal.sfm.report.page import checks_values, count_verdicts
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, render

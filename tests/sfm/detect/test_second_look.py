@@ -8,8 +8,7 @@ import pytest
 from stcal.design import reference_target
 from stcal.geometry.camera import Camera
 from stcal.labels import BOARD, parse_labels
-from stcal.sfm.data.centres import Centres
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.observations import Centres, ImageObservations
 from stcal.sfm.detect.circles.ellipses import EllipseOptions
 from stcal.sfm.detect.labels import _second, labelled_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, contradictions, measure_predicted

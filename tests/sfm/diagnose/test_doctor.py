@@ -16,10 +16,9 @@ from stcal.labels import CircleLabel
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.patterns import Pattern, ideal_border, in_view
 from stcal.sfm.detect.circles.ellipses import EllipseOptions, find_ellipses
-from stcal.sfm.diagnose.doctor import diagnose
+from stcal.sfm.diagnose.doctor import diagnose, missing_circles
 from stcal.sfm.diagnose.examine import LEAST_MIN_DIAMETER_PX
 from stcal.sfm.diagnose.findings import Diagnosis, Finding, GateCount, by_gate, in_order, table
-from stcal.sfm.diagnose.missing import missing_circles
 from stcal.sfm.diagnose.trace import trace_outlines
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model

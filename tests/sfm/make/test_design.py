@@ -9,7 +9,7 @@ from stcal.cli.sfm.make import design as command
 from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.io.design import load_board, load_target, target_toml
-from stcal.likeness import MIN_COMMON
+from stcal.lookalikes import MIN_COMMON
 from stcal.sfm.detect.ambiguity import confusable, in_common, is_named, mirror_images
 from stcal.sfm.make import design
 from stcal.sfm.make.box import sides_of, size_of

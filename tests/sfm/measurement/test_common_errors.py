@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.io.cameras.model import CameraPrior, intrinsic_basis
-from stcal.sfm.measurement.common_errors import MOST, common_errors
-from stcal.sfm.measurement.pose import pose_from_circles
+from stcal.sfm.measurement.pose import MOST, common_errors, pose_from_circles
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.support.image_poses import faces_view, known_target, pose_error, see, view
 

@@ -20,7 +20,7 @@ from stcal.io.images import Skipped
 from stcal.io.table import read_table
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.data.projection import project_circles
+from stcal.sfm.data.patterns import project_circles
 from stcal.sfm.measurement.images import MeasureOptions, measure, measure_labelled
 from stcal.sfm.measurement.output import measure_text, poses_file
 from stcal.sfm.measurement.pose import NO_FACE, PoseOptions, pose_from_circles, resolved

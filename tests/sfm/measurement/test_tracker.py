@@ -8,7 +8,7 @@ import pytest
 from stcal.errors import InputError
 from stcal.io.cameras.read import read_camera
 from stcal.sfm import MeasureOptions, Tracker, measure
-from stcal.sfm.detect.near import common_shift
+from stcal.sfm.detect.predict import common_shift
 from stcal.sfm.measurement.target import TargetCircles
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.render import RenderOptions, render

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from stcal.design import reference_board, reference_target
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, CameraPrior
-from stcal.sfm.adjust import dots_first
+from stcal.sfm.adjust import equations
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjust_jointly, covariance_of
 from stcal.sfm.adjust.uncertainty import derivatives
@@ -502,7 +502,7 @@ def test_dots_reduced_first_are_the_same_as_cameras_first(exact, monkeypatch, co
     board = replace(exact.board, sigma_mm=0.02)
     found = []
     for first in (True, False):
-        monkeypatch.setattr(dots_first, "is_cheaper", lambda _, first=first: first)
+        monkeypatch.setattr(equations, "is_dots_first_cheaper", lambda _, first=first: first)
         found.append(covariance_of(models, board, exact.camera, 0.02, prior, common))
     dots, cameras = found
     np.testing.assert_allclose(

@@ -12,8 +12,8 @@ from markupsafe import Markup
 from stcal.report.figure import round_below
 from stcal.report.page import environment
 from stcal.report.text import number
+from stcal.sfm.report.figures import FIRST_IMAGES, shown_overlays
 from stcal.sfm.report.page import report_html
-from stcal.sfm.report.photographs import FIRST_IMAGES, shown_overlays
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
 VOID = {"meta", "img", "br", "link", "hr", "input"}

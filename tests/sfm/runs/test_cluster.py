@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from stcal.errors import DetectionError
+from stcal.io.image_jobs import run_on_images, spread
 from stcal.io.images import ImageFile
-from stcal.io.spread import run_on_images, spread
 from stcal.parallel import run_parallel
 from stcal.sfm import RunOptions, run
 from stcal.workflows import cluster

@@ -18,6 +18,7 @@ from stcal.handeye.report.export.frames import (
 from stcal.handeye.report.export.opencv import opencv_yaml, read_zivid, zivid_yaml
 from stcal.handeye.report.export.ros import ros_yaml, urdf_joint
 from stcal.handeye.result import HandEye
+from stcal.io.poses.columns import program_name
 from stcal.io.poses.controllers import ABB, FANUC, KUKA, UR
 from stcal.io.poses.static import (
     Static,
@@ -28,7 +29,6 @@ from stcal.io.poses.static import (
     ros2_commands,
     ros2_launch,
 )
-from stcal.io.poses.text import program_name
 
 __all__ = [
     "FORMS",

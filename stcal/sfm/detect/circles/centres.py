@@ -25,7 +25,7 @@ import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.robust import robust_sigmas
-from stcal.sfm.data.centres import Centres
+from stcal.sfm.data.observations import Centres
 from stcal.sfm.detect.circles import bands
 from stcal.sfm.detect.circles.ellipses import Ellipses
 from stcal.sfm.detect.circles.fits import Fits

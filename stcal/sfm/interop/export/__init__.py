@@ -7,7 +7,7 @@ from pathlib import Path
 
 from stcal.errors import InputError
 from stcal.io.saving import save
-from stcal.sfm.interop.export import gltf, robots, solids, tables
+from stcal.sfm.interop.export import gltf, solids, tables
 from stcal.sfm.interop.export.content import Content, content_of
 from stcal.sfm.interop.export.recording import write_rrd
 from stcal.sfm.runs.saved import load_run
@@ -28,11 +28,11 @@ class Form:
 
 
 FORMS = {
-    "urdf": Form(".urdf", robots.urdf, "cameras, σ of circles; σ of faces is in comments"),
-    "xacro": Form(".xacro", robots.xacro, "cameras, σ of circles; σ of faces is in comments"),
-    "tf2": Form(".yaml", robots.tf2, "cameras, radii, σ of circles; σ of faces is in comments"),
-    "ros2": Form(".py", robots.launch_ros2, "cameras, radii, σ of circles; σ of faces is in comments"),
-    "ros1": Form(".launch", robots.launch_ros1, "cameras, radii, σ of circles; σ of faces is in comments"),
+    "urdf": Form(".urdf", tables.urdf, "cameras, σ of circles; σ of faces is in comments"),
+    "xacro": Form(".xacro", tables.xacro, "cameras, σ of circles; σ of faces is in comments"),
+    "tf2": Form(".yaml", tables.tf2, "cameras, radii, σ of circles; σ of faces is in comments"),
+    "ros2": Form(".py", tables.launch_ros2, "cameras, radii, σ of circles; σ of faces is in comments"),
+    "ros1": Form(".launch", tables.launch_ros1, "cameras, radii, σ of circles; σ of faces is in comments"),
     "opencv": Form(".yml", tables.opencv, "cameras"),
     "csv": Form(".csv", tables.table, "cameras, correlations"),
     "ply": Form(".ply", solids.ply, "σ of circles, the lens's distortion; σ of faces is in comments"),

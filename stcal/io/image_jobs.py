@@ -1,4 +1,4 @@
-"""Jobs on images, run by processes of this machine or by an executor, for example of a cluster."""
+"""Jobs on images, run by processes of this machine or by an executor such as a cluster's."""
 
 import contextlib
 import socket

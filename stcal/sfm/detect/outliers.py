@@ -1,9 +1,4 @@
-"""Detection of circles that contradict the other observations of their group.
-
-The rim of a circle that something cuts follows an ellipse still, about another centre. One image cannot tell it from a
-circle that was made off its place; the group can: where each image was taken from, and where each plane stands, is
-known to a fraction of a pixel from all other circles, and what was made off its place is off it alike in all images.
-"""
+"""Circles whose centres do not agree with the rest of their group."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,8 +10,7 @@ from stcal.geometry.pose_descent import PoseStack
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.observations import ImageObservations
 from stcal.sfm.data.patterns import Pattern
-from stcal.sfm.detect.arrangement import Arrangement
-from stcal.sfm.detect.plane_bundle import PlaneBundle
+from stcal.sfm.detect.group_geometry import Arrangement, PlaneBundle
 
 MIN_LIMIT_PX = 0.5
 """What is nearer to its place is never outlying: centres of clear circles are good to hundredths, designs to tenths."""

@@ -1,4 +1,4 @@
-"""Cross-validation: rows are held out of a fit and then predicted by it (Stone 1974, J. R. Stat. Soc. B 36)."""
+"""Rows held out of a fit, to see how well it predicts what it has not seen (Stone 1974, J. R. Stat. Soc. B 36)."""
 
 from collections.abc import Callable, Sequence
 

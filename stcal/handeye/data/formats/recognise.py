@@ -1,4 +1,4 @@
-"""Recognition of the format of a file of poses from its content, whatever its name. Read this first."""
+"""Recognises the format of a file of poses by its content, whatever its name; read this first."""
 
 import json
 import re

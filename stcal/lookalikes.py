@@ -1,4 +1,4 @@
-"""Likeness of two patterns of circles under rotation and scale: a camera cannot tell alike patterns apart."""
+"""How alike two patterns of circles are when turned and scaled, so that a camera could take one for the other."""
 
 from dataclasses import dataclass
 

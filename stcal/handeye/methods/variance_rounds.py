@@ -1,4 +1,4 @@
-"""Observations in groups of one σ each, and the adjustment that estimates these σ in rounds."""
+"""An adjustment with unknown σ: groups of observations with one σ each, estimated in rounds."""
 
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar

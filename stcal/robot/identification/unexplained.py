@@ -1,10 +1,4 @@
-"""F tests of whether residuals of a model go with a joint's angle, gravity or place.
-
-Each candidate is a set of motions of the tool. What the fitted parameters can absorb of it is removed first, so that a
-clean fit gives F its exact distribution, whatever share of the degrees of freedom the parameters used (Frisch & Waugh
-1933). The strongest candidate is named and removed too, and the others are tested again: one cause is not named six
-times.
-"""
+"""F tests of what a model leaves unexplained: residuals that go with a joint's angle, gravity or place."""
 
 from dataclasses import dataclass
 
