@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.io.saving import json_text
+from stcal.io.files import json_text
 from stcal.parallel import ONE_THREAD
 from stcal.register import register
 from stcal.register.core.pairs import read_pairs

@@ -215,7 +215,7 @@ def proportional(pid: int) -> int:
 def timed_detection(data: Path, cache: Path):
     """Seconds of detection alone, and the centres of the board's dots by image."""
     from stcal.io.images import find_images
-    from stcal.sfm.detect.circles.ellipses import EllipseOptions
+    from stcal.sfm.detect.circles.candidates import EllipseOptions
     from stcal.sfm.detect.files import detect_files
 
     designs = load_target(data / "target.toml"), load_board(data / "board.toml")
@@ -262,7 +262,7 @@ def timed_advice() -> float:
     from stcal.sfm.adjust.joint import covariance_of
     from stcal.sfm.planning.advise import Known, advise
     from stcal.sfm.planning.forecast import CentreNoise, Setup
-    from stcal.sfm.planning.simulated import observe, true_models
+    from stcal.sfm.planning.nominal import observe, true_models
     from stcal.sfm.planning.views import known_scene
     from stcal.synthetic.scene import SceneOptions, make_scene
 
@@ -363,7 +363,7 @@ def detection_profile(paths: list[Path], data: Path) -> dict[str, float]:
     from stcal.io.images import decode
     from stcal.parallel import one_thread
     from stcal.sfm.detect import files, image
-    from stcal.sfm.detect.circles.ellipses import EllipseOptions
+    from stcal.sfm.detect.circles.candidates import EllipseOptions
 
     target, board = load_target(data / "target.toml"), load_board(data / "board.toml")
     camera = read_camera(data / "cameras.txt")

@@ -24,7 +24,7 @@ from stcal.geometry.rigid import Rigid, Similarity
 from stcal.report.figure import COLOURS, FAINT, INK, calm, new_figure
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
-from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import SceneOptions, make_scene, nominal_target_from_face
 
@@ -34,8 +34,8 @@ FOCAL_PX = 24 / 36 * 5184
 """Of a 24 mm lens over 5184 px."""
 NOISE_PX = 0.01
 LAYERS = (
-    ("errors", "geometry"),
-    ("labels", "design", "likeness", "io", "boards", "report"),
+    ("errors", "cross_validation", "geometry"),
+    ("labels", "design", "lookalikes", "io", "boards", "report"),
     ("synthetic", "drawing"),
     ("sfm", "robot", "register", "handeye", "locate"),
     ("workflows",),

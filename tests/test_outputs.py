@@ -9,7 +9,7 @@ from typer.models import ParameterInfo
 
 from stcal.cli.main import main
 from stcal.cli.options import ALWAYS_NEW
-from stcal.io.saving import RUN_ENTRIES, RUN_MARKER, keep_apart
+from stcal.io.files import RUN_ENTRIES, RUN_MARKER, keep_apart
 from tests.commands import CALLS, COMMANDS, paths_of
 from tests.outcome import fails_with
 

@@ -24,7 +24,7 @@ import numpy as np
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import METHODS, handeye, motion_errors
-from stcal.handeye.data.loop import Loop, Motions
+from stcal.handeye.data.pairs import Loop, Motions
 from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.solve import UNIT_MM
 from stcal.parallel import one_thread

@@ -31,8 +31,8 @@ from stcal.register.core.liu2017 import Liu2017Options, affine_least_squares, li
 from stcal.register.workspace.field import residual_field
 from stcal.report.figure import save
 from stcal.robot.identification.result import IdentifyOptions
-from stcal.robot.kinematics.damped import InverseProblem, solve
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.inverse import InverseProblem, solve
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import made

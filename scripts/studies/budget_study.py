@@ -37,7 +37,7 @@ from stcal.sfm.adjust.uncertainty import contributions_of, derivatives
 from stcal.sfm.budget.combine import Budget, budget
 from stcal.sfm.budget.sources import FIELDS, Statement, correction
 from stcal.sfm.data.model import MetricModel
-from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of

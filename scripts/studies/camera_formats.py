@@ -11,7 +11,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.fit import fit_lens
+from stcal.io.cameras.difference import fit_lens
 from stcal.io.cameras.foreign import ForeignLens
 from stcal.io.cameras.forms import WRITERS, written
 from stcal.io.cameras.model import CalibratedCamera, parameter_names

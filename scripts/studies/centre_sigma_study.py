@@ -19,9 +19,9 @@ import numpy as np
 from stcal.geometry.camera import Camera
 from stcal.io.images import decode
 from stcal.parallel import one_thread
-from stcal.sfm.data.observations import Centres
+from stcal.sfm.data.model import Centres
+from stcal.sfm.detect.circles.candidates import Ellipses
 from stcal.sfm.detect.circles.centres import measure_centres
-from stcal.sfm.detect.circles.ellipses import Ellipses
 from tests.support import degrade
 
 RADII_PX = (6.0, 8.0, 12.0, 20.0, 30.0)

@@ -28,8 +28,7 @@ import numpy as np
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
 from stcal.robot.identification.adjustment import parameter_units
-from stcal.robot.identification.elastic import HEAVIER
-from stcal.robot.identification.nominal import Deviations, NominalRows
+from stcal.robot.identification.prior import HEAVIER, Deviations, NominalRows
 from stcal.robot.identification.residuals import State, jacobian, observed, tip_jacobian, tips
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify

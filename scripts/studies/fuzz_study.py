@@ -27,8 +27,8 @@ from stcal.parallel import ONE_THREAD
 
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
 
-from stcal.io.saving import json_text
-from stcal.io.saving import save as write
+from stcal.io.files import json_text
+from stcal.io.files import save as write
 from tests.commands import CALLS, COMMANDS
 from tests.fuzzing.cases import Judged, option_cases
 from tests.fuzzing.mistakes import MISTAKES

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise, handeye
-from stcal.handeye.data.loop import SETUPS, Loop
+from stcal.handeye.data.pairs import SETUPS, Loop
 from stcal.handeye.data.views import Views, pairs_of_views
 from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.noise import components

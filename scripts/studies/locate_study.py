@@ -24,9 +24,9 @@ from stcal.geometry.rigid import Poses
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode, find_images
+from stcal.locate.calibration.solve import CalibrationImages
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.data.layout import LayoutPlan, TargetLayout
-from stcal.locate.data.views import CalibrationImages
 from stcal.locate.pipeline import LocateOptions, run
 from stcal.locate.pose.estimate import locate
 from stcal.locate.pose.merge import merge
@@ -34,7 +34,7 @@ from stcal.locate.pose.patent import PatentOptions
 from stcal.locate.pose.verdict import VerdictOptions, judge
 from stcal.parallel import one_thread
 from stcal.synthetic.exposure import Light, expose
-from stcal.workflows.locate import calibration_images
+from stcal.workflows.board_views import calibration_images
 from tests.support.holdout import PoseTrial, half_calibrated, subset_trials
 from tests.support.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
 

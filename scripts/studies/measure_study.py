@@ -16,7 +16,7 @@ import numpy as np
 
 from stcal.io.cameras.model import CameraPrior, intrinsic_basis
 from stcal.parallel import one_thread
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.measurement.pose import TargetPose, pose_from_circles
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of

@@ -23,7 +23,7 @@ from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
-from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, nominal_target_from_face
 from stcal.workflows.cluster import executor_of

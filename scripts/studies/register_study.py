@@ -28,9 +28,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher
 
 from stcal.errors import DegenerateError
-from stcal.geometry.affine import Affine
 from stcal.geometry.align import align_rigid
-from stcal.geometry.rigid import Rigid, Similarity, skew
+from stcal.geometry.rigid import Affine, Rigid, Similarity, skew
 from stcal.parallel import one_thread
 from stcal.register import Liu2017Options, Registration, register
 from stcal.register.core.liu2017 import affine_least_squares

@@ -20,9 +20,9 @@ from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.checks.suite import Evidence, run_checks
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.database import write_database
-from stcal.sfm.mapping.graph import image_graph
+from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.solve import solve_groups
 from stcal.synthetic.observe import image_circles, simulate_centres

@@ -25,7 +25,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stcal.io.saving import json_text
+from stcal.io.files import json_text
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.adjust.options import AdjustOptions

@@ -1,4 +1,4 @@
-"""Readers of board files of every kind: dots (``stcal.io.design``), chessboards, ChArUco boards, tags, and Kalibr's."""
+"""Readers of board files: dots (``stcal.io.design``), chessboards, ChArUco boards, AprilGrids, and Kalibr's YAML."""
 
 import tomllib
 from pathlib import Path
@@ -9,7 +9,6 @@ import numpy as np
 import yaml
 from pydantic import AfterValidator, Field, model_validator
 
-from stcal.boards import kalibr
 from stcal.boards.design import (
     AprilGridDesign,
     AsymmetricCirclesDesign,
@@ -199,7 +198,7 @@ def design_of(path: str | Path, content: dict[str, Any] | None) -> BoardDesign |
 def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
     """Return the board of keys and values; errors as :func:`load_flat_board`, with ``where`` in front."""
     if "target_type" in content:
-        return kalibr.board_of(content, where)
+        return kalibr_board_of(content, where)
     kind = content.get("type", "circles")
     if kind == "circles":
         return board_design(validated(content, BoardEntry, where), where)
@@ -343,3 +342,86 @@ def _asymmetric(data: _AsymmetricCircles, where: str) -> AsymmetricCirclesDesign
             "neighbours in a row are apart",
         )
     return AsymmetricCirclesDesign(data.rows, data.columns, data.spacing_mm, radius, data.polarity, data.sigma_mm)
+
+
+METRE_MM = 1000.0
+MOST_M = 100.0
+"""Longest tag, square or spacing, m; a larger value is a wrong unit."""
+SAME_WITHIN = 1e-6
+"""Largest relative difference between the sides of a square."""
+FAMILY = "DICT_APRILTAG_36h11"
+KALIBR_KINDS = ("aprilgrid", "checkerboard", "circlegrid")
+
+Metres = Annotated[Positive, Field(le=MOST_M)]
+
+
+class _KalibrAprilGrid(Strict):
+    target_type: Literal["aprilgrid"]
+    tagCols: Few
+    tagRows: Few
+    tagSize: Metres
+    tagSpacing: Annotated[float, Field(gt=0, le=10, strict=True)]
+    codeOffset: Annotated[int, Field(ge=0, strict=True)] = 0
+
+
+class _Checkerboard(Strict):
+    target_type: Literal["checkerboard"]
+    targetCols: Squares
+    targetRows: Squares
+    rowSpacingMeters: Metres
+    colSpacingMeters: Metres
+
+
+class _CircleGrid(Strict):
+    target_type: Literal["circlegrid"]
+    targetCols: Count
+    targetRows: Count
+    spacingMeters: Metres
+    asymmetricGrid: bool
+
+
+def kalibr_board_of(
+    content: dict[str, Any], where: str
+) -> AprilGridDesign | ChessboardDesign | AsymmetricCirclesDesign:
+    """Return the board of a file of Kalibr; the message of an InputError begins with ``where``.
+
+    Kalibr's frame of an AprilGrid differs by half a turn about X (:class:`AprilGridDesign`). Its asymmetric circle
+    grids do not state the radius of circles, which is determined from images.
+
+    Raises
+    ------
+    InputError
+        Keys are missing or unknown, the kind is another one, squares are oblong, or a grid of circles is not
+        asymmetric.
+    """
+    kind = content["target_type"]
+    if kind == "aprilgrid":
+        data = validated(content, _KalibrAprilGrid, where)
+        available = len(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11).bytesList)
+        if (count := data.codeOffset + data.tagRows * data.tagCols) > available:
+            raise InputError(
+                "E-TAG-ID-RANGE",
+                f"{where}: tags up to {count - 1}, tag36h11 has 0 … {available - 1}; correct tagRows, tagCols",
+            )
+        size = METRE_MM * data.tagSize
+        return AprilGridDesign(data.tagRows, data.tagCols, size, data.tagSpacing, None, data.codeOffset, FAMILY)
+    if kind == "checkerboard":
+        data = validated(content, _Checkerboard, where)
+        across, down = data.colSpacingMeters, data.rowSpacingMeters
+        if abs(across - down) > SAME_WITHIN * across:
+            raise InputError(
+                "E-BOARD-SPACING",
+                f"{where}: colSpacingMeters {across:g}, rowSpacingMeters {down:g}; squares needed, both the same",
+            )
+        return ChessboardDesign(data.targetRows, data.targetCols, METRE_MM * across)
+    if kind == "circlegrid":
+        data = validated(content, _CircleGrid, where)
+        if not data.asymmetricGrid:
+            raise InputError(
+                "E-BOARD-RADIUS",
+                f"{where}: asymmetricGrid false, a grid whose circles have no radius; write a board.toml with rows, "
+                "columns, pitch_mm, radius_mm and polarity",
+            )
+        spacing = METRE_MM * data.spacingMeters
+        return AsymmetricCirclesDesign(data.targetRows, data.targetCols, spacing, None, "dark")
+    raise InputError("E-BOARD-TYPE", f"{where}: target_type {kind!r}; one of {', '.join(KALIBR_KINDS)} needed")

@@ -119,7 +119,7 @@ def compare(
 
 
 def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
-    from stcal.io.cameras.fit import fit_lens
+    from stcal.io.cameras.difference import fit_lens
     from stcal.io.cameras.model import CameraModel
     from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
     from stcal.io.cameras.read import read_lens

@@ -120,7 +120,7 @@ def calibrate(
     from stcal.locate.calibration.solve import calibrate as calibrated
     from stcal.locate.data.layout import layout_toml, load_plan
     from stcal.locate.report.calibration import calibrated_file, calibrated_text, warnings
-    from stcal.workflows.locate import calibration_images
+    from stcal.workflows.board_views import calibration_images
 
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
     dictionaries = tuple(dict.fromkeys(dictionary for dictionary, _ in plan.tags))
@@ -231,10 +231,9 @@ def run(
     from stcal.locate.pipeline import run as located
     from stcal.locate.pose.patent import PatentOptions
     from stcal.locate.pose.verdict import VerdictOptions
-    from stcal.locate.report.chain import read_chain, read_registered
+    from stcal.locate.report.chain import on_chain, read_chain, read_registered
     from stcal.locate.report.located import LocatedFile
     from stcal.locate.report.page import accepted, poses_csv, run_text, uncertain
-    from stcal.locate.report.plausible import on_chain
 
     if hand_eye and registration:
         raise InputError(

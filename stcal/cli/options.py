@@ -15,12 +15,12 @@ import typer
 from stcal.cli.help import Command, panel_of
 from stcal.cli.terminal import STANDARD_OUTPUT, manner, print_each, said_apart, say
 from stcal.errors import ChecksFailed, InputError, StcalError
-from stcal.io.saving import keep_apart
+from stcal.io.files import keep_apart
 
 if TYPE_CHECKING:
     from stcal.io.quaternions import Order
     from stcal.io.table import Table
-    from stcal.sfm.detect.circles.ellipses import EllipseOptions
+    from stcal.sfm.detect.circles.candidates import EllipseOptions
 
 
 Images = Annotated[Path, typer.Argument(help="Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.")]
@@ -255,7 +255,7 @@ def load_ahead(workers: int | None) -> None:
 
 def ellipse_options(min_diameter: float | None, max_diameter: float) -> "EllipseOptions":
     """Sizes of the circles that detection seeks."""
-    from stcal.sfm.detect.circles.ellipses import EllipseOptions
+    from stcal.sfm.detect.circles.candidates import EllipseOptions
 
     if min_diameter is not None and max_diameter <= min_diameter:
         raise InputError(
@@ -354,7 +354,7 @@ def designs_told(
         Whether the reference design stands in for a file that was not.
     """
     from stcal.io.design import target_of
-    from stcal.sfm.detect.ambiguity import likeness_notes
+    from stcal.sfm.detect.sightings import likeness_notes
 
     if target is not None:
         print_each("note", likeness_notes(target_of(target)))

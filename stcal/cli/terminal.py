@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from stcal.io import saving
+from stcal.io import files
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -154,10 +154,10 @@ def said_apart() -> Iterator[None]:
 def write(path: Path, content, said: str = "written") -> None:
     """Save text, bytes, or a dict or result file as JSON, and say so; or give JSON to standard output, ``-``."""
     if path == STANDARD_OUTPUT and (taker := _taker.get()) is not None:
-        taker.write(_escaped(saving.json_text(content), taker.encoding or "ascii"))
+        taker.write(_escaped(files.json_text(content), taker.encoding or "ascii"))
         taker.flush()
         return
-    saving.save(path, content if isinstance(content, str | bytes) else saving.json_text(content))
+    files.save(path, content if isinstance(content, str | bytes) else files.json_text(content))
     say(f"{said}: {path}")
 
 

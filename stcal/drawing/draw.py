@@ -3,19 +3,20 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from stcal.boards.design import BoardSet, FlatBoard
 from stcal.boards.file import board_content
 from stcal.boards.several import load_boards
 from stcal.design import BoardDesign, TargetDesign
-from stcal.drawing.dxf import dxf
+from stcal.drawing.formats import dxf, pdf, svg
 from stcal.drawing.net import net_parts
 from stcal.drawing.parts import Part, board_parts, target_parts
-from stcal.drawing.pdf import pdf
+from stcal.drawing.shapes import said_mm
 from stcal.drawing.sheets import MOST_MM, PAPERS, Sheet, one_sheet, paper_sheets
-from stcal.drawing.svg import svg
 from stcal.errors import InputError
 from stcal.io.design import load_target
-from stcal.io.saving import save
+from stcal.io.files import save
 
 SUFFIXES = (".pdf", ".svg", ".dxf")
 OWN = "own"
@@ -129,3 +130,23 @@ def _paper(path: Path, paper: str) -> str:
             "E-OPTION-CONFLICT", f"--paper {paper}: a DXF is no page; take .pdf or .svg, or leave --paper out"
         )
     return name
+
+
+def drawn_text(drawn: Drawn) -> str:
+    """Return the parts and sheets of a drawing, and how to use them, as text."""
+    lines = []
+    for part in drawn.parts:
+        width, height = np.ptp(part.outline, axis=0).tolist()
+        lines.append(f"{part.name}: {said_mm(width)} × {said_mm(height)} mm")
+    sheets = len(drawn.sheets)
+    kind = "of its own size" if drawn.paper == OWN else drawn.paper
+    lines.append(f"{drawn.path}: {sheets} sheet{'s' if sheets > 1 else ''} {kind}")
+    if drawn.path.suffix.lower() == ".dxf":
+        lines.append("lengths are mm; PATTERN and GROUND are inked or milled, CUT is cut, the other layers are to read")
+    else:
+        lines.append("print at 100 %, not fitted to the page, and measure the scale bars")
+    if drawn.paper != OWN and sheets > len(drawn.parts):
+        lines.append(
+            "parts that are glued of several sheets are off at the seams: state it in sigma_mm, or print larger"
+        )
+    return "\n".join(lines)

@@ -3,8 +3,7 @@
 import numpy as np
 
 from stcal.errors import DegenerateError
-from stcal.geometry.affine import Affine
-from stcal.geometry.rigid import Rigid, Similarity
+from stcal.geometry.rigid import Affine, Rigid, Similarity
 
 
 def align_rigid(xyz_a: np.ndarray, xyz_b: np.ndarray, weights: np.ndarray | None = None) -> Rigid:

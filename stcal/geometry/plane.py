@@ -1,13 +1,16 @@
-"""Planes, plane-to-plane homographies, and poses of planar patterns."""
+"""Planes, homographies between them, and the two poses from which a camera may see one (Collins & Bartoli 2014)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from stcal.errors import DegenerateError
+from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.arrays import Array, freeze
-from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
+from stcal.geometry.least_squares import Minima, NormalEquations, PoseStack, minimise, perturbed
 from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
 
 MAX_STEPS = 100
 EXACT = 1e-22
@@ -197,3 +200,241 @@ def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normal
         raise DegenerateError("E-POINTS-BEHIND", "planar pose: points behind the camera")
     minimum = minimise(camera_from_plane, linearise, perturbed, least_gain=EXACT, max_steps=MAX_STEPS)
     return minimum.required("planar pose", "check that the points are numbered rightly").state
+
+
+OUTLIER = 6.0
+"""Length of an outlier, in stated σ or the residuals' robust σ, whichever is larger; chance exceeds it for one point in
+6·10⁷ (Rayleigh)."""
+MAX_OUTLIER_SHARE = 1 / 3
+"""Largest share of outliers among the observed points; beyond it the inliers are no trustworthy majority."""
+SAME = 1.0
+"""Distance, in σ, below which two minima count as one: the covariance covers both."""
+WIDER = 1.1
+"""Factor of increase of the residuals' robust σ beyond which the descent is repeated with a new limit of Huber's
+loss."""
+MAX_SIGMA_RAD = 0.5
+"""Largest σ of a usable rotation; beyond it linear error propagation is meaningless."""
+Descend = Callable[[PoseStack, float], Minima]
+"""Function that descends from h poses, with the limit of Huber's loss in σ, to the h minima next to them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaneMinima:
+    """The distinct minima of the residuals of single points.
+
+    ``minima`` : one or two, the better one first; ``robust_sigma`` : robust σ of the residuals in units of their stated
+    σ, 1 or more.
+    """
+
+    minima: Minima
+    robust_sigma: float
+
+    @property
+    def outlier_limit(self) -> float:
+        """Length, in stated σ, beyond which a residual is an outlier."""
+        return OUTLIER * self.robust_sigma
+
+
+def mirrored(poses: PoseStack, target_from_plane: Rigid) -> PoseStack:
+    """Return h poses camera_from_target with the depths about the plane's origin mirrored along the line of sight."""
+    middle = poses.rotation @ target_from_plane.translation + poses.translation
+    sight = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    mirror = np.eye(3) - 2 * sight[:, :, None] * sight[:, None, :]
+    axis = target_from_plane.rotation[:, 2]
+    rotation = mirror @ poses.rotation @ (np.eye(3) - 2 * np.outer(axis, axis))
+    return PoseStack(rotation, middle - rotation @ target_from_plane.translation)
+
+
+def step_between(pose: PoseStack, second: PoseStack) -> np.ndarray:
+    """Return the left perturbation (6,), rad and mm, from one pose to a second; both are stacks of one pose."""
+    turn = Rotation.from_matrix(second.rotation[0] @ pose.rotation[0].T).as_rotvec()
+    return np.concatenate([turn, second.translation[0] - pose.translation[0]])
+
+
+def distinct(poses: PoseStack, normal: np.ndarray, robust_sigma: float = 1.0) -> bool:
+    """Return True if the second of two poses differs significantly from the first.
+
+    Parameters
+    ----------
+    poses : the two poses
+    normal : (6, 6) normal matrix of the first pose, by the stated σ
+    robust_sigma : robust σ of the residuals, in stated σ. If it exceeds 1, the stated σ are too small, and so is the σ
+        of the pose: without this factor two minima that the residuals cannot tell apart would count as two.
+    """
+    step = step_between(poses[[0]], poses[[1]])
+    return bool(step @ normal @ step > (SAME * robust_sigma) ** 2)
+
+
+def two_minima(
+    descend_near: Callable[[PoseStack], Descend],
+    start: PoseStack,
+    target_from_plane: Rigid,
+    failure: str,
+    planar: bool = True,
+) -> PlaneMinima:
+    """Return one or two distinct minima of the residuals of single points.
+
+    Parameters
+    ----------
+    descend_near : returns the descent with residuals whitened near a stack of one pose; the whitening is the same for
+        both minima, so that their costs are comparable
+    start : one pose, to which its mirror image is added, or two poses, the likelier one first
+    target_from_plane : frame with the origin in the middle of the points, Z along the plane's normal
+    failure : message of the ConvergenceError
+    planar : True if all points lie in the plane. If the two starts then end in the same minimum, they may have been on
+        the same side, and the mirror image of the minimum is tried as a further start.
+
+    Raises
+    ------
+    ConvergenceError
+        No minimum is reached.
+    """
+    poses = start.plus(mirrored(start, target_from_plane)) if len(start) == 1 else start
+    sigma = 1.0
+    for _ in range(2):  # the second time with the residuals' robust σ, if that is larger
+        descend = descend_near(poses[[0]])
+        minima = _ordered(descend(poses, HUBER * sigma))
+        poses = minima.poses
+        wider = robust_sigma(minima.length[0], 2)
+        if wider <= WIDER * sigma:
+            break
+        sigma = wider
+    if not np.isfinite(minima.cost[0]) or not minima.settled[0]:
+        raise ConvergenceError("E-NO-MINIMUM", failure)
+    is_double = distinct(minima.poses, minima.normal[0], sigma)
+    if planar and not is_double:
+        again = descend(mirrored(minima.poses[[0]], target_from_plane), HUBER * sigma)
+        minima = _ordered(minima.rows([0]).plus(again))
+        is_double = distinct(minima.poses, minima.normal[0], sigma)
+    return PlaneMinima(minima if is_double and np.isfinite(minima.cost[1]) else minima.rows([0]), sigma)
+
+
+def _ordered(found: Minima) -> Minima:
+    return found.rows(np.argsort(found.cost, kind="stable"))
+
+
+def weights_of(length: np.ndarray) -> np.ndarray:
+    """Return Huber's weights of points, same shape, from the lengths of their residuals in σ."""
+    return huber_weights(length, HUBER)
+
+
+def deciding_delta(flip_odds: float, sigma_margin: float, variance_factor: float) -> float:
+    """Return the Δχ² of the second solution that decides for the first: −2 ln of the odds, times a variance factor.
+
+    Parameters
+    ----------
+    flip_odds : largest odds of the second solution, for Gaussian errors
+    sigma_margin : factor by which all σ may be too small without exceeding these odds
+    variance_factor : χ² over redundancy; it counts if it exceeds the margin's square
+    """
+    return -2 * float(np.log(flip_odds)) * max(sigma_margin**2, variance_factor)
+
+
+def covariance_of_both(covariance: np.ndarray, away: np.ndarray, delta_chi2: float) -> np.ndarray:
+    """Return the second moment (6, 6) about a pose if a second pose, ``away`` (6,) from it, may be the true one."""
+    odds = np.exp(-delta_chi2 / 2)
+    return covariance + odds / (1 + odds) * np.outer(away, away)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weighed:
+    """Result of one step of generalised least squares from h poses.
+
+    ``poses`` : poses after the step; ``residual`` : (h, n, 2) after the step, to first order; ``normal`` : (h, 6, 6);
+    ``chi2`` : (h,); ``moved2`` : (h,) squared length of the step in σ.
+    """
+
+    poses: PoseStack
+    residual: np.ndarray
+    normal: np.ndarray
+    chi2: np.ndarray
+    moved2: np.ndarray
+
+
+def weigh(residual: np.ndarray, by_pose: np.ndarray, covariance: np.ndarray, poses: PoseStack) -> Weighed:
+    """Return the step of h poses that weights the points by the full covariance of their residuals.
+
+    Parameters
+    ----------
+    residual : (h, n, 2) measured minus projected
+    by_pose : (h, n, 2, 6) negative derivative of the residuals by left perturbations
+    covariance : (h, 2n, 2n)
+    """
+    h = len(residual)
+    r, a = residual.reshape(h, -1, 1), by_pose.reshape(h, -1, 6)
+    solved = np.linalg.solve(covariance, np.concatenate([a, r], axis=2))
+    back = np.swapaxes(a, 1, 2) @ solved
+    normal, right = back[..., :6], back[..., 6:]
+    step = np.linalg.solve(normal, right)[..., 0]
+    square = (np.swapaxes(r, 1, 2) @ solved[..., 6:])[:, 0, 0]
+    gain = (step * right[..., 0]).sum(1)
+    remaining = residual - (a @ step[..., None]).reshape(residual.shape)
+    return Weighed(poses.moved(step), remaining, normal, square - gain, gain)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlanePoses:
+    """The two poses camera_from_plane that agree with a homography about one point to first order.
+
+    ``poses`` : both poses; ``determinant`` : determinant of the homography's derivative at the point, in (normalised
+    coordinates per unit of the plane)²; ``foreshortening`` : cosine of the angle between the plane's normal and the
+    line of sight, independent of the size and distance of the plane.
+    """
+
+    poses: tuple[Rigid, Rigid]
+    determinant: float
+    foreshortening: float
+
+
+def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePoses:
+    """Return both poses from n ≥ 4 points (n, 2) of a plane and their ideal normalised coordinates (n, 2).
+
+    The homography is computed by the normalised DLT, its derivative at the mean of the points. The Z axis of the plane
+    points away from the camera.
+
+    Raises
+    ------
+    DegenerateError
+        The points do not determine a homography, or the plane is seen edge-on or from behind.
+    """
+    xy, xy_image = np.asarray(xy_plane, float), np.asarray(xy_normalised, float)
+    middle = xy.mean(0)
+    homography = fit_homography(xy - middle, xy_image)
+    jacobian = homography_jacobian(homography, np.zeros((1, 2)))[0]
+    determinant = float(np.linalg.det(jacobian))
+    if determinant <= 0:
+        raise DegenerateError(
+            "E-POINTS-MIRRORED", "plane: its points are seen mirrored; seen from behind, or numbered wrongly"
+        )
+    sight_point = homography[:2, 2] / homography[2, 2]
+    camera_from_sight = _turn_to(np.append(sight_point, 1.0))
+    # Derivative of the projection onto a screen perpendicular to the line of sight, at unit distance.
+    flat = np.linalg.solve(np.column_stack([np.eye(2), -sight_point]) @ camera_from_sight[:, :2], jacobian)
+    large, small = np.linalg.svd(flat, compute_uv=False)
+    upper = flat / large
+    remainder = np.eye(2) - upper.T @ upper
+    low = np.sqrt(np.maximum(np.diag(remainder), 0)) * [1.0, -1.0 if remainder[0, 1] < 0 else 1.0]
+    poses = []
+    for sign in (1.0, -1.0):
+        first, second = np.append(upper[:, 0], sign * low[0]), np.append(upper[:, 1], sign * low[1])
+        turn = np.column_stack([first, second, np.cross(first, second)])
+        u, _, vt = np.linalg.svd(camera_from_sight @ turn)
+        poses.append(_placed(u @ vt, xy, xy_image))
+    return PlanePoses((poses[0], poses[1]), determinant, float(small / large))
+
+
+def _turn_to(sight: np.ndarray) -> np.ndarray:
+    """Return the smallest rotation that takes Z to the direction ``sight``, which points forwards (z > 0)."""
+    x, y, z = sight / np.linalg.norm(sight)
+    cross = skew(np.array([-y, x, 0.0]))
+    return np.eye(3) + cross + cross @ cross / (1 + z)
+
+
+def _placed(rotation: np.ndarray, xy: np.ndarray, seen: np.ndarray) -> Rigid:
+    """Return the pose with this rotation and the translation that fits the points best (linear least squares)."""
+    turned = xy @ rotation[:, :2].T
+    rows = np.zeros((len(xy), 2, 3))
+    rows[:, 0, 0] = rows[:, 1, 1] = 1
+    rows[:, :, 2] = -seen
+    right = seen * turned[:, 2:] - turned[:, :2]
+    return Rigid(rotation, np.linalg.lstsq(rows.reshape(-1, 3), right.ravel())[0])

@@ -1,4 +1,4 @@
-"""Rigid and similarity transforms: ``a_from_b @ b_from_c == a_from_c`` and ``xyz_a = a_from_b @ xyz_b``."""
+"""Rigid, similarity and affine transforms: ``a_from_b @ b_from_c == a_from_c`` and ``xyz_a = a_from_b @ xyz_b``."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from stcal.errors import InputError
+from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import Array, freeze, frozen
 
 UNIT_WITHIN = 1e-3
@@ -274,3 +274,53 @@ class Poses:
         """Return the motions (m, 6) from ``other`` to these: rotation vector (rad) and translation (mm) in frame a."""
         turn = self.rotation @ np.swapaxes(other.rotation, 1, 2)
         return np.hstack([Rotation.from_matrix(turn).as_rotvec(), self.translation - other.translation])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Affine:
+    """An affine transform a_from_b of twelve parameters.
+
+    Parameters
+    ----------
+    linear : (3, 3) array
+    translation : (3,) array
+        Image of b's origin in a, mm.
+    """
+
+    linear: Array
+    translation: Array
+
+    def __post_init__(self):
+        freeze(self, "linear", (3, 3), "linear part")
+        freeze(self, "translation", (3,), "translation")
+
+    def matrix(self) -> np.ndarray:
+        """Return the homogeneous 4×4 matrix."""
+        m = np.eye(4)
+        m[:3, :3], m[:3, 3] = self.linear, self.translation
+        return m
+
+    def inverse(self) -> "Affine":
+        """Return b_from_a.
+
+        Raises
+        ------
+        DegenerateError
+            The linear part is singular.
+        """
+        if np.linalg.cond(self.linear) > 1e12:
+            raise DegenerateError(
+                "E-AFFINE-SINGULAR", "affine transform: its 3×3 part is singular; an invertible one needed"
+            )
+        back = np.linalg.inv(self.linear)
+        return Affine(back, -back @ self.translation)
+
+    @overload
+    def __matmul__(self, other: "Affine") -> "Affine": ...
+    @overload
+    def __matmul__(self, other: ArrayLike) -> np.ndarray: ...
+    def __matmul__(self, other):
+        """Return a_from_c for a transform b_from_c, or points in frame a for points (..., 3) in frame b, mm."""
+        if isinstance(other, Affine):
+            return Affine(self.linear @ other.linear, self.linear @ other.translation + self.translation)
+        return np.asarray(other, float) @ self.linear.T + self.translation

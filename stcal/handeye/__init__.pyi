@@ -1,4 +1,4 @@
-from .data.loop import SETUPS as SETUPS
+from .data.pairs import SETUPS as SETUPS
 from .data.pairs import HandEyePoses as HandEyePoses
 from .data.pairs import read_poses as read_poses
 from .data.rig import RigCamera as RigCamera
@@ -11,7 +11,7 @@ from .methods.noise import Noise as Noise
 from .plan import NextPoses as NextPoses
 from .plan import plan_poses as plan_poses
 from .result import HandEye as HandEye
-from .rig.result import Rig as Rig
+from .rig.solve import Rig as Rig
 from .rig.solve import RigOptions as RigOptions
 from .rig.solve import handeye_rig as handeye_rig
 from .solve import METHODS as METHODS

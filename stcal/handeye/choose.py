@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from stcal.errors import DegenerateError, StcalError
-from stcal.handeye.data.loop import Setup
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import HandEyePoses, Setup
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.result import HandEye

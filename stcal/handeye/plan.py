@@ -11,8 +11,7 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.handeye.data.loop import Loop
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import HandEyePoses, Loop
 from stcal.handeye.result import HandEye
 
 CANDIDATES = 2000

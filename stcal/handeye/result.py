@@ -7,7 +7,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.loop import FRAMES, Setup
+from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.methods.reprojection import Reprojection
 
@@ -23,7 +23,7 @@ class HandEye:
     setup : str
         ``eye-in-hand`` or ``eye-to-hand``.
     mount_from_camera, stand_from_board : Rigid
-        The two unknowns, mm. :mod:`stcal.handeye.data.loop` defines mount and stand. See :attr:`transforms`.
+        The two unknowns, mm. :mod:`stcal.handeye.data.pairs` defines mount and stand. See :attr:`transforms`.
     residuals : (m, 6) array
         Deviation of each pose's chain from ``stand_from_board``: rotation vector (rad), and translation (mm) at the
         board's origin, in the axes of the stand.

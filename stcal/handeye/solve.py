@@ -11,18 +11,17 @@ from scipy.stats import chi2
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.loop import FRAMES, Loop, Motions, Setup, poses_with_log
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge import remarks
 from stcal.handeye.judge.conventions import Guess, check_conventions
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
 from stcal.handeye.judge.remarks import Aside
 from stcal.handeye.judge.symmetry import repair
-from stcal.handeye.methods import start
+from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.arm import ArmModel
 from stcal.handeye.methods.camera_error import of_poses
-from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, closed_form
+from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, solve_closed_form
 from stcal.handeye.methods.convex import convex
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
 from stcal.handeye.methods.noise import Noise
@@ -118,8 +117,8 @@ class _Task:
 def _guess(options: HandEyeOptions, seen: Observability, loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
     """Returns the first X, Z and scale."""
     if options.four_dof:
-        return start.about_one_axis(loop, seen.mount_axis, with_scale)
-    return start.robust(loop, with_scale)
+        return closed_form.about_one_axis(loop, seen.mount_axis, with_scale)
+    return closed_form.robust(loop, with_scale)
 
 
 @one_thread()
@@ -227,12 +226,12 @@ def _by_equations(task: _Task, method: str) -> HandEye:
                 f"{method}; use method pose or shah",
             )
     if method in (*AX_XB, *AX_ZB):
-        x, z = closed_form(loop, method, unit_mm)
+        x, z = solve_closed_form(loop, method, unit_mm)
     else:
         x = _by_motions(loop, method, unit_mm, task.options.evolution)
         if method == "de":
             notes = (*notes, Aside(task.options.evolution.in_words(unit_mm)))
-        z = start.mean_pose(task.loop.chain(x))
+        z = closed_form.mean_pose(task.loop.chain(x))
     outliers = np.zeros(len(task.loop), bool)
     residuals = task.loop.residuals(x, z)
     return HandEye(
@@ -255,7 +254,7 @@ def _by_motions(loop: Loop, method: str, unit_mm: float, options: EvolutionOptio
         return convex(motions, unit_mm)
     objective = Objective(motions.with_log(method), unit_mm, options.weight)
     farthest = max(np.linalg.norm(p.translation, axis=1).max() for p in (loop.camera_from_board, loop.stand_from_mount))
-    known_x = closed_form(loop, "park-martin", unit_mm)[0] if options.needs_closed_form() else None
+    known_x = solve_closed_form(loop, "park-martin", unit_mm)[0] if options.needs_closed_form() else None
     x = evolve(objective, options, float(farthest), known_x)
     return polish(objective, x) if method == "de-polished" else x
 
@@ -417,7 +416,7 @@ def _remarks(task: _Task, outliers: np.ndarray, residuals: np.ndarray, hint: tup
 def _without_slide(task: _Task, x: Rigid, z: Rigid, normal: np.ndarray):
     """Returns X with no translation along the one axis of rotation, Z, the covariance given that, and all notes."""
     axis, frames = task.seen.mount_axis, FRAMES[task.setup]
-    x, z = start.slid(x, z, axis, task.loop)
+    x, z = closed_form.slid(x, z, axis, task.loop)
     held = normal.copy()
     held[3:6, 3:6] += np.outer(axis, axis) / HELD_MM**2
     note = (

@@ -13,10 +13,9 @@ from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.loop import Loop, Setup
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.data.stream import Stream
-from stcal.handeye.methods import start
+from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
 from stcal.handeye.result import HandEye
@@ -148,7 +147,7 @@ def estimate_offset(
             )
         at = seconds[within] + offset
         loop = Loop.of(replace(pairs[within], base_from_flange=stream.at(at)), setup)
-        state = state or LoopState(*start.robust(loop, with_scale))
+        state = state or LoopState(*closed_form.robust(loop, with_scale))
         solution = adjust_poses(loop, state, noise, with_scale)
         state, speed = solution.state, stream.velocity(at)
         x, scale = state.mount_from_camera, state.scale
@@ -206,7 +205,7 @@ def _scanned(pairs: HandEyePoses, stream: Stream, seconds: np.ndarray, setup: Se
         if within.sum() < max(LEAST_POSES, LEAST_KEPT * len(seconds)):
             continue
         loop = Loop.of(replace(pairs[within], base_from_flange=stream.at(seconds[within] + offset)), setup)
-        miss = loop.residuals(*start.robust(loop, with_scale)).reshape(-1, 2, 3)
+        miss = loop.residuals(*closed_form.robust(loop, with_scale)).reshape(-1, 2, 3)
         cost = float(np.log(np.median(np.linalg.norm(miss, axis=2), axis=0) + 1e-12).sum())
         if cost < least:
             best, least = float(offset), cost

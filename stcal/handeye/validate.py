@@ -11,8 +11,7 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.loop import Loop, Motions, Setup
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import HandEyePoses, Loop, Motions, Setup
 from stcal.handeye.data.views import View, Views, resect
 from stcal.handeye.judge.remarks import Grave
 from stcal.handeye.judge.symmetry import repair

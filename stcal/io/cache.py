@@ -11,8 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from stcal.errors import StcalError
-from stcal.io.files import TABLE_BYTES, read_bytes
-from stcal.io.saving import save
+from stcal.io.files import TABLE_BYTES, read_bytes, save
 
 R = TypeVar("R")
 META = "meta"

@@ -1,8 +1,15 @@
-"""Reading of files that the user names, with a size limit for each kind of file."""
+"""Reading of files within a size limit, and writing: completely or not at all, and never over an input."""
 
 import errno
+import json
 import os
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from itertools import chain
 from pathlib import Path
+
+from stcal.errors import InputError
 
 MB = 1_000_000
 SETTINGS_BYTES = 10 * MB
@@ -49,3 +56,197 @@ def require_size(path: str | Path, most: int) -> None:
 def _too_large(path: str | Path, most: int) -> OSError:
     size = f"{Path(path).stat().st_size / MB:.0f} MB" if Path(path).is_file() else "no end"
     return OSError(errno.EFBIG, f"{size}, at most {most // MB} MB are read", str(path))
+
+
+RUN_MARKER = "stcal-run.json"
+"""Name of the file that marks the folder of a run."""
+CAMERA, TARGET, BOARD = "cameras.txt", "target.toml", "board.toml"
+"""Names of the copies of a run's inputs."""
+REFINED_CAMERA = "refined_cameras.txt"
+"""Name of the camera file with the intrinsics that a run refined, and their σ."""
+REPORT_PDF = "report.pdf"
+"""Name of the optional PDF of a run's report.html."""
+RUN_ENTRIES = (
+    RUN_MARKER,
+    "faces.json",
+    "report.json",
+    "report.html",
+    REPORT_PDF,
+    "labels.csv",
+    "detections.csv",
+    "database.db",
+    CAMERA,
+    REFINED_CAMERA,
+    TARGET,
+    BOARD,
+    "models",
+    "target_model",
+    "overlays",
+)
+"""Files and folders of a run, in the order in which they are put in place; the marker file describes the others."""
+UNFINISHED, ADDED, READY, CACHE = "unfinished", "added", "ready", "cache"
+"""Folders inside a run's folder: files of an unfinished run, files that a command adds to a finished run, results that
+are ready to be put in place, and the cache for later runs."""
+NEVER_READ = (".csv", ".json", ".html", ".pdf", ".svg")
+"""Suffixes of outputs that no command reads from a folder. Besides a run's entries, commands read images, YAML poses,
+and COLMAP's models and databases from folders."""
+
+
+def save(path: Path, content: str | bytes) -> None:
+    """Write a file atomically; a missing folder is made.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
+    """
+    if not path.name or path.is_dir():
+        raise InputError("E-OUTPUT-FOLDER", f"{path}: is a folder; the name of a file needed")
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        os.replace(partial, path)
+    except OSError as error:
+        raise InputError(
+            "E-OUTPUT-UNWRITABLE",
+            f"{path}: cannot be written: {error.strerror or error}; check the folder's space and rights, or give "
+            "another place",
+        ) from error
+    finally:
+        with suppress(OSError):  # if the folder's path is a file, there is nothing to remove
+            partial.unlink(missing_ok=True)
+
+
+def require_new_folder(out: Path, images: Path) -> None:
+    """Refuse, before the work, an output folder that is not empty, lies among the photographs, or cannot be written.
+
+    Raises
+    ------
+    InputError
+        The message names the reason.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError("E-OUTPUT-EXISTS", f"--out {out}: is not a new or empty folder; give another place")
+    if real_place(images) in (real_place(out), *real_place(out).parents):
+        raise InputError(
+            "E-OUTPUT-PLACE", f"--out {out}: lies in the folder of the photographs {images}; give another place"
+        )
+    above = next(parent for parent in out.absolute().parents if parent.exists())
+    try:
+        tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=above).cleanup()
+    except OSError as error:
+        raise InputError(
+            "E-OUTPUT-UNWRITABLE", f"--out {out}: cannot be written: {error.strerror or error}; give another place"
+        ) from error
+
+
+def save_folder(out: Path, files: dict[str, str]) -> None:
+    """Write all files into a new folder, or none of them.
+
+    Raises
+    ------
+    InputError
+        The files cannot be written.
+    """
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
+        made = Path(folder) / "made"
+        for name, content in files.items():
+            save(made / name, content)
+        try:
+            made.replace(out)
+        except OSError as error:
+            raise InputError(
+                "E-OUTPUT-UNWRITABLE", f"{out}: cannot be written: {error.strerror or error}; give another place"
+            ) from error
+
+
+def json_text(content) -> str:
+    """Return the text of a JSON file in the package's form; ``content`` : dict or ``stcal.io.json.ResultFile``."""
+    plain = content if isinstance(content, dict) else content.content()
+    return _indented(plain, "\n") + "\n"
+
+
+_encode = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
+PLAIN = {float, int, bool, type(None)}
+"""Types whose text holds neither a comma nor a bracket."""
+
+
+def _indented(value, line: str) -> str:
+    """Return the text of ``json.dumps`` with ``indent=1``, but faster.
+
+    The standard writer handles one number after the other; here lists of numbers, and lists of such lists, are encoded
+    at once. ``line`` : line break with the present indent.
+    """
+    inner = line + " "
+    if isinstance(value, dict):
+        items = [f"{_key(key)}: {_indented(item, inner)}" for key, item in value.items()]
+        return f"{{{inner}{f',{inner}'.join(items)}{line}}}" if items else "{}"
+    if not isinstance(value, list | tuple):
+        return _encode(value)
+    if not value:
+        return "[]"
+    kinds = set(map(type, value))
+    if kinds <= PLAIN:
+        return f"[{inner}{_encode(value)[1:-1].replace(',', f',{inner}')}{line}]"
+    if kinds == {list} and all(value) and set(map(type, chain.from_iterable(value))) <= PLAIN:
+        ends, between = f"{inner}]", f"{inner} "
+        rows = _encode(value)[2:-2].replace(",", f",{between}").replace(f"],{between}[", f"{ends},{inner}[{between}")
+        return f"[{inner}[{between}{rows}{ends}{line}]"
+    return f"[{inner}{f',{inner}'.join([_indented(item, inner) for item in value])}{line}]"
+
+
+def _key(key) -> str:
+    """Return a key as ``json.dumps`` writes it: numbers in quotes."""
+    return _encode(key) if isinstance(key, str) else _encode({key: 0})[1:-3]
+
+
+def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, Path]]) -> None:
+    """Refuse, before the work, outputs that would replace an input, a file in an input folder, or each other.
+
+    Parameters
+    ----------
+    outputs, inputs : (option, path); an input may be a folder
+
+    Raises
+    ------
+    InputError
+        The message names the output, and what it would replace.
+    """
+    places: dict[Path, str] = {}
+    for option, path in outputs:
+        place = real_place(path)
+        for given, read in inputs:
+            input_place = real_place(read)
+            if place == input_place:
+                raise InputError(
+                    "E-OUTPUT-IS-INPUT", f"{option} {path}: is an input of this command; give another name"
+                )
+            if input_place in place.parents and place.exists() and not _is_ours(place, input_place):
+                raise InputError(
+                    "E-OUTPUT-IS-INPUT", f"{option} {path}: is a file of {given} {read}; give another name"
+                )
+        if place in places:
+            raise InputError(
+                "E-OUTPUT-TWICE", f"{option} {path}: is also what {places[place]} writes; give each its own name"
+            )
+        if place.is_dir():
+            raise InputError("E-OUTPUT-FOLDER", f"{option} {path}: is a folder; the name of a file needed")
+        places[place] = option
+
+
+def real_place(path: str | Path) -> Path:
+    """Return the path with all links resolved; a circular link stays as it is, and is reported when it is read."""
+    return Path(os.path.realpath(path))
+
+
+def _is_ours(place: Path, folder: Path) -> bool:
+    """Return True if no command reads this file of an input folder, so that it may be replaced.
+
+    In a run's folder these are the files that no run makes; in a folder of images, those with the suffix of a table or
+    a page.
+    """
+    if (folder / RUN_MARKER).exists():
+        return place.relative_to(folder).parts[0] not in {*RUN_ENTRIES, UNFINISHED, ADDED, READY, CACHE}
+    return place.name not in RUN_ENTRIES and place.suffix.lower() in NEVER_READ

@@ -18,8 +18,7 @@ import numpy as np
 from PIL import Image
 
 from stcal.errors import InputError
-from stcal.io.files import IMAGE_BYTES, read_bytes
-from stcal.io.saving import RUN_MARKER
+from stcal.io.files import IMAGE_BYTES, RUN_MARKER, read_bytes
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 EXCLUDED = "taken out with --exclude"

@@ -12,8 +12,8 @@ from stcal.parallel import one_thread
 from stcal.register.core.covariance import covariance_of, shifted_too, sigma_within
 from stcal.register.core.liu2017 import Liu2017Options, liu2017
 from stcal.register.core.models import MODELS, parts, squares
-from stcal.register.core.problem import Problem, noise_of
-from stcal.register.core.result import Alternative, Registration
+from stcal.register.core.pairs import Problem, noise_of
+from stcal.register.core.result import Alternative, Registration, held_out
 from stcal.register.core.robust import (
     AS_GOOD,
     BY_CHANCE,
@@ -25,13 +25,10 @@ from stcal.register.core.robust import (
     turn_between,
 )
 from stcal.register.core.search import LEAST_SHARE
-from stcal.register.core.validate import held_out
 from stcal.register.judge.degeneracy import check_extent, check_supports, row_name
-from stcal.register.judge.groups import two_groups
-from stcal.register.judge.lengths import Wider, wider
-from stcal.register.judge.mistakes import check_mirrored, check_units, mirrored_error, mirrored_ratio
+from stcal.register.judge.groups import Shifted, shifted_rows, two_groups
+from stcal.register.judge.mistakes import Wider, check_mirrored, check_units, mirrored_error, mirrored_ratio, wider
 from stcal.register.judge.notes import Subject, notes_of
-from stcal.register.judge.shifts import Shifted, shifted_rows
 
 METHODS = ("robust", "least-squares", "liu2017")
 NEAREST_MM = 1e-9

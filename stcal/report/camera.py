@@ -3,8 +3,7 @@
 import numpy as np
 
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.difference import CameraDifference, image_grid, rays
-from stcal.io.cameras.fit import FittedLens
+from stcal.io.cameras.difference import CameraDifference, FittedLens, image_grid, rays
 from stcal.io.cameras.model import CalibratedCamera, parameter_names
 from stcal.io.cameras.photograph import SIGMA_FOCAL
 from stcal.report.figure import INK, SMALL, calm, new_figure

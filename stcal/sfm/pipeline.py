@@ -8,25 +8,24 @@ from stcal.errors import StcalError
 from stcal.io.cameras.model import CameraModel, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_of, target_of
+from stcal.io.files import save
 from stcal.io.images import chosen_images
-from stcal.io.saving import save
 from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread
 from stcal.sfm.adjust.calibration import calibrate, calibrate_board
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.checks.suite import run_checks
-from stcal.sfm.data.observations import by_group, detections_csv
+from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.detect.board_alone import is_board_alone, label_boards
 from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
 from stcal.sfm.detect.labels import LabelledImage, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
-from stcal.sfm.mapping.graph import image_graph
+from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.runs.folder import overlays_beside, write_run
-from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.solve import solve_groups, ungrouped, unseen_board, usable_groups
-from stcal.sfm.runs.transaction import RunFolder, run_folder
+from stcal.sfm.runs.transaction import MarkerFile, RunFolder, run_folder
 
 DRAWN_WITH = "matplotlib.backends.backend_svg", "mpl_toolkits.mplot3d.axes3d"
 """Modules that draw the figures of the report. They take half a second to load."""

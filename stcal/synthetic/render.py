@@ -1,16 +1,184 @@
-"""Synthesis of photographs of a scene: circles by exact area coverage, lens blur, vignetting, noise, quantisation."""
+"""Synthesis of photographs of a scene: circles by exact area coverage, lens blur, vignetting, background."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial import ConvexHull
 
+from stcal.design import Polarity
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
-from stcal.synthetic.background import draw_background, look_of
 from stcal.synthetic.observe import ImageCircles, image_circles, rim_points
-from stcal.synthetic.scene import Scene
+from stcal.synthetic.scene import Group, Scene
+
+WALL_BEHIND_MM = 350.0
+WALL_CELL_MM = 35.0
+WALL_REACH = 3.0
+"""Half the side of the wall, in widths of the view. An oblique view reaches far; cells out of view cost little."""
+LAMP_REACH_MM = 1000.0
+TABLE_BELOW_MM = 50.0
+SHIFT = 4
+"""Fractional bits of cv2's fixed-point pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Grey levels (0 to 255) of the parts of a scene; ``lamps`` is their range for discs and ellipses on the wall."""
+
+    circle: float
+    face: float
+    body: float
+    plate: float
+    wall: float
+    checker: tuple[float, float]
+    lamps: tuple[float, float]
+
+
+BRIGHT = Look(circle=180, face=5, body=3, plate=5, wall=2, checker=(14, 27), lamps=(25, 225))
+DARK = Look(circle=24, face=205, body=140, plate=214, wall=85, checker=(75, 108), lamps=(8, 250))
+
+
+def look_of(polarity: Polarity) -> Look:
+    """Returns the grey levels for a target or a board with circles of this polarity."""
+    return BRIGHT if polarity == "bright" else DARK
+
+
+def draw_background(scene: Scene, group: str, image: int, clutter: bool, scenery_seed: int) -> np.ndarray:
+    """Draws the image without the circles, (height, width) uint8.
+
+    The scenery belongs to the group: all images of the group show the same scenery from different places.
+    """
+    g, look = scene.groups[group], look_of(scene.target.polarity)
+    painter = _Painter(scene.camera, g.camera_from_target[image], look.wall)
+    if clutter:
+        names = list(scene.groups)
+        rng = np.random.default_rng([scene.seed, scenery_seed, names.index(group)])
+        wall = _wall(scene, g, rng)
+        _draw_checker(painter, wall, look)
+        _draw_lamps(painter, wall, look, rng)
+        _draw_reflections(painter, scene, g, look)
+    _draw_body(painter, scene, look)
+    painter.polygons(_edges(scene.board_outline(group)), look_of(scene.board.polarity).plate)
+    return painter.canvas
+
+
+class _Painter:
+    """Canvas in the image of a camera, for polygons in the target frame."""
+
+    def __init__(self, camera: Camera, camera_from_target: Rigid, level: float):
+        self.camera, self.camera_from_target = camera, camera_from_target
+        self.canvas = np.full((camera.height, camera.width), round(level), np.uint8)
+
+    def pixels(self, polygons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the pixels (n, k, 2) of polygons (n, k, 3), and which polygons are near the field of view, (n,)."""
+        xyz = self.camera_from_target @ polygons
+        xy = xyz[..., :2] / np.maximum(xyz[..., 2:], 1.0)
+        size = np.array([self.camera.width, self.camera.height])
+        # Beyond this reach the distortion may fold points back into the image.
+        reach = 0.8 * size / self.camera.focal
+        near = (xyz[..., 2].min(1) > 1) & (np.abs(xy) < reach).all((1, 2))
+        xy = np.clip(xy, -reach, reach)
+        pixel = self.camera.pixel_from_normalised(xy)
+        near &= ((pixel.max(1) > -1) & (pixel.min(1) < size)).all(1)
+        return pixel, near
+
+    def polygons(self, polygons: np.ndarray, levels) -> None:
+        """Fills polygons (n, k, 3), later ones on top."""
+        pixel, near = self.pixels(polygons)
+        fixed = np.rint(pixel * 2**SHIFT).astype(np.int32)
+        for outline, level in zip(fixed[near], np.broadcast_to(levels, len(near))[near], strict=True):
+            cv2.fillPoly(self.canvas, [outline], float(level), cv2.LINE_AA, SHIFT)
+
+
+def _edges(corners: np.ndarray, pieces: int = 12) -> np.ndarray:
+    """Returns points along the edges of a polygon (k, 3), so that the lens can bend the edges, (1, k·pieces, 3)."""
+    t = np.arange(pieces)[:, None] / pieces
+    following = np.roll(corners, -1, axis=0)
+    return (corners[:, None] * (1 - t) + following[:, None] * t).reshape(1, -1, 3)
+
+
+def _wall(scene: Scene, g: Group, rng) -> Rigid:
+    """Returns target_from_wall of a wall behind target and board, z towards the camera."""
+    points = np.vstack([*(scene.face_outline(face.id) for face in scene.target.faces), scene.board_outline(g.name)])
+    turn = Rigid.exp([*np.radians(rng.uniform(-10, 10, 3)), 0, 0, 0]).rotation
+    rotation = g.axes.T @ turn
+    depth = (points @ g.axes[2]).min() - WALL_BEHIND_MM
+    middle = (points.min(0) + points.max(0)) / 2
+    return Rigid(rotation, middle + (depth - middle @ g.axes[2]) * g.axes[2])
+
+
+def _view_mm(painter: _Painter) -> float:
+    """Returns the approximate width of the view at the distance of the wall."""
+    distance = np.linalg.norm(painter.camera_from_target.translation) + WALL_BEHIND_MM
+    return float(distance * painter.camera.width / painter.camera.focal[0])
+
+
+def _draw_checker(painter: _Painter, wall: Rigid, look: Look) -> None:
+    n = int(WALL_REACH * _view_mm(painter) / WALL_CELL_MM)
+    row, column = np.mgrid[-n:n, -n:n].reshape(2, -1)
+    light = (row + column) % 2 == 0
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    xy = WALL_CELL_MM * (np.column_stack([column, row])[light][:, None] + corners)
+    painter.canvas[:] = round(look.checker[0])
+    painter.polygons(wall @ np.dstack([xy, np.zeros(xy.shape[:2])]), look.checker[1])
+
+
+def _draw_lamps(painter: _Painter, wall: Rigid, look: Look, rng) -> None:
+    """Draws random discs of all sizes, as bright as the circles or fainter, and random ellipses."""
+    n_discs, n_ellipses = 120, 60
+    n = n_discs + n_ellipses
+    centre = np.column_stack([rng.uniform(-LAMP_REACH_MM, LAMP_REACH_MM, (n, 2)), np.full(n, 1.0)])
+    radius = np.exp(rng.uniform(np.log(2.0), np.log(45.0), n))
+    ratio = np.where(np.arange(n) < n_discs, 1.0, rng.uniform(0.2, 0.9, n))
+    angle = rng.uniform(0, np.pi, n)
+    level = np.where(rng.random(n) < 0.4, look.lamps[1] * rng.uniform(0.6, 1, n), rng.uniform(*look.lamps, n))
+    t = 2 * np.pi * np.arange(96) / 96
+    x, y = radius[:, None] * np.cos(t), (ratio * radius)[:, None] * np.sin(t)
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    rim = np.stack([c * x - s * y, s * x + c * y, np.zeros_like(x)], axis=-1)
+    order = rng.permutation(n)
+    painter.polygons((wall @ (centre[:, None] + rim))[order], level[order])
+
+
+def _draw_reflections(painter: _Painter, scene: Scene, g: Group, look: Look) -> None:
+    """Draws faint mirror images of the circles in a glossy table under the target."""
+    up = g.axes[1]
+    circles = [
+        (scene.face_circles(f.id), scene.target_from_face[f.id].rotation[:, 2], f.radius_mm) for f in scene.target.faces
+    ]
+    circles.append((g.board_circles_target, -g.target_from_board.rotation[:, 2], scene.board.radii_mm()))
+    outlines = np.vstack([*(scene.face_outline(f.id) for f in scene.target.faces), scene.board_outline(g.name)])
+    table = (outlines @ up).min() - TABLE_BELOW_MM
+    camera_centre = painter.camera_from_target.inverse().translation
+    for xyz, normal, radius in circles:
+        mirrored = xyz - 2 * np.outer(xyz @ up - table, up)
+        mirrored_normal = normal - 2 * (normal @ up) * up
+        reflected = (camera_centre - mirrored) @ mirrored_normal > 0
+        # Only light from the front of a circle above the table is reflected to a camera above the table.
+        if reflected.any() and camera_centre @ up > table:
+            rims = rim_points(
+                mirrored[reflected], np.tile(mirrored_normal, (reflected.sum(), 1)), radius[reflected], 48
+            )
+            painter.polygons(rims, look.checker[1] + 0.12 * (look.circle - look.checker[1]))
+
+
+def _draw_body(painter: _Painter, scene: Scene, look: Look) -> None:
+    """Draws the box: its silhouette, which hides the background, then the faces towards the camera, far ones first."""
+    outlines = {face.id: scene.face_outline(face.id) for face in scene.target.faces}
+    pixel, _ = painter.pixels(np.concatenate([_edges(outline) for outline in outlines.values()]))
+    points = pixel.reshape(-1, 2)
+    hull = np.rint(points[ConvexHull(points).vertices] * 2**SHIFT).astype(np.int32)
+    cv2.fillPoly(painter.canvas, [hull], float(look.body), cv2.LINE_AA, SHIFT)
+    camera_centre = painter.camera_from_target.inverse().translation
+    for face_id in sorted(outlines, key=lambda face: -np.linalg.norm(outlines[face].mean(0) - camera_centre)):
+        ray = camera_centre - outlines[face_id].mean(0)
+        cosine = scene.target_from_face[face_id].rotation[:, 2] @ ray / np.linalg.norm(ray)
+        if cosine > 0:
+            painter.polygons(_edges(outlines[face_id]), look.face * (0.8 + 0.2 * cosine))
+
 
 SUBSAMPLES = 8
 """Number of cells per pixel side at a rim. A cell that the rim crosses counts by its linear share."""

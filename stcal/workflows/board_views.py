@@ -1,21 +1,261 @@
-"""Corners of a board in a folder of images: every kind of board, each image decoded once, in parallel.
-
-Dots (``stcal.sfm``) and the boards of other makers (``stcal.boards``) are brought together here, for all commands that
-start from images of a board.
-"""
+"""Corners of a board of any kind in one image and in a folder of images."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
-from stcal.boards.design import BoardView
-from stcal.boards.tags import Tags, find_tags
-from stcal.errors import InputError
+import numpy as np
+
+from stcal.boards.aprilgrid import find_aprilgrid
+from stcal.boards.chessboard import find_chessboard, why_no_chessboard
+from stcal.boards.design import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    BoardSet,
+    BoardView,
+    CharucoDesign,
+    ChessboardDesign,
+    FlatBoard,
+    TagLayout,
+    turns,
+)
+from stcal.boards.tags import Tags, find_charuco, find_tags, view_of_tags
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import InputError, StcalError
 from stcal.geometry.camera import Camera
+from stcal.geometry.conic import circle_image_offset
+from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.image_jobs import run_on_images
-from stcal.io.images import ImageFile, Skipped, decode
-from stcal.workflows.board_in_image import Board, find_board, symmetries
+from stcal.io.images import ImageFile, Skipped, decode, find_images, grey_8bit
+from stcal.locate.calibration.solve import CalibrationImages
+from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, find_ellipses
+from stcal.sfm.detect.image import detect_image
+
+CENTRING_ROUNDS = 3
+"""Rounds of the correction for the ellipses' centres. The error of the pose from these centres is less than a
+thousandth of the correction; two rounds would be enough."""
+CORNER_SIGMA_PX = 0.1
+"""σ of corners whose detector states none, where they are used with boards whose detector does."""
+NEAREST = 6
+"""Number of outlines about a circle, one of which is its neighbour."""
+MIN_SHARE = 0.35
+"""Smallest share of a board's circles that must be seen."""
+Board = BoardDesign | FlatBoard | BoardSet
+KINDS = {
+    BoardDesign: "dots",
+    ChessboardDesign: "chessboard",
+    CharucoDesign: "ChArUco",
+    TagLayout: "tags",
+    AprilGridDesign: "AprilGrid",
+    AsymmetricCirclesDesign: "asymmetric circles",
+}
+
+
+def kind_of(board: Board) -> str:
+    """Returns the name of the board's kind in messages."""
+    return f"{len(board.boards)} boards" if isinstance(board, BoardSet) else KINDS[type(board)]
+
+
+def symmetries(board: Board) -> list[Rigid]:
+    """Returns the rotations after which the board looks the same, as board_from_board, without the identity."""
+    if not isinstance(board, BoardDesign):
+        return board.symmetries()
+    if board.corner is not None:
+        return []
+    return turns(board.xy_mm(), [1, 2, 3] if board.rows == board.columns else [2])
+
+
+def find_board(image: np.ndarray, name: str, camera: Camera, board: Board) -> tuple[BoardView | None, str]:
+    """Returns the view of the board in a grey image, or the reason why there is none. For a set of boards it is the
+    view of all that are seen."""
+    if not isinstance(board, BoardSet):
+        return _find_or_why(image, name, camera, board)
+    views, reasons = [], []
+    places = zip(board.names, board.common_from_board, board.first_ids(), strict=True)
+    for single, (board_name, place, first) in zip(board.boards, places, strict=True):
+        view, why = _find_or_why(image, name, camera, single)
+        if view is None:
+            reasons.append(f"{board_name}: {why}")
+        else:
+            views.append(_placed(view, board_name, place, first))
+    if not views:
+        return None, "; ".join(reasons)
+    return _together(name, views, tuple(reasons)), ""
+
+
+def _find_or_why(
+    image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard
+) -> tuple[BoardView | None, str]:
+    try:
+        return _find_flat(image, name, camera, board)
+    except StcalError as error:
+        return None, str(error)
+
+
+def _placed(view: BoardView, own: str, common_from_board: Rigid, first: int) -> BoardView:
+    """Returns a view of one board of a set in the frame of the set."""
+    return BoardView(
+        view.image,
+        view.ids + first,
+        common_from_board @ view.xyz_board,
+        view.xy_px,
+        view.covariance_px2,
+        np.tile(common_from_board.rotation[:, 2], (len(view), 1)),
+        tuple(f"{own}: {reason}" for reason in view.unused),
+    )
+
+
+def _together(name: str, views: list[BoardView], reasons: tuple[str, ...]) -> BoardView:
+    """Returns the views of several boards as one view."""
+    covariances = [_covariance_px2(view) for view in views]
+    return BoardView(
+        name,
+        np.concatenate([view.ids for view in views]),
+        np.concatenate([view.xyz_board for view in views]),
+        np.concatenate([view.xy_px for view in views]),
+        np.concatenate(covariances),
+        np.concatenate([view.normal for view in views if view.normal is not None]),
+        (*(reason for view in views for reason in view.unused), *reasons),
+    )
+
+
+def _covariance_px2(view: BoardView) -> np.ndarray:
+    """Returns the covariances of a view. A board whose detector states none gets the default, since the other boards
+    have theirs."""
+    if view.covariance_px2 is not None:
+        return view.covariance_px2
+    return np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
+
+
+def _find_flat(
+    image: np.ndarray, name: str, camera: Camera, board: BoardDesign | FlatBoard
+) -> tuple[BoardView | None, str]:
+    """Returns the view of a single board, or the reason why there is none."""
+    if isinstance(board, BoardDesign):
+        return _find_dots(image, name, camera, board)
+    if isinstance(board, AsymmetricCirclesDesign):
+        return _find_asymmetric(image, name, camera, board)
+    if isinstance(board, ChessboardDesign):
+        view = find_chessboard(image, name, board)
+        return view, "" if view else why_no_chessboard(image, board)
+    if isinstance(board, CharucoDesign):
+        view = find_charuco(image, name, board, camera)
+        return view, "" if view else _without_charuco(image, board)
+    if isinstance(board, AprilGridDesign):
+        return find_aprilgrid(image, name, board, camera)
+    tags = find_tags(image, tuple(dict.fromkeys(dictionary for dictionary, _ in board.tags)))
+    return view_of_tags(name, tags, board), "no tag of the layout"
+
+
+def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
+    """Returns the reason why there are no corners, as far as the tags show it."""
+    ids = [tag for _, tag in find_tags(image, (board.dictionary,)).tags]
+    few, board_ids = "fewer than 4 corners of the ChArUco board", board.tag_ids()
+    if not ids:
+        return f"{few}: no tag of {board.dictionary}"
+    if others := [tag for tag in ids if tag not in board_ids]:
+        extent = f"{len(board_ids)} on a board of {board.rows}×{board.columns}"
+        return f"{few}: tag {max(others)} of {board.dictionary}, of {extent}" + (
+            f" from {board_ids[0]}" if board_ids[0] else ""
+        )
+    return (
+        f"{few}, but {len(ids)} of its tags: are rows and columns exchanged, or is it one that OpenCV drew before 4.6 "
+        "(legacy = true)?"
+    )
+
+
+def _find_dots(image: np.ndarray, name: str, camera: Camera, board: BoardDesign) -> tuple[BoardView | None, str]:
+    place = np.arange(board.rows * board.columns).reshape(board.rows, board.columns)
+    return _find_circles(image, name, camera, board, board, place)
+
+
+def _find_asymmetric(
+    image: np.ndarray, name: str, camera: Camera, board: AsymmetricCirclesDesign
+) -> tuple[BoardView | None, str]:
+    if board.radius_mm is None:
+        radius = _radius_seen(image, camera, board)
+        if radius is None:
+            return None, f"no {board.polarity} circles"
+        board = replace(board, radius_mm=radius)
+    grid = board.lattice()
+    place = np.full((grid.rows, grid.columns), -1)
+    place[tuple(grid.cells().T)] = np.arange(len(grid.cells()))
+    return _find_circles(image, name, camera, board, grid, place)
+
+
+def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesign) -> float | None:
+    """Returns the radius from the distance of neighbours, the median over all circles in the image, mm; None where
+    there are none."""
+    candidates = Candidates.of(find_ellipses(grey_8bit(image), board.polarity, EllipseOptions()), camera)
+    if len(candidates) < len(board.xy_mm()) * MIN_SHARE:
+        return None
+    near = candidates.tree.query(candidates.xy, k=NEAREST + 1)[1][:, 1:]
+    # In oblique views, the circle that looks nearest may not be nearest: lengths are in units of the circle's image.
+    apart = np.linalg.solve(candidates.shape[:, None], (candidates.xy[near] - candidates.xy[:, None])[..., None])[
+        ..., 0
+    ]
+    steps = np.median(np.linalg.norm(apart, axis=2).min(1))
+    return float(np.sqrt(2) * board.spacing_mm / steps)
+
+
+def _find_circles(
+    image: np.ndarray,
+    name: str,
+    camera: Camera,
+    board: BoardDesign | AsymmetricCirclesDesign,
+    grid: BoardDesign,
+    place: np.ndarray,
+) -> tuple[BoardView | None, str]:
+    """Returns the view of a board of circles, or the reason why there is none.
+
+    ``grid`` : the lattice in which the circles of the board are found; ``place`` : (rows, columns) of the lattice, rows
+    of its circles in the board's ``xy_mm``.
+    """
+    pattern = "board of dots" if grid is board else "asymmetric grid of circles"
+    detected = detect_image(image, camera, TargetDesign("none", grid.polarity, ()), grid, EllipseOptions())
+    if detected.repeated:
+        return None, "the board is in view more than once"
+    if detected.board is None or not len(detected.board.rows):
+        return None, f"no {pattern} recognised"
+    ids = place[tuple(np.moveaxis(detected.board.numberings, 2, 0))]
+    if not _turned_only(ids, board):
+        return None, "a strip of the board is hidden, so that its dots cannot be numbered; show more of it"
+    centres, xy = detected.centres.select(detected.board.rows), board.xy_mm()[ids[0]]
+    xyz = np.column_stack([xy, np.zeros(len(xy))])
+    centre_px = images_of_centres(centres.centre_px, xyz, board.radii_mm()[ids[0]], camera)
+    return BoardView(name, ids[0], xyz, centre_px, centres.covariance_px2), ""
+
+
+def _turned_only(ids: np.ndarray, board: BoardDesign | AsymmetricCirclesDesign) -> bool:
+    """True if all numberings (k, n) differ only by a rotation that leaves the board as it is."""
+    xy = board.xy_mm()
+    pitch = board.pitch_mm if isinstance(board, BoardDesign) else board.spacing_mm
+    places = [(turn @ np.column_stack([xy, np.zeros(len(xy))]))[:, :2] for turn in (Rigid(), *symmetries(board))]
+    return all(any(np.allclose(xy[numbering], place[ids[0]], atol=pitch / 4) for place in places) for numbering in ids)
+
+
+def images_of_centres(
+    centre_px: np.ndarray, xyz_board: np.ndarray, radius_mm: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """Returns the images (n, 2) of the centres of a flat board's circles, px, from their ellipses' centres (n, 2).
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than four circles, or all on a line.
+    """
+    corrected_px = centre_px
+    for _ in range(CENTRING_ROUNDS):
+        normalised = camera.normalised_from_pixel(corrected_px)
+        pose = camera_from_plane(fit_homography(xyz_board[:, :2], normalised))
+        pose = refine_planar_pose(pose, xyz_board[:, :2], normalised)
+        centre = pose @ xyz_board
+        ellipse = circle_image_offset(centre, pose.rotation[:, 2], radius_mm)
+        corrected_px = centre_px - (camera.project(ellipse) - camera.project(centre))
+    return corrected_px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,3 +363,21 @@ def _of_size(each: BoardDetection | Skipped, size: tuple[int, int], first: str) 
     return Skipped(
         each.name, f"{own_size}, but {first} has {wanted}; use images of one camera", "image_size", own_size, wanted
     )
+
+
+def calibration_images(
+    folder: Path,
+    model: CameraModel,
+    board: Board,
+    dictionaries: tuple[str, ...],
+    workers: int | None = None,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> CalibrationImages:
+    """Returns board and tags in all images of a folder; ``progress`` is called with (stage, done, total)."""
+    files, skipped = find_images(folder)
+    detections = detect_boards(files, model, board, dictionaries, workers, partial(progress, "images"))
+    names, views, tags = zip(*((image.name, image.view, image.tags) for image in detections.images), strict=True)
+    left_out = tuple(
+        f"{image.name}: {image.reason}" for image in (*skipped, *detections.skipped) if image.name not in names
+    )
+    return CalibrationImages(names, views, tags, detections.camera, detections.symmetries, left_out)

@@ -11,7 +11,7 @@ from typing import TextIO
 import numpy as np
 
 from stcal.io.device import SATURATED, Source, checked_name, png
-from stcal.io.saving import save
+from stcal.io.files import save
 from stcal.parallel import Progress
 from stcal.workflows.watch import Growing, Update
 

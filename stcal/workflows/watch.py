@@ -12,8 +12,8 @@ from stcal.errors import InputError, StcalError
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_of, target_of
+from stcal.io.files import CACHE
 from stcal.io.images import ImageFile, Skipped, find_images
-from stcal.io.saving import CACHE
 from stcal.parallel import Progress
 from stcal.sfm.detect.files import detect_files
 from stcal.sfm.detect.labels import LabelledImage, label_images

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.drawing.pdf import INCH_MM, figure_of
+from stcal.drawing.formats import INCH_MM, figure_of
 from stcal.geometry.camera import COEFFICIENTS, Camera
 
 PER_MM = 4

@@ -15,8 +15,8 @@ from stcal.boards.design import AprilGridDesign, ChessboardDesign
 from stcal.design import reference_board, reference_target
 from stcal.drawing.dimensions import framed
 from stcal.drawing.draw import SUFFIXES, draw
+from stcal.drawing.formats import POINT_MM, pdf
 from stcal.drawing.parts import board_parts
-from stcal.drawing.pdf import POINT_MM, pdf
 from stcal.drawing.shapes import Disc, Line, Text, extent
 from stcal.drawing.sheets import EDGE, FOOT, FURNITURE, OVERLAP, PAPERS, SIDE, one_sheet, paper_sheets, seams_between
 from stcal.io.design import board_toml, target_toml

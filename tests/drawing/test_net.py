@@ -12,7 +12,7 @@ from stcal.drawing.net import _overlap, net_parts
 from stcal.drawing.shapes import Disc, Text
 from stcal.geometry.rigid import Rigid
 from stcal.io.design import target_toml
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.make.box import sides_of
 from stcal.sfm.make.pattern import make_pattern

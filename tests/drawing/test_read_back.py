@@ -13,7 +13,7 @@ from stcal.drawing.parts import board_parts, target_parts
 from stcal.drawing.shapes import Area, Disc
 from stcal.geometry.plane import apply_homography
 from stcal.io.design import target_toml
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import label_images, label_single  # noqa: F401
 from stcal.synthetic.designs import second_design

@@ -19,7 +19,7 @@ from io import TextIOWrapper
 from pathlib import Path
 
 from stcal.cli.main import MESSAGE_CHARACTERS
-from stcal.io.saving import RUN_ENTRIES
+from stcal.io.files import RUN_ENTRIES
 from tests.commands import PROGRAMS, Call
 from tests.shared import own_copy, without_rights
 

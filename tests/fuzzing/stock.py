@@ -26,7 +26,7 @@ from stcal.sfm.interop.export_model import export_model
 from stcal.sfm.make.box import sides_of
 from stcal.sfm.make.pattern import make_pattern
 from stcal.sfm.pipeline import RunOptions, run
-from stcal.sfm.runs.marker import MarkerFile, digest_of
+from stcal.sfm.runs.transaction import MarkerFile, digest_of
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.boards.drawn import chessboard_mm, photograph

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.plane_poses import poses_of_plane
+from stcal.geometry.plane import poses_of_plane
 from stcal.geometry.rigid import Rigid
 from tests.outcome import fails_with
 

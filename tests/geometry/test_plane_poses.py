@@ -6,8 +6,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from stcal.geometry import pose_descent
-from stcal.geometry.plane_poses import (
+from stcal.geometry import least_squares
+from stcal.geometry.least_squares import Normal, PoseStack
+from stcal.geometry.plane import (
     covariance_of_both,
     deciding_delta,
     distinct,
@@ -16,7 +17,6 @@ from stcal.geometry.plane_poses import (
     two_minima,
     weigh,
 )
-from stcal.geometry.pose_descent import Normal, PoseStack
 from stcal.geometry.rigid import Rigid, skew
 from tests.outcome import fails_with
 
@@ -41,7 +41,7 @@ def descend(measured, poses, huber):
         xy, by_pose, possible = seen(poses)
         return Normal.of((measured - xy) / SIGMA, by_pose / SIGMA, possible, huber)
 
-    return pose_descent.descend(evaluate, poses, 1e-6)
+    return least_squares.descend(evaluate, poses, 1e-6)
 
 
 def measured(truth, factor=1.0, seed=0):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from stcal.geometry.pose_descent import Normal, PoseStack, block_diagonal, descend
+from stcal.geometry.least_squares import Normal, PoseStack, block_diagonal, descend
 from stcal.geometry.rigid import Poses, Rigid, skew
 
 RNG = np.random.default_rng(0)

@@ -12,7 +12,7 @@ from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.least_squares import perturbed
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, handeye
-from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.pairs import Loop
 from stcal.handeye.data.views import View, Views, pairs_of_views
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.judge.remarks import of_size

@@ -20,8 +20,7 @@ from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import find_images
-from stcal.workflows.board_in_image import images_of_centres, symmetries
-from stcal.workflows.board_views import detect_boards
+from stcal.workflows.board_views import detect_boards, images_of_centres, symmetries
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph_of_several
 from tests.handeye.photographed import (
     CAMERA,

@@ -5,7 +5,7 @@ import pytest
 
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, handeye, plan_poses
-from stcal.handeye.data.loop import SETUPS, Loop
+from stcal.handeye.data.pairs import SETUPS, Loop
 from stcal.handeye.plan import judged_at, worst_sigma
 from tests.outcome import fails_with
 from tests.support.handeye import CAMERA, board_corners, disturbed, simulated

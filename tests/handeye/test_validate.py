@@ -19,7 +19,7 @@ from stcal.handeye import (
     predict_motions,
     splits,
 )
-from stcal.handeye.data.loop import Loop, Motions
+from stcal.handeye.data.pairs import Loop, Motions
 from stcal.handeye.validate import predicted, scatter, widened_by_scatter
 from tests.outcome import fails_with
 from tests.support.handeye import simulated, simulated_views

@@ -10,9 +10,8 @@ from stcal.boards.file import load_flat_board
 from stcal.errors import InputError
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import load_board
-from stcal.io.files import MB, MODEL_BYTES, SETTINGS_BYTES, TABLE_BYTES, read_bytes
+from stcal.io.files import MB, MODEL_BYTES, SETTINGS_BYTES, TABLE_BYTES, keep_apart, read_bytes
 from stcal.io.json import read_json
-from stcal.io.saving import keep_apart
 from stcal.io.table import read_table
 from tests.outcome import fails_with
 

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from stcal.io.cameras.fit import fit_lens
+from stcal.io.cameras.difference import fit_lens
 from stcal.io.cameras.foreign import COLMAP_FOREIGN, ForeignLens
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera, read_lens

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
+from stcal.io.files import RUN_MARKER
 from stcal.io.images import TOP_GROUP, decode, find_images, name_fault, percentiles, thumbnail
-from stcal.io.saving import RUN_MARKER
 from tests.outcome import fails_with
 
 

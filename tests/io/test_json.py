@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
+from stcal.io.files import json_text
 from stcal.io.json import ByFace, Part, Pose, ResultFile, Vector3, checked, read_json, read_result
-from stcal.io.saving import json_text
 from tests.outcome import fails_with
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from stcal.io.cameras.fit import fit_lens
+from stcal.io.cameras.difference import fit_lens
 from stcal.io.cameras.foreign import ForeignLens
 from stcal.io.cameras.forms import written
 from stcal.io.cameras.read import read_camera, read_lens

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stcal.errors import InputError
-from stcal.io.saving import json_text, keep_apart, save
+from stcal.io.files import json_text, keep_apart, save
 
 
 def test_text_bytes_and_folders(tmp_path):

@@ -9,8 +9,8 @@ import pytest
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.files import require_new_folder, save_folder
 from stcal.io.images import Skipped
-from stcal.io.saving import require_new_folder, save_folder
 from stcal.io.table import Table, pose_cells, read_table
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.kinematics.forward import forward
@@ -21,9 +21,7 @@ from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.synthetic.scene import SceneOptions, make_scene
 from stcal.workflows.from_photos import run as work
-from stcal.workflows.from_photos.output import files_of
-from stcal.workflows.from_photos.report import story
-from stcal.workflows.from_photos.result import FromPhotos
+from stcal.workflows.from_photos.result import FromPhotos, files_of, story
 from tests.outcome import fails_with
 from tests.support.image_poses import known_target, see
 

@@ -12,7 +12,7 @@ from stcal.design import BoardDesign, reference_target
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.read import read_camera
 from stcal.sfm import RunOptions, run
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.interop.crosscheck import crosscheck
 from stcal.sfm.report.compare import compare

@@ -6,8 +6,7 @@ import numpy as np
 
 from stcal.errors import ConvergenceError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.robot.identification.elastic import DOWN, MOMENT, usual
-from stcal.robot.identification.nominal import Deviations
+from stcal.robot.identification.prior import DOWN, MOMENT, Deviations, usual
 from stcal.robot.kinematics.forward import chain_parameters, flange_poses, jacobian, moved_chain, with_values
 from stcal.robot.kinematics.inverse import inverse
 from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, Robot, Tree, mh80

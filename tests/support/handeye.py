@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.loop import Setup
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import HandEyePoses, Setup
 from stcal.handeye.data.views import View, Views, pairs_of_views
 
 FLANGE_FROM_CAMERA = Rigid(Rotation.from_euler("zyx", [90, 4, -7], degrees=True).as_matrix(), [35.0, -62.0, 84.0])

@@ -7,8 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.loop import Setup
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import HandEyePoses, Setup
 from stcal.handeye.data.stream import Stream
 from tests.support.handeye import (
     BASE_FROM_BOARD,

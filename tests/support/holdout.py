@@ -8,13 +8,11 @@ import numpy as np
 
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError, StcalError
-from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
-from stcal.geometry.plane_poses import mirrored
-from stcal.geometry.pose_descent import PoseStack
+from stcal.geometry.least_squares import PoseStack
+from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored, refine_planar_pose
 from stcal.geometry.rigid import Rigid
-from stcal.locate.calibration.solve import CalibratedLayout, calibrate
+from stcal.locate.calibration.solve import CalibratedLayout, CalibrationImages, calibrate
 from stcal.locate.data.layout import LayoutPlan, TargetLayout
-from stcal.locate.data.views import CalibrationImages
 from stcal.locate.pose.estimate import SeenTags, locate
 from stcal.locate.pose.merge import merge
 from stcal.locate.pose.patent import PatentOptions, locate_as_patent

@@ -7,17 +7,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from stcal.geometry.plane_poses import mirrored
-from stcal.geometry.pose_descent import PoseStack
+from stcal.geometry.least_squares import PoseStack
+from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import covariance_of
 from stcal.sfm.adjust.uncertainty import derivatives
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.measurement.pose import TargetPose
 from stcal.sfm.measurement.target import TargetCircles
-from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.planning.nominal import observe, true_models
 from stcal.synthetic.scene import Scene
 
 FLATNESS_MM = 0.02

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.affine import Affine
 from stcal.geometry.arrays import frozen
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Affine, Rigid
 from stcal.register.core.models import Transform, parts
 
 SIGMA_MM = 0.15

@@ -37,11 +37,11 @@ from stcal.cli.options import (
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write
 from stcal.errors import InputError
-from stcal.io.saving import keep_apart
+from stcal.io.files import keep_apart
 
 if TYPE_CHECKING:
     from stcal.handeye import EvolutionOptions
-    from stcal.handeye.data.loop import Setup
+    from stcal.handeye.data.pairs import Setup
     from stcal.handeye.methods.evolution import Bounds
     from stcal.handeye.report.export.frames import CameraFrame
     from stcal.handeye.report.outcome import Outcome

@@ -17,7 +17,7 @@ from stcal.cli.options import (
     require_passed,
 )
 from stcal.cli.terminal import StageProgress, print_each, say, write
-from stcal.io.saving import keep_apart
+from stcal.io.files import keep_apart
 
 
 def rig(
@@ -66,7 +66,7 @@ def rig(
     from stcal.handeye.data.rig import read_rig_file
     from stcal.handeye.report.file import HandEyeRigFile
     from stcal.handeye.report.outcome import rig_judged
-    from stcal.handeye.report.rig import rig_page, rig_text
+    from stcal.handeye.report.page import rig_page, rig_text
     from stcal.workflows.handeye.calibrate import Splits
     from stcal.workflows.handeye.rig import calibrate_rig, read_rig
 

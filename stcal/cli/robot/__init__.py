@@ -3,7 +3,7 @@
 import typer
 
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.robot import axes, compensate, convert, design, evaluate, from_photos, identify, verify
+from stcal.cli.robot import axes, compensate, convert, design, evaluate, from_photos, identify
 
 app = typer.Typer(
     name="stcal robot",
@@ -17,7 +17,7 @@ COMMANDS = (
     identify.identify,
     evaluate.evaluate,
     compensate.compensate,
-    verify.verify,
+    evaluate.verify,
     design.design,
     convert.convert,
     from_photos.from_photos,

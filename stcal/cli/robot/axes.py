@@ -56,8 +56,8 @@ def axes(
 ) -> None:
     """Find each joint's axis from sweeps of that joint alone, and the robot that follows (the axis method)."""
     from stcal.robot.axes.model import robot_from_sweeps
-    from stcal.robot.axes.orientations import ring
     from stcal.robot.axes.report import axes_file, axes_page, axes_text
+    from stcal.robot.axes.sweeps import ring
     from stcal.robot.kinematics.file import load_robot, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
 
@@ -87,7 +87,7 @@ def axes(
 
 def _length(text: str, data: "Measurements") -> float | None:
     """Distance of virtual reflectors, mm; None for positions alone."""
-    from stcal.robot.axes.orientations import length_of
+    from stcal.robot.axes.sweeps import length_of
 
     if text in ("auto", "off"):
         return length_of(data) if text == "auto" else None

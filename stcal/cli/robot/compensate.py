@@ -22,7 +22,7 @@ from stcal.cli.options import (
 )
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import DegenerateError, InputError
-from stcal.io.saving import keep_apart
+from stcal.io.files import keep_apart
 
 
 class ExportAs(StrEnum):

@@ -53,13 +53,12 @@ def from_photos(
     load_ahead(workers)
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, target_of
-    from stcal.io.saving import require_new_folder, save_folder
+    from stcal.io.files import require_new_folder, save_folder
     from stcal.robot.identification.result import IdentifyOptions
     from stcal.robot.kinematics.file import load_robot
     from stcal.sfm.measurement.images import MeasureOptions
     from stcal.sfm.measurement.target import read_target
-    from stcal.workflows.from_photos.output import files_of
-    from stcal.workflows.from_photos.report import story
+    from stcal.workflows.from_photos.result import files_of, story
     from stcal.workflows.from_photos.run import from_photos
 
     require_new_folder(out, images)

@@ -112,7 +112,7 @@ def identify(
     report: ReportFile = None,
 ) -> None:
     """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
-    from stcal.robot.identification.nominal import adjusted
+    from stcal.robot.identification.prior import adjusted
     from stcal.robot.identification.report import identified_file, identified_page, identified_text
     from stcal.robot.identification.result import IdentifyOptions
     from stcal.robot.identification.solve import identify as identified_from
@@ -134,7 +134,7 @@ def identify(
             robot_toml(result.robot, [f"Identified from {name_of(source)}: {result.rank} parameters."]),
         )
     if offsets:
-        from stcal.robot.export.offsets import offsets_csv
+        from stcal.robot.export.files import offsets_csv
 
         write(offsets, offsets_csv(result, nominal))
     if json_file:

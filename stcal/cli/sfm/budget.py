@@ -8,7 +8,7 @@ import typer
 from stcal.cli.options import JsonFile, ReportFile, Run
 from stcal.cli.terminal import say, write
 from stcal.errors import InputError
-from stcal.io.saving import keep_apart
+from stcal.io.files import keep_apart
 
 app = typer.Typer()
 

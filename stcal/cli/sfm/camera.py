@@ -73,7 +73,7 @@ def calibrate_camera(
     from stcal.boards.file import load_flat_board
     from stcal.design import BoardDesign
     from stcal.io.design import board_of, target_of
-    from stcal.workflows.calibrate_rig import Models
+    from stcal.workflows.calibrate_camera import Models
 
     models = Models.of(model or [], "OPENCV")
     target_design = target_of(target)
@@ -124,10 +124,10 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
 
 def _rig(images: Path, out: Path, target, board, models, json_file, report, workers) -> list[str]:
     """What failed."""
-    from stcal.io.saving import require_new_folder, save_folder
+    from stcal.io.files import require_new_folder, save_folder
     from stcal.sfm.camera.file import RigCalibrationFile
     from stcal.sfm.camera.report import rig_page, rig_text
-    from stcal.workflows.calibrate_rig import calibrate_rig_from_photographs, files_of
+    from stcal.workflows.calibrate_camera import calibrate_rig_from_photographs, files_of
 
     require_new_folder(out, images)
     with StageProgress() as progress:

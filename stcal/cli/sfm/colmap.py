@@ -40,8 +40,8 @@ def export_database(
     ],
 ) -> None:
     """Copy the run's database for another version of COLMAP to open; ids, orders and values stay."""
+    from stcal.sfm.interop.crosscheck import database_text
     from stcal.sfm.interop.export_database import export_database as export
-    from stcal.sfm.interop.file import database_text
     from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
@@ -64,8 +64,8 @@ def export_model(
     ],
 ) -> None:
     """Write the run's final model, mm, target frame, for other programs; labels beside it."""
+    from stcal.sfm.interop.crosscheck import model_text
     from stcal.sfm.interop.export_model import export_model as export
-    from stcal.sfm.interop.file import model_text
 
     written = export(run, out, kind)
     say(model_text(written, kind))
@@ -95,8 +95,8 @@ def export_run(
     ] = "target",
 ) -> None:
     """Write faces and circles, with σ and cameras where the form holds them, for robots, drawings and viewers."""
+    from stcal.sfm.interop.crosscheck import export_text
     from stcal.sfm.interop.export import export_run as export
-    from stcal.sfm.interop.file import export_text
 
     say(export_text(export(run, out, form, name)))
 
@@ -176,8 +176,8 @@ def faces(
     ] = Chained.chain,
 ) -> None:
     """Find scale and faces from a COLMAP model made or edited elsewhere; labels come by (image, keypoint)."""
+    from stcal.sfm.interop.crosscheck import faces_text
     from stcal.sfm.interop.external import calibrate_models, write_faces
-    from stcal.sfm.interop.file import faces_text
     from stcal.sfm.runs.saved import load_run
 
     if out is not None and not out.parent.is_dir():
@@ -198,7 +198,7 @@ def pairs(
     out: JsonFile = None,
 ) -> None:
     """Rank the initial pairs, and show how each fares at every gate: ours, and COLMAP's as set and at its defaults."""
-    from stcal.sfm.interop.file import PairsFile
+    from stcal.sfm.interop.crosscheck import PairsFile
     from stcal.sfm.interop.gates import limits_text, pairs_table, run_gates
     from stcal.sfm.runs.saved import load_run
 

@@ -10,7 +10,7 @@ import typer
 from stcal.cli.options import MOST_SEED
 from stcal.cli.terminal import StageProgress, say
 from stcal.errors import InputError
-from stcal.io.saving import BOARD, TARGET, save
+from stcal.io.files import BOARD, TARGET, save
 
 app = typer.Typer()
 
@@ -40,7 +40,7 @@ def draw(
 ) -> None:
     """Draw a target or a board 1:1, with dimensions, cut marks and scale bars, to print, cut or mill."""
     from stcal.drawing.draw import draw as drawn
-    from stcal.drawing.text import drawn_text
+    from stcal.drawing.draw import drawn_text
 
     say(drawn_text(drawn(design, out, paper, margin, net)))
 

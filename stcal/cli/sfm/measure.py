@@ -130,7 +130,7 @@ def measure(
     from stcal.io.design import load_board, target_of
     from stcal.io.table import read_table
     from stcal.sfm.measurement import images as work
-    from stcal.sfm.measurement import output
+    from stcal.sfm.measurement import report as output
     from stcal.sfm.measurement.pose import PoseOptions, fit_verdict
     from stcal.sfm.measurement.target import read_target
 
@@ -166,8 +166,7 @@ def _serve(camera, faces, target, board, sigma_factor, ellipses, listen) -> None
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, target_of
     from stcal.sfm.measurement.pose import PoseOptions
-    from stcal.sfm.measurement.serve import MeasureServer, ServeOptions, counts_text, serve
-    from stcal.sfm.measurement.service import MeasureService, Setting
+    from stcal.sfm.measurement.serve import MeasureServer, MeasureService, ServeOptions, Setting, counts_text, serve
     from stcal.sfm.measurement.target import read_target
 
     host, port, max_megabytes, workers = listen

@@ -28,7 +28,7 @@ from stcal.cli.options import (
 )
 from stcal.cli.terminal import StageProgress, say, verbose, write
 from stcal.errors import InputError
-from stcal.io.saving import keep_apart
+from stcal.io.files import keep_apart
 
 app = typer.Typer()
 
@@ -195,10 +195,9 @@ def detect(
     from stcal.io.design import board_of, target_of
     from stcal.io.images import chosen_images
     from stcal.sfm import pipeline
-    from stcal.sfm.runs.marker import MarkerFile
     from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.text import detection_text
-    from stcal.sfm.runs.transaction import run_folder
+    from stcal.sfm.runs.transaction import MarkerFile, run_folder
 
     model = read_camera(camera)
     target_design = target_of(target)

@@ -11,7 +11,7 @@ import typer
 from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, TargetFile, Workers, designs_told
 from stcal.cli.terminal import StageProgress, say, write
 from stcal.errors import InputError
-from stcal.io.saving import RUN_MARKER, json_text, real_place, save
+from stcal.io.files import RUN_MARKER, json_text, real_place, save
 
 if TYPE_CHECKING:
     from stcal.design import BoardDesign, TargetDesign

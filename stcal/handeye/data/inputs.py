@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.formats.columns import read_columns
+from stcal.handeye.data.formats.numeric import read_columns
 from stcal.handeye.data.formats.recognise import read_content
 from stcal.handeye.data.formats.record import FRAMES, Content, Frames, Role, Said, Side
 from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance

@@ -1,11 +1,13 @@
-"""Pose pairs: the robot's poses of its flange, and the camera's poses of the board."""
+"""Pose pairs of robot and camera, the loop of transforms AX = ZB, and the motions AX = XB between its poses."""
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from stcal.errors import InputError
+from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.quaternions import Order
@@ -177,3 +179,183 @@ def inverse_covariance(poses: Poses, covariance: np.ndarray) -> np.ndarray:
     """Returns the covariances (m, 6, 6) of the inverses of poses with these covariances (m, 6, 6)."""
     jacobian = inverse_jacobian(poses)
     return jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+
+
+Setup = Literal["eye-in-hand", "eye-to-hand"]
+SETUPS: tuple[str, ...] = get_args(Setup)
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Names of the frame that carries the camera and of the frame that carries the board."""
+
+    mount: str
+    stand: str
+
+    @property
+    def camera(self) -> str:
+        """Name of mount_from_camera."""
+        return f"{self.mount}_from_camera"
+
+    @property
+    def board(self) -> str:
+        """Name of stand_from_board."""
+        return f"{self.stand}_from_board"
+
+
+FRAMES = {"eye-in-hand": Frames("flange", "base"), "eye-to-hand": Frames("base", "flange")}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Loop:
+    """m pose pairs in the terms of the one equation.
+
+    ``inverted`` : whether stand_from_mount is the inverse of what the robot reports, base_from_flange;
+    ``robot_covariance``, ``camera_covariance`` : (m, 6, 6) of base_from_flange and camera_from_board, where known.
+    """
+
+    stand_from_mount: Poses
+    camera_from_board: Poses
+    inverted: bool = False
+    robot_covariance: np.ndarray | None = None
+    camera_covariance: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, pairs: HandEyePoses, setup: Setup) -> "Loop":
+        """Returns the loop of pairs in one of the setups."""
+        if setup not in SETUPS:
+            raise InputError("E-HANDEYE-SETUP", f"hand-eye: setup {setup!r}; {' or '.join(SETUPS)} needed")
+        inverted = setup == "eye-to-hand"
+        hand = pairs.base_from_flange.inverse() if inverted else pairs.base_from_flange
+        covariances = (pairs.base_from_flange_covariance, pairs.camera_from_board_covariance)
+        return cls(hand, pairs.camera_from_board, inverted, *covariances)
+
+    def __len__(self) -> int:
+        return len(self.stand_from_mount)
+
+    def __getitem__(self, index) -> "Loop":
+        """Returns the pairs selected by a mask, slice or list."""
+        covariances = (None if c is None else c[index] for c in (self.robot_covariance, self.camera_covariance))
+        return Loop(self.stand_from_mount[index], self.camera_from_board[index], self.inverted, *covariances)
+
+    def chain(self, mount_from_camera: Rigid, scale: float = 1.0) -> Poses:
+        """Returns stand_from_board by each pose; the camera's lengths are multiplied by ``scale``."""
+        camera = self.camera_from_board
+        if scale != 1:
+            camera = Poses(camera.rotation, scale * camera.translation)
+        return self.stand_from_mount @ mount_from_camera @ camera
+
+    def residuals(self, mount_from_camera: Rigid, stand_from_board: Rigid, scale: float = 1.0) -> np.ndarray:
+        """Returns the residuals of the chains against ``stand_from_board``, (m, 6): rad, and mm at the board's origin;
+        stand axes."""
+        chain = self.chain(mount_from_camera, scale)
+        return chain.difference(Poses.of([stand_from_board] * len(self)))
+
+    def jacobian(self, mount_from_camera: Rigid, scale: float = 1.0) -> np.ndarray:
+        """Returns the derivative (m, 6, 13) of :meth:`residuals` by left perturbations of X and Z, and by the scale.
+
+        The dependence of the rotation's derivative on the size of the residual is neglected. Its contribution to the
+        gradient of a squared rotation residual is zero, since φ × φ = 0.
+        """
+        to_stand = self.stand_from_mount.rotation
+        arm = self.camera_from_board.translation @ mount_from_camera.rotation.T
+        derivative = np.zeros((len(self), 6, 13))
+        derivative[:, :3, :3] = derivative[:, 3:, 3:6] = to_stand
+        derivative[:, 3:, :3] = -to_stand @ skew(scale * arm)
+        derivative[:, :, 6:12] = -np.eye(6)
+        derivative[:, 3:, 12] = np.einsum("mij,mj->mi", to_stand, arm)
+        return derivative
+
+    def by_camera(self, mount_from_camera: Rigid, scale: float = 1.0) -> np.ndarray:
+        """Returns the derivative (m, 6, 6) of :meth:`residuals` by left perturbations of camera_from_board."""
+        to_stand = self.stand_from_mount.rotation @ mount_from_camera.rotation
+        derivative = np.zeros((len(self), 6, 6))
+        derivative[:, :3, :3], derivative[:, 3:, 3:] = to_stand, scale * to_stand
+        return derivative
+
+    def by_robot(self, mount_from_camera: Rigid, scale: float = 1.0) -> np.ndarray:
+        """Returns the derivative (m, 6, 6) of :meth:`residuals` by left perturbations of base_from_flange."""
+        derivative = np.tile(np.eye(6), (len(self), 1, 1))
+        arm = self.chain(mount_from_camera, scale).translation - self.stand_from_mount.translation
+        derivative[:, 3:, :3] = -skew(arm)
+        return derivative @ inverse_jacobian(self.stand_from_mount.inverse()) if self.inverted else derivative
+
+
+LARGEST_RAD = np.radians(170)
+"""Angle beyond which the logarithm is ill-conditioned: at a half turn the smallest error reverses the axis."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motions:
+    """k motions between two poses each.
+
+    ``first``, ``second`` : (k,) poses i, j; ``mount`` : mount_j_from_mount_i, A; ``camera`` : camera_j_from_camera_i,
+    B; ``alpha``, ``beta`` : (k, 3) their rotation vectors, rad.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    mount: Poses
+    camera: Poses
+    alpha: np.ndarray
+    beta: np.ndarray
+
+    @classmethod
+    def between(cls, loop: Loop, first: np.ndarray, second: np.ndarray) -> "Motions":
+        """Returns the motions between poses ``first`` and ``second`` (k,) of a loop."""
+        hand, eye = loop.stand_from_mount, loop.camera_from_board
+        mount = hand[second].inverse() @ hand[first]
+        camera = eye[second] @ eye[first].inverse()
+        logs = (Rotation.from_matrix(np.array(p.rotation)).as_rotvec() for p in (mount, camera))
+        return cls(np.asarray(first), np.asarray(second), mount, camera, *logs)
+
+    @classmethod
+    def consecutive(cls, loop: Loop) -> "Motions":
+        """Returns the motions from each pose to the next."""
+        at = np.arange(len(loop) - 1)
+        return cls.between(loop, at, at + 1)
+
+    @classmethod
+    def all(cls, loop: Loop) -> "Motions":
+        """Returns the motions between every pair of poses."""
+        return cls.between(loop, *np.triu_indices(len(loop), 1))
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def __getitem__(self, index) -> "Motions":
+        """Returns the motions selected by a mask, slice or list."""
+        return Motions(*(getattr(self, name)[index] for name in self.__slots__))
+
+    def has_log(self) -> np.ndarray:
+        """Returns (k,) True where the logarithms of both rotations are well-conditioned."""
+        return (np.linalg.norm(self.alpha, axis=1) < LARGEST_RAD) & (np.linalg.norm(self.beta, axis=1) < LARGEST_RAD)
+
+    def with_log(self, method: str) -> "Motions":
+        """Returns the motions that satisfy :meth:`has_log`.
+
+        Raises
+        ------
+        DegenerateError
+            Fewer than two motions do.
+        """
+        good = self.has_log()
+        if good.sum() < 2:
+            raise DegenerateError(
+                "E-HANDEYE-LARGE-TURNS",
+                f"hand-eye: {len(good) - good.sum()} of {len(good)} motions turn by more than "
+                f"{np.degrees(LARGEST_RAD):.0f}°, {method} needs 2 that do not; use another method or order of poses",
+            )
+        return self[good]
+
+
+def poses_with_log(loop: Loop) -> np.ndarray:
+    """Returns which poses (m,) to use so that the logarithm between any two of them is well-conditioned. Poses with
+    most ill-conditioned motions are left out first."""
+    motions, used = Motions.all(loop), np.ones(len(loop), bool)
+    bad = ~motions.has_log()
+    while bad.any():
+        worst = np.bincount(np.concatenate([motions.first[bad], motions.second[bad]]), minlength=len(loop)).argmax()
+        used[worst] = False
+        bad &= (motions.first != worst) & (motions.second != worst)
+    return used

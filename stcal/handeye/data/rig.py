@@ -10,8 +10,7 @@ from pydantic import Field
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.loop import Setup
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import HandEyePoses, Setup
 from stcal.handeye.data.views import Views, pairs_of_views
 from stcal.io.cameras.model import CameraPrior
 from stcal.io.design import Name

@@ -11,10 +11,9 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.loop import Loop, Setup
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.judge.remarks import Grave
-from stcal.handeye.methods.start import mean_pose
+from stcal.handeye.methods.closed_form import mean_pose
 from stcal.io.quaternions import INVERTED as CONJUGATED
 from stcal.io.quaternions import ORDERS, Reading
 

@@ -7,11 +7,11 @@ from scipy.stats import chi2
 from stcal.errors import StcalError
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.loop import Loop, Setup
+from stcal.handeye.data.pairs import Loop, Setup
 from stcal.handeye.judge.observability import LEAST_POSES, LEAST_TURN, Observability, scale_is_seen, unit_of
+from stcal.handeye.methods.closed_form import robust
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
-from stcal.handeye.methods.start import robust
 
 
 class Grave(str):

@@ -7,11 +7,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.handeye.data.loop import Loop, Setup
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.data.views import View, Views
 from stcal.handeye.judge.remarks import Aside
-from stcal.handeye.methods import start
+from stcal.handeye.methods import closed_form
 
 ROUNDS = 20
 
@@ -101,7 +100,7 @@ def _settled(loop: Loop, variants: list[Poses], labels: np.ndarray) -> tuple[np.
     """Returns labels that fit the solution they lead to, and the sum of their residuals, mm."""
     for _ in range(ROUNDS):
         chosen = replace(loop, camera_from_board=Poses.of(variants[k][i] for i, k in enumerate(labels)))
-        x, z, _ = start.robust(chosen)
+        x, z, _ = closed_form.robust(chosen)
         costs = []
         for variant in variants:
             misses = replace(loop, camera_from_board=variant).residuals(x, z).reshape(-1, 2, 3)

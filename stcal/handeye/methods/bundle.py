@@ -12,7 +12,7 @@ from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.robust import length_limit
 from stcal.handeye.data.views import project_jacobian
 from stcal.handeye.methods.arm import LinearArm
-from stcal.handeye.methods.variance_rounds import Knowledge
+from stcal.handeye.methods.noise import Knowledge
 
 CORNER, POSE = length_limit(2, 0.001), length_limit(6, 0.001)
 """Huber's limits: one good corner, and one good pose, in a thousand has a weight below one."""

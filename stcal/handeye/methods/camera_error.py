@@ -11,11 +11,11 @@ import numpy as np
 
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.pairs import Loop
 from stcal.handeye.data.views import Views, whitened
 from stcal.handeye.methods.bundle import Bundle, Corners, camera_parts
+from stcal.handeye.methods.noise import Problem, estimated
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution
-from stcal.handeye.methods.variance_rounds import Problem, estimated
 from stcal.io.cameras.model import CameraPrior, intrinsic_basis
 
 ROUNDS = 50

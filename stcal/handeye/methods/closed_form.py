@@ -1,16 +1,168 @@
-"""The closed-form methods that OpenCV has, by their authors' names.
+"""Closed-form methods of OpenCV by their authors' names, and linear solutions of the loop from subsets of the poses."""
 
-Andreff, Daniilidis and Li mix rotation and translation in one equation. Lengths are therefore passed to OpenCV in a
-unit in which both weigh alike, so that the unit of the input makes no difference.
-"""
+from dataclasses import replace
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from stcal.errors import ConvergenceError
+from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.loop import Loop
-from stcal.handeye.methods.start import mean_pose
+from stcal.handeye.data.pairs import Loop, Motions
+
+SUBSETS = 200
+"""Number of subsets of three or four poses. With a third of all poses bad, enough subsets are clean on average."""
+LEAST_LENGTH = 0.1
+"""Least ratio of the fitted length of the camera's paths to that of the flange. It is 1 but for the board's size, and 0
+where neither moves."""
+LEAST_SCALE = 1e-6
+"""Smallest scale of the board; lengths in metres give 0.001."""
+SEED = 0
+"""Seed of the subsets, so that they are the same every time."""
+
+
+def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
+    """Returns X, Z and scale of the best of many small subsets, by least product of median rotation and translation.
+
+    The product needs no weight between the two units. Translations are in units of the board, since a board shrunk to
+    nothing would fit a flange that turns about a point. The solution is repeated with all poses within three times the
+    medians. Rotations are found by Shah (2013), then translations, and the board's scale where wanted, by linear least
+    squares. No logarithms are used, so that half turns are motions like any other.
+
+    Raises
+    ------
+    DegenerateError
+        Fewer than three poses.
+    """
+    m = len(loop)
+    if m < 3:
+        raise DegenerateError(
+            "E-HANDEYE-FEW-POSES", f"hand-eye: {m} poses, 3 needed; rotate the flange about two axes and take more"
+        )
+    candidates = [_linear(loop, np.arange(m)[None], with_scale)]
+    rng = np.random.default_rng(SEED)
+    if m > 3:
+        size = 3 if m < 6 else 4
+        order = rng.permuted(np.tile(np.arange(m), (SUBSETS, 1)), axis=1)
+        candidates.append(_linear(loop, order[:, :size], with_scale))
+    parts = [np.concatenate(arrays) for arrays in zip(*candidates, strict=True)]
+    turn, shift = _misses(loop, *parts)
+    shift = _in_board_units(shift, parts[4])
+    best = np.argmin(np.log(np.median(turn, 1) + 1e-15) + np.log(np.median(shift, 1) + 1e-12))
+    inside = (turn[best] <= 3 * np.median(turn[best])) & (shift[best] <= 3 * np.median(shift[best]))
+    if inside.sum() >= 3:
+        again = _linear(loop, np.flatnonzero(inside)[None], with_scale)
+        new_turn, new_shift = _misses(loop, *again)
+        new_shift = _in_board_units(new_shift, again[4])
+        if np.median(new_turn) * np.median(new_shift) < np.median(turn[best]) * np.median(shift[best]):
+            parts, best = again, 0
+    x, t_x, z, t_z, scale = (arrays[best] for arrays in parts)
+    return Rigid(x, t_x), Rigid(z, t_z), float(scale)
+
+
+def _in_board_units(shift: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Returns distances (s, m) over scales (s,); infinite for a board of no size."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(np.abs(scale) < LEAST_SCALE, np.inf, shift.T / np.abs(scale)).T
+
+
+def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
+    """Returns X, Z and scale of poses that turn about one axis (3,) of the mount only; X has no part along the axis.
+
+    The rotations give the direction of the axis in the camera. The angle about it comes from the translations, linear
+    in its cosine and sine; their length is the scale.
+    """
+    hand, eye = loop.stand_from_mount, loop.camera_from_board
+    motions = Motions.all(loop)
+    motions = motions[motions.has_log()]
+    camera_axis = (motions.alpha @ mount_axis) @ motions.beta
+    turn = Rotation.align_vectors(mount_axis[None], camera_axis[None])[0]
+    board = eye.translation @ turn.as_matrix().T
+    along = (board @ mount_axis)[:, None] * mount_axis
+    across = np.stack([board - along, np.cross(mount_axis, board)], axis=2)
+    rows = np.concatenate(
+        [hand.rotation @ across, hand.rotation, np.tile(-np.eye(3), (len(loop), 1, 1))], axis=2
+    ).reshape(-1, 8)
+    right = -hand.translation - np.einsum("mab,mb->ma", hand.rotation, along)
+    cosine, sine = np.linalg.lstsq(rows, right.ravel(), rcond=1e-9)[0][:2]
+    length = float(np.hypot(cosine, sine))
+    if length < LEAST_LENGTH:
+        raise DegenerateError(
+            "E-HANDEYE-AXES",
+            "hand-eye: the flange turns about one axis at one place, so that the angle about it is open; move it "
+            "across the axis too, by a tenth of the board's distance or more",
+        )
+    scale = length if with_scale else 1.0
+    about = Rotation.from_rotvec(np.arctan2(sine, cosine) * mount_axis)
+    x = (about * turn).as_matrix()
+    z = mean_pose(loop.chain(Rigid(x, np.zeros(3)))).rotation
+    t_x, t_z, _ = _translations(_scaled(loop, scale), np.arange(len(loop))[None], x[None], False)
+    return *slid(Rigid(x, t_x[0]), Rigid(z, t_z[0]), mount_axis, loop), scale
+
+
+def slid(x: Rigid, z: Rigid, mount_axis: np.ndarray, loop: Loop) -> tuple[Rigid, Rigid]:
+    """Returns X without its part along the axis about which all poses turn, and the Z that still closes the loop."""
+    along = (x.translation @ mount_axis) * mount_axis
+    stand = (loop.stand_from_mount.rotation @ along).mean(0)
+    return Rigid(x.rotation, x.translation - along), Rigid(z.rotation, z.translation - stand)
+
+
+def _linear(loop: Loop, subsets: np.ndarray, with_scale: bool) -> tuple[np.ndarray, ...]:
+    """Returns X, Z and scale of subsets (s, k) of the poses: rotations (s, 3, 3) and translations (s, 3) of each, and
+    scales (s,)."""
+    hand, eye = loop.stand_from_mount, loop.camera_from_board
+    # R_G R_X R_C = R_Z: Σ R_C ⊗ R_G maps vec R_X to k vec R_Z, both of one length. They are the first singular vectors.
+    k = np.einsum("mab,mcd->madbc", hand.rotation, eye.rotation).reshape(len(loop), 9, 9)
+    u, _, vt = np.linalg.svd(k[subsets].sum(1))
+    z, x = u[:, :, 0].reshape(-1, 3, 3), vt[:, 0].reshape(-1, 3, 3)
+    sign = np.sign(np.linalg.det(x))[:, None, None]
+    x, z = _nearest_rotation(sign * x), _nearest_rotation(sign * z)
+    t_x, t_z, scale = _translations(loop, subsets, x, with_scale)
+    return x, t_x, z, t_z, scale
+
+
+def _translations(loop: Loop, subsets: np.ndarray, x: np.ndarray, with_scale: bool) -> tuple[np.ndarray, ...]:
+    """Returns t_X and t_Z, (s, 3), and scales (s,) for rotations of X (s, 3, 3), from R_G t_X + s R_G R_X t_C − t_Z =
+    −t_G. Where they are not unique, the shortest is returned."""
+    hand, eye = loop.stand_from_mount, loop.camera_from_board
+    rows = np.concatenate([hand.rotation, np.tile(-np.eye(3), (len(loop), 1, 1))], axis=2)[subsets]
+    moved = np.einsum("skab,sbc,skc->ska", hand.rotation[subsets], x, eye.translation[subsets])
+    right = -hand.translation[subsets]
+    if with_scale:
+        rows = np.concatenate([rows, moved[..., None]], axis=3)
+    else:
+        right = right - moved
+    s = len(subsets)
+    solved = (np.linalg.pinv(rows.reshape(s, -1, rows.shape[3]), rcond=1e-9) @ right.reshape(s, -1, 1))[:, :, 0]
+    return solved[:, :3], solved[:, 3:6], solved[:, 6] if with_scale else np.ones(s)
+
+
+def _scaled(loop: Loop, scale: float) -> Loop:
+    eye = loop.camera_from_board
+    return replace(loop, camera_from_board=Poses(eye.rotation, scale * eye.translation))
+
+
+def _misses(loop: Loop, x, t_x, z, t_z, scale) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the angles (s, m) and distances (s, m) by which the chains miss Z."""
+    hand, eye = loop.stand_from_mount, loop.camera_from_board
+    chain = np.einsum("mab,sbc,mcd->smad", hand.rotation, x, eye.rotation)
+    cosine = (np.einsum("smab,sab->sm", chain, z) - 1) / 2
+    board = scale[:, None, None] * eye.translation @ np.swapaxes(x, 1, 2) + t_x[:, None]
+    at = np.einsum("mab,smb->sma", hand.rotation, board)
+    return np.arccos(np.clip(cosine, -1, 1)), np.linalg.norm(at + hand.translation - t_z[:, None], axis=2)
+
+
+def _nearest_rotation(m: np.ndarray) -> np.ndarray:
+    """Returns the rotations nearest to matrices (s, 3, 3)."""
+    u, _, vt = np.linalg.svd(m)
+    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+    return u @ vt
+
+
+def mean_pose(chain: Poses) -> Rigid:
+    """Returns the mean of poses, with the chordal mean of their rotations."""
+    return Rigid(Rotation.from_matrix(np.array(chain.rotation)).mean().as_matrix(), chain.translation.mean(0))
+
 
 AX_XB = {
     "tsai-lenz": cv2.CALIB_HAND_EYE_TSAI,
@@ -24,7 +176,7 @@ AX_ZB = {"shah": cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH, "li": cv2.CALIB_ROBOT_WORL
 """Shah 2013, Li, Wang & Wu 2010."""
 
 
-def closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple[Rigid, Rigid]:
+def solve_closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple[Rigid, Rigid]:
     """Returns X and Z by one of :data:`AX_XB` or :data:`AX_ZB`; ``unit_mm`` is the length that weighs like one radian.
 
     AX = XB does not contain Z: Z is then the mean of the chains.

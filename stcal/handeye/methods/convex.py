@@ -12,7 +12,7 @@ from scipy.optimize import minimize, nnls
 
 from stcal.errors import ConvergenceError
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.loop import Motions
+from stcal.handeye.data.pairs import Motions
 
 GAP = 1e-4
 """Largest relative excess of the largest error over the proven bound: a hundredth of any σ."""

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Rigid, skew
-from stcal.handeye.data.loop import Motions
+from stcal.handeye.data.pairs import Motions
 
 MOST = 100_000
 """Largest number of candidates, and of generations."""

@@ -8,7 +8,7 @@ from scipy.stats import chi2, f
 from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise, perturbed
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.pairs import Loop
 from stcal.handeye.methods.noise import Noise, components, variance_components
 
 FALSE_ALARM = 0.01

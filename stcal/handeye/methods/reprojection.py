@@ -13,14 +13,13 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.pairs import Loop
 from stcal.handeye.data.views import Views, resect
 from stcal.handeye.methods.arm import ROUNDS, SETTLED_MM, ArmModel, LinearArm
 from stcal.handeye.methods.bundle import Bundle, Corners
 from stcal.handeye.methods.camera_error import CameraError, of_corners
-from stcal.handeye.methods.noise import Noise
+from stcal.handeye.methods.noise import LEAST, Noise, Problem, adjust
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
-from stcal.handeye.methods.variance_rounds import LEAST, Problem, adjust
 from stcal.io.cameras.model import PARAMETER_NAMES, CameraPrior, intrinsic_basis
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2

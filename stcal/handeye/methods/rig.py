@@ -8,11 +8,11 @@ from scipy.stats import f
 from stcal.errors import DegenerateError
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.loop import Loop, Setup
+from stcal.handeye.data.pairs import Loop, Setup
 from stcal.handeye.data.rig import RigPoses
 from stcal.handeye.methods.bundle import RigBundle, RigCorners
 from stcal.handeye.methods.camera_error import CameraError, considered
-from stcal.handeye.methods.noise import Noise
+from stcal.handeye.methods.noise import Noise, adjust
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
 from stcal.handeye.methods.reprojection import (
     CAMERA_GAIN,
@@ -27,7 +27,6 @@ from stcal.handeye.methods.reprojection import (
     problem,
     scale_hint,
 )
-from stcal.handeye.methods.variance_rounds import adjust
 from stcal.io.cameras.model import intrinsic_basis
 
 LEAST_VIEWS = 1

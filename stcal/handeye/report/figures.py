@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
-from stcal.handeye.data.loop import Loop
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import HandEyePoses, Loop
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.methods.reprojection import Reprojection

@@ -8,9 +8,9 @@ from pydantic import Field
 
 import stcal
 from stcal.handeye.choose import Choice, Tried
-from stcal.handeye.data.loop import FRAMES, Setup
+from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
-from stcal.handeye.methods.variance_rounds import kind
+from stcal.handeye.methods.noise import kind
 from stcal.handeye.report.outcome import ArmFound, Outcome, RigOutcome, Verdict, Word, judged, rig_judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.rig.validate import CameraHeldOut

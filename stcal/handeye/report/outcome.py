@@ -10,13 +10,12 @@ from scipy.stats import f
 
 from stcal.geometry.rigid import skew
 from stcal.handeye.choose import Choice
-from stcal.handeye.data.loop import FRAMES
-from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.pairs import FRAMES, HandEyePoses
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.observability import COMMON_MM
 from stcal.handeye.judge.remarks import MANY, Aside, Grave
 from stcal.handeye.result import HandEye
-from stcal.handeye.rig.result import Rig
+from stcal.handeye.rig.solve import Rig
 from stcal.handeye.rig.validate import RigHeldOut
 from stcal.handeye.time_offset import TimeOffset
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses

@@ -10,10 +10,9 @@ from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.loop import Setup
+from stcal.handeye.data.pairs import Setup
 from stcal.handeye.data.rig import RigPoses
-from stcal.handeye.rig.result import POSE, Rig
-from stcal.handeye.rig.solve import RigOptions, alone, handeye_rig
+from stcal.handeye.rig.solve import POSE, Rig, RigOptions, alone, handeye_rig
 from stcal.handeye.validate import SCATTERED, HeldOutPoses, predicted
 from stcal.parallel import one_thread, run_parallel
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.saving import save
+from stcal.io.files import save
 
 COLMAP_PIXEL_ORIGIN = 0.5
 """COLMAP's coordinate of the centre of the top-left pixel; OpenCV's, and ours, is 0."""

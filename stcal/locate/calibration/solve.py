@@ -1,24 +1,300 @@
-"""Calibration of the target: corners of its tags, from photographs with a board in the same plane.
-
-The start follows the patent (step S3): the board's pose in each image, each corner at the intersection of its ray with
-the board's plane, {obj} in the middle of a chosen tag. Then one adjustment refines all poses and corners, with σ.
-"""
+"""Calibration of a target of tags: poses of the board in all images, and corners of the tags in the board's plane."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import null_space
+from scipy.optimize import root_scalar
 
 from stcal.boards.design import BoardView
-from stcal.boards.edges import corners_by_edges
-from stcal.boards.tags import Tags
+from stcal.boards.tags import Tags, corners_by_edges
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
+from stcal.geometry.least_squares import minimise
+from stcal.geometry.normal_equations import Reduction, reduce
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
-from stcal.geometry.rigid import Rigid
-from stcal.locate.calibration.adjust import AdjustedLayout, ImageCorners, adjust
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.robust import huber_cost, huber_weights, length_limit, robust_sigma
+from stcal.geometry.variances import sigma_factor
 from stcal.locate.data.layout import LayoutPlan, TargetLayout, obj_from_plane
+from stcal.locate.pose.estimate import PlanarProblem, project
 from stcal.parallel import one_thread
+
+MAX_STEPS = 60
+HUBER_TAIL = 0.011
+"""Share of inlier points, or tags, whose residuals Huber's loss damps: 3 σ in the plane."""
+GROSS = 4.0
+"""Multiple of Huber's limit beyond which a residual is gross, such as a misread tag or a hidden corner: weight 0."""
+VARIANCE_ROUNDS = 6
+LEAST_FACTOR = 1e-3
+"""Least factor on the stated σ of the board's points. Exact data would give 0, and rounding would be weighed."""
+TOGETHER = np.tile(np.eye(2), (4, 1))
+"""Basis (8, 2) of the corners' displacements when a tag moves as a whole."""
+APART = null_space(TOGETHER.T)
+"""Basis (8, 6) of all other displacements of a tag's corners."""
+NEAR_PX = 0.005
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageCorners:
+    """Board and tags in one image, in normalised coordinates without distortion.
+
+    ``pose`` : camera_from_board; ``board_xyz`` : (b, 3) points of the board, mm; ``board_seen`` : (b, 2) their image;
+    ``board_noise`` : (b, 2, 2) covariance of ``board_seen`` up to a factor; ``rows`` : (k,) rows of the tags;
+    ``seen`` : (4k, 2) corners of the tags; ``noise`` : (k, 8, 8) covariance of each tag's corners, px²; ``focal_px`` :
+    approximate ratio of pixels to normalised coordinates.
+    """
+
+    name: str
+    pose: Rigid
+    board_xyz: np.ndarray
+    board_seen: np.ndarray
+    board_noise: np.ndarray
+    rows: np.ndarray
+    seen: np.ndarray
+    noise: np.ndarray
+    focal_px: float
+
+    def numbered(self, rows: np.ndarray) -> "ImageCorners":
+        """Returns the image with other row numbers of the tags."""
+        return replace(self, rows=rows)
+
+    def turned(self, board_from_board: Rigid) -> "ImageCorners":
+        """Returns the image with the board numbered as after one of its symmetries."""
+        inverse = board_from_board.inverse()
+        return replace(self, pose=self.pose @ inverse, board_xyz=board_from_board @ self.board_xyz)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdjustedLayout:
+    """Result of the adjustment: corners of the tags, and poses of the board.
+
+    ``corners_mm`` : (n, 4, 2) corners in the frame of the board; ``covariance_mm2`` : (8n, 8n); ``poses`` :
+    camera_from_board; ``board_factor`` : estimated factor on the stated σ of the board's points; ``sigma_px``,
+    ``tag_sigma_px`` : estimated σ due to print, lens and flatness, of single corners and of the four of a tag together;
+    ``board_rms_px``, ``tag_rms_px`` : RMS residuals per coordinate; ``image_rms_px`` : (m,) RMS of the tags by image;
+    ``downweighted`` : share of the tags that are damped as outliers; ``settled`` : whether the σ converged within
+    :data:`VARIANCE_ROUNDS`.
+    """
+
+    corners_mm: np.ndarray
+    covariance_mm2: np.ndarray
+    poses: Poses
+    board_factor: float
+    sigma_px: float
+    tag_sigma_px: float
+    board_rms_px: float
+    tag_rms_px: float
+    image_rms_px: np.ndarray
+    downweighted: float
+    settled: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Noise:
+    """Noise model: ``board``, factor on the σ of the board's points; ``corner_px``, ``tag_px``, additional σ of single
+    corners, and of the four corners of a tag together."""
+
+    board: float
+    corner_px: float
+    tag_px: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Group:
+    """Residuals of p points of the board (d = 2) or tags (d = 8).
+
+    ``residual`` : (p, d) whitened residuals; ``by_pose`` : (p, d, 6) and ``by_point`` : (p, d, d) their derivatives by
+    pose and points; ``weight`` : (p,) Huber's weights; ``px`` : (p, d) residuals in pixels; ``cost`` : Huber's loss,
+    constant beyond gross residuals.
+    """
+
+    residual: np.ndarray
+    by_pose: np.ndarray
+    by_point: np.ndarray
+    weight: np.ndarray
+    px: np.ndarray
+    cost: float
+
+
+def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
+    """Minimises Huber's loss over 6m + 8n unknowns; the poses are eliminated image by image.
+
+    The board is the datum and exact. A factor on the σ of the board's measured points, and additional σ of the tags'
+    corners, are estimated from residuals and redundancy (variance components: Förstner 1979).
+
+    Raises
+    ------
+    ConvergenceError
+        The iteration does not converge.
+    """
+    corners = start.reshape(-1, 2).copy()
+    poses = Poses.of([image.pose for image in images])
+    noise = _first_noise(images, poses, corners)
+    settled = False
+    for round_ in range(VARIANCE_ROUNDS):
+        poses, corners = _settled(images, poses, corners, noise)
+        linear = _Linear.of(images, poses, corners, noise)
+        covariance = np.linalg.inv(linear.normal)
+        previous, noise = noise, _variances(images, linear, covariance, noise)
+        change = max(abs(noise.corner_px - previous.corner_px), abs(noise.tag_px - previous.tag_px))
+        settled = round_ > 0 and abs(noise.board / previous.board - 1) < 0.01 and change < NEAR_PX
+        if settled:
+            break
+    board, tags = ([block[side] for block in linear.blocks] for side in (0, 1))
+    return AdjustedLayout(
+        corners_mm=corners.reshape(-1, 4, 2),
+        covariance_mm2=covariance,
+        poses=poses,
+        board_factor=noise.board,
+        sigma_px=noise.corner_px,
+        tag_sigma_px=noise.tag_px,
+        board_rms_px=_rms(np.concatenate([g.px.ravel() for g in board])),
+        tag_rms_px=_rms(np.concatenate([g.px.ravel() for g in tags])),
+        image_rms_px=np.array([_rms(g.px) for g in tags]),
+        downweighted=float((np.concatenate([g.weight for g in tags]) < 1).mean()),
+        settled=settled,
+    )
+
+
+def _first_noise(images, poses: Poses, corners: np.ndarray) -> "_Noise":
+    """Returns first σ from the medians of the residuals."""
+    blocks = [_blocks(image, poses[[i]], corners, _Noise(1.0, 0.0, 0.0)) for i, image in enumerate(images)]
+    board = np.concatenate([np.linalg.norm(b[0].residual, axis=1) for b in blocks])
+    tags = np.concatenate([np.linalg.norm(b[1].px.reshape(-1, 2), axis=1) for b in blocks])
+    return _Noise(max(robust_sigma(board, 2), LEAST_FACTOR), robust_sigma(tags, 2), 0.0)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+def _settled(images, poses: Poses, corners: np.ndarray, noise: _Noise) -> tuple[Poses, np.ndarray]:
+    def moved(at: tuple[Poses, np.ndarray], step: np.ndarray) -> tuple[Poses, np.ndarray]:
+        by_corner, by_pose = np.split(step, [corners.size])
+        return at[0].moved(by_pose.reshape(-1, 6)), at[1] + by_corner.reshape(-1, 2)
+
+    minimum = minimise((poses, corners), lambda at: _Linear.of(images, *at, noise), moved, max_steps=MAX_STEPS)
+    return minimum.required("layout", "check board file and camera file").state
+
+
+def _blocks(image: ImageCorners, pose: Poses, corners: np.ndarray, noise: _Noise) -> tuple[_Group, _Group]:
+    """Returns the residuals of board and tags in one image."""
+    points = (4 * image.rows[:, None] + np.arange(4)).ravel()
+    board = _group(image, pose, image.board_xyz[:, :2], image.board_seen, noise.board**2 * image.board_noise)
+    covariance = image.noise + noise.corner_px**2 * np.eye(8) + noise.tag_px**2 * TOGETHER @ TOGETHER.T
+    return board, _group(image, pose, corners[points], image.seen, covariance / image.focal_px**2)
+
+
+def _group(image: ImageCorners, pose: Poses, xy: np.ndarray, seen: np.ndarray, noise: np.ndarray) -> _Group:
+    p, d = noise.shape[:2]
+    empty = np.zeros((0, 0))
+    view = project(PlanarProblem(xy, seen, empty, empty, empty, empty, empty), pose)
+    raw = view.residual[0].reshape(p, d)
+    by_point = np.zeros((p, d // 2, 2, d // 2, 2))
+    k = np.arange(d // 2)
+    by_point[:, k, :, k] = np.moveaxis(view.by_corner[0].reshape(p, d // 2, 2, 2), 1, 0)
+    root = np.linalg.inv(np.linalg.cholesky(noise))
+    residual = (root @ raw[..., None])[..., 0]
+    limit = length_limit(d, HUBER_TAIL)
+    length = np.linalg.norm(residual, axis=1)
+    return _Group(
+        residual=residual,
+        by_pose=root @ view.by_pose[0].reshape(p, d, 6),
+        by_point=root @ by_point.reshape(p, d, d),
+        weight=np.where(length > GROSS * limit, 0.0, huber_weights(length, limit)),
+        px=image.focal_px * raw,
+        cost=float(huber_cost(np.minimum(length, GROSS * limit), limit).sum()),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Linear:
+    """Problem linearised about a state.
+
+    ``cost`` : Huber's loss; ``blocks`` : residuals of board and tags by image; ``normal``, ``right`` : (8n, 8n), (8n,)
+    normal equations of the corners after elimination of the ``poses``.
+    """
+
+    cost: float
+    blocks: list[tuple[_Group, _Group]]
+    normal: np.ndarray
+    right: np.ndarray
+    poses: Reduction
+
+    @classmethod
+    def of(cls, images, poses: Poses, corners: np.ndarray, noise: _Noise) -> "_Linear":
+        blocks = [_blocks(image, poses[[i]], corners, noise) for i, image in enumerate(images)]
+        m, k = len(blocks), corners.size
+        pose_normal, pose_right, cross = np.zeros((m, 6, 6)), np.zeros((m, 6)), np.zeros((m, 6, k))
+        normal, right = np.zeros((k, k)), np.zeros(k)
+        for i, (image, block) in enumerate(zip(images, blocks, strict=True)):
+            for group in block:
+                weighted = group.weight[:, None, None] * group.by_pose
+                pose_normal[i] += np.einsum("pij,pik->jk", weighted, group.by_pose)
+                pose_right[i] += np.einsum("pij,pi->j", weighted, group.residual)
+            tags, place = block[1], _place(image)
+            weighted = tags.weight[:, None, None] * tags.by_point
+            cross[i][:, place.ravel()] = np.einsum("pij,pik->jpk", tags.by_pose, weighted).reshape(6, -1)
+            normal[place[:, :, None], place[:, None, :]] += np.einsum("pij,pik->pjk", weighted, tags.by_point)
+            right[place] += np.einsum("pij,pi->pj", weighted, tags.residual)
+        reduction = reduce(pose_normal, pose_right, cross)
+        cost = sum(group.cost for block in blocks for group in block)
+        return cls(cost, blocks, normal - reduction.normal, right - reduction.right, reduction)
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Returns the step and its predicted gain: damped for the corners, then the best poses given that step."""
+        corner_step = np.linalg.solve(self.normal + damping * np.diag(np.diag(self.normal)), self.right)
+        gain = 2 * float(corner_step @ self.right) - float(corner_step @ self.normal @ corner_step) + self.poses.gain
+        return np.concatenate([corner_step, self.poses.back(corner_step).ravel()]), gain
+
+
+def _place(image: ImageCorners) -> np.ndarray:
+    """Returns the numbers of the unknowns of each tag's coordinates, (k, 8)."""
+    return 8 * image.rows[:, None] + np.arange(8)
+
+
+def _variances(images, linear: _Linear, covariance: np.ndarray, noise: _Noise) -> _Noise:
+    """Returns the noise with which the squared residuals of board and tags each equal their redundancy."""
+    squared_sum, redundancy, taken_by_poses, blocks = 0.0, np.zeros(2), 0.0, linear.blocks
+    for i, (image, block) in enumerate(zip(images, blocks, strict=True)):
+        unknowns_of_tags = _place(image).ravel()
+        by_corners = linear.poses.from_kept[i][:, unknowns_of_tags]
+        of_pose = (
+            linear.poses.inverse[i] + by_corners @ covariance[np.ix_(unknowns_of_tags, unknowns_of_tags)] @ by_corners.T
+        )
+        board = block[0]
+        by_board = np.einsum("p,pij,pik->jk", board.weight, board.by_pose, board.by_pose)
+        taken_by_poses += float(np.trace(of_pose @ by_board))
+        squared_sum += float((board.weight * (board.residual**2).sum(1)).sum())
+        redundancy += [group.residual.shape[1] * np.count_nonzero(group.weight) for group in block]
+    unknowns = 6 * len(blocks) + len(covariance)
+    redundancy = np.maximum(redundancy - [taken_by_poses, unknowns - taken_by_poses], 1.0)
+    tag_noise = np.concatenate([image.noise for image in images])
+    px = np.concatenate([block[1].px for block in blocks])
+    weight = np.concatenate([block[1].weight for block in blocks])
+
+    corner = _added(tag_noise, px, weight, APART, 6 / 8 * redundancy[1])
+    whole_tag = _added(tag_noise, px, weight, TOGETHER / 2, 2 / 8 * redundancy[1])
+    # Twice the mean of four corners: its variance holds that of the tag's shift four times, that of a corner once.
+    tag = np.sqrt(max(whole_tag**2 - corner**2, 0.0) / 4)
+    return _Noise(max(noise.board * sigma_factor(squared_sum, redundancy[0]), LEAST_FACTOR), corner, float(tag))
+
+
+def _added(own: np.ndarray, px: np.ndarray, weight: np.ndarray, part: np.ndarray, free: float) -> float:
+    """Returns σ of the residuals px (p, 8) in addition to their covariance (p, 8, 8), in directions ``part`` (8, q)."""
+    components, variance, identity = px @ part, part.T @ own @ part, np.eye(part.shape[1])
+
+    def excess(added_px: float) -> float:
+        solved = np.linalg.solve(variance + added_px**2 * identity, components[..., None])[..., 0]
+        return float((weight * (components * solved).sum(1)).sum()) - free
+
+    if excess(0.0) <= 0:
+        return 0.0
+    upper = float(np.sqrt((components**2).sum() / free)) + 1e-9
+    return float(root_scalar(excess, method="brentq", bracket=(0.0, upper)).root)
+
 
 MIN_IMAGES = 2
 MIN_BOARD_POINTS = 4
@@ -272,3 +548,19 @@ def _deviation(nominal: np.ndarray, corners: np.ndarray) -> np.ndarray:
         distance = np.linalg.norm((b - b.mean(0)) @ turn.T + a.mean(0) - a, axis=1)
         deviation[placed] = distance.reshape(-1, 4).max(1)
     return deviation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationImages:
+    """Images of a target's calibration.
+
+    ``names`` : names of m readable images of one size; ``views`` : views of the board in them, None if it is not seen;
+    ``symmetries`` : rotations that map the board onto itself; ``left_out`` : files that are not used, and why.
+    """
+
+    names: tuple[str, ...]
+    views: tuple[BoardView | None, ...]
+    tags: tuple[Tags, ...]
+    camera: Camera
+    symmetries: tuple[Rigid, ...] = ()
+    left_out: tuple[str, ...] = ()

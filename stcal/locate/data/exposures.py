@@ -13,10 +13,9 @@ import stcal
 from stcal.boards.tags import Tags, find_tags
 from stcal.errors import InputError
 from stcal.io.device import DARK, SATURATED, Source, checked_name, png
-from stcal.io.files import IMAGE_BYTES, read_bytes
+from stcal.io.files import IMAGE_BYTES, json_text, read_bytes, real_place, save
 from stcal.io.images import SUFFIXES, TOP_GROUP, ImageFile, decode, find_images, grey_8bit
 from stcal.io.json import Part, ResultFile
-from stcal.io.saving import json_text, real_place, save
 from stcal.locate.data.layout import TargetLayout
 
 

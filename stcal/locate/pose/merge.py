@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.boards.edges import corners_by_edges
-from stcal.boards.tags import Tags
+from stcal.boards.tags import Tags, corners_by_edges
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pose.estimate import SeenTags
 

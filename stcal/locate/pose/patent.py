@@ -12,7 +12,7 @@ from scipy.spatial import Delaunay, QhullError
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane_poses import PlanePoses, poses_of_plane
+from stcal.geometry.plane import PlanePoses, poses_of_plane
 from stcal.geometry.rigid import Rigid
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pose.verdict import PoseCheck, Verdict

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import chi2 as chi_square
 
 from stcal.errors import InputError
-from stcal.geometry.plane_poses import deciding_delta
+from stcal.geometry.plane import deciding_delta
 from stcal.geometry.rigid import Poses
 from stcal.locate.pose.estimate import ObjPose, covering_both
 

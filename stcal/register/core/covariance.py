@@ -8,7 +8,7 @@ from scipy.special import chdtr, chdtrc
 
 from stcal.geometry.arrays import Array, freeze
 from stcal.register.core.models import Model, Transform, unit_covariance
-from stcal.register.core.problem import Problem
+from stcal.register.core.pairs import Problem
 
 CONTRADICTED_AT = 0.01
 """Significance level of the one-sided χ² test; stated σ are scaled if the test rejects them."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.affine import Affine
+from stcal.geometry.rigid import Affine
 from stcal.parallel import one_thread
 
 SIZES = range(4, 41, 2)

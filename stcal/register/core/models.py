@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.errors import DegenerateError
-from stcal.geometry.affine import Affine
 from stcal.geometry.align import align_affine, align_rigid, align_similarity, best_rotations
 from stcal.geometry.least_squares import NormalEquations, minimise
-from stcal.geometry.rigid import Rigid, Similarity, skew
+from stcal.geometry.rigid import Affine, Rigid, Similarity, skew
 
 Transform = Rigid | Similarity | Affine
 

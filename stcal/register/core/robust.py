@@ -18,7 +18,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.robust import ratio_limit
 from stcal.register.core.covariance import sigma_within
 from stcal.register.core.models import Model, Transform, leverages, parts
-from stcal.register.core.problem import Problem
+from stcal.register.core.pairs import Problem
 from stcal.register.core.search import FALSE_ALARMS, LEAST_REDUNDANCY, Consensus, by_scale, by_threshold, search
 
 SUBSET = 500

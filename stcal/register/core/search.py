@@ -20,7 +20,7 @@ from scipy.special import gammaln
 
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.register.core.models import Model, hypotheses
-from stcal.register.core.problem import Problem
+from stcal.register.core.pairs import Problem
 
 FALSE_ALARMS = 1e-4
 """Expectation of sets declared in data without outliers. It is small because a chance set of few points claims a

@@ -1,16 +1,6 @@
-"""Whether points that seem to agree on one transform are two groups, each with a transform of its own.
+"""Whether points that agree on one transform are two groups, each with a transform of its own or shifted."""
 
-When half of the points are shifted together by a few σ, one transform between the two leaves residuals that look like
-more noise. Two transforms are found by least trimmed squares for half of the points and for the rest, and then by
-assigning points and fitting in turn. Of groups chosen beforehand Wilks' Λ = det S₂ / det S₁ of the residuals' scatter
-with two transforms and with one has a known distribution, whatever the noise's covariance; there are 2ⁿ⁻¹ ways to
-choose, and so a number of false alarms as in ``search.py``. Square sums instead of determinants, x = RSS₂ / RSS₁ ~
-Beta((3n − 2p)/2, p/2), tell more about few points, but take noise that is greater along one axis for two groups: they
-are used up to 16 points, where noise of equal strength along all axes is left within the groups. (Noise twice as large
-along one axis would be parted so, but is no false alarm below 50 points; of larger ratios more is left along it.)
-"""
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -18,8 +8,9 @@ from scipy.special import bdtrc, chdtrc, gammaln
 
 from stcal.errors import ConvergenceError, DegenerateError
 from stcal.register.core.models import Model, Transform
-from stcal.register.core.problem import Problem
+from stcal.register.core.pairs import Problem
 from stcal.register.core.search import FALSE_ALARMS, by_share, chernoff, search
+from stcal.register.judge.mistakes import FEWEST_NEIGHBOURS, neighbours_alike
 
 TRIED = 200
 """Points that are looked at: a shift of 4 σ of half of them is seen then."""
@@ -163,3 +154,125 @@ def _assigned(problem: Problem, rng: np.random.Generator) -> _Assignment | None:
         second = ~first
         best = _Assignment(first, transforms, total)
     return best
+
+
+NEEDED, ALONG = 14.5, 9.2
+"""Gain in log likelihood that is needed: along any direction, and along the first principal axis."""
+LEAST_SHARE = 0.15
+"""Smallest fraction of the points in a group."""
+ROUNDS = 60
+NARROWEST = 0.01
+"""Variance of a group over that of all, along the shift."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shifted:
+    """Points of which some are shifted against the others.
+
+    Parameters
+    ----------
+    rows : (m,) int array
+        Indices of the fewer.
+    count : int
+        Of all points.
+    by_mm : (3,) array
+        Their shift against the others, frame b.
+    together : bool
+        Whether they lie together in space.
+    """
+
+    rows: np.ndarray
+    count: int
+    by_mm: np.ndarray
+    together: bool
+
+    def off_mm(self) -> np.ndarray:
+        """(3,) how far the transform lies off that of the fewer, if these are the right ones."""
+        return (1 - len(self.rows) / self.count) * self.by_mm
+
+
+def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
+    """The rows that are shifted together.
+
+    Parameters
+    ----------
+    problem : Problem
+        Points that agree.
+    transform : Transform
+        Their fit.
+
+    Returns
+    -------
+    Shifted or None
+        None where one group explains the residuals, where a bent frame does, or with too few points.
+    """
+    count = len(problem)
+    residuals = problem.whitened(transform)
+    if count < FEWEST_NEIGHBOURS or np.abs(residuals).max() <= problem.rounding_mm():
+        return None
+    sample = np.unique(np.linspace(0, count - 1, min(count, TRIED)).astype(int))
+    middle = residuals[sample].mean(0)
+    centred = residuals[sample] - middle
+    variances, axes = np.linalg.eigh(centred.T @ centred / len(sample))
+    if variances[0] <= 1e-12 * variances[2]:
+        return None
+    to_unit = axes / np.sqrt(variances) @ axes.T
+    unit = centred @ to_unit
+    best = _clear(unit, axes)
+    if best is None or neighbours_alike(problem.xyz_a, problem.residuals(transform)):
+        return None
+    second = (residuals - middle) @ to_unit @ best.axis < best.border
+    if second.sum() > count / 2:
+        second = ~second
+    plain = problem.residuals(transform)
+    by_mm = plain[second].mean(0) - plain[~second].mean(0)
+    return Shifted(np.flatnonzero(second), count, by_mm, lies_together(problem.xyz_a, second))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Parted:
+    """``gain`` of log likelihood by two groups, ``axis`` of the shift, ``border`` between them along it."""
+
+    gain: float
+    axis: np.ndarray
+    border: float
+
+
+def _clear(unit: np.ndarray, axes: np.ndarray) -> _Parted | None:
+    """Two groups of residuals (n, 3) of unit scatter that chance does not make; ``axes`` : principal ones before they
+    were scaled, in columns, the longest last."""
+    best = max((_parted(unit, axis) for axis in (*_by_kurtosis(unit).T, *axes.T)), key=lambda found: found.gain)
+    across = unit - (unit @ best.axis)[:, None] * best.axis
+    rest = max(_parted(across, axis).gain for axis in _by_kurtosis(across).T[1:])
+    if best.gain - max(rest, 0.0) > NEEDED:
+        return best
+    *others, longest = (_parted(unit @ axis[:, None], np.ones(1)) for axis in axes.T)
+    if longest.gain - max(0.0, *(each.gain for each in others)) > ALONG:
+        return replace(longest, axis=longest.axis[0] * axes[:, 2])
+    return None
+
+
+def _by_kurtosis(unit: np.ndarray) -> np.ndarray:
+    """(3, 3) directions in columns, that of the least kurtosis first of those in which points vary (Cardoso 1989)."""
+    return np.linalg.eigh((unit * (unit**2).sum(1)[:, None]).T @ unit)[1]
+
+
+def _parted(unit: np.ndarray, axis: np.ndarray) -> _Parted:
+    """Divides residuals (n, d) of unit scatter into two groups, starting from the median along ``axis``."""
+    along = unit @ axis
+    first = (along > np.median(along)).astype(float)
+    low, high, apart = 0.0, 0.0, 0.0
+    for _ in range(ROUNDS):
+        share = float(np.clip(first.mean(), LEAST_SHARE, 1 - LEAST_SHARE))
+        shift = first @ unit / max(first.sum(), 1e-300) - (1 - first) @ unit / max(len(first) - first.sum(), 1e-300)
+        apart = max(float(np.linalg.norm(shift)), 1e-12)
+        axis, narrow = shift / apart, max(1 - share * (1 - share) * apart**2, NARROWEST)
+        high, low = (1 - share) * apart, -share * apart
+        along = unit @ axis
+        one = np.log(share) - (along - high) ** 2 / (2 * narrow)
+        two = np.log1p(-share) - (along - low) ** 2 / (2 * narrow)
+        both = np.logaddexp(one, two)
+        first = np.exp(one - both)
+    gain = float((both + along**2 / 2).sum() - len(unit) / 2 * np.log(narrow))
+    border = (high + low) / 2 - narrow / apart * np.log(share / (1 - share))
+    return _Parted(gain, axis, float(border))

@@ -1,17 +1,19 @@
-"""Mistakes that the data themselves show: units, mirrored axes, rows exchanged or in another unit."""
+"""Mistakes that the data show: units, mirrored axes, exchanged rows, scale, and residuals alike at neighbours."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from scipy.special import bdtrc
+from scipy.special import bdtrc, ndtr
 
-from stcal.errors import InputError
+from stcal.errors import InputError, StcalError
 from stcal.geometry.align import best_rotations
+from stcal.geometry.rigid import Affine, Similarity
 from stcal.geometry.robust import ratio_limit
-from stcal.register.core.models import Model, parts
-from stcal.register.core.problem import Problem
+from stcal.register.core.models import MODELS, Model, Transform, parts, unit_covariance
+from stcal.register.core.pairs import Problem
 from stcal.register.core.robust import BY_CHANCE, Fitted
 
 Namer = Callable[[int], str]
@@ -142,3 +144,109 @@ def outlier_notes(problem: Problem, fitted: Fitted, name: Namer) -> list[str]:
 
 def _more(count: int) -> str:
     return f" (and {count - SHOWN} more)" if count > SHOWN else ""
+
+
+SCALE_BY_CHANCE = 1e-4
+"""Frames of one scale called of two: so many."""
+MATTERS = 0.1
+"""Share of the noise's σ by which the wider model must lower it: less is seen in many points, and moves none."""
+THERMAL = 5e-4
+"""Relative: 45 K in steel, 20 K in aluminium; what is more has another cause."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Wider:
+    """The wider model that explains the points: ``transform``, σ of a coordinate by it, and what is to be said."""
+
+    problem: Problem
+    transform: Transform
+    sigma_mm: float
+    note: str
+
+
+def wider(problem: Problem, transform: Transform) -> Wider | None:
+    """The narrowest model wider than the problem's own that explains its points better, more than chance does.
+
+    Parameters
+    ----------
+    problem : Problem
+        Points that agree.
+    transform : Transform
+        Their fit.
+
+    Returns
+    -------
+    Wider or None
+        None where the problem's own model is enough.
+    """
+    narrow, found = (problem, transform), None
+    for name in {"rigid": ("similarity", "affine"), "similarity": ("affine",), "affine": ()}[problem.model.name]:
+        model = MODELS[name]
+        if len(problem) < model.needed + 1:
+            break
+        other = replace(problem, model=model)
+        try:
+            fitted = other.fit()
+        except StcalError:  # coplanar points have no affine transform
+            break
+        before, after = _square(*narrow), _square(other, fitted)
+        more, left = model.parameters - narrow[0].model.parameters, other.redundancy
+        rounding = 3 * len(problem) * problem.rounding_mm() ** 2
+        gain = (before - after) / more / max(after / left, rounding / left)
+        sigma = np.sqrt(max(after, 0) / left)
+        enough = sigma < (1 - MATTERS) * np.sqrt(before / narrow[0].redundancy)
+        if before > rounding and gain > ratio_limit(SCALE_BY_CHANCE, more, left) and enough:
+            narrow = other, fitted
+            found = Wider(other, fitted, float(sigma), _said(other, fitted, float(sigma)))
+    return found
+
+
+def _square(problem: Problem, transform: Transform) -> float:
+    return float(problem.squares(transform).sum())
+
+
+def _said(problem: Problem, transform: Transform, sigma_mm: float) -> str:
+    """What lengths in b are of those in a, the likely cause, and what to do."""
+    covariance = sigma_mm**2 * unit_covariance(problem.model, transform, problem.xyz_a, problem.noise.precision)
+    if isinstance(transform, Similarity):
+        scale, sigma = transform.scale, transform.scale * float(np.sqrt(covariance[6, 6]))
+        off, digits = scale - 1, max(1, 1 - int(np.floor(np.log10(max(sigma, 1e-15)))))
+        cause = "a length standard, a board or an instrument of another scale"
+        if abs(off) < THERMAL:
+            cause = f"{1e6 * abs(off):.0f} ppm, of temperature (steel 11.5, aluminium 23 ppm/K) or a length standard"
+        return (
+            f"lengths in b are {scale:.{digits}f} ± {sigma:.{digits}f} times those in a: {cause}; correct one "
+            "of the files, or use --model similarity"
+        )
+    assert isinstance(transform, Affine)
+    scales = np.linalg.svd(transform.linear, compute_uv=False)
+    return (
+        f"lengths in b are {', '.join(f'{s:.6g}' for s in scales)} times those in a along three axes: an axis of one "
+        "instrument is scaled or not square to the others, or an arm bends; correct it, or use --model affine within "
+        "these points"
+    )
+
+
+NEIGHBOURS = 2000
+"""Number of points whose residuals are compared with the nearest neighbour's …"""
+FEWEST_NEIGHBOURS = 20
+"""… and of no fewer: the sum of fewer products is not normal."""
+BY_NEIGHBOURS = 1e-4
+"""Clean data called bent: so many."""
+
+
+def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
+    """Whether points (n, 3) have residuals (n, 3) in common with their nearest neighbours, more than chance has it.
+
+    Of independent ones the products r · r' of neighbours have mean zero (a little less after a fit), and their sum is
+    normal with the variance Σ (r · r')².
+    """
+    rows = slice(None, None, max(1, len(xyz_a) // NEIGHBOURS))
+    xyz, r = xyz_a[rows], residuals[rows]
+    if len(xyz) < FEWEST_NEIGHBOURS:
+        return False
+    nearest = np.asarray(KDTree(xyz).query(xyz, k=2)[1])[:, 1]
+    pairs = np.column_stack([np.arange(len(xyz)), nearest])
+    one, two = np.unique(np.sort(pairs, axis=1), axis=0).T
+    product = np.einsum("ni,ni->n", r[one], r[two])
+    return bool(ndtr(-product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)

@@ -6,12 +6,11 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from stcal.geometry.affine import Affine
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Affine, Rigid
 from stcal.io.json import Finite, Matrix, Matrix4, Part, Points, Pose, ResultFile, Vector, Vector3
 from stcal.register.core.models import Transform, parts
 from stcal.register.core.result import Alternative, ErrorFigures, HeldOutPoints
-from stcal.register.workspace.cubes import Cubes
+from stcal.register.workspace.field import Cubes
 from stcal.register.workspace.field import Field as ResidualField
 from stcal.register.workspace.findings import Findings
 

@@ -5,15 +5,13 @@ from itertools import pairwise
 import numpy as np
 from markupsafe import Markup
 
-from stcal.geometry.affine import Affine
-from stcal.geometry.rigid import Similarity
+from stcal.geometry.rigid import Affine, Similarity
 from stcal.parallel import one_thread
 from stcal.register.core.liu2017 import Liu2017Options, SampleSize
 from stcal.register.core.result import ErrorFigures
 from stcal.register.report.drawings import errors_figure, field_figure, sample_size_figure, space_figure
 from stcal.register.report.file import matrix_of
-from stcal.register.workspace.cubes import Cubes
-from stcal.register.workspace.field import Field
+from stcal.register.workspace.field import Cubes, Field
 from stcal.register.workspace.findings import Findings
 from stcal.report.figure import COLOURS, uri
 from stcal.report.page import Sections, render

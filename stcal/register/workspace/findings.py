@@ -9,8 +9,7 @@ from stcal.geometry.arrays import Array, freeze
 from stcal.parallel import one_thread
 from stcal.register.core.models import MODELS, jacobian
 from stcal.register.core.result import Registration
-from stcal.register.workspace.cubes import Cubes, cubes
-from stcal.register.workspace.field import Field, residual_field
+from stcal.register.workspace.field import Cubes, Field, cubes, residual_field
 
 
 @dataclass(frozen=True, slots=True, eq=False)

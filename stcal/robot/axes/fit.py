@@ -9,8 +9,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.least_squares import NormalEquations, minimise
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, huber_weights, robust_sigma
-from stcal.robot.axes.orientations import VirtualReflectors
-from stcal.robot.axes.sweeps import Arc
+from stcal.robot.axes.sweeps import Arc, VirtualReflectors
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 

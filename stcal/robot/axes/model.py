@@ -9,12 +9,10 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
-from stcal.robot.axes.checks import off_mm, remarks, require_like_nominal
+from stcal.robot.axes.checks import LeaveOneOut, leave_one_out, off_mm, remarks, require_like_nominal
 from stcal.robot.axes.fit import TINY, AxisFit, fit_axes
-from stcal.robot.axes.orientations import virtual_reflectors
 from stcal.robot.axes.pairs import Pair, chain_through, jacobian_by_axes, pairs_of, sigma_of
-from stcal.robot.axes.sweeps import STILL_RAD, find_arcs
-from stcal.robot.axes.without_one import LeaveOneOut, leave_one_out
+from stcal.robot.axes.sweeps import STILL_RAD, find_arcs, virtual_reflectors
 from stcal.robot.kinematics.dh import PARALLEL_RAD, robot_from_chain
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Chain, Robot
@@ -71,7 +69,7 @@ def robot_from_sweeps(
         Change of a revolute joint's value up to which the joint stands still.
     places : (k, 3) array, optional
         Places of virtual reflectors in the target's frame, mm, k ≥ 3 and not in line, by which orientations are used
-        too: those of :func:`~stcal.robot.axes.orientations.ring`, or points of a real target. If None, positions alone
+        too: those of :func:`~stcal.robot.axes.sweeps.ring`, or points of a real target. If None, positions alone
         are used.
 
     Returns

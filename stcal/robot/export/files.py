@@ -1,8 +1,7 @@
-"""Files of controllers with points: Yaskawa JBI, FANUC LS, KUKA dat, ABB mod, URScript.
+"""Files for robot controllers: points, and differences from the nominal robot."""
 
-Joint values are in degrees, and in mm for prismatic joints; pulses for Yaskawa, rad for Universal Robots.
-"""
-
+import csv
+import io
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +12,10 @@ import numpy as np
 from stcal.geometry.rigid import Poses
 from stcal.io.poses.columns import fixed, joined, without_comments
 from stcal.io.poses.controllers import ABB, DEG_DIGITS, FANUC, KUKA, NUMBER, UNIT_DIGITS, UR, YASKAWA, PoseText
+from stcal.robot.identification.prior import dh_values
+from stcal.robot.identification.report import DH, SHOWN, UNITS
+from stcal.robot.identification.result import Identified
+from stcal.robot.kinematics.model import Robot
 
 REMARK = 32
 """Largest number of characters of a remark, in a FANUC program and in a JBI file."""
@@ -213,3 +216,48 @@ FORMS = {
     ),
 }
 """The form for each word of ``--export``."""
+
+
+HEAD = ("joint", "parameter", "nominal", "identified", "difference", "sigma", "unit", "determined")
+DIGITS = {"mm": 6, "deg": 9}
+ZERO = "zero"
+LENGTH_AT, ANGLE_AT = DH.index("d"), DH.index("theta")
+
+
+def zeros(result: Identified, nominal: Robot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the joint values that the controller should have where it has 0 now, their σ, and a mask of those that
+    the data determine.
+
+    All are (n,), rad or mm. The identified rows have θ + Δ, or d + Δ for prismatic joints, where the nominal ones have
+    θ; with the coupling C the joints turn by C q. Nominal rows do the same with q + C⁻¹ Δ.
+    """
+    at = np.where(nominal.prismatic, LENGTH_AT, ANGLE_AT)
+    joints, back = np.arange(len(at)), np.linalg.inv(nominal.coupling)
+    change = back @ (dh_values(result.robot) - dh_values(nominal))[joints, at]
+    jacobian = back @ result.adjustment.rows.by_parameters(result.robot)[joints, at]
+    k = jacobian.shape[1]
+    sigma = np.sqrt(np.einsum("nk,kl,nl->n", jacobian, result.covariance[:k, :k], jacobian).clip(0))
+    open_ = result.dh_sigma[joints, at] == 0
+    open_[[turn for turn, _ in result.adjustment.rows.coaxial]] = True
+    return change, sigma, (np.abs(back) > 0) @ open_ == 0
+
+
+def offsets_csv(result: Identified, nominal: Robot) -> str:
+    """Returns the table of ``--offsets`` (form: ``data_layout.md``)."""
+    before, values, sigma = dh_values(nominal) * SHOWN, dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
+    change, change_sigma, known = zeros(result, nominal)
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(HEAD)
+
+    def row(joint: int, name: str, old: float, new: float, deviation: float, unit: str, told: bool) -> None:
+        shown = [fixed(v, DIGITS[unit]) for v in (old, new, new - old)]
+        sigma_text = fixed(deviation, DIGITS[unit]) if told else ""
+        writer.writerow([joint, name, *shown, sigma_text, unit, "yes" if told else "no"])
+
+    for i, slides in enumerate(nominal.prismatic):
+        for name, unit, old, new, deviation in zip(DH, UNITS, before[i], values[i], sigma[i], strict=True):
+            row(i + 1, name, old, new, deviation, unit, deviation > 0)
+        factor, unit = (1.0, "mm") if slides else (float(np.degrees(1.0)), "deg")
+        row(i + 1, ZERO, 0.0, factor * change[i], factor * change_sigma[i], unit, bool(known[i]))
+    return stream.getvalue()

@@ -7,8 +7,8 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.robot.identification.residuals import WIDTH, Kind, State, tip_jacobian, tool_width
-from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.forward import chain_parameters
+from stcal.robot.kinematics.inverse import reach_mm
 from stcal.robot.kinematics.model import Robot
 
 SEEN = 1e-9
@@ -122,7 +122,7 @@ def identification_jacobian(
 def parameter_scale(robot: Robot, observe: Kind = "position", tools: Iterable[str] = ("",)) -> np.ndarray:
     """Returns factors (k,) of the columns of an identification Jacobian that bring all parameters to mm.
 
-    An angle counts by the arc that it makes at the arm's whole reach (:func:`~stcal.robot.kinematics.damped.reach_mm`,
+    An angle counts by the arc that it makes at the arm's whole reach (:func:`~stcal.robot.kinematics.inverse.reach_mm`,
     with the longest tool).
     """
     tools = list(tools)

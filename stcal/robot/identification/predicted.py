@@ -13,7 +13,7 @@ from stcal.robot.identification.observability import directions_named
 from stcal.robot.identification.residuals import WIDTH, Kind, Observed, State, tip_jacobian
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.conditions import USUAL, Conditions
-from stcal.robot.kinematics.damped import reach_mm
+from stcal.robot.kinematics.inverse import reach_mm
 from stcal.robot.kinematics.model import Robot
 
 SAMPLES, SEED = 200, 0

@@ -12,8 +12,8 @@ from stcal.report.figure import COLOURS, calm, new_figure, uri
 from stcal.report.page import render
 from stcal.report.text import NONE, number, text_table
 from stcal.robot.identification.drawings import Drawn, joints_figure, space_picture
-from stcal.robot.identification.nominal import DIMENSIONS, Placed, dh_values
 from stcal.robot.identification.observability import EXPLAINED, MEANING
+from stcal.robot.identification.prior import DIMENSIONS, Placed, dh_values
 from stcal.robot.identification.result import OUTLIER_WEIGHT, Identified
 from stcal.robot.kinematics.forward import links, torques
 from stcal.robot.kinematics.model import Elasticity, Robot

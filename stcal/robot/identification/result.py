@@ -11,9 +11,9 @@ from stcal.robot.identification.adjustment import (
     Solution,
     Weighting,
 )
-from stcal.robot.identification.nominal import Adjusted, Deviations, NominalRows, Placed
 from stcal.robot.identification.observability import ObservabilityIndices
 from stcal.robot.identification.predicted import Predicted
+from stcal.robot.identification.prior import Adjusted, Deviations, NominalRows, Placed
 from stcal.robot.identification.residuals import (
     Kind,
     Observed,

@@ -15,9 +15,9 @@ from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.quaternions import EXPLAINS
 from stcal.robot.identification.adjustment import USELESS_MM
 from stcal.robot.identification.residuals import State, observed, residuals, tips_of
-from stcal.robot.kinematics.damped import reach_mm
 from stcal.robot.kinematics.dh import FITS, require_convention
 from stcal.robot.kinematics.forward import carried_poses
+from stcal.robot.kinematics.inverse import reach_mm
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 

@@ -16,8 +16,7 @@ from scipy.special import chdtr, chdtrc
 from stcal.geometry.least_squares import NormalEquations
 from stcal.geometry.variances import Parts
 from stcal.robot.identification.adjustment import USELESS_MM, Bent, Solution, Weighting, curvature_of, huber_limit
-from stcal.robot.identification.elastic import ACROSS, AXIS, MOMENT
-from stcal.robot.identification.nominal import DOUBT, Deviations, NominalRows
+from stcal.robot.identification.prior import ACROSS, AXIS, DOUBT, MOMENT, Deviations, NominalRows
 from stcal.robot.identification.residuals import WIDTH, Kind, Observed, jacobian
 
 LEAST = 1e-9

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.saving import save
+from stcal.io.files import save
 from stcal.io.toml import Finite, PoseEntry, Strict, load_toml, toml_string
 from stcal.robot.kinematics.conditions import MOST_KG
 from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, JointType, Robot, Tree

@@ -20,7 +20,7 @@ from stcal.robot.kinematics.conditions import (
     read_conditions,
     unread,
 )
-from stcal.robot.kinematics.damped import reach_mm
+from stcal.robot.kinematics.inverse import reach_mm
 from stcal.robot.kinematics.model import Robot
 
 WHAT = "robot data"

@@ -9,12 +9,26 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
 from stcal.parallel import one_thread
-from stcal.robot.kinematics.damped import reach_mm
-from stcal.robot.kinematics.inverse import LIMIT, ORIENTATION, SAME_BRANCH, SINGULAR_POSE, UNREACHABLE, Inverse
+from stcal.robot.kinematics.inverse import (
+    LIMIT,
+    ORIENTATION,
+    SAME_BRANCH,
+    SINGULAR_POSE,
+    UNREACHABLE,
+    Inverse,
+    reach_mm,
+)
 from stcal.robot.kinematics.model import Joint, Robot
 from stcal.robot.use.files import CompensationFile
-from stcal.robot.use.plausible import on_targets, out_of_reach, position_misfit_mm, robots_apart
-from stcal.robot.use.targets import Targets, joints_of, poses_of
+from stcal.robot.use.targets import (
+    Targets,
+    joints_of,
+    on_targets,
+    out_of_reach,
+    poses_of,
+    position_misfit_mm,
+    robots_apart,
+)
 
 ISOLATED = 6
 """Joints, up to which solutions are isolated: another one is another configuration."""

@@ -11,7 +11,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import length_limit, robust_sigma
 from stcal.robot.identification.adjustment import Weighting
-from stcal.robot.identification.nominal import Placed, base_name, tool_name
+from stcal.robot.identification.prior import Placed, base_name, tool_name
 from stcal.robot.identification.residuals import (
     WIDTH,
     Observed,

@@ -22,16 +22,21 @@ from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.io.cameras.model import PARAMETER_NAMES, CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel, DotLabel, dot_cells
 from stcal.sfm.adjust import equations
-from stcal.sfm.adjust.blocks import Block, Shared, normalised, robust_weights, rows_of_view, without_cameras
 from stcal.sfm.adjust.equations import (
     FREE_DIRECTIONS,
+    Block,
     JointState,
     Setting,
+    Shared,
     SharedEquations,
     cost_of,
     free_directions,
     normal_equations,
+    normalised,
     planes,
+    robust_weights,
+    rows_of_view,
+    without_cameras,
 )
 from stcal.sfm.adjust.scale import MIN_DOTS
 from stcal.sfm.data.model import GroupModel, MetricModel

@@ -11,9 +11,17 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.normal_equations import constrained_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.io.cameras.model import PARAMETER_NAMES
-from stcal.sfm.adjust.blocks import Block, Reduced, robust_weights
 from stcal.sfm.adjust.chain import CalibratedTarget
-from stcal.sfm.adjust.equations import Setting, Shared, free_directions, normal_equations, planes
+from stcal.sfm.adjust.equations import (
+    Block,
+    Reduced,
+    Setting,
+    Shared,
+    free_directions,
+    normal_equations,
+    planes,
+    robust_weights,
+)
 from stcal.sfm.adjust.faces import (
     FrameKind,
     face_frames,

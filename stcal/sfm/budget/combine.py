@@ -15,8 +15,7 @@ from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.uncertainty import Contributions, Derivatives, contributions_of, derivatives
 from stcal.sfm.budget.sources import Source, Statement, correction, sources_of, statement_of
 from stcal.sfm.data.model import MetricModel
-from stcal.sfm.runs.adjusted import adjusted_run
-from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.saved import SavedRun, adjusted_run
 
 COVERAGE_FACTOR = 2.0
 LONGEST = 5

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import Field
 
 import stcal
+from stcal.io.files import RUN_MARKER
 from stcal.io.json import ByName, Finite, Part, ResultFile
-from stcal.io.saving import RUN_MARKER
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row
 from stcal.sfm.budget.lengths import LengthTest
 from stcal.sfm.budget.sources import Source

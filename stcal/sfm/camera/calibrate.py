@@ -14,20 +14,30 @@ from stcal.io.cameras.model import COLMAP_MODELS, CameraModel
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, Skipped, decode, find_images
 from stcal.parallel import Progress, counted, one_thread
-from stcal.sfm.camera.held_out import AUTO, Candidate, HeldOut, choose_model, held_out
-from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, model_parameters
-from stcal.sfm.camera.trust import (
+from stcal.sfm.camera.checks import (
+    AUTO,
     MIN_REACH,
+    Candidate,
+    HeldOut,
     ProjectionSigma,
     SplitHalf,
+    choose_model,
+    held_out,
     image_grid,
     projection_jacobian,
     projection_sigma,
     split_half,
 )
-from stcal.sfm.camera.views import board_views, closed_form, start_camera
-from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.camera.intrinsics import (
+    Intrinsics,
+    adjust_intrinsics,
+    board_views,
+    closed_form,
+    model_parameters,
+    start_camera,
+)
+from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import DetectionResult, detect_files
 
 MIN_VIEWS = 3

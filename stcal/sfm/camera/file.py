@@ -10,9 +10,9 @@ from pydantic import Field
 from stcal.io.cameras.model import parameter_names
 from stcal.io.json import ByName, Matrix, NamedReason, Part, Pose, PoseCovariance, ResultFile
 from stcal.sfm.camera.calibrate import CORNERS, OUTLIER_WEIGHT, CameraCalibration, residual_rms_px
+from stcal.sfm.camera.checks import Verdict
 from stcal.sfm.camera.intrinsics import Intrinsics, model_parameters
 from stcal.sfm.camera.rig import RigCalibration
-from stcal.sfm.camera.trust import Verdict
 
 ByCorner = Annotated[str, "corner"]
 

@@ -8,9 +8,9 @@ from stcal.report.figure import COLOURS, INK, SMALL, calm, new_figure, plane, ro
 from stcal.report.page import render
 from stcal.report.text import HEADS, number, text_table, transform_rows
 from stcal.sfm.camera.calibrate import CameraCalibration
+from stcal.sfm.camera.checks import FAILED_P, GRID, SUSPICIOUS_P, projection_jacobian
 from stcal.sfm.camera.file import CalibrationFile
 from stcal.sfm.camera.rig import RigCalibration
-from stcal.sfm.camera.trust import FAILED_P, GRID, SUSPICIOUS_P, projection_jacobian
 
 CELLS = (12, 8)
 """Number of cells of the figure of residuals, in x and y."""

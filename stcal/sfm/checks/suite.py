@@ -14,7 +14,7 @@ from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_fac
 from stcal.sfm.adjust.network import Network, free_network, solve_score
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust
-from stcal.sfm.checks.board import board_checks, pitch_check
+from stcal.sfm.checks.board import board_checks, measure_radii, pitch_check, radius_checks
 from stcal.sfm.checks.faces import (
     Again,
     agreement_check,
@@ -28,16 +28,14 @@ from stcal.sfm.checks.images import (
     evenness_check,
     field_check,
     image_check,
+    labels_check,
     moved_check,
     sharpness_check,
     sigma_check,
     summed,
 )
-from stcal.sfm.checks.labels import labels_check
-from stcal.sfm.checks.radii import measure_radii, radius_checks
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
-from stcal.sfm.data.model import Outlier, WorldModel
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
 
 JOINT = (
     ("agreement", "Groups, board and faces against one another (σ₀)"),

@@ -15,7 +15,7 @@ from stcal.geometry.conic import circle_image_offset, circle_images, shape_of_sq
 from stcal.geometry.plane import fit_homography, homography_jacobian
 from stcal.geometry.rigid import Rigid, skew
 from stcal.labels import BOARD, DotLabel, Label, dot_cells
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 
 MAX_TILT_RAD = np.radians(70.0)
 """Largest angle between a circle's normal and the line of sight. Circles seen more obliquely need not be found."""

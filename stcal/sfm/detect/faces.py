@@ -14,8 +14,8 @@ import numpy as np
 from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.plane import homography_jacobian
 from stcal.labels import CircleLabel
-from stcal.sfm.detect.ambiguity import is_named, mirror_images
 from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, grow_matches, singular_values
+from stcal.sfm.detect.sightings import is_named, mirror_images
 
 NEIGHBOURS_IN_DESIGN = 3
 NEIGHBOURS_IN_IMAGE = 12

@@ -17,12 +17,12 @@ from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cache import keep, kept, packed
 from stcal.io.cameras.model import CameraModel
+from stcal.io.files import save
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, same_photograph, thumbnail
-from stcal.io.saving import save
 from stcal.labels import parse_label, parse_labels
-from stcal.sfm.data.observations import Centres
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.data.model import Centres
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection

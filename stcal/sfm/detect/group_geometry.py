@@ -7,9 +7,8 @@ from itertools import permutations
 import numpy as np
 from scipy.spatial import KDTree
 
-from stcal.geometry.least_squares import minimise
+from stcal.geometry.least_squares import PoseStack, minimise
 from stcal.geometry.normal_equations import blocks_of, reduce
-from stcal.geometry.pose_descent import PoseStack
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights
 from stcal.labels import BOARD

@@ -10,11 +10,10 @@ from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_8bit, grey_fine
 from stcal.labels import Label
-from stcal.sfm.data.observations import Centres
+from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.board import BoardReading, find_boards
-from stcal.sfm.detect.circles.candidates import Candidates
+from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, find_ellipses
 from stcal.sfm.detect.circles.centres import measure_centres
-from stcal.sfm.detect.circles.ellipses import EllipseOptions, Ellipses, find_ellipses
 from stcal.sfm.detect.faces import FaceFinder, FaceFinding, FaceReading
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.observations import Centres, ImageObservations
+from stcal.sfm.data.model import Centres, ImageObservations
 from stcal.sfm.data.patterns import Pattern, patterns_of
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
 from stcal.sfm.detect.group_geometry import (
     MAX_SHIFT_PITCHES,

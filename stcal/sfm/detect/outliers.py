@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.geometry.conic import circle_image_offset
-from stcal.geometry.pose_descent import PoseStack
+from stcal.geometry.least_squares import PoseStack
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import Pattern
 from stcal.sfm.detect.group_geometry import Arrangement, PlaneBundle
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.labels import BOARD, CircleLabel, DotLabel
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 
 # OpenCV's order: blue, green, red. The palette of Okabe & Ito (2008), for all kinds of colour vision.
 PALETTE = [(0, 159, 230), (115, 158, 0), (66, 228, 240), (167, 121, 204), (0, 94, 213), (178, 114, 0)]

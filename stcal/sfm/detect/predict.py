@@ -11,11 +11,17 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_fine
 from stcal.labels import BOARD, Label
-from stcal.sfm.data.observations import Centres, ImageObservations
+from stcal.sfm.data.model import Centres, ImageObservations
 from stcal.sfm.data.patterns import MAX_TILT_RAD, ideal_border, images_px, in_view, patterns_of
-from stcal.sfm.detect.circles.candidates import MAX_POSITION_ERROR, MAX_POSITION_ERROR_PX, singular_values
+from stcal.sfm.detect.circles.candidates import (
+    MAX_POSITION_ERROR,
+    MAX_POSITION_ERROR_PX,
+    MIN_DIAMETER_PX,
+    EllipseOptions,
+    Ellipses,
+    singular_values,
+)
 from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
-from stcal.sfm.detect.circles.ellipses import MIN_DIAMETER_PX, EllipseOptions, Ellipses
 from stcal.sfm.detect.circles.fits import MIN_SIGMA
 from stcal.sfm.detect.group_geometry import Arrangement
 

@@ -18,10 +18,10 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit
-from stcal.sfm.data.observations import Centres
+from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.board import find_boards
-from stcal.sfm.detect.circles.candidates import Candidates
-from stcal.sfm.detect.circles.ellipses import (
+from stcal.sfm.detect.circles.candidates import (
+    Candidates,
     EllipseOptions,
     Ellipses,
     contrast_of,

@@ -14,10 +14,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode
 from stcal.parallel import run_parallel
-from stcal.sfm.data.model import MIN_POINTS, MetricModel
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import MIN_POINTS, ImageObservations, MetricModel
 from stcal.sfm.data.patterns import Pattern, ideal_border, in_view, patterns_of
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.labels import leaves_a_pattern_out
 from stcal.sfm.diagnose.examine import CircleVerdict, Expected, OptionTrial, by_geometry, examine, labels_found, trials
 from stcal.sfm.diagnose.findings import WHOLE_PATTERN, Diagnosis, Finding, advice, in_order

@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError, MappingError
 from stcal.geometry.camera import Camera
-from stcal.io.saving import json_text, save
+from stcal.io.files import json_text, save
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.file import FacesFile

@@ -15,7 +15,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.io.cameras.model import CalibratedCamera
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import colmap_camera, image_ids, match_labels, to_colmap_px, write_database
 from stcal.sfm.mapping.incremental import LOG_ERRORS_ONLY, SEED, pipeline_options

@@ -11,10 +11,9 @@ from stcal.errors import InputError
 from stcal.geometry.camera import COEFFICIENTS, Camera
 from stcal.io.cameras.model import CameraModel
 from stcal.sfm.data.patterns import MAX_TILT_RAD
-from stcal.sfm.detect.circles.ellipses import EllipseOptions, diameter_limits_px
+from stcal.sfm.detect.circles.candidates import EllipseOptions, diameter_limits_px
 from stcal.sfm.make.box import sides_of
-from stcal.sfm.make.hidden import unnamed_cases
-from stcal.sfm.make.pattern import HIDDEN, LARGE, Pattern, make_pattern
+from stcal.sfm.make.pattern import HIDDEN, LARGE, MadeTarget, make_pattern, unnamed_cases
 from stcal.synthetic.scene import FOCAL_PER_WIDTH
 
 FARTHER = 1.1
@@ -90,7 +89,7 @@ class Made:
     """
 
     options: MakeOptions
-    pattern: Pattern
+    pattern: MadeTarget
     board: BoardDesign
     radius_mm: float
     least_mm: float
@@ -136,7 +135,9 @@ def make_target(options: MakeOptions, progress: Callable[[int, int], None] | Non
     return Made(options, pattern, _board(options, least), radius, least, cases)
 
 
-def _named(options: MakeOptions, radius_mm: float, progress: Callable[[int, int], None] | None) -> tuple[Pattern, int]:
+def _named(
+    options: MakeOptions, radius_mm: float, progress: Callable[[int, int], None] | None
+) -> tuple[MadeTarget, int]:
     """Returns the first pattern whose faces are all identified in every case of hidden circles, and the number of
     cases."""
     name, sides = "box {:g} x {:g} x {:g} mm".format(*options.size_mm), sides_of(options.size_mm)

@@ -11,7 +11,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.io.cameras.model import COLMAP_PIXEL_ORIGIN, CalibratedCamera
 from stcal.labels import CircleLabel
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.colmap import pycolmap
 
 CAMERA_ID = 1
@@ -68,7 +68,7 @@ def write_database(
 
     Parameters
     ----------
-    pairs : (n, 2) indices of the images to match, see :func:`stcal.sfm.mapping.graph.image_graph`
+    pairs : (n, 2) indices of the images to match, see :func:`stcal.sfm.mapping.pairs.image_graph`
     keypoints_px : one (n, 2) array for each image, OpenCV pixel origin; by default the measured centres
     """
     path = Path(path)

@@ -15,8 +15,7 @@ from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.model import CalibratedCamera, camera_from_colmap
 from stcal.io.files import MODEL_BYTES, TABLE_BYTES, read_bytes, require_size
 from stcal.labels import DotLabel, Label
-from stcal.sfm.data.model import GroupModel, MetricModel, WorldModel
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import GroupModel, ImageObservations, MetricModel, WorldModel
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import CAMERA_ID, colmap_camera, from_colmap_px, to_colmap_px
 

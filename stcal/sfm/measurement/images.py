@@ -16,8 +16,8 @@ from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import ImageFile, Skipped, find_images
 from stcal.parallel import Progress, counted, one_thread
-from stcal.sfm.data.observations import ImageObservations, by_group
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.data.model import ImageObservations, by_group
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.labels import label_single
 from stcal.sfm.measurement.pose import PoseOptions, TargetPose, common_errors, measured_pose, resolved

@@ -6,10 +6,9 @@ from functools import partial
 import numpy as np
 
 from stcal.errors import DegenerateError
-from stcal.geometry import pose_descent
-from stcal.geometry.plane import camera_from_plane, fit_homography
-from stcal.geometry.plane_poses import MAX_OUTLIER_SHARE, Descend, two_minima
-from stcal.geometry.pose_descent import Minima, Normal, PoseStack, block_diagonal
+from stcal.geometry import least_squares
+from stcal.geometry.least_squares import Minima, Normal, PoseStack, block_diagonal
+from stcal.geometry.plane import MAX_OUTLIER_SHARE, Descend, camera_from_plane, fit_homography, two_minima
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm.data.model import Outlier
@@ -94,7 +93,7 @@ def _descend(problem: PoseProblem, whiten: np.ndarray, poses: PoseStack, huber: 
         r = (whiten @ residual.reshape(h, 2 * n, 1)).reshape(h, n, 2)
         return Normal.of(r, whiten @ image.by_pose.reshape(h, 2 * n, 6), np.all(image.depth > 0, axis=1), huber)
 
-    return pose_descent.descend(evaluate, poses, SETTLED, HOPELESS)
+    return least_squares.descend(evaluate, poses, SETTLED, HOPELESS)
 
 
 MIN_CIRCLES = 4

@@ -9,7 +9,8 @@ import numpy as np
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane_poses import (
+from stcal.geometry.least_squares import Minima, PoseStack, block_diagonal
+from stcal.geometry.plane import (
     MAX_SIGMA_RAD,
     OUTLIER,
     deciding_delta,
@@ -19,14 +20,12 @@ from stcal.geometry.plane_poses import (
     weigh,
     weights_of,
 )
-from stcal.geometry.pose_descent import Minima, PoseStack, block_diagonal
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import ImageFit
 from stcal.io.cameras.model import CameraPrior, intrinsic_basis
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
-from stcal.sfm.data.model import Outlier
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations, Outlier
 from stcal.sfm.data.patterns import CircleImages
 from stcal.sfm.measurement.minima import (
     HOPELESS,

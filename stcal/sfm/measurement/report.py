@@ -1,7 +1,15 @@
-"""The page of ``measure``: where the target was, how well that is known, and what was left out."""
+"""Result file, table, text and page of measured poses."""
+
+import csv
+import io
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
+from stcal.errors import InputError
+from stcal.io.json import Finite, Matrix6, NamedReason, Pair, Part, Pose, ResultFile
+from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells
 from stcal.report.figure import (
     COLOURS,
     FAINT,
@@ -17,8 +25,236 @@ from stcal.report.figure import (
 from stcal.report.page import render
 from stcal.report.text import number
 from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
-from stcal.sfm.measurement.output import summary
 from stcal.sfm.measurement.pose import fit_verdict
+
+
+class OtherPose(Part):
+    camera_from_target: Pose
+    covariance: Matrix6
+
+
+class CircleRow(Part):
+    label: str
+    residual_px: Pair
+    weight: float
+
+
+class OutlierCircleRow(Part):
+    label: str
+    residual_px: float
+    limit_px: float
+
+
+class ImagePose(Part):
+    image: str
+    faces: list[str]
+    status: str
+    camera_from_target: Pose
+    covariance: Matrix6
+    covariance_parts: dict[str, Matrix6] = Field(
+        description="what it is the sum of: `image`, `target`, `intrinsics`, `curvature`: by which the likelihood is "
+        "wider, or narrower, than its linearisation says (zero unless a face is frontal, far and noisy)"
+    )
+    alternative: OtherPose | None = Field(
+        description="`camera_from_target` and `covariance` of the other pose that fits, null where there is none"
+    )
+    delta_chi2: Finite = Field(
+        description="by which the other pose fits worse (null: there is no other; below 0: this one does, and "
+        "`--previous` chose it)"
+    )
+    delta_chi2_needed: float | None = Field(description="from where on this one is certain")
+    rms_px: float = Field(description="of the residuals, per coordinate")
+    chi2: float = Field(description="of the residuals")
+    dof: int = Field(description="their degrees of freedom")
+    p_value: float = Field(description="of as much by chance")
+    fit: Literal["passed", "suspicious", "failed"] = Field(description="suspicious: p < 0.001, failed: p < 0.00001")
+    circles: list[CircleRow] = Field(
+        description="`label`, `residual_px` measured minus projected ellipse centre, Huber's `weight`"
+    )
+    outliers: list[OutlierCircleRow] = Field(
+        description="`label`, `residual_px`, `limit_px` of circles that contradict the others and are left out"
+    )
+    notes: list[str] = Field(description="what detection saw and left out")
+
+
+class PosesFile(ResultFile):
+    """Of ``measure``."""
+
+    format: Literal["stcal poses 1"] = Field(description="the file's form and its version")
+    unit: Literal["mm"] = Field(description="of all lengths")
+    sigma_factor: float = Field(
+        description="factor on the centres' own σ: `centre_sigma_factor` of `faces.json`, or `--sigma-factor`"
+    )
+    intrinsics_held: bool = Field(description="whether the camera file states no σ")
+    notes: list[str] = Field(description="what `faces.json` lacks for the covariance")
+    images: list[ImagePose] = Field(
+        description="`image`, `faces`, `status`, `camera_from_target` 4×4, `covariance` 6×6, and"
+    )
+    left_out: list[NamedReason] = Field(description="`name`, `reason` of files and images without a pose")
+
+
+IMAGE, FACES, CIRCLES, STATUS = "image", "faces", "circles", "status"
+QUALITY = ("rms_px", "chi2_per_dof")
+
+
+def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, tuple[str, ...]]:
+    """Text of ``poses.csv``, and what could not be joined; ``joints`` : more columns by image, whose rows
+    alone are then written.
+
+    Raises
+    ------
+    InputError
+        The table has no column ``image``, an image twice, or a column that is here already.
+    """
+    header = [IMAGE, FACES, CIRCLES, STATUS, *POSE, *COVARIANCE, *QUALITY]
+    common = common_columns(result.common.shape[2])
+    where, more, rows = "", [], None
+    if joints is not None:
+        where, (more, rows) = joints.where, _joint_cells(joints, header + common)
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(header + more + common)
+    missing = []
+    for each, felt in zip(result.images, result.common, strict=True):
+        if rows is not None and each.name not in rows:
+            missing.append(f"{each.name}: measured, but not in {where}")
+            continue
+        pose = each.pose
+        writer.writerow(
+            [each.name, "+".join(pose.faces), len(pose.labels), pose.status]
+            + pose_cells(pose.camera_from_target, pose.covariance)
+            + [f"{pose.rms_px():.5f}", f"{pose.chi2_per_redundancy():.4f}"]
+            + (rows[each.name] if rows is not None else [])
+            + [f"{v:.7g}" for v in felt.T.ravel()]
+        )
+    if rows is not None:
+        names = {each.name for each in result.images}
+        missing += [f"{name}: in {where}, but without a pose" for name in rows if name not in names]
+        if len(rows.keys() & names) == 0:
+            raise InputError(
+                "E-IMAGES-UNMATCHED",
+                f"{where}: none of its images was measured; names are like {result.images[0].name}",
+            )
+    return stream.getvalue(), tuple(missing)
+
+
+def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str, list[str]]]:
+    """Names of the further columns, and their cells by image, as they stand in the file."""
+    more = [name for name in joints.columns if name != IMAGE]
+    taken = [name for name in more if name in header]
+    if taken:
+        raise InputError(
+            "E-TABLE-COLUMNS-CONFLICT", f"{joints.where}: column {taken[0]} is measured here; leave it out"
+        )
+    names = joints.text(IMAGE)
+    cells = [joints.columns[name] for name in more]
+    rows: dict[str, list[str]] = {}
+    for i, name in enumerate(names):
+        if name in rows:
+            raise InputError(
+                "E-TABLE-ROW-REPEATED",
+                f"{joints.where}: line {joints.lines[i]}: image {name} a second time; every image once",
+            )
+        rows[name] = [c[i] if isinstance(c, list) else repr(float(c[i])) for c in cells]
+    return more, rows
+
+
+def poses_file(result: MeasureResult) -> PosesFile:
+    """The content of ``--json``."""
+    return PosesFile.model_validate(
+        {
+            "format": "stcal poses 1",
+            "unit": "mm",
+            "sigma_factor": result.sigma_factor,
+            "intrinsics_held": result.intrinsics_held,
+            "notes": list(result.notes),
+            "images": [_image_json(each) for each in result.images],
+            "left_out": result.left_out,
+        }
+    )
+
+
+def _image_json(each: MeasuredImage) -> dict:
+    pose = each.pose
+    other = pose.second
+    return {
+        "image": each.name,
+        "faces": list(pose.faces),
+        "status": pose.status,
+        "camera_from_target": pose.camera_from_target,
+        "covariance": pose.covariance,
+        "covariance_parts": pose.parts,
+        "alternative": other,
+        "delta_chi2": pose.delta_chi2,
+        "delta_chi2_needed": pose.needed_chi2,
+        "rms_px": pose.rms_px(),
+        "chi2": pose.chi2,
+        "dof": pose.redundancy,
+        "p_value": pose.p_value(),
+        "fit": fit_verdict(pose),
+        "circles": [
+            {"label": label, "residual_px": residual, "weight": float(weight)}
+            for label, residual, weight in zip(pose.labels, pose.residuals_px, pose.weights, strict=True)
+        ],
+        "outliers": pose.outliers,
+        "notes": list(each.notes),
+    }
+
+
+def measure_text(result: MeasureResult) -> str:
+    """The table for people, 80 columns wide for names of eight characters: σ are the largest of three axes, n counts
+    circles."""
+    wide = max([len(each.name) for each in result.images] + [5])
+    faces = max([len("+".join(each.pose.faces)) for each in result.images] + [5])
+    lines = [
+        f"{'image':{wide}}  {'faces':{faces}}  n {'status':9} {'x':>9} {'y':>8} {'z':>8} mm {'σ µm':>5} {'σ mdeg':>6} "
+        f"{'RMS px':>6}"
+    ]
+    for each in result.images:
+        pose = each.pose
+        sigma = np.sqrt(np.diag(pose.covariance))
+        place = " ".join(f"{v:8.3f}" for v in pose.camera_from_target.translation)
+        verdict = fit_verdict(pose)
+        lines.append(
+            f"{each.name:{wide}}  {'+'.join(pose.faces):{faces}} {len(pose.labels):2} {pose.status:9}  {place}   "
+            f"{1e3 * sigma[3:].max():5.1f} {1e3 * np.degrees(sigma[:3].max()):6.2f} {pose.rms_px():6.4f}"
+            + ("" if verdict == "passed" else f"  {verdict}")
+        )
+        lines += [
+            f"  outlier {each.name} {o.label}: residual {o.residual_px:.3f} px, limit {o.limit_px:.3f} px"
+            for o in pose.outliers
+        ]
+    left_out = [f"left out {each.name}: {each.reason}" for each in result.left_out]
+    return "\n".join([*lines, *summary(result), *left_out])
+
+
+def summary(result: MeasureResult) -> list[str]:
+    """Counts, then what is to be known besides."""
+    poses = [each.pose for each in result.images]
+    count = {s: sum(pose.status == s for pose in poses) for s in ("certain", "resolved", "ambiguous")}
+    told = ", ".join(f"{n} {s}" for s, n in count.items() if n)
+    lines = [f"{len(poses)} poses: {told}; centres' σ × {result.sigma_factor:.3g}"]
+    held = "held: their errors are not in σ"
+    lines[0] += f", intrinsics {held if result.intrinsics_held else 'with their σ'}"
+    if result.searched is not None:
+        total = len(poses) + sum(each.gate == "pose" for each in result.left_out)
+        lines.append(
+            f"sequence: {total - result.searched} images followed from the one before, "
+            f"{result.searched} searched as a whole"
+        )
+    if count["ambiguous"]:
+        lines.append(
+            "ambiguous: two poses fit, mirrored at the line of sight; the likelier one is given, --json has both; "
+            "show a second face, come nearer, or use --previous for small motions"
+        )
+    failed = [each.name for each in result.images if fit_verdict(each.pose) == "failed"]
+    if failed:
+        lines.append(
+            f"χ² failed in {len(failed)} images, first {failed[0]}: residuals beyond their σ by chance in one image of "
+            "100 000; check that camera file, faces.json and images belong together"
+        )
+    return [*lines, *result.notes]
+
 
 COLOUR_OF = {"certain": COLOURS[0], "resolved": COLOURS[2], "ambiguous": COLOURS[1]}
 MOST_ROWS = 500

@@ -14,9 +14,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.images import grey_8bit, grey_fine
 from stcal.labels import Label
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import MAX_TILT_RAD
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.group_geometry import Arrangement
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import LabelledImage, label_single, labelled_image

@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.errors import DegenerateError
 from stcal.parallel import Progress, kept_processes, one_thread, run_briefly
-from stcal.sfm.adjust.blocks import rows_of_view
+from stcal.sfm.adjust.equations import rows_of_view
 from stcal.sfm.adjust.joint import JointResult, basis_of, photographs_of
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.planning.forecast import (
@@ -22,10 +22,9 @@ from stcal.sfm.planning.forecast import (
     without_sources,
     worst_of,
 )
-from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.planning.views import PlannedView, candidates, known_scene
-from stcal.sfm.runs.adjusted import adjusted_run
-from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.saved import SavedRun, adjusted_run
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 from stcal.synthetic.scene import Group, Scene, group_name
 

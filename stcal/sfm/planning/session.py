@@ -21,7 +21,7 @@ from stcal.sfm.planning.forecast import (
     variance_shares,
     without_sources,
 )
-from stcal.sfm.planning.simulated import observe, true_models
+from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, group_name, make_scene, seen_by
 

@@ -16,14 +16,12 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 from stcal.io.design import board_toml, target_toml
-from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.files import BOARD, CAMERA, REFINED_CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, json_text, read_bytes, save
 from stcal.io.json import checked, read_json
-from stcal.io.saving import BOARD, CAMERA, REFINED_CAMERA, RUN_MARKER, TARGET, json_text, save
 from stcal.parallel import Progress
 from stcal.report.page import pdf_of, require_pdf
 from stcal.sfm.adjust.file import FacesFile
-from stcal.sfm.data.model import GroupModel
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import GroupModel, ImageObservations
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.detect.overlay import draw_overlay

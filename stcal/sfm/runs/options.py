@@ -7,9 +7,8 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import AdjustOptions, Solve
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
-from stcal.sfm.mapping.graph import GraphKind
-from stcal.sfm.mapping.pairs import PairOptions
+from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.mapping.pairs import GraphKind, PairOptions
 
 Compare = Literal["paper"]
 
@@ -31,7 +30,7 @@ class RunOptions:
     reference_face : str, optional
         Id of the face whose frame is the target frame; the first face of the design if None.
     graph : {"all", "sparse"}, optional
-        Which pairs of images are matched, see :func:`stcal.sfm.mapping.graph.image_graph`. If None, the number of
+        Which pairs of images are matched, see :func:`stcal.sfm.mapping.pairs.image_graph`. If None, the number of
         images decides.
     pairs : PairOptions
         Options of the initial pair.

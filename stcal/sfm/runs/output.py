@@ -7,9 +7,8 @@ import numpy as np
 import stcal
 from stcal.geometry.plane import fit_plane
 from stcal.labels import DotLabel
-from stcal.sfm.data.model import MIN_POINTS, GroupModel
-from stcal.sfm.data.observations import ImageObservations
-from stcal.sfm.mapping.resect import MIN_RAY_ANGLE_RAD
+from stcal.sfm.data.model import MIN_POINTS, GroupModel, ImageObservations
+from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
 from stcal.sfm.runs.report import ReportFile
 from stcal.sfm.runs.result import RunResult
 

@@ -13,10 +13,10 @@ from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import FaceChain
 from stcal.sfm.checks.suite import Evidence
 from stcal.sfm.checks.verdict import Check
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
-from stcal.sfm.mapping.graph import ImageGraph
+from stcal.sfm.mapping.pairs import ImageGraph
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.solve import GroupSolution

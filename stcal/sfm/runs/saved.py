@@ -14,21 +14,26 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import CalibratedCamera
+from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.model import CalibratedCamera, CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.io.design import load_board, load_target
-from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.files import BOARD, CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, read_bytes
 from stcal.io.json import Part, checked, read_json
-from stcal.io.saving import BOARD, CAMERA, RUN_MARKER, TARGET
+from stcal.labels import circle_labels
+from stcal.sfm.adjust.calibration import with_sigma
+from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
-from stcal.sfm.data.observations import ImageObservations, by_group
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.adjust.joint import Adjusted, adjusted
+from stcal.sfm.data.model import ImageObservations, by_group
+from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.mapping.database import image_ids
+from stcal.sfm.mapping.models import read_model
 from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.report import ReportCamera, ReportRead
-from stcal.sfm.runs.transaction import complete_interrupted
+from stcal.sfm.runs.transaction import MarkerFile, complete_interrupted
 
 AGAIN = "run it again"
 ReportPart = TypeVar("ReportPart", bound=Part)
@@ -217,3 +222,39 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
         )
         corrected.append(values[:, 2:4])
     return tuple(observations), tuple(corrected)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdjustedRun:
+    """The final adjustment of a run.
+
+    ``state`` : groups in mm in the target frame, at the minimum, with σ as in the run; ``start`` : result of the run;
+    ``prior`` : of the intrinsics if they were adjusted.
+    """
+
+    state: Adjusted
+    start: CalibratedTarget
+    prior: CameraPrior | None
+
+
+def adjusted_run(run: SavedRun) -> AdjustedRun:
+    """Repeats the final adjustment of a run, which moves nothing.
+
+    Raises
+    ------
+    InputError
+        The run's ``target_model`` is missing or damaged.
+    ConvergenceError
+        The adjustment finds no minimum.
+    """
+    read = read_model(run.folder / "target_model", run.observations, image_ids(run.observations), run.corrected_px)
+    models = [with_sigma(model, run.report["summary"]["sigma_factor"]) for model in read.in_mm()]
+    start = CalibratedTarget(
+        run.faces.reference_face,
+        run.faces.poses(),
+        dict(zip(circle_labels(run.faces.circles), run.faces.circles.values(), strict=True)),
+        {model.group: Rigid() for model in models},
+    )
+    prior = camera_prior(run.camera) if run.options.refine_camera else None
+    state = adjusted(models, run.board, run.camera, run.options.flatness_mm, prior, read.camera)
+    return AdjustedRun(state, start, prior)

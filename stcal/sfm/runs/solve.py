@@ -20,14 +20,12 @@ from stcal.labels import DotLabel, dot_cells, parse_labels
 from stcal.parallel import Progress
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import find_scale
-from stcal.sfm.data.model import Outlier, WorldModel
-from stcal.sfm.data.observations import ImageObservations, by_group
+from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group
 from stcal.sfm.data.patterns import pitch_hint
 from stcal.sfm.detect.labels import LabelledImage, leaves_a_board_out
 from stcal.sfm.mapping.database import image_ids, write_database
-from stcal.sfm.mapping.graph import ImageGraph
 from stcal.sfm.mapping.incremental import left_out, map_group
-from stcal.sfm.mapping.pairs import PairOptions, PairScore, rank_pairs
+from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, rank_pairs
 from stcal.sfm.runs.options import RunOptions
 
 CACHE_VERSION = 6

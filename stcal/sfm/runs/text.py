@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from stcal.io.cameras.model import CalibratedCamera
+from stcal.io.files import REFINED_CAMERA
 from stcal.io.images import Skipped
-from stcal.io.saving import REFINED_CAMERA
 from stcal.labels import DotLabel
 from stcal.report.text import text_table
 from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked

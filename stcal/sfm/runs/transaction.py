@@ -1,23 +1,23 @@
-"""The folder of a run as a transaction: it holds the complete results of one run, the earlier or the new one.
+"""The folder of a run as a transaction, with the marker that holds the hashes of its files."""
 
-A run writes beside the earlier results, in ``unfinished/``. When all results are there, that folder is renamed to
-``ready/``, which is the decisive moment, and its entries take their places. A run that is killed before this moment
-leaves the earlier results. A run that is killed after it is completed by whoever opens the folder next.
-"""
-
+import hashlib
+import json
 import os
 import shutil
 import socket
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import filelock
+from pydantic import Field
 
+import stcal
 from stcal.errors import InputError, StcalError
-from stcal.io.json import read_result
-from stcal.io.saving import (
+from stcal.io.files import (
     ADDED,
     CACHE,
     READY,
@@ -29,7 +29,62 @@ from stcal.io.saving import (
     real_place,
     save,
 )
-from stcal.sfm.runs.marker import MarkerFile, digest_of, files_below
+from stcal.io.json import ResultFile, read_result
+from stcal.sfm.runs.options import RunOptions
+
+ByFile = Annotated[str, "file"]
+
+
+class MarkerFile(ResultFile):
+    """Marker of a run's folder: the input of the run, and the hashes of its files."""
+
+    program: Literal["stcal-sfm"] = Field(description="that made the folder")
+    version: str = Field(description="of stcal")
+    images: str = Field(description="the folder of photographs")
+    options: dict[str, Any] | None = Field(description="of the run; null for `detect`")
+    sha256: dict[ByFile, str] | None = Field(
+        default=None,
+        description="path below the folder → SHA-256 (hex) of every file of the results, and of this one without its "
+        "own entry; absent until the run has ended well",
+    )
+
+    @classmethod
+    def of(cls, images: str | Path, options: RunOptions | None) -> "MarkerFile":
+        """Returns the marker of a run, or of a detection alone, that begins."""
+        return cls(
+            program="stcal-sfm",
+            version=stcal.__version__,
+            images=str(Path(images).absolute()),
+            options=None if options is None else asdict(options),
+        )
+
+    def sealed(self, digests: dict[str, str]) -> "MarkerFile":
+        """Returns the marker of results with these hashes, which include its own."""
+        others = {name: value for name, value in digests.items() if name != RUN_MARKER}
+        content = self.model_copy(update={"sha256": others}).content()
+        return self.model_copy(update={"sha256": {RUN_MARKER: own_digest(content), **others}})
+
+
+def own_digest(content: dict[str, Any]) -> str:
+    """Returns the SHA-256 of a marker's content without its own entry among the hashes."""
+    others = {name: value for name, value in content["sha256"].items() if name != RUN_MARKER}
+    return hashlib.sha256(json.dumps(content | {"sha256": others}, sort_keys=True).encode()).hexdigest()
+
+
+def files_below(folder: Path) -> Iterator[str]:
+    """Yields the paths of all files and links below a folder, with forward slashes; links are not followed."""
+    for place, folders, files in os.walk(folder):
+        for name in (*files, *(subfolder for subfolder in folders if os.path.islink(os.path.join(place, subfolder)))):
+            yield (Path(place) / name).relative_to(folder).as_posix()
+
+
+def digest_of(path: Path) -> str:
+    """Returns the SHA-256 of a file, read piece by piece; empty for a link, a folder, a pipe, or nothing."""
+    if not (os.path.lexists(path) and stat.S_ISREG(path.lstat().st_mode)):
+        return ""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
 
 COMPARISON = "compare.json"
 RESULTS = (*RUN_ENTRIES, COMPARISON)

@@ -8,10 +8,17 @@ from pydantic import Field
 
 import stcal
 from stcal.errors import InputError
+from stcal.io.files import ADDED, CACHE, READY, RUN_MARKER, UNFINISHED
 from stcal.io.json import ResultFile, checked, read_json
-from stcal.io.saving import ADDED, CACHE, READY, RUN_MARKER, UNFINISHED
-from stcal.sfm.runs.marker import MarkerFile, digest_of, files_below, own_digest
-from stcal.sfm.runs.transaction import DATABASE_SIDES, RESULTS, complete_interrupted
+from stcal.sfm.runs.transaction import (
+    DATABASE_SIDES,
+    RESULTS,
+    MarkerFile,
+    complete_interrupted,
+    digest_of,
+    files_below,
+    own_digest,
+)
 
 SHOWN = 20
 """Number of files of a kind that are listed on the terminal."""

@@ -1,19 +1,31 @@
-"""The results on the way from photographs to joint values."""
+"""Results on the way from photographs to joint values: their page, summary and folder."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from stcal.io.files import json_text
+from stcal.report.figure import COLOURS, calm, new_figure, uri
+from stcal.report.page import render
+from stcal.report.text import number
 from stcal.robot.axes.model import AxesResult
+from stcal.robot.axes.report import axes_file, axes_page
 from stcal.robot.identification.predicted import predicted_at
+from stcal.robot.identification.report import identified_file, identified_page
 from stcal.robot.identification.result import Identified
+from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import (
     Compensated,
+    compensated_csv,
+    compensated_summary,
+    compensation_file,
 )
 from stcal.robot.use.evaluation import Figures
+from stcal.robot.use.report import compensation_page
 from stcal.sfm.measurement.images import MeasureResult
+from stcal.sfm.measurement.report import measure_page, poses_csv, poses_file, summary
 
 DRAWING, AXES, SAME_ROWS = "as drawn", "by the axis method", "identified, the same rows"
 
@@ -74,3 +86,173 @@ class FromPhotos:
         if compensated is None or compensated.nominal is None:
             return np.zeros((0, len(self.nominal.rows)))
         return np.where(compensated.compared()[:, None], compensated.found.q - compensated.nominal.q, np.nan)
+
+
+PAGES = {
+    "poses.html": "Poses of the target in the photographs",
+    "axes.html": "Axes by the axis method",
+    "identified.html": "Identification of the arm",
+    "compensated.html": "Joint values for the targets",
+}
+MOST_NOTES, MOST_TARGETS = 20, 20
+
+
+def story(result: FromPhotos) -> list[str]:
+    """Returns the steps and their results, one sentence a step."""
+    identified, least = result.identified, list(result.errors.values())[-1]
+    sentences = [*summary(result.measured), f"{len(result.data)} poses have joint values"]
+    if result.axes is None:
+        sentences.append(f"the axis method was left out: {result.without_axes}")
+    else:
+        spans = [
+            f"{np.degrees(fit.span):.0f}°" if len(fit.gain) != 2 else f"{fit.span:.0f} mm" for fit in result.axes.fits
+        ]
+        sentences.append(f"every joint is swept by itself, over {', '.join(spans)}: axis method")
+    sentences.append(
+        f"identified: {identified.rank} parameters; position errors {result.errors[DRAWING].rms:.3g} mm RMS as drawn, "
+        f"{least.rms:.3g} mm {'of rows held out' if identified.held_out else 'of the same rows'}"
+    )
+    if result.compensated is not None:
+        sentences += [line[0].lower() + line[1:] for line in compensated_summary(result.compensated)]
+        sentences += _at_targets(result)
+    return sentences
+
+
+def _at_targets(result: FromPhotos) -> list[str]:
+    """Returns sentences on the predicted error of the identified arm at the targets, and on the motion of the
+    joints."""
+    sentences, sigma, moves = [], result.sigma_mm(), result.moves()
+    known, moved = sigma[np.isfinite(sigma)], moves[np.isfinite(moves).all(axis=1)]
+    prediction = result.identified.predicted
+    if len(known) and prediction is not None:
+        sentences.append(
+            f"predicted σ of the tool's position there: {known.min():.2g} to {known.max():.2g} mm; at the measured "
+            f"rows {np.sqrt((prediction.here_mm**2).mean()):.2g} mm RMS"
+        )
+    if len(moved):
+        most = _shown(result, np.abs(moved).max(axis=0))
+        motions = [f"{number(v, 4)}{unit}" for v, unit in zip(most, _units(result), strict=True)]
+        sentences.append(f"joints move by up to {', '.join(motions)}")
+    return sentences
+
+
+def _units(result: FromPhotos) -> list[str]:
+    """Returns the unit in which each joint's values are shown."""
+    return [" mm" if sliding else "°" for sliding in result.nominal.prismatic]
+
+
+def _shown(result: FromPhotos, values: np.ndarray) -> np.ndarray:
+    """Returns joint values (…, n) in these units."""
+    return np.where(result.nominal.prismatic, values, np.degrees(values))
+
+
+def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
+    """Returns the report: the story, errors of each model of the arm, and the links to other files. ``names`` : of the
+    other files."""
+    compensated, last = result.compensated, list(result.errors.values())[-1]
+    before = (
+        None
+        if compensated is None or not compensated.compared().any()
+        else compensated.before_mm[compensated.compared()]
+    )
+    tiles = [
+        (str(len(result.data)), "", "poses measured, with joint values"),
+        (number(result.errors[DRAWING].rms, 3), "mm RMS", "position error of the arm as drawn"),
+        (number(last.rms, 3), "mm RMS", list(result.errors)[-1]),
+    ]
+    if before is not None:
+        tiles.append(
+            (number(float(np.sqrt((before**2).mean())), 3), "mm RMS", "taken away at the targets, base included")
+        )
+    notes = [
+        *result.notes,
+        *(f"{entry.name}: {entry.reason}" for entry in result.measured.left_out),
+        *result.identified.notes,
+        *([] if compensated is None else compensated.notes()),
+    ]
+    return render(
+        "workflows/from_photos/page.html.jinja",
+        robot=result.nominal.name,
+        images=result.images,
+        figures=tiles,
+        story=story(result),
+        errors=[
+            [name, str(entry.rows), *(number(v, 4) for v in (entry.mean, entry.rms, entry.p95, entry.max))]
+            for name, entry in result.errors.items()
+        ],
+        drawn=uri(_figure(result)),
+        heads=[f"J{i}, {unit.strip()}" for i, unit in enumerate(_units(result), 1)],
+        targets=_target_rows(result),
+        more_targets=0 if compensated is None else max(len(compensated) - MOST_TARGETS, 0),
+        pages=[(name, PAGES[name]) for name in names if name in PAGES],
+        files=[name for name in names if not name.endswith(".html")],
+        notes=notes[:MOST_NOTES],
+        more=max(len(notes) - MOST_NOTES, 0),
+    )
+
+
+def _target_rows(result: FromPhotos) -> list[list[str]]:
+    """Returns, for each target, the error of its nominal joint values, the predicted σ, and the motion of the
+    joints."""
+    compensated = result.compensated
+    if compensated is None:
+        return []
+    moves, sigma = _shown(result, result.moves()), result.sigma_mm()
+    return [
+        [
+            str(compensated.targets.lines[i]),
+            compensated.found.status[i],
+            *(number(float(v), 4) for v in (compensated.before_mm[i], sigma[i], *moves[i])),
+        ]
+        for i in range(min(MOST_TARGETS, len(compensated)))
+    ]
+
+
+def _figure(result: FromPhotos):
+    """Returns a figure of median, RMS and largest error of each model, on a logarithmic scale."""
+    figure = new_figure(8, 0.5 * len(result.errors) + 0.9)
+    axes = figure.add_subplot()
+    for place, figures in enumerate(result.errors.values()):
+        axes.plot([figures.median, figures.max], [place, place], color=COLOURS[0], lw=1.2)
+        axes.plot([figures.rms], [place], "o", color=COLOURS[0], ms=6, label="RMS" if not place else None)
+        axes.plot([figures.max], [place], "|", color=COLOURS[1], ms=10, mew=2, label="largest" if not place else None)
+    axes.set_yticks(range(len(result.errors)), list(result.errors), fontsize=8)
+    axes.set_ylim(len(result.errors) - 0.5, -0.5)
+    axes.set_xscale("log")
+    axes.set_xlabel("position error of a row, mm", fontsize=8)
+    axes.legend(fontsize=7.5, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1))
+    calm(axes)
+    figure.subplots_adjust(left=0.3, right=0.97, bottom=0.5 / (0.5 * len(result.errors) + 0.9), top=0.86)
+    return figure
+
+
+POSES = "poses.csv"
+
+
+def files_of(result: FromPhotos) -> dict[str, str]:
+    """Returns the contents of all files, by name."""
+    identified, compensated = result.identified.robot, result.compensated
+    files = {
+        POSES: poses_csv(result.measured)[0],
+        "poses.json": json_text(poses_file(result.measured)),
+        "poses.html": measure_page(result.measured, result.images),
+    }
+    if result.axes is not None:
+        files |= {
+            "axes.toml": robot_toml(result.axes.robot, ["Identified by the axis method from the sweeps."]),
+            "axes.json": json_text(axes_file(result.axes)),
+            "axes.html": axes_page(result.axes, result.data.where),
+        }
+    source = f"Identified from {result.data.where}: {result.identified.rank} parameters."
+    files |= {
+        "identified.toml": robot_toml(identified, [source]),
+        "identified.json": json_text(identified_file(result.identified, result.nominal)),
+        "identified.html": identified_page(result.identified, result.nominal),
+    }
+    if compensated is not None:
+        files |= {
+            "compensated.csv": compensated_csv(compensated, identified),
+            "compensated.json": json_text(compensation_file(compensated, identified)),
+            "compensated.html": compensation_page(compensated, identified),
+        }
+    return files | {"report.html": from_photos_page(result, tuple(files))}

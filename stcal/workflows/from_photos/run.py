@@ -15,13 +15,12 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
+from stcal.io.files import save
 from stcal.io.images import find_images
 from stcal.io.join import join
-from stcal.io.saving import save
 from stcal.io.table import POSE, Table, read_table
 from stcal.robot.axes.model import AxesResult, robot_from_sweeps
-from stcal.robot.axes.orientations import length_of, ring
-from stcal.robot.axes.sweeps import find_arcs
+from stcal.robot.axes.sweeps import find_arcs, length_of, ring
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.measurements import Measurements, joint_values, read_measurements, targets_of
@@ -32,10 +31,9 @@ from stcal.robot.use.compensation import (
 from stcal.robot.use.evaluation import Figures, evaluate
 from stcal.robot.use.targets import Targets, read_targets
 from stcal.sfm.measurement.images import MeasureOptions, MeasureResult, measure
-from stcal.sfm.measurement.output import IMAGE, poses_csv
+from stcal.sfm.measurement.report import IMAGE, poses_csv
 from stcal.sfm.measurement.target import TargetCircles
-from stcal.workflows.from_photos.output import POSES
-from stcal.workflows.from_photos.result import AXES, DRAWING, SAME_ROWS, FromPhotos
+from stcal.workflows.from_photos.result import AXES, DRAWING, POSES, SAME_ROWS, FromPhotos
 
 PHOTOGRAPHS = "the photographs"
 

@@ -9,7 +9,7 @@ import numpy as np
 from stcal.errors import DegenerateError, StcalError
 from stcal.handeye import HandEyeOptions, handeye
 from stcal.handeye.choose import choose
-from stcal.handeye.data.loop import Setup
+from stcal.handeye.data.pairs import Setup
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.validate import (

@@ -12,11 +12,11 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses, View, Views, pairs_of_views, read_poses
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two
-from stcal.handeye.data.loop import SETUPS, Loop, Setup
+from stcal.handeye.data.pairs import SETUPS, Loop, Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import Timed
 from stcal.handeye.judge.remarks import spread_text
-from stcal.handeye.methods import start
+from stcal.handeye.methods import closed_form
 from stcal.io.cameras.model import CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
@@ -24,8 +24,7 @@ from stcal.io.quaternions import Order
 from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
-from stcal.workflows.board_in_image import Board, kind_of
-from stcal.workflows.board_views import detect_boards
+from stcal.workflows.board_views import Board, detect_boards, kind_of
 from stcal.workflows.handeye.arm import Arm, read_arm
 from stcal.workflows.handeye.times import Timing, robot_at_images
 
@@ -223,7 +222,7 @@ def _from_told(told: Told, said: Said) -> HandEyeInput:
 
 def _about_mm(pairs: HandEyePoses, setup: Setup) -> tuple[HandEyePoses, float]:
     """Returns the pairs with the camera's lengths in mm, and the factor, which is found from the robot's motions."""
-    scale = start.robust(Loop.of(pairs, setup), True)[2]
+    scale = closed_form.robust(Loop.of(pairs, setup), True)[2]
     if not scale > 0:
         raise DegenerateError(
             "E-HANDEYE-MODEL-SCALE",

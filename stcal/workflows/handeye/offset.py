@@ -6,7 +6,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.handeye import HandEyeOptions
-from stcal.handeye.data.loop import Setup
+from stcal.handeye.data.pairs import Setup
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.time_offset import TimeOffset, estimate_offset

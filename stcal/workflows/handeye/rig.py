@@ -14,8 +14,7 @@ from stcal.handeye.data.rig import RigCamera, RigFiles, RigPoses
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import TOLERANCE_S
 from stcal.handeye.report.outcome import Outcome, RigOutcome
-from stcal.handeye.rig.result import Rig
-from stcal.handeye.rig.solve import RigOptions, alone_or_none, handeye_rig, of_places, same_numbering
+from stcal.handeye.rig.solve import Rig, RigOptions, alone_or_none, handeye_rig, of_places, same_numbering
 from stcal.handeye.rig.validate import RigHeldOut, cross_validate_rig, widened_by_scatter
 from stcal.handeye.validate import LEAST_LEFT, splits
 from stcal.io.quaternions import Order

@@ -9,7 +9,7 @@ import pytest
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, handeye
-from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.pairs import Loop
 from stcal.handeye.methods.noise import components
 from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses, against_others
 from tests.support.handeye import simulated, simulated_views

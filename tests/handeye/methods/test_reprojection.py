@@ -6,7 +6,7 @@ import pytest
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, handeye, pairs_of_views
-from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.pairs import Loop
 from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.reprojection import problem
 from stcal.io.cameras.model import CalibratedCamera, camera_prior, intrinsic_basis

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.loop import SETUPS, Loop
-from stcal.handeye.data.pairs import HandEyePoses
-from stcal.handeye.methods.start import mean_pose, robust
+from stcal.handeye.data.pairs import SETUPS, HandEyePoses, Loop
+from stcal.handeye.methods.closed_form import mean_pose, robust
 from tests.outcome import fails_with
 from tests.support.handeye import disturbed, simulated
 

@@ -15,7 +15,7 @@ from stcal.handeye.report.page import outcome_page, outcome_text
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.cameras.model import CalibratedCamera, camera_prior
-from stcal.io.saving import json_text
+from stcal.io.files import json_text
 from tests.support.handeye import simulated, simulated_views
 
 VOID = {"meta", "img", "br"}

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import Noise, RigCamera, RigOptions, RigPoses, View, Views, handeye_rig
-from stcal.handeye.data.loop import Loop
+from stcal.handeye.data.pairs import Loop
 from stcal.handeye.methods.bundle import RigBundle, RigCorners
 from stcal.handeye.methods.reprojection import board_of, problem
 from stcal.handeye.rig.solve import alone, of_places

@@ -9,8 +9,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.quaternions import INVERTED
-from stcal.locate.report.chain import GoalChain
-from stcal.locate.report.plausible import on_chain
+from stcal.locate.report.chain import GoalChain, on_chain
 
 MOUNT = Rigid.exp([0.1, -0.2, 1.5, 60, -30, 110])
 

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from stcal.geometry.affine import Affine
-from stcal.geometry.rigid import Rigid, Similarity
+from stcal.geometry.rigid import Affine, Rigid, Similarity
 from stcal.register.core.models import (
     MODELS,
     fit,

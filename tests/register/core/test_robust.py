@@ -8,7 +8,7 @@ from stcal.errors import DegenerateError
 from stcal.geometry.align import align_rigid
 from stcal.register import register
 from stcal.register.core.models import MODELS, fit
-from stcal.register.core.problem import PointNoise, Problem
+from stcal.register.core.pairs import PointNoise, Problem
 from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, deletion_squares
 from stcal.register.core.search import by_scale, chernoff, search
 from stcal.register.judge.groups import lies_together, sphericity, two_groups, wilks_bound

@@ -6,7 +6,7 @@ import pytest
 from stcal.errors import DegenerateError
 from stcal.geometry.align import align_rigid
 from stcal.register import register
-from stcal.register.core.validate import held_out
+from stcal.register.core.result import held_out
 from tests.support.point_pairs import SIGMA_MM, make_scene
 
 

@@ -9,7 +9,7 @@ import pytest
 from markupsafe import Markup
 
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.saving import json_text
+from stcal.io.files import json_text
 from stcal.parallel import _limited
 from stcal.register import register
 from stcal.register.report import page

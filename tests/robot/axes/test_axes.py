@@ -13,10 +13,9 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.axes.checks import _shape
 from stcal.robot.axes.fit import fit_axes
 from stcal.robot.axes.model import robot_from_sweeps
-from stcal.robot.axes.orientations import length_of, ring
 from stcal.robot.axes.pairs import pairs_of
 from stcal.robot.axes.report import axes_file
-from stcal.robot.axes.sweeps import find_arcs
+from stcal.robot.axes.sweeps import find_arcs, length_of, ring
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import flange_poses, forward, joint_frames
 from stcal.robot.kinematics.measurements import Measurements, read_measurements
@@ -192,9 +191,9 @@ def test_influence_is_leaving_out(monkeypatch):
     """Of 240 instants: linear, which neglects the square of what a row at an arc's end weighs."""
     nominal = mh80()
     data = measured(arm(nominal), sweep_values(nominal, 40), SIGMA, 2)
-    monkeypatch.setattr("stcal.robot.axes.without_one.REFITTED", 1000)
+    monkeypatch.setattr("stcal.robot.axes.checks.REFITTED", 1000)
     exact = robot_from_sweeps(data, nominal).without_one
-    monkeypatch.setattr("stcal.robot.axes.without_one.REFITTED", 0)
+    monkeypatch.setattr("stcal.robot.axes.checks.REFITTED", 0)
     linear = robot_from_sweeps(data, nominal).without_one
     assert linear.lines == exact.lines
     change = exact.distance - np.median(exact.distance, axis=0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.nominal import adjusted, dh_values
+from stcal.robot.identification.prior import adjusted, dh_values
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.file import load_robot, robot_toml

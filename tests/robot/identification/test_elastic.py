@@ -7,7 +7,7 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot import forward, read_measurements
-from stcal.robot.identification.elastic import DOWN, HEAVIER, MOMENT, usual
+from stcal.robot.identification.prior import DOWN, HEAVIER, MOMENT, usual
 from stcal.robot.identification.report import identified_file, identified_text
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify

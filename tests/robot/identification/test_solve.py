@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
-from stcal.robot.identification.nominal import dh_values
+from stcal.robot.identification.prior import dh_values
 from stcal.robot.identification.report import identified_file, identified_page, identified_text
 from stcal.robot.identification.residuals import jacobian, moved, observed, residuals, tips
 from stcal.robot.identification.result import IdentifyOptions

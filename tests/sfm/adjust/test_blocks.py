@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.adjust import blocks
+from stcal.sfm.adjust import equations
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.sfm.adjust import dense
 
@@ -25,7 +25,7 @@ def test_without_cameras_it_is_the_schur_complement_of_the_full_equations(group,
     """Points and the camera's parameters remain; a step of these brings the cameras' own along."""
     model, camera = group
     basis = np.eye(16)[:, :intrinsics]
-    normal, right, away = blocks.without_cameras(model, camera, basis, np.inf)
+    normal, right, away = equations.without_cameras(model, camera, basis, np.inf)
     jacobian = dense.jacobian(model, camera)
     if intrinsics:
         by = [
@@ -54,37 +54,37 @@ def test_weights_are_hubers_and_the_cost_is_theirs(group):
     far = model.measured_px.copy()
     far[5] += [1.0, 0.0]
     model = replace(model, measured_px=far)
-    length = np.linalg.norm(blocks.normalised(model, camera), axis=1)
-    weights = blocks.robust_weights(model, camera, 4.0)
+    length = np.linalg.norm(equations.normalised(model, camera), axis=1)
+    weights = equations.robust_weights(model, camera, 4.0)
     assert weights[5] == pytest.approx(4 / length[5])
     assert (weights[length < 4] == 1).all()
 
     def cost(shift: float) -> float:
         changed = far.copy()
         changed[5, 0] += shift
-        return blocks.image_cost(replace(model, measured_px=changed), camera, 4.0)
+        return equations.image_cost(replace(model, measured_px=changed), camera, 4.0)
 
     gradient = (cost(1e-4) - cost(-1e-4)) / 2e-4
     by_x = model.whiten(np.tile([1.0, 0.0], (len(far), 1)))[5]
-    assert gradient == pytest.approx(2 * weights[5] * by_x @ blocks.normalised(model, camera)[5], rel=1e-5)
+    assert gradient == pytest.approx(2 * weights[5] * by_x @ equations.normalised(model, camera)[5], rel=1e-5)
 
 
 def test_points_behind_a_camera_cost_everything(group):
     model, camera = group
     turned = tuple(Rigid.exp([np.pi, 0, 0, 0, 0, 0]) @ pose for pose in model.camera_from_model)
     behind = replace(model, camera_from_model=turned)
-    assert blocks.image_cost(behind, camera, 4.0) == np.inf
+    assert equations.image_cost(behind, camera, 4.0) == np.inf
 
 
 def test_dots_off_their_design_cost_their_squares_over_sigma(group):
     model, camera = group
     dots, none = np.arange(5), np.zeros(0, int)
-    shared = blocks.Shared(
+    shared = equations.Shared(
         xyz_model=np.zeros((0, 3)), shape_mm=np.zeros((0, 3)), camera=camera, basis=np.zeros((12, 0))
     )
 
     def cost(off_mm: np.ndarray) -> float:
-        block = blocks.Block(
+        block = equations.Block(
             model=model,
             model_from_board=Rigid(),
             design=model.xyz_model[dots] + off_mm,

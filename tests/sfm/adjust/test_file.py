@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Rigid
-from stcal.io.saving import json_text
+from stcal.io.files import json_text
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.runs.options import RunOptions
 

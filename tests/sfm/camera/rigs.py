@@ -9,10 +9,9 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.camera.calibrate import CameraCalibration
-from stcal.sfm.camera.intrinsics import adjust_intrinsics
-from stcal.sfm.camera.trust import projection_sigma
-from stcal.sfm.camera.views import closed_form, start_camera
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.camera.checks import projection_sigma
+from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera
+from stcal.sfm.data.model import ImageObservations
 from tests.sfm.camera.test_intrinsics import BOARD, MIDDLE_MM, TRUE
 
 CAMERAS = (

@@ -7,13 +7,12 @@ import pytest
 
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
-from stcal.sfm.camera import held_out as module
+from stcal.sfm.camera import checks
 from stcal.sfm.camera.calibrate import judged, of_chosen_model, require_model
+from stcal.sfm.camera.checks import choose_model, held_out
 from stcal.sfm.camera.file import CalibrationFile
-from stcal.sfm.camera.held_out import choose_model, held_out
-from stcal.sfm.camera.intrinsics import adjust_intrinsics
+from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera
 from stcal.sfm.camera.report import calibration_page, calibration_text
-from stcal.sfm.camera.views import closed_form, start_camera
 from tests.levels import sampled
 from tests.outcome import fails_with
 from tests.sfm.camera.test_intrinsics import BOARD, TRUE, calibrated, views_of
@@ -86,13 +85,13 @@ def test_the_model_of_the_lens_is_chosen(truth, wanted):
     views = views_of(np.random.default_rng(4), count=16, camera=truth)
     chosen, rows = choose_model(views, BOARD, known_of(views, truth), 2)
     assert chosen in wanted
-    assert [row.model for row in rows] == list(module.CANDIDATES)
+    assert [row.model for row in rows] == list(checks.CANDIDATES)
     assert min(row.worse for row in rows if row.worse is not None) == 0
     assert all(row.why for row in rows if row.worse is None)
 
 
 def few(monkeypatch):
-    monkeypatch.setattr(module, "CANDIDATES", ("PINHOLE", "SIMPLE_RADIAL", "OPENCV"))
+    monkeypatch.setattr(checks, "CANDIDATES", ("PINHOLE", "SIMPLE_RADIAL", "OPENCV"))
 
 
 @pytest.mark.slow
@@ -111,14 +110,14 @@ def test_as_good_and_simpler_is_taken(monkeypatch):
 def test_a_model_that_fails_says_why(monkeypatch):
     few(monkeypatch)
     views = views_of(np.random.default_rng(6), count=12)
-    own = module.adjust_intrinsics
+    own = checks.adjust_intrinsics
 
     def failing(views, board, start, model, *more):
         if model == "PINHOLE":
             raise DegenerateError("E-TEST", "no minimum")
         return own(views, board, start, model, *more)
 
-    monkeypatch.setattr(module, "adjust_intrinsics", failing)
+    monkeypatch.setattr(checks, "adjust_intrinsics", failing)
     chosen, rows = choose_model(views, BOARD, known_of(views, TRUE), 1)
     assert chosen == "OPENCV"
     assert (rows[0].why, rows[0].rms_px) == ("no minimum", None)
@@ -135,7 +134,7 @@ def test_too_few_views_to_choose(monkeypatch):
 @pytest.mark.slow
 def test_where_no_perspective_lens_fits_the_wide_one_begins(monkeypatch):
     few(monkeypatch)
-    monkeypatch.setattr(module, "CANDIDATES", ("OPENCV_FISHEYE",))
+    monkeypatch.setattr(checks, "CANDIDATES", ("OPENCV_FISHEYE",))
     views = views_of(np.random.default_rng(7), count=10, camera=FISHEYE)
     asked = []
 
@@ -168,7 +167,7 @@ def test_unknown_models_are_refused():
 def result():
     views = views_of(np.random.default_rng(8), count=12)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "CANDIDATES", ("SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"))
+        patch.setattr(checks, "CANDIDATES", ("SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"))
         return of_chosen_model(lambda model: judged(calibrated(views, model), views, (), 1, True, BOARD), BOARD, 1)
 
 

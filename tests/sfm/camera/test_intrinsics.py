@@ -19,10 +19,9 @@ from stcal.io.cameras.model import camera_prior, parameter_names
 from stcal.io.cameras.read import read_camera
 from stcal.sfm.camera import calibrate as calibration
 from stcal.sfm.camera.calibrate import require_determined
-from stcal.sfm.camera.intrinsics import adjust_intrinsics, model_parameters
-from stcal.sfm.camera.trust import projection_sigma, split_half
-from stcal.sfm.camera.views import board_views, closed_form, start_camera
-from stcal.sfm.data.observations import Centres, ImageObservations
+from stcal.sfm.camera.checks import projection_sigma, split_half
+from stcal.sfm.camera.intrinsics import adjust_intrinsics, board_views, closed_form, model_parameters, start_camera
+from stcal.sfm.data.model import Centres, ImageObservations
 from stcal.sfm.detect.sightings import BoardSighting, ImageDetection
 from tests.outcome import fails_with
 

@@ -14,11 +14,10 @@ from stcal.io.cameras.read import read_lens
 from stcal.labels import DotLabel
 from stcal.sfm.adjust.refine import moved_poses
 from stcal.sfm.camera.equations import Setting, derivatives
-from stcal.sfm.camera.instants import gathered, symmetries
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, design_shapes, model_parameters
 from stcal.sfm.camera.report import rig_page, rig_text
-from stcal.sfm.camera.rig import _sightings, _start, adjust_rig, calibrate_rig
-from stcal.workflows.calibrate_rig import Models, camera_names, files_of
+from stcal.sfm.camera.rig import _sightings, _start, adjust_rig, calibrate_rig, gathered, symmetries
+from stcal.workflows.calibrate_camera import Models, camera_names, files_of
 from tests.outcome import fails_with
 from tests.sfm.camera.rigs import alone, calibrated_alone, seen_by_rig
 from tests.sfm.camera.test_intrinsics import BOARD

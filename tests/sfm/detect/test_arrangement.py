@@ -5,7 +5,7 @@ import pytest
 
 from stcal.design import reference_target
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.data.observations import Centres
+from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.labels import label_groups, label_single
 from stcal.sfm.detect.predict import predict_circles
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection

@@ -9,8 +9,8 @@ from scipy.ndimage import gaussian_filter
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
+from stcal.sfm.detect.circles.candidates import Ellipses
 from stcal.sfm.detect.circles.centres import measure_centres
-from stcal.sfm.detect.circles.ellipses import Ellipses
 from tests.levels import sampled
 from tests.support import degrade
 

@@ -8,7 +8,7 @@ import pytest
 from stcal.design import reference_board, reference_target
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import find_images
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import detect_files
 from tests.outcome import fails_with
 

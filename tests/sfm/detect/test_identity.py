@@ -8,11 +8,10 @@ from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board,
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
-from stcal.sfm.detect.ambiguity import confusable, is_named, mirror_images
 from stcal.sfm.detect.board import find_boards
-from stcal.sfm.detect.circles.candidates import Candidates
-from stcal.sfm.detect.circles.ellipses import Ellipses
+from stcal.sfm.detect.circles.candidates import Candidates, Ellipses
 from stcal.sfm.detect.faces import FaceFinder
+from stcal.sfm.detect.sightings import confusable, is_named, mirror_images
 
 CAMERA = Camera(2592, 1728, [2785.0, 2785.0], [1295.5, 863.5], np.zeros(8))
 TARGET = reference_target()

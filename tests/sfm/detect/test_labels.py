@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.design import reference_target
-from stcal.sfm.data.observations import Centres
+from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.labels import label_groups
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 

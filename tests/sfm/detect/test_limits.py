@@ -9,7 +9,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.sfm.detect import image as stage
 from stcal.sfm.detect.board import MAX_UNEXPLAINED, _offsets
-from stcal.sfm.detect.circles.ellipses import OPTION_RANGES, EllipseOptions
+from stcal.sfm.detect.circles.candidates import OPTION_RANGES, EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
 from tests.outcome import fails_with
 

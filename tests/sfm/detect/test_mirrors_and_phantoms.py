@@ -12,7 +12,7 @@ import pytest
 from stcal.errors import DetectionError
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import ImageFile
-from stcal.sfm.data.observations import Centres
+from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.files import DetectedImage, require_upright
 from stcal.sfm.detect.labels import label_groups
 from stcal.sfm.detect.sightings import FaceSighting, ImageDetection

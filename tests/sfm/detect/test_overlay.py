@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.detect.overlay import draw_overlay
 from stcal.sfm.runs.folder import overlay_path
 

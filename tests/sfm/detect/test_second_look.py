@@ -8,8 +8,8 @@ import pytest
 from stcal.design import reference_target
 from stcal.geometry.camera import Camera
 from stcal.labels import BOARD, parse_labels
-from stcal.sfm.data.observations import Centres, ImageObservations
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.data.model import Centres, ImageObservations
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.labels import _second, labelled_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, contradictions, measure_predicted
 from tests.sfm.detect.test_centres import sheet

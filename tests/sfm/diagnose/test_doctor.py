@@ -15,11 +15,10 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.patterns import Pattern, ideal_border, in_view
-from stcal.sfm.detect.circles.ellipses import EllipseOptions, find_ellipses
+from stcal.sfm.detect.circles.candidates import EllipseOptions, find_ellipses
 from stcal.sfm.diagnose.doctor import diagnose, missing_circles
-from stcal.sfm.diagnose.examine import LEAST_MIN_DIAMETER_PX
+from stcal.sfm.diagnose.examine import LEAST_MIN_DIAMETER_PX, trace_outlines
 from stcal.sfm.diagnose.findings import Diagnosis, Finding, GateCount, by_gate, in_order, table
-from stcal.sfm.diagnose.trace import trace_outlines
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
 from stcal.sfm.runs.saved import load_run

@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 
 from stcal.cli.main import main_sfm
-from stcal.io.saving import RUN_MARKER
+from stcal.io.files import RUN_MARKER
 from stcal.sfm.interop import native
 from stcal.sfm.interop.crosscheck import crosscheck, mapper_options
 from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable

@@ -259,7 +259,7 @@ def test_recording(files, faces, small_run):
 def test_photographs_that_are_gone_are_said(small_run, tmp_path):
     saved = load_run(small_run)
     object.__setattr__(saved, "images", tmp_path / "gone")
-    recording = importlib.import_module("stcal.sfm.interop.export.recording")
+    recording = importlib.import_module("stcal.sfm.interop.export.viewers")
     notes = recording.write_rrd(content_of(saved, "target"), tmp_path / "run.rrd")
     assert notes == [
         f"{len(saved.report['scene']['cameras'])} photographs are no longer in {tmp_path / 'gone'}, "

@@ -10,12 +10,11 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.io.design import load_board, load_target, target_toml
 from stcal.lookalikes import MIN_COMMON
-from stcal.sfm.detect.ambiguity import confusable, in_common, is_named, mirror_images
+from stcal.sfm.detect.sightings import confusable, in_common, is_named, mirror_images
 from stcal.sfm.make import design
 from stcal.sfm.make.box import sides_of, size_of
 from stcal.sfm.make.design import MakeOptions, make_target
-from stcal.sfm.make.hidden import unnamed_cases
-from stcal.sfm.make.pattern import HIDDEN, LARGE, LEAST_CIRCLES, make_pattern
+from stcal.sfm.make.pattern import HIDDEN, LARGE, LEAST_CIRCLES, make_pattern, unnamed_cases
 from stcal.synthetic.designs import face_of_drawing, second_design
 from tests.outcome import fails_with
 

@@ -15,10 +15,9 @@ from stcal.sfm.mapping.database import (
     to_colmap_px,
     write_database,
 )
-from stcal.sfm.mapping.graph import image_graph
 from stcal.sfm.mapping.incremental import map_group
 from stcal.sfm.mapping.models import write_model
-from stcal.sfm.mapping.pairs import PairOptions, rank_pairs
+from stcal.sfm.mapping.pairs import PairOptions, image_graph, rank_pairs
 from tests.outcome import fails_with
 
 

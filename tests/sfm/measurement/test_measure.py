@@ -19,12 +19,11 @@ from stcal.io.cameras.read import read_camera
 from stcal.io.images import Skipped
 from stcal.io.table import read_table
 from stcal.sfm import RunOptions, run
-from stcal.sfm.data.observations import ImageObservations
+from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import project_circles
 from stcal.sfm.measurement.images import MeasureOptions, measure, measure_labelled
-from stcal.sfm.measurement.output import measure_text, poses_file
 from stcal.sfm.measurement.pose import NO_FACE, PoseOptions, pose_from_circles, resolved
-from stcal.sfm.measurement.report import measure_page
+from stcal.sfm.measurement.report import measure_page, measure_text, poses_file
 from stcal.sfm.measurement.target import TargetCircles, read_target
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.levels import FULL

@@ -13,8 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.io.cameras.read import read_camera
-from stcal.sfm.measurement.serve import MeasureServer, ServeOptions
-from stcal.sfm.measurement.service import MeasureService, Setting
+from stcal.sfm.measurement.serve import MeasureServer, MeasureService, ServeOptions, Setting
 from stcal.sfm.measurement.target import read_target
 
 NODE = Path(__file__).resolve().parents[3] / "docs" / "ros2_measure_node.py"

@@ -18,9 +18,17 @@ import pytest
 
 from stcal.io.cameras.read import read_camera
 from stcal.sfm import MeasureOptions, measure
-from stcal.sfm.measurement.output import poses_file
-from stcal.sfm.measurement.serve import MeasureServer, ServeOptions, counts_text
-from stcal.sfm.measurement.service import DONE, WAITING, Answer, MeasureService, Setting
+from stcal.sfm.measurement.report import poses_file
+from stcal.sfm.measurement.serve import (
+    DONE,
+    WAITING,
+    Answer,
+    MeasureServer,
+    MeasureService,
+    ServeOptions,
+    Setting,
+    counts_text,
+)
 from stcal.sfm.measurement.target import read_target
 from tests.outcome import fails_with
 

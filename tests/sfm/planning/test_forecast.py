@@ -32,9 +32,9 @@ from stcal.sfm.planning.forecast import (
     _rim_integrals,
     forecast,
 )
+from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.planning.session import PlanOptions
 from stcal.sfm.planning.session import plan as make_plan
-from stcal.sfm.planning.simulated import observe, true_models
 from stcal.sfm.planning.views import PlannedView, candidates, known_scene
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, nominal_target_from_face, second_design

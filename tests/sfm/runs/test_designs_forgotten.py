@@ -7,7 +7,7 @@ import pytest
 from stcal.design import reference_board, reference_target
 from stcal.io.design import board_toml, load_target, target_toml
 from stcal.sfm.data.patterns import measured_pitch_mm, pitch_hint
-from stcal.sfm.detect.ambiguity import likeness_notes
+from stcal.sfm.detect.sightings import likeness_notes
 from stcal.synthetic.scene import second_design
 from tests.outcome import fails_with
 

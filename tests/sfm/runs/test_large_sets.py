@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stcal.sfm.adjust.calibration import calibrate
-from stcal.sfm.mapping.graph import (
+from stcal.sfm.mapping.incremental import complete
+from stcal.sfm.mapping.pairs import (
     MIN_SHARED,
     MIN_VIEWS,
     NEIGHBOURS,
@@ -21,7 +22,6 @@ from stcal.sfm.mapping.graph import (
     incidence,
     track_parts,
 )
-from stcal.sfm.mapping.resect import complete
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.solve import solve_groups
 from stcal.synthetic.scene import SceneOptions, make_scene

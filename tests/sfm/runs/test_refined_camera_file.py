@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stcal.io.cameras.read import read_camera
-from stcal.io.saving import CAMERA, REFINED_CAMERA
+from stcal.io.files import CAMERA, REFINED_CAMERA
 from stcal.sfm.camera.intrinsics import model_parameters
 from stcal.sfm.pipeline import RunOptions, run
 

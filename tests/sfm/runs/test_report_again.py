@@ -9,7 +9,7 @@ import shutil
 import pytest
 from markupsafe import escape
 
-from stcal.io.saving import RUN_MARKER
+from stcal.io.files import RUN_MARKER
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs import folder
 from stcal.sfm.runs.text import run_text

@@ -12,12 +12,11 @@ import pytest
 
 from stcal.errors import InputError
 from stcal.sfm import run
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import load_run
-from stcal.sfm.runs.transaction import run_folder
+from stcal.sfm.runs.transaction import MarkerFile, run_folder
 from tests.outcome import INPUT, assert_error
 from tests.shared import own_copy
 

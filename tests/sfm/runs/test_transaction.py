@@ -9,10 +9,9 @@ from contextlib import suppress
 import pytest
 
 from stcal.errors import DetectionError, InputError
-from stcal.io.saving import RUN_MARKER
-from stcal.sfm.runs.marker import MarkerFile
+from stcal.io.files import RUN_MARKER
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.transaction import READY, RESULTS, complete, run_folder
+from stcal.sfm.runs.transaction import READY, RESULTS, MarkerFile, complete, run_folder
 from tests.outcome import fails_with
 
 MARKER = MarkerFile.of("images", RunOptions())
@@ -101,7 +100,7 @@ def test_a_run_that_is_killed_while_results_take_their_places_is_completed(tmp_p
 
 HOLD = """
 import sys
-from stcal.sfm.runs.marker import MarkerFile
+from stcal.sfm.runs.transaction import MarkerFile
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.transaction import run_folder
 with run_folder(sys.argv[1], MarkerFile.of("images", RunOptions()), {}):

@@ -8,13 +8,12 @@ import pytest
 
 import stcal
 from stcal.errors import InputError
-from stcal.io.saving import RUN_MARKER
+from stcal.io.files import RUN_MARKER
 from stcal.sfm.interop import crosscheck as interop
 from stcal.sfm.runs.crosscheck import Tolerances
-from stcal.sfm.runs.marker import MarkerFile
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import load_run
-from stcal.sfm.runs.transaction import added_results, run_folder
+from stcal.sfm.runs.transaction import MarkerFile, added_results, run_folder
 from stcal.sfm.runs.verify import require_whole, verified_text, verify
 from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy

@@ -12,7 +12,7 @@ from stcal.sfm import RunOptions, run
 from stcal.sfm.adjust.calibration import image_sigma_factor, with_sigma
 from stcal.sfm.adjust.joint import adjust_jointly
 from stcal.sfm.adjust.uncertainty import calibrated_target
-from stcal.sfm.detect.circles.ellipses import EllipseOptions
+from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
 from stcal.sfm.pipeline import detect
 from stcal.sfm.report.compare import compare

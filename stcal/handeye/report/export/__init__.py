@@ -7,7 +7,8 @@ import numpy as np
 
 from stcal.errors import InputError, StcalError
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.report.export import robots, ros
+from stcal.handeye.report.export import files
+from stcal.handeye.report.export.files import opencv_yaml, read_zivid, ros_yaml, urdf_joint, zivid_yaml
 from stcal.handeye.report.export.frames import (
     CameraFrame,
     frame_names,
@@ -15,8 +16,6 @@ from stcal.handeye.report.export.frames import (
     said_of,
     tree,
 )
-from stcal.handeye.report.export.opencv import opencv_yaml, read_zivid, zivid_yaml
-from stcal.handeye.report.export.ros import ros_yaml, urdf_joint
 from stcal.handeye.result import HandEye
 from stcal.io.poses.columns import program_name
 from stcal.io.poses.controllers import ABB, FANUC, KUKA, UR
@@ -65,16 +64,16 @@ ROS_FORMS = {
     "ros2": Form(lambda result, transforms, _: ros2_commands(transforms, said_of(result)), read_ros2_commands),
     "moveit": Form(lambda result, transforms, _: ros1_launch(transforms, said_of(result)), read_ros1_launch),
     "moveit2": Form(lambda result, transforms, _: ros2_launch(transforms, said_of(result)), read_ros2_launch),
-    "easy-handeye": Form(ros.easy_handeye, ros.read_easy_handeye),
-    "easy-handeye2": Form(ros.easy_handeye2, ros.read_easy_handeye2),
+    "easy-handeye": Form(files.easy_handeye, files.read_easy_handeye),
+    "easy-handeye2": Form(files.easy_handeye2, files.read_easy_handeye2),
 }
 """Formats that hold names of frames, and the camera's link on demand."""
 FORMS = ROS_FORMS | {
     "zivid": Form(lambda result, *_: zivid_yaml(result), read_zivid),
-    "kuka": Form(lambda result, _, name: robots.kuka_dat(result, program_name(name)), KUKA.first),
-    "abb": Form(lambda result, _, name: robots.abb_module(result, program_name(name)), ABB.first),
-    "ur": Form(lambda result, *_: robots.ur_script(result), UR.first),
-    "fanuc": Form(lambda result, _, name: robots.fanuc_program(result, program_name(name)), FANUC.first),
+    "kuka": Form(lambda result, _, name: files.kuka_dat(result, program_name(name)), KUKA.first),
+    "abb": Form(lambda result, _, name: files.abb_module(result, program_name(name)), ABB.first),
+    "ur": Form(lambda result, *_: files.ur_script(result), UR.first),
+    "fanuc": Form(lambda result, _, name: files.fanuc_program(result, program_name(name)), FANUC.first),
 }
 """All formats, by the word of ``--export``."""
 

@@ -7,7 +7,7 @@ import numpy as np
 import stcal
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.loop import FRAMES, Setup
+from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.result import HandEye
 from stcal.io.poses.static import Static
 

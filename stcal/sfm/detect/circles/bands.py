@@ -3,7 +3,7 @@
 import numpy as np
 
 from stcal.geometry.camera import Camera
-from stcal.sfm.detect.circles.ellipses import Ellipses
+from stcal.sfm.detect.circles.candidates import Ellipses
 
 BAND_PX = 4.0
 """Half width of the band of pixels around the rim, at first and at least."""

@@ -1,13 +1,315 @@
-"""Candidates in ideal (undistorted, normalised) coordinates, and the test that an ellipse is a given circle's image."""
+"""Candidates: blobs whose outline is an ellipse, over a pyramid of scales, and the test that one is a circle."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 
+import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
+from stcal.design import Polarity
+from stcal.errors import InputError
+from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homographies, homography_jacobian
-from stcal.sfm.detect.circles.ellipses import Ellipses
+from stcal.io.images import percentiles, shrunk
+
+WINDOWS_PX = (41, 193)
+"""Sides of the windows whose mean is the threshold, on every level of the pyramid."""
+WINDOW_OVER_DIAMETER = 3.0
+"""Smallest ratio of window to blob. In a smaller window the blob pulls the mean towards itself."""
+HALF_SCALE_FROM_PX = 8_000_000
+"""Images of more pixels start the pyramid at half scale, unless smaller circles are required …"""
+MIN_DIAMETER_AT_HALF_SCALE_PX = 9.0
+"""Smallest default diameter at half scale."""
+MIN_DIAMETER_PX = 4.5
+"""Smallest diameter of the circle of the same area: a circle 8 px across at 70° has 4.7."""
+DOUBLE_SCALE_BELOW_PX = 1_500_000
+"""Images of fewer pixels start at double scale: the outline of a small ellipse is coarse."""
+REACH_PX = 11
+OUTLINE_LEVEL = 0.45
+"""Outlines run at this fraction of the highest value within reach."""
+MIN_LEVEL_DIAMETER_PX = 3.0
+MIN_COARSE_DIAMETER_PX = 24.0
+"""Smallest diameter on coarse levels. Smaller ellipses are found on finer levels, where outlines are more accurate."""
+MAX_OUTLINE_DEVIATION = 0.025
+"""RMS deviation of the outline from the ellipse, in units of its radius (a square has 0.07) …"""
+MAX_OUTLINE_DEVIATION_PX = 0.45
+"""Additional deviation by pixels and noise."""
+MAX_AREA_ERROR = 0.15
+"""Largest difference between the areas of the outline and of its ellipse, as a fraction of the latter."""
+MIN_THRESHOLD = 4.0
+"""Smallest threshold, in grey values of the 8-bit image."""
+
+OPTION_RANGES = {
+    "min_diameter_px": (1.0, 1e6),
+    "max_diameter_px": (1.0, 1e6),
+    "min_axis_ratio": (0.01, 1.0),
+    "min_contrast": (1e-6, 1.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class EllipseOptions:
+    """Limits for candidates.
+
+    ``min_diameter_px``, ``max_diameter_px`` : diameter of the circle of the same area; if None, the smallest is
+    4.5 px, and 9 px in images over 8 megapixels;
+    ``min_axis_ratio`` : minor over major axis (cos 70° is 0.34; blur and pixels take some more);
+    ``min_contrast`` : inside against surroundings, as a fraction of the image's grey range.
+    """
+
+    min_diameter_px: float | None = None
+    max_diameter_px: float = 450.0
+    min_axis_ratio: float = 0.2
+    min_contrast: float = 0.08
+
+    def __post_init__(self):
+        for name, (low, high) in OPTION_RANGES.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InputError(
+                    "E-OPTION-RANGE", f"option {name} {value:g}: {low:g} to {high:g} possible; give another"
+                )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ellipses:
+    """n candidates.
+
+    ``centre_px`` : (n, 2); ``shape_px`` : (n, 2, 2), symmetric, rim = centre + shape @ unit circle; ``contrast`` :
+    (n,) middle against surroundings, grey values of the 8-bit image, positive.
+    """
+
+    centre_px: np.ndarray
+    shape_px: np.ndarray
+    contrast: np.ndarray
+
+    def __post_init__(self):
+        n = len(self.centre_px)
+        object.__setattr__(self, "centre_px", frozen(self.centre_px, (n, 2), "centres"))
+        object.__setattr__(self, "shape_px", frozen(self.shape_px, (n, 2, 2), "shapes"))
+        object.__setattr__(self, "contrast", frozen(self.contrast, (n,), "contrasts"))
+
+    def __len__(self) -> int:
+        return len(self.centre_px)
+
+    @classmethod
+    def concatenate(cls, parts: list["Ellipses"]) -> "Ellipses":
+        """Returns the ellipses of all parts, one part after the other."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+
+    def radius_px(self) -> np.ndarray:
+        """Returns the radius of the circle of the same area, (n,)."""
+        return np.sqrt(np.abs(np.linalg.det(self.shape_px)))
+
+    def select(self, keep: np.ndarray) -> "Ellipses":
+        """Returns the ellipses of the indices or mask ``keep``."""
+        return Ellipses(self.centre_px[keep], self.shape_px[keep], self.contrast[keep])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """One level of the pyramid: ``image``, ``scale`` of its pixels in px of the full image, ``lowest`` diameter
+    sought, px of the level."""
+
+    image: np.ndarray
+    scale: float
+    lowest: float
+
+    def in_full(self, rows: list[tuple[float, ...]]) -> np.ndarray:
+        """Converts ellipses, rows (x, y, full axis 1, full axis 2, angle of axis 1 in deg), from the level to the
+        image."""
+        table = np.array(rows).reshape(-1, 5)
+        table[:, :2] = table[:, :2] * self.scale + (self.scale - 1) / 2
+        table[:, 2:4] *= self.scale
+        return table
+
+
+@dataclass(frozen=True, slots=True)
+class OutlineVerdict:
+    """The first ``gate`` that an outline fails, with its ``value`` and ``limit``, empty if it passes all;
+    ``ellipse`` : (x, y, full axis 1, full axis 2, angle of axis 1 in degrees), fitted after the first three gates."""
+
+    gate: str
+    value: float
+    limit: float
+    ellipse: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class OutlineGates:
+    """Limits for outlines in one mask; px of the level, ``shortest`` and ``longest`` in points."""
+
+    width: int
+    height: int
+    lowest: float
+    highest: float
+    min_axis_ratio: float
+    shortest: float
+    longest: float
+
+    def check(self, contour: np.ndarray) -> OutlineVerdict:
+        """Fits the ellipse and checks the outline against the limits."""
+        if len(contour) < self.shortest:
+            return OutlineVerdict("short", len(contour), self.shortest)
+        if len(contour) > self.longest:
+            return OutlineVerdict("long", len(contour), self.longest)
+        x, y, w, h = cv2.boundingRect(contour)
+        if x == 0 or y == 0 or x + w == self.width or y + h == self.height:
+            return OutlineVerdict("border", 0.0, 1.0)
+        (cx, cy), (d1, d2), angle = cv2.fitEllipseDirect(contour)
+        if not np.isfinite(d1 + d2 + cx + cy):
+            return OutlineVerdict("ellipse", np.nan, np.nan)
+        # The outline runs through the centres of the outermost pixels, half a pixel inside the edge.
+        d1, d2 = d1 + 1, d2 + 1
+        row = (cx, cy, d1, d2, angle)
+        if min(d1, d2) < self.min_axis_ratio * max(d1, d2):
+            return OutlineVerdict("min_axis_ratio", min(d1, d2) / max(d1, d2), self.min_axis_ratio, row)
+        diameter = np.sqrt(d1 * d2)
+        if not diameter >= self.lowest:
+            return OutlineVerdict("min_diameter", diameter, self.lowest, row)
+        if not diameter <= self.highest:
+            return OutlineVerdict("max_diameter", diameter, self.highest, row)
+        error = abs(outline_area(contour) / (np.pi / 4 * d1 * d2) - 1)
+        if error > MAX_AREA_ERROR:
+            return OutlineVerdict("outline_area", error, MAX_AREA_ERROR, row)
+        deviation = _outline_deviation(contour[:, 0, :], cx, cy, d1 - 1, d2 - 1, angle)
+        if deviation > 1:
+            return OutlineVerdict("outline_deviation", deviation, 1.0, row)
+        return OutlineVerdict("", 0.0, 0.0, row)
+
+
+def find_ellipses(image: np.ndarray, polarity: Polarity, options: EllipseOptions) -> Ellipses:
+    """Finds blobs of one polarity with an elliptic outline in an 8-bit grey image; centres are good to about 0.1 px."""
+    threshold, _ = contrast_threshold(image, options)
+    found = [_rows(level, polarity, threshold, options) for level in levels(image, options)]
+    centre, shape = distinct(np.concatenate(found))
+    contrast = contrast_of(image, polarity, centre, shape)
+    keep = contrast > threshold
+    return Ellipses(centre[keep], shape[keep], contrast[keep])
+
+
+def contrast_threshold(image: np.ndarray, options: EllipseOptions) -> tuple[float, float]:
+    """Returns the contrast that a circle must exceed, and the image's grey range that defines it; grey values."""
+    low, high = percentiles(image[::8, ::8], [0.5, 99.9])
+    grey_range = max(high, 1.0) - low
+    return max(MIN_THRESHOLD, options.min_contrast * grey_range), grey_range
+
+
+def diameter_limits_px(pixels: int, options: EllipseOptions) -> tuple[float, float]:
+    """Returns the smallest and largest diameter to find in an image of the given number of pixels."""
+    default = MIN_DIAMETER_AT_HALF_SCALE_PX if pixels > HALF_SCALE_FROM_PX else MIN_DIAMETER_PX
+    return options.min_diameter_px or default, options.max_diameter_px
+
+
+def levels(image: np.ndarray, options: EllipseOptions) -> Iterator[Level]:
+    """Yields the levels of the pyramid, the finest first."""
+    scale, minimum = 1.0, diameter_limits_px(image.size, options)[0]
+    if image.size > HALF_SCALE_FROM_PX and minimum >= MIN_DIAMETER_AT_HALF_SCALE_PX:
+        image, scale = shrunk(image, 0.5), 2.0
+    elif image.size < DOUBLE_SCALE_BELOW_PX:
+        image, scale = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), 0.5
+    first = True
+    while True:
+        # Both of the first two levels of a small image look for everything: the coarser one sees less noise.
+        fine = first or scale <= 1
+        smallest = max(MIN_LEVEL_DIAMETER_PX, minimum / scale) if fine else MIN_COARSE_DIAMETER_PX
+        yield Level(image, scale, max((options.min_diameter_px or 0) / scale, smallest))
+        if options.max_diameter_px / scale <= WINDOWS_PX[-1] / WINDOW_OVER_DIAMETER or min(image.shape) < 16:
+            return
+        scale, first = 2 * scale, False
+        image = shrunk(image, 0.5)
+
+
+def contrast_of(image: np.ndarray, polarity: Polarity, centre: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Returns the median grey value in the middle minus the median around, (n,); with opposite sign for dark
+    circles."""
+    angle = np.arange(16) * (np.pi / 8)
+    unit = np.column_stack([np.cos(angle), np.sin(angle)])
+
+    def sample(factor: float, margin_px: float) -> np.ndarray:
+        wide = factor * shape + margin_px * np.eye(2)
+        at = np.round(centre[:, None] + np.einsum("nij,kj->nki", wide, unit)).astype(int)
+        x, y = (np.clip(at[..., k], 0, image.shape[1 - k] - 1) for k in range(2))
+        return np.median(image[y, x], axis=1) if len(at) else np.zeros(0)
+
+    return (sample(0.4, 0.0) - sample(1.25, 2.0)) * (1 if polarity == "bright" else -1)
+
+
+def masks(
+    level: Level, polarity: Polarity, threshold: float, options: EllipseOptions
+) -> Iterator[tuple[np.ndarray, OutlineGates]]:
+    """Yields masks of blobs in one level, one for each window that circles of the level fit into, and the limits for
+    outlines in them."""
+    smooth = cv2.GaussianBlur(level.image, (3, 3), 0)
+    for window in WINDOWS_PX:
+        highest = min(options.max_diameter_px / level.scale, window / WINDOW_OVER_DIAMETER)
+        if highest < level.lowest:
+            continue
+        mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REFLECT)
+        difference = cv2.subtract(smooth, mean) if polarity == "bright" else cv2.subtract(mean, smooth)
+        # An outline at half the blob's own height neither grows with blur nor runs into a neighbour.
+        peak = cv2.dilate(difference, np.ones((REACH_PX, REACH_PX), np.uint8))
+        mask = cv2.bitwise_and(
+            cv2.threshold(difference, threshold, 255, cv2.THRESH_BINARY)[1],
+            cv2.compare(difference, cv2.convertScaleAbs(peak, alpha=OUTLINE_LEVEL), cv2.CMP_GT),
+        )
+        shortest, longest = max(6.0, 2 * level.lowest), 4 * highest / np.sqrt(options.min_axis_ratio)
+        height, width = mask.shape
+        yield mask, OutlineGates(width, height, level.lowest, highest, options.min_axis_ratio, shortest, longest)
+
+
+def outlines(mask: np.ndarray) -> list[np.ndarray]:
+    """Returns the outer outlines in a mask, without outlines of holes."""
+    contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    return [contours[i] for i in np.flatnonzero(hierarchy[0, :, 3] < 0).tolist()] if contours else []
+
+
+def outline_area(contour: np.ndarray) -> float:
+    """Returns the area of the pixels inside an outline, including its own."""
+    return cv2.contourArea(contour) + 0.5 * cv2.arcLength(contour, True) + 1
+
+
+def _rows(level: Level, polarity: Polarity, threshold: float, options: EllipseOptions) -> np.ndarray:
+    """Returns the ellipses of one level, rows as in :meth:`Level.in_full`."""
+    rows = []
+    for mask, gates in masks(level, polarity, threshold, options):
+        for contour in outlines(mask):
+            verdict = gates.check(contour)
+            if not verdict.gate:
+                rows.append(verdict.ellipse)
+    return level.in_full(rows)
+
+
+def _outline_deviation(points, cx, cy, d1, d2, angle_deg) -> float:
+    """Returns the RMS distance of the outline from the ellipse divided by its limit."""
+    angle = np.radians(angle_deg)
+    c, s = np.cos(angle), np.sin(angle)
+    dx, dy = points[:, 0] - cx, points[:, 1] - cy
+    rho = np.hypot((c * dx + s * dy) * 2 / max(d1, 1e-6), (c * dy - s * dx) * 2 / max(d2, 1e-6))
+    size = np.sqrt(d1 * d2) / 2
+    return float(np.sqrt(np.mean((rho - 1) ** 2)) * size / (MAX_OUTLINE_DEVIATION_PX + MAX_OUTLINE_DEVIATION * size))
+
+
+def distinct(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns centres and shapes without duplicates: of coincident rows the first, from the finest level, is kept."""
+    if not len(table):
+        return np.zeros((0, 2)), np.zeros((0, 2, 2))
+    centre = table[:, :2]
+    radius = np.sqrt(table[:, 2] * table[:, 3]) / 2
+    pairs = KDTree(centre).query_pairs(0.5 * radius.max(), output_type="ndarray")
+    smaller = np.minimum(radius[pairs[:, 0]], radius[pairs[:, 1]])
+    larger = np.maximum(radius[pairs[:, 0]], radius[pairs[:, 1]])
+    near = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1) < 0.3 * smaller + 0.5
+    keep = np.ones(len(table), bool)
+    keep[pairs[near & (smaller > 0.75 * larger), 1]] = False
+    table = table[keep]
+    angle = np.radians(table[:, 4])
+    axes = np.stack([np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)], 2)
+    shape = (axes * table[:, None, 2:4] / 2) @ np.swapaxes(axes, 1, 2)
+    return table[:, :2], shape
+
 
 MAX_POSITION_ERROR = 0.15
 """Largest distance between a pattern's prediction and a candidate, in radii of the circle …"""

@@ -4,7 +4,7 @@ import numpy as np
 
 from stcal.geometry.robust import robust_sigmas
 from stcal.sfm.detect.circles import bands
-from stcal.sfm.detect.circles.ellipses import Ellipses
+from stcal.sfm.detect.circles.candidates import Ellipses
 
 BAND_BLURS = 4.0
 """Half width of the band of pixels, in units of the blur."""

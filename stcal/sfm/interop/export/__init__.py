@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stcal.errors import InputError
-from stcal.io.saving import save
-from stcal.sfm.interop.export import gltf, solids, tables
+from stcal.io.files import save
+from stcal.sfm.interop.export import solids, tables, viewers
 from stcal.sfm.interop.export.content import Content, content_of
-from stcal.sfm.interop.export.recording import write_rrd
+from stcal.sfm.interop.export.viewers import write_rrd
 from stcal.sfm.runs.saved import load_run
 
 ROOT = "target"
@@ -37,8 +37,8 @@ FORMS = {
     "csv": Form(".csv", tables.table, "cameras, correlations"),
     "ply": Form(".ply", solids.ply, "σ of circles, the lens's distortion; σ of faces is in comments"),
     "dxf": Form(".dxf", solids.dxf, "cameras, correlations; σ is in extended data"),
-    "gltf": Form(".gltf", gltf.gltf, "the lens's distortion but as numbers in extras"),
-    "glb": Form(".glb", gltf.glb, "the lens's distortion but as numbers in extras"),
+    "gltf": Form(".gltf", viewers.gltf, "the lens's distortion but as numbers in extras"),
+    "glb": Form(".glb", viewers.glb, "the lens's distortion but as numbers in extras"),
     RERUN: Form(".rrd", None, "the lens's distortion; covariances but as ellipsoids"),
 }
 """By the word of ``--form``."""

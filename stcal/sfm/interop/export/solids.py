@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stcal.drawing.dxf import dxf_text, new_drawing
+from stcal.drawing.formats import dxf_text, new_drawing
 from stcal.sfm.interop.export.content import BOARD_RGB, Content, Photograph
 
 EDGES = 48

@@ -1,18 +1,17 @@
-"""Export of a hand-eye transform for ROS: messages, URDF, publishers of static transforms, MoveIt, easy_handeye.
-
-Each kind of file has a reader that follows the rules of the program that uses the file.
-"""
+"""Files of a hand-eye transform for OpenCV, Zivid's SDK, robot controllers and ROS."""
 
 import xml.etree.ElementTree as ElementTree
 from xml.sax.saxutils import quoteattr
 
+import numpy as np
 import yaml
 
 from stcal.geometry.rigid import Rigid
-from stcal.handeye.data.loop import FRAMES
+from stcal.handeye.data.pairs import FRAMES
 from stcal.handeye.report.export.frames import CameraFrame, said_of, tree
 from stcal.handeye.result import HandEye
-from stcal.io.plain_yaml import load_yaml
+from stcal.io.plain_yaml import load_yaml, opencv_matrix
+from stcal.io.poses.controllers import ABB, FANUC, KUKA, UR
 from stcal.io.poses.static import (
     Static,
     fixed_joint,
@@ -23,6 +22,70 @@ from stcal.io.poses.static import (
     static_of_joint,
     xyzw,
 )
+
+
+def opencv_yaml(result: HandEye) -> str:
+    """Returns a file for ``cv2.FileStorage``: both transforms, 4×4, and their covariances if there are any; mm, rad."""
+    covariances = (result.covariance, result.stand_covariance)
+    lines = ["%YAML:1.0", "---", f'setup: "{result.setup}"', f'method: "{result.method}"', 'unit: "mm"']
+    for (name, pose), covariance in zip(result.transforms.items(), covariances, strict=True):
+        lines += opencv_matrix(name, pose.matrix())
+        if covariance is not None:
+            lines += opencv_matrix(f"{name}_covariance", covariance)
+    return "\n".join(lines) + "\n"
+
+
+def zivid_yaml(result: HandEye) -> str:
+    """Returns a file as ``zivid.Matrix4x4`` saves and loads it: 4×4, mm."""
+    head = "".join(f"# {line}\n" for line in said_of(result))
+    content = {
+        "__version__": {"serializer": 1, "data": 1},
+        "FloatMatrix": {"Data": result.mount_from_camera.matrix().tolist()},
+    }
+    return head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=200)
+
+
+def read_zivid(text: str) -> Rigid:
+    """Returns the transform in a file of :func:`zivid_yaml`, mm."""
+    return Rigid.from_matrix(load_yaml(text)["FloatMatrix"]["Data"])
+
+
+REMARK = 32
+"""Largest number of characters of a remark in a FANUC program."""
+
+
+def kuka_dat(result: HandEye, name: str) -> str:
+    """Returns a data list of KRL with the frame."""
+    head = "".join(f"; {line}\n" for line in said_of(result))
+    frame = f"DECL GLOBAL FRAME {FRAMES[result.setup].camera}={{{KUKA.write(result.mount_from_camera)}}}\n"
+    return f"&ACCESS RVP\nDEFDAT {name} PUBLIC\n{head}{frame}ENDDAT\n"
+
+
+def abb_module(result: HandEye, name: str) -> str:
+    """Returns a module of RAPID with a ``pose``."""
+    head = "".join(f"  ! {line}\n" for line in said_of(result))
+    frame = f"  PERS pose {FRAMES[result.setup].camera}:=[{ABB.write(result.mount_from_camera)}];\n"
+    return f"MODULE {name}\n{head}{frame}ENDMODULE\n"
+
+
+def ur_script(result: HandEye) -> str:
+    """Returns a pose of URScript."""
+    head = "".join(f"# {line}\n" for line in said_of(result))
+    return f"{head}{FRAMES[result.setup].camera} = {UR.write(result.mount_from_camera)}\n"
+
+
+def fanuc_program(result: HandEye, name: str) -> str:
+    """Returns a program (LS) with the frame as its position."""
+    remarks = [FRAMES[result.setup].camera]
+    if result.covariance is not None:
+        sigma = np.sqrt(np.diag(result.covariance))
+        for unit, part in (("mm", sigma[3:]), ("deg", np.degrees(sigma[:3]))):
+            remarks.append(f"sigma {unit} " + " ".join(f"{v:.2g}" for v in part))
+    lines = [f"/PROG  {name}", "/ATTR", 'COMMENT = "stcal handeye";', "/MN"]
+    lines += [f"   {k}:  !{remark[:REMARK]} ;" for k, remark in enumerate(remarks, 1)]
+    lines += ["/POS", "P[1]{", "   GP1:", "\tUF : 0, UT : 0,\t\tCONFIG : 'N U T, 0, 0, 0',"]
+    return "\n".join([*lines, FANUC.write(result.mount_from_camera), "};", "/END"]) + "\n"
+
 
 IN_HAND = "eye-in-hand"
 
