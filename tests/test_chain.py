@@ -26,7 +26,7 @@ from stcal.synthetic.render import RenderOptions
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.locate.drawn_target import LAYOUT, photo, tilted
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.full
 JOINTS = [f"q{i}_deg" for i in range(1, 7)]
 REST = np.radians([10.0, 20.0, -15.0, 30.0, -50.0, 40.0])
 REACH = np.radians([8.0, 7.0, 9.0, 22.0, 22.0, 30.0])

@@ -8,9 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.levels import FULL, SLOW
+
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 BLOCK = re.compile(r"^```(bash|python|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LONG = ("hand-eye", "robot")
+"""Tutorials of more than twenty seconds whose commands other slow tests call too."""
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 """Of what a page shows; another processor rounds otherwise."""
 
@@ -25,8 +29,9 @@ def run(kind: str, code: str, folder: Path) -> str:
     return ended.stdout
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, marks=FULL if page.stem in LONG else SLOW, id=page.stem) for page in TUTORIALS]
+)
 def test_a_tutorial_runs_and_prints_what_it_says(page, tmp_path):
     (tmp_path / "tests").symlink_to(ROOT / "tests")
     printed = ""

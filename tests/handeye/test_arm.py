@@ -104,7 +104,7 @@ def command(monkeypatch, capsys):
     return call
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_photographs_and_joint_values(command, photographed, tmp_path):
     files, robot_file, arm = photographed
     out, written, page = tmp_path / "h.json", tmp_path / "made.toml", tmp_path / "h.html"

@@ -68,8 +68,8 @@ def drawn(kind: str, folder):
     ("kind", "said"),
     [
         ("aprilgrid", "AprilGrid"),
-        ("asymmetric circles", "asymmetric circles"),
-        pytest.param("boards", "2 boards", marks=pytest.mark.slow),
+        pytest.param("asymmetric circles", "asymmetric circles", marks=pytest.mark.full),
+        pytest.param("boards", "2 boards", marks=pytest.mark.full),
     ],
 )
 def test_the_camera_is_found(command, tmp_path, kind, said):  # noqa: F811

@@ -242,7 +242,7 @@ def turning(flange: Poses, seed: int) -> HandEyePoses:
     return HandEyePoses(disturbed(rng, flange, 2e-4, 0.1), disturbed(rng, board, 5e-4, 0.2))
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 8))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(1, 8))])
 def test_a_flange_that_only_turns_tells_no_size(seed):
     """Z, the lever of X and the size are open together: refused where it is asked for, and no note says otherwise."""
     rng = np.random.default_rng(seed)

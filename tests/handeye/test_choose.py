@@ -60,7 +60,7 @@ def test_a_camera_file_that_is_wrong_is_found_out():
     assert off_mm(found.result, truth) < off_mm(handeye(pairs, truth.setup, views=views), truth) / 2
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_board_of_another_size_is_found_out():
     truth = simulated_views(np.random.default_rng(6), 14, "eye-to-hand", ROBOT, 0.1, scale=1.01)
     found = chosen(truth)

@@ -21,7 +21,7 @@ def script():
     return load_script("handeye_shared")
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_charuco_photographs(script, shared_data, tmp_path):
     data = shared_data("charuco_handeye").parent
     splits = replace(script.SPLITS, workers=1)
@@ -37,7 +37,7 @@ def test_charuco_photographs(script, shared_data, tmp_path):
     assert ours["sigma"]["corner_px"] < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_pitch_of_the_dots_is_found(script, shared_data, tmp_path):
     found, text = script.dots(shared_data("dotgrid_handeye").parent, tmp_path, Splits(0, workers=1))
     board = found["board"]

@@ -58,7 +58,10 @@ def test_poses_from_the_other_half(images, held_out):
     assert np.mean([trial.error_mm for trial in trials]) < 1.0
 
 
-@pytest.mark.parametrize(("size", "accepted"), [(1, 0.0), (2, 0.4), (3, 0.7), (4, 0.8)])
+@pytest.mark.parametrize(
+    ("size", "accepted"),
+    [(1, 0.0), pytest.param(2, 0.4, marks=pytest.mark.full), (3, 0.7), pytest.param(4, 0.8, marks=pytest.mark.full)],
+)
 def test_subsets_are_right_or_not_accepted(images, held_out, size, accepted):
     trials = list(subset_trials(images, held_out[1], held_out[0], size, most=25))
     used = [trial for trial in trials if trial.decision == "accept"]

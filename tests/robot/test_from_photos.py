@@ -162,7 +162,7 @@ def test_files_are_read_by_the_next_step(tmp_path, swept):
     np.testing.assert_allclose(q, swept.compensated.found.q, atol=1e-10)  # nine decimals of a degree
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_without_sweeps_the_axis_method_is_left_out_with_its_reason(cell):
     q = cell.about(40)
     found = work.from_measured("views", cell.measured(q), joint_table(q), mh80())
@@ -180,7 +180,7 @@ def test_without_sweeps_the_axis_method_is_left_out_with_its_reason(cell):
     assert found.errors["as drawn"].rms > 5 * found.errors["identified, the same rows"].rms
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_an_axis_that_is_not_found_does_not_end_the_rest(cell, monkeypatch):
     def unsettled(*_, **__):
         raise ConvergenceError("E-TEST", "joint 2: no minimum; measure a longer sweep")

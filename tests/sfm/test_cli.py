@@ -202,7 +202,7 @@ def test_simulate_detect_run_compare(command, tmp_path):
     assert json.loads((out / "faces.json").read_text()) == faces
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_demo_ends_within_its_own_sigma(command, tmp_path):
     code, text, _ = command("demo", "--out", tmp_path / "demo")
     assert code == 0

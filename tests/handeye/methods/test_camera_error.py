@@ -25,7 +25,7 @@ def by_a_wrong_camera(seed: int, times: float, method: str, options: HandEyeOpti
     return found, float(off @ np.linalg.solve(found.covariance, off))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("method", ["pose", pytest.param("reprojection", marks=pytest.mark.full)])
 @pytest.mark.parametrize("times", [1.0, 4.0])
 def test_sigma_covers_what_the_camera_file_errs(method, times):

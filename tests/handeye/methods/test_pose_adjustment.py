@@ -55,7 +55,7 @@ def test_pose_error_reaches_the_bound_and_knows_it(setup, stated):
     assert 0.8 < normalised(errors, covariances) < 1.25
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("robot", [(3e-4, 0.1), (1e-3, 0.02)])
 def test_sigma_are_estimated(robot):
     """Mean of 30 estimates from 30 poses each: 180 − 12 redundancies, 3 each of 4 kinds, so 1/√(2·30·90) = 1.4 % and

@@ -46,7 +46,7 @@ def test_the_covariance_is_true(shown, layout, shared):
     assert 0.9 < np.mean(fits) < 1.1
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_intrinsics_with_sigma_make_the_pose_as_uncertain():
     rng = np.random.default_rng(2)
     sigma = np.array([3.0, 3.0, 2.0, 2.0])

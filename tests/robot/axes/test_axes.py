@@ -149,7 +149,7 @@ def test_errors_of_the_axes_are_as_large_as_their_covariance(name, rests):
     assert np.mean(np.square(coordinates)) == pytest.approx(1, abs=0.03)  # 100 draws × 4 axes × 30 or more
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_errors_of_pairs_are_as_large_as_their_sigma():
     nominal = mh80()
     true = arm(nominal)

@@ -113,7 +113,7 @@ def test_the_better_robot_is_named_with_its_error(pair):
     assert "true is better than nominal: mean error " in evaluated_text(pair)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_equal_robots_are_told_apart_seldom():
     """Files that are off alike, by chance: at 5 %, of 60 pairs more than eight once in 200 runs."""
     true, named = arm(), 0

@@ -123,7 +123,7 @@ def draws(scenes, labels_only):
     return [(scene, *labels_only.calibrate(scene, NOISE_PX, seed)) for seed, scene in enumerate(drawn)]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_predicted_covariances_are_true(draws):
     """Normalised squared error of 4 faces over 24 draws: mean of χ²₆/6, standard deviation 0.06 if independent.
 

@@ -34,7 +34,7 @@ def position_error_um(scene, observations, camera, refine_camera: bool) -> float
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("sets", "groups"), [(1, TWO), pytest.param(3, None, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("sets", "groups"), [(1, TWO), pytest.param(3, None, marks=pytest.mark.full)])
 def test_wrong_intrinsics_are_refined(sets, groups):
     """0.03 % in f, 2 px in c, 1 % in k1: within 1.5 times the error with the true camera; several times it without."""
     errors = []

@@ -46,7 +46,7 @@ def test_errors_of_one_input_are_as_its_contribution_says(fixed, which):
         assert low < square < high, (row.measurand.name, row.measurand.kind, square / error.size)
 
 
-@pytest.mark.parametrize("which", study.SINGLE)
+@pytest.mark.parametrize("which", sampled(study.SINGLE))
 def test_a_change_of_scale_is_foretold(fixed, which):
     """Drawn stratified, so that the numbers themselves have their σ to 4 % with so few; second order is far less."""
     case, stated = fixed

@@ -34,7 +34,7 @@ def photographs(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_chessboard_gives_the_camera_with_its_sigma(photographs, tmp_path, stcal_sfm):
     (tmp_path / "board.toml").write_text(CHESSBOARD, encoding="utf-8")
     out = tmp_path / "cameras.txt"

@@ -34,7 +34,7 @@ def test_held_out_residuals_are_those_of_noise():
     assert len(found.in_sigma) == 24
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_each_view_is_foretold_without_itself():
     """One that is of another lens is far off, and the others are as before but for the fits that had it."""
     rng = np.random.default_rng(1)
@@ -94,7 +94,7 @@ def few(monkeypatch):
     monkeypatch.setattr(checks, "CANDIDATES", ("PINHOLE", "SIMPLE_RADIAL", "OPENCV"))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_as_good_and_simpler_is_taken(monkeypatch):
     few(monkeypatch)
     views = views_of(np.random.default_rng(5), count=12, camera=RADIAL)
@@ -131,7 +131,7 @@ def test_too_few_views_to_choose(monkeypatch):
         choose_model(views, BOARD, known_of(views, TRUE), 1)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_where_no_perspective_lens_fits_the_wide_one_begins(monkeypatch):
     few(monkeypatch)
     monkeypatch.setattr(checks, "CANDIDATES", ("OPENCV_FISHEYE",))

@@ -159,7 +159,7 @@ def test_noise_beyond_the_centres_own_sigma_is_said(full_scene, lab, over, verdi
     assert check.measured[0].value == pytest.approx(over, rel=0.05)  # 3000 degrees of freedom: 1.3 %
 
 
-@pytest.mark.parametrize("solve", ["chain", pytest.param("joint", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("solve", ["chain", pytest.param("joint", marks=pytest.mark.full)])
 def test_a_moved_target_is_named(full_scene, lab, solve):
     """0.2 mm and 0.05° against the board, in half of the images of a group; the others are innocent."""
     motion = Rigid.exp([np.radians(0.05), 0, 0, 0.2, 0, 0])

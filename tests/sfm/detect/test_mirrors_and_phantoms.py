@@ -54,7 +54,7 @@ def test_a_mirror_image_of_the_target_gives_no_wrong_label(bench, kind):
     assert "a pattern like face 4: the image of another face in a mirror" in found.notes()
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_mirror_at_another_place_in_every_group_gives_no_wrong_label(bench):
     """In each the one of 26 of which its photographs show most."""
     bench.label("reflection", 0.7, *ALL).assert_all_found()

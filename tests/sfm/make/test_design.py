@@ -79,7 +79,7 @@ def test_a_symmetric_design_fails_the_cases_of_hidden_circles():
     assert len(failed) < 0.2 * cases
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_pattern_that_is_not_always_named_is_drawn_anew(monkeypatch):
     """Nine circles leave six, which is all that a face needs: of such patterns one in a few fails a case."""
     options = MakeOptions((130.0, 120.0, 110.0), circles=LEAST_CIRCLES, width=1296)

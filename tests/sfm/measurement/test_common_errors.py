@@ -43,7 +43,7 @@ def test_what_is_common_is_less_than_the_whole(scene, known):
 
 
 @pytest.mark.parametrize(
-    ("with_camera", "draws"), [(True, 4), *(pytest.param(own, 20, marks=pytest.mark.slow) for own in (True, False))]
+    ("with_camera", "draws"), [(True, 4), *(pytest.param(own, 20, marks=pytest.mark.full) for own in (True, False))]
 )
 def test_poses_err_together_as_stated(scene, known, with_camera, draws):
     """Without noise in the images all errors are common ones: z of each direction, from the errors of all poses, has

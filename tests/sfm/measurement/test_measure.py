@@ -80,7 +80,7 @@ SLOW = pytest.mark.slow
 COUNTS = [50, pytest.param(MANY, marks=SLOW)]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("count", COUNTS)
 def test_errors_of_single_faces_are_as_predicted(scene, known, count):
     """500 images: the mean of χ²(6)/6 has a standard error of 0.026; every image has a target of its own."""

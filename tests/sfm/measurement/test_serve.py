@@ -30,6 +30,7 @@ from stcal.sfm.measurement.serve import (
     counts_text,
 )
 from stcal.sfm.measurement.target import read_target
+from tests.levels import sampled
 from tests.outcome import fails_with
 
 PATIENCE_S = 60.0
@@ -81,8 +82,7 @@ def said(server, raw: bytes) -> bytes:
     return b"".join(parts)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sequence", [False, True])
+@pytest.mark.parametrize("sequence", sampled([False, True]))
 def test_the_answers_are_those_of_measure(server, photographs, small_dataset, known, small_scene, sequence):
     options = MeasureOptions(sequence=sequence, workers=1)
     images = small_dataset / "images" / "12"

@@ -25,7 +25,7 @@ def two_images(small_set):
     return small
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_reference_target_is_said_and_named_in_an_error(stcal_sfm, two_images, tmp_path):
     board = tmp_path / "board.toml"
     board.write_text(board_toml(second_design()[1]))
