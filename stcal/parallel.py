@@ -234,11 +234,11 @@ class OwnProcess:
             raise
 
     def close(self) -> None:
-        """Ends the process; waiting calls are cancelled."""
+        """Ends the process after the call that it works at; waiting calls are cancelled."""
         with self._guard:
             pool, self._pool = self._pool, None
         if pool is not None:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(wait=True, cancel_futures=True)  # see _Processes.__exit__
 
 
 def _begin_own(begin: Callable[..., object], *arguments) -> None:

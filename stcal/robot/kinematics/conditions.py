@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
-from stcal.io.poses.columns import read_rotations
 from stcal.io.table import ANGLES, COMMON, COVARIANCE, LENGTHS, POSE, Table
 
 PAYLOAD = "payload_kg"
@@ -165,6 +164,8 @@ def oriented(table: Table, rotation: str | None = None) -> tuple[Poses | None, t
         The columns of a rotation are incomplete, ``rotation`` is given without such columns, or the convention is
         missing or given although the columns state it.
     """
+    from stcal.io.poses.columns import read_rotations
+
     turned = None if table.has_rotation() else read_rotations(table, rotation=rotation)
     if rotation is not None and (turned is None or turned.stated):
         raise InputError(
