@@ -46,7 +46,7 @@ def one_run(seed: int, board_sigma_mm: float, refine: bool) -> list[tuple[float,
     ]
     options = RunOptions(refine_camera=refine).adjustment(scene.target)
     result = calibrate(models, camera, scene.target, board, options, prior)
-    scale = (result.sigma_factor * result.joint.sigma0) ** 2
+    scale = (result.sigma_factors.circles * result.joint.sigma_scale) ** 2
     rows = []
     for face, pose in result.target.target_from_face.items():
         if face == result.target.reference_face:

@@ -10,10 +10,12 @@ from stcal.errors import MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
+from stcal.labels import DotLabel
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
 from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
+from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import Scale, find_scale
@@ -24,12 +26,27 @@ JOINT_ROUNDS = 2
 """Number of joint adjustments. Eccentricity changes by nanometres between the first and the second."""
 
 
+MIN_REDUNDANCY = 30.0
+"""Smallest redundancy of a kind of circle for a factor of its own; below, that of all circles holds. Of 30, a factor is
+known to 13 %."""
+
+
+@dataclass(frozen=True, slots=True)
+class SigmaFactors:
+    """Ratios of the residuals of the single groups to the centres' own σ: of ``all``, and by kind (``circles`` of the
+    faces, ``dots`` of the board)."""
+
+    all: float
+    circles: float
+    dots: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
     """The calibrated target, and what it rests on.
 
     ``target`` : the result; ``scales`` : by group; ``faces`` : faces of the single groups; ``joint`` : joint adjustment
-    if it was requested; ``sigma_factor`` : ratio of the residuals of the single groups to the centres' own σ;
+    if it was requested; ``sigma_factors`` : ratios of the residuals of the single groups to the centres' own σ;
     ``models`` : models that the result rests on, mm, target frame, without groups that are not linked to it;
     ``camera`` : refined camera if it was refined, else the given one; ``notes`` : faces without a frame and the
     reasons, and an adjustment that did not settle.
@@ -39,7 +56,7 @@ class Calibration:
     scales: dict[str, Scale]
     faces: tuple[FaceInGroup, ...]
     joint: JointResult | None
-    sigma_factor: float
+    sigma_factors: SigmaFactors
     models: tuple[MetricModel, ...]
     camera: Camera
     notes: tuple[str, ...]
@@ -84,12 +101,12 @@ def calibrate(
         calibrated = (chain_singly if published else chain_faces)(faces, target, options.reference_face)
     except MappingError as error:  # a face without a frame may be why
         raise MappingError(error.code, "; ".join([str(error), *notes])) from error
-    factor = image_sigma_factor(models, camera)
+    factors = image_sigma_factors(models, camera)
     metric = [_placed(m, scales[m.group], calibrated) for m in models if m.group in calibrated.target_from_group]
     joint = None
     step(None)
     if joint_rounds:
-        joint, factor = _adjust_all(metric, factor, camera, target, board, options, prior, step)
+        joint, factors = _adjust_all(metric, factors, camera, target, board, options, prior, step)
         calibrated = calibrated_target(joint, calibrated, target, options.frame)
         step(None)
         metric = [m.moved(calibrated.target_from_group[m.group]) for m in joint.models]
@@ -100,7 +117,7 @@ def calibrate(
         scales=scales,
         faces=tuple(faces),
         joint=joint,
-        sigma_factor=factor,
+        sigma_factors=factors,
         models=tuple(metric),
         camera=camera,
         notes=tuple(notes),
@@ -125,7 +142,7 @@ def calibrate_board(
         scales=scales,
         faces=(),
         joint=None,
-        sigma_factor=image_sigma_factor(models, camera),
+        sigma_factors=image_sigma_factors(models, camera),
         models=tuple(model.metric(scales[model.group].board_from_world) for model in models),
         camera=camera,
         notes=(),
@@ -190,12 +207,12 @@ def _joint_rounds(options: AdjustOptions, prior: CameraPrior | None) -> int:
 
 
 def _adjust_all(
-    models: list[MetricModel], factor: float, camera: Camera, target, board, options: AdjustOptions, prior, step
-) -> tuple[JointResult, float]:
-    """Runs the joint adjustments from the chained result; returns the last one and the factor on the centres' σ.
+    models: list[MetricModel], factors: SigmaFactors, camera: Camera, target, board, options: AdjustOptions, prior, step
+) -> tuple[JointResult, SigmaFactors]:
+    """Runs the joint adjustments from the chained result; returns the last one and the factors on the centres' σ.
 
-    The eccentricity is computed anew before each adjustment. With refined intrinsics the factor is computed anew, too:
-    a wrong camera causes residuals of its own.
+    The eccentricity is computed anew before each adjustment. With refined intrinsics the factors are computed anew,
+    too: a wrong camera causes residuals of its own.
     """
     radius = target.radius_of() | board.radius_of()
     covariances = [m.covariance_px2 for m in models]
@@ -205,23 +222,36 @@ def _adjust_all(
     for _ in range(rounds):
         if options.eccentricity:
             models = [replace(m, shift_px=eccentricity_px(m, current, radius, 1.0)) for m in models]
-        models = [replace(m, covariance_px2=factor**2 * c) for m, c in zip(models, covariances, strict=True)]
+        models = [with_sigma(replace(m, covariance_px2=c), factors) for m, c in zip(models, covariances, strict=True)]
         result = adjust_jointly(models, board, camera, options.flatness_mm, prior, current)
         models, current = list(result.models), result.camera
         step(None)
         if prior is not None:
             unscaled = [replace(m, covariance_px2=c) for m, c in zip(models, covariances, strict=True)]
-            factor = image_sigma_factor([adjust(m, current) for m in unscaled], current)
-    return result, factor
+            factors = image_sigma_factors([adjust(m, current) for m in unscaled], current)
+    return result, factors
 
 
-def image_sigma_factor(models: Sequence[GroupModel], camera: Camera) -> float:
-    """Returns the ratio of the residuals of free networks to the centres' own σ (one variance component)."""
-    square = sum(float((m.whiten(m.residuals_px(camera)) ** 2).sum()) for m in models)
-    redundancy = sum(2 * len(m.image_index) - 6 * len(m.images) - 3 * len(m.labels) + 7 for m in models)
-    return float(np.sqrt(square / redundancy)) if redundancy > 0 else 1.0
+def image_sigma_factors(models: Sequence[GroupModel], camera: Camera) -> SigmaFactors:
+    """Returns the ratios of the residuals of adjusted free networks to the centres' own σ: variance components by kind
+    (Förstner 1979)."""
+    square, redundancy = np.zeros(2), np.zeros(2)
+    for model in models:
+        network = free_network(model, camera)
+        is_dot = np.array([isinstance(label, DotLabel) for label in model.labels])[model.point_index].astype(int)
+        square += np.bincount(is_dot, (network.residual**2).sum(1), minlength=2)
+        redundancy += np.bincount(is_dot, network.redundancy, minlength=2)
+    if redundancy.sum() <= 0:
+        return SigmaFactors(1.0, 1.0, 1.0)
+    overall = float(np.sqrt(square.sum() / redundancy.sum()))
+    circles, dots = (
+        float(np.sqrt(s / r)) if r >= MIN_REDUNDANCY else overall for s, r in zip(square, redundancy, strict=True)
+    )
+    return SigmaFactors(overall, circles, dots)
 
 
-def with_sigma(model: M, factor: float) -> M:
-    """Returns the model with the σ of its observations multiplied by ``factor``."""
-    return replace(model, covariance_px2=factor**2 * model.covariance_px2)
+def with_sigma(model: M, factors: SigmaFactors) -> M:
+    """Returns the model with the σ of its observations multiplied by the factor of their kind."""
+    is_dot = np.array([isinstance(label, DotLabel) for label in model.labels])[model.point_index]
+    factor = np.where(is_dot, factors.dots, factors.circles)
+    return replace(model, covariance_px2=factor[:, None, None] ** 2 * model.covariance_px2)

@@ -64,7 +64,8 @@ class JointResult:
 
     ``models`` : one for each group, mm; ``model_from_board`` : by group; ``labels`` : (c,) of the target's circles;
     ``xyz_model`` : (c, 3) mm; ``covariance_mm2`` : (3c, 3c) marginal, in the datum of smallest trace, scaled by
-    ``sigma0``²; ``sigma0`` : residuals over the centres' own σ; ``board_residuals_mm`` : by group, (n, 3), board frame;
+    ``sigma_scale``²; ``sigma0`` : residuals over the σ of all observations; ``board_residuals_mm`` : by group, (n, 3),
+    board frame;
     ``board_common`` : share of the board's variance that all groups have in common; ``camera`` : adjusted if requested;
     ``camera_covariance`` : (q, q) of the parameters of its COLMAP model, else empty; ``weights`` : by group, (n,)
     Huber's; ``redundancy`` : degrees of freedom; ``last_move_px`` : largest move of a projection by the last whole
@@ -89,6 +90,15 @@ class JointResult:
         c = len(self.labels)
         object.__setattr__(self, "xyz_model", frozen(self.xyz_model, (c, 3), "circles"))
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (3 * c, 3 * c), "covariance"))
+
+    @property
+    def sigma_scale(self) -> float:
+        """Factor that the covariances hold: σ₀ where the residuals are larger than the σ of the observations, else 1.
+
+        The single groups have confirmed the centres' σ, and these are not smaller because a board is better than its
+        design says.
+        """
+        return scale_of(self.sigma0)
 
     @property
     def settled(self) -> bool:
@@ -393,6 +403,11 @@ def _largest_move(old: Block, shared: Shared, new: Block, new_shared: Shared) ->
     return float(np.abs(after - before).max(initial=0.0))
 
 
+def scale_of(sigma0: float) -> float:
+    """Returns the factor on σ by which residuals of ``sigma0`` times their σ enlarge the covariances."""
+    return max(1.0, sigma0)
+
+
 def _result(
     blocks: list[Block],
     shared: Shared,
@@ -418,7 +433,7 @@ def _result(
     redundancy = observations - unknowns + FREE_DIRECTIONS
     if sigma0 is None:
         sigma0 = float(np.sqrt(cost_of(blocks, shared, setting) / max(redundancy, 1)))
-    covariance = sigma0**2 * inverse
+    covariance = scale_of(sigma0) ** 2 * inverse
     return JointResult(
         tuple(b.model for b in blocks),
         {b.model.group: b.model_from_board for b in blocks},

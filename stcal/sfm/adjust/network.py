@@ -5,7 +5,7 @@ residuals alone tell whether these parameters are needed, to first order and wit
 1948; for one observation Baarda's data snooping, 1968).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -105,9 +105,8 @@ class Network:
         )
 
 
-def free_network(model: MetricModel, camera: Camera, factor: float) -> Network:
-    """Returns the free network of an adjusted metric model; ``factor`` : factor on the centres' own σ."""
-    model = replace(model, covariance_px2=factor**2 * model.covariance_px2)
+def free_network(model: GroupModel, camera: Camera) -> Network:
+    """Returns the free network of an adjusted model."""
     by_pose, by_point = projection_jacobians(model, camera)
     a, b = model.whiten(by_pose), model.whiten(by_point)
     m, p = len(model.images), len(model.labels)

@@ -297,13 +297,13 @@ def contributions_of(state: Adjusted) -> Contributions:
         heights = inverse[:c].reshape(-1, 3, c)[members]
         rows = across @ np.einsum("j,mjk->mk", plane_normal, heights) / setting.flatness_mm
         covariance[FLATNESS] += rows.T @ rows
-    variance = joint.sigma0**2
+    variance = joint.sigma_scale**2
     return Contributions(
         joint,
         {kind: variance * (matrix + matrix.T) / 2 for kind, matrix in covariance.items()},
         by_scale,
         by_intrinsics,
-        {kind: joint.sigma0 * _centre_sigma_px(blocks, kind) for kind in (CIRCLES, DOTS)},
+        {kind: joint.sigma_scale * _centre_sigma_px(blocks, kind) for kind in (CIRCLES, DOTS)},
     )
 
 

@@ -138,7 +138,9 @@ class BudgetFile(ResultFile):
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
     coverage_factor: float = Field(description="k of the expanded uncertainties")
-    sigma0: float = Field(description="residuals of the adjustment over the σ of all observations; scales these")
+    sigma0: float = Field(
+        description="residuals of the adjustment over the σ of all observations, 1 where they are smaller; scales these"
+    )
     redundancy: int = Field(description="degrees of freedom of the adjustment")
     views: list[ViewsRow] = Field(
         description="of each `group`: `images`, and `spread_deg`, the largest angle between two camera axes"
@@ -198,7 +200,7 @@ def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, A
         "fields": stated.fields,
         "reference_face": budget.reference_face,
         "coverage_factor": COVERAGE_FACTOR,
-        "sigma0": budget.joint.sigma0,
+        "sigma0": budget.joint.sigma_scale,
         "redundancy": budget.joint.redundancy,
         "views": [
             {"group": each.group, "images": each.images, "spread_deg": float(np.degrees(each.spread_rad))}

@@ -139,7 +139,7 @@ def sources_of(
     zero = np.zeros_like(found.joint.covariance_mm2)
     common = found.joint.board_common
     shape = f"{100 * common:.0f} % of it common to all groups" if common else "each group its own"
-    by_dots = f"sigma_mm of board.toml × σ₀ {found.joint.sigma0:.3f}; {shape}"
+    by_dots = f"sigma_mm of board.toml × σ₀ {found.joint.sigma_scale:.3f}; {shape}"
     rows = [
         Source(
             "circle_centres",
@@ -167,7 +167,7 @@ def sources_of(
             "B",
             "stated",
             by_dots,
-            1e3 * board.sigma_mm * found.joint.sigma0,
+            1e3 * board.sigma_mm * found.joint.sigma_scale,
             "µm",
             found.covariance_mm2[BOARD],
         ),
@@ -185,10 +185,10 @@ def sources_of(
 
 
 def _flatness(found: Contributions, flatness_mm: float | None) -> Source:
-    words = f"--flatness of the run × σ₀ {found.joint.sigma0:.3f}"
+    words = f"--flatness of the run × σ₀ {found.joint.sigma_scale:.3f}"
     if flatness_mm is None:
         words = "--flatness off: faces need not be flat"
-    sigma = None if flatness_mm is None else 1e3 * flatness_mm * found.joint.sigma0
+    sigma = None if flatness_mm is None else 1e3 * flatness_mm * found.joint.sigma_scale
     origin: Origin = "not stated" if flatness_mm is None else "stated"
     return Source("flatness", "flatness of faces", "B", origin, words, sigma, "µm", found.covariance_mm2[FLATNESS])
 

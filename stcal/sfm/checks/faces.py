@@ -141,7 +141,7 @@ def groups_check(again: Again) -> Check:
             without, joint = again.posed(adjustment, faces)
         except StcalError:
             continue
-        scale = (again.joint.sigma0 / joint.sigma0) ** 2
+        scale = (again.joint.sigma_scale / joint.sigma_scale) ** 2
         for face in faces[1:]:
             change = _difference(without.target_from_face[face], whole.target_from_face[face])
             larger = scale * without.face_covariance[face]

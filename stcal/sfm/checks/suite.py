@@ -10,7 +10,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.io.cameras.model import CalibratedCamera, CameraPrior
 from stcal.parallel import Progress, counted
-from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factor
+from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factors, with_sigma
 from stcal.sfm.adjust.network import Network, free_network, solve_score
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust
@@ -74,9 +74,9 @@ class Evidence:
         models = self.models
         if not camera.same_as(self.camera):
             models = tuple(adjust(model, camera) for model in models)
-        factor = image_sigma_factor(models, camera)
+        factors = image_sigma_factors(models, camera)
         scales = self.calibration.scales
-        return [free_network(m.metric(scales[m.group].group_from_world()), camera, factor) for m in models]
+        return [free_network(with_sigma(m.metric(scales[m.group].group_from_world()), factors), camera) for m in models]
 
 
 def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
@@ -87,7 +87,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
     makers: tuple[Callable[[], Check | Iterable[Check]], ...] = (
         lambda: camera_check(networks, evidence.camera, calibration, evidence.prior),
         lambda: field_check(networks, camera),
-        lambda: sigma_check(networks, calibration.sigma_factor),
+        lambda: sigma_check(networks, calibration.sigma_factors.all),
         *_joint_checks(evidence, networks),
         lambda: moved_check(networks),
         lambda: image_check(networks),

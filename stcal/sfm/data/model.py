@@ -21,7 +21,8 @@ class ImageObservations:
     ``centre_px`` : (n, 2) ellipse centres in the original image, OpenCV pixel origin; ``centre`` : (n, 2) and
     ``shape`` : (n, 2, 2) the ideal ellipse in normalised coordinates; ``covariance_px2`` : (n, 2, 2) covariances
     of ``centre_px``; ``uneven_px`` : (n, 2) shift of the centres that uneven brightness would have caused, zero by
-    default and if no uneven brightness was detected.
+    default and if no uneven brightness was detected; ``blur_px`` : (n,) standard deviation of the blur across each rim,
+    zero by default and where it is not known.
     """
 
     name: str
@@ -32,6 +33,7 @@ class ImageObservations:
     shape: np.ndarray
     covariance_px2: np.ndarray
     uneven_px: np.ndarray = None  # type: ignore[assignment]
+    blur_px: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self):
         object.__setattr__(self, "labels", parse_labels(self.labels))
@@ -41,6 +43,8 @@ class ImageObservations:
         object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (n, 2, 2), "covariance_px2"))
         uneven = np.zeros((n, 2)) if self.uneven_px is None else self.uneven_px
         object.__setattr__(self, "uneven_px", frozen(uneven, (n, 2), "uneven_px"))
+        blur = np.zeros(n) if self.blur_px is None else self.blur_px
+        object.__setattr__(self, "blur_px", frozen(blur, (n,), "blur_px"))
 
     def __len__(self) -> int:
         return len(self.labels)

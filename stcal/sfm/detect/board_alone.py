@@ -9,8 +9,9 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD
+from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.files import DetectedImage, DetectionResult
-from stcal.sfm.detect.labels import MIN_EXPECTED, LabelledImage, labelled_image
+from stcal.sfm.detect.labels import MIN_EXPECTED, LabelledImage, labelled_image, without_defocus
 from stcal.sfm.detect.sightings import PlaneView, likely_views, readings_of
 
 MAX_SHIFT_PITCHES = 0.3
@@ -35,7 +36,8 @@ def label_boards(detection: DetectionResult, target: TargetDesign, board: BoardD
     groups: dict[str, list[DetectedImage]] = {}
     for image in detection.images:
         groups.setdefault(image.file.group, []).append(image)
-    return [each for images in groups.values() for each in _label_group(images, target, board)]
+    found = [each for images in groups.values() for each in _label_group(images, target, board)]
+    return without_defocus(found, detection.camera, patterns_of(target, board))
 
 
 def _label_group(images: list[DetectedImage], target: TargetDesign, board: BoardDesign) -> list[LabelledImage]:

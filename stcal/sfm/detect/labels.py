@@ -2,17 +2,19 @@
 for what the group says must be in view."""
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
+from stcal.geometry.camera import Camera
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import Centres, ImageObservations
 from stcal.sfm.data.patterns import Pattern, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.defocus import Focus, correct_defocus
 from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
 from stcal.sfm.detect.group_geometry import (
     MAX_SHIFT_PITCHES,
@@ -40,10 +42,14 @@ MIN_CONFIRMED = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledImage:
-    """Observations of one image, and notes on what was excluded."""
+    """Observations of one image, and notes on what was excluded.
+
+    ``focus`` : its blur, from which the observations are corrected; None if it has too few circles or is not corrected.
+    """
 
     observations: ImageObservations
     notes: tuple[str, ...]
+    focus: Focus | None = None
 
     def plus(self, labels: Sequence[Label], centres: Centres, notes: Sequence[str]) -> "LabelledImage":
         """Returns the image with further circles and notes."""
@@ -71,9 +77,26 @@ def labelled_image(
         shape=centres.shape,
         covariance_px2=centres.covariance_px2,
         uneven_px=centres.uneven_px,
+        blur_px=centres.blur_px,
     )
     times = Counter(notes)
     return LabelledImage(observations, tuple(f"{note} ({n} times)" if n > 1 else note for note, n in times.items()))
+
+
+def without_defocus(
+    images: Sequence[LabelledImage], camera: Camera, patterns: Mapping[str, Pattern]
+) -> list[LabelledImage]:
+    """Returns the images with centres corrected for blur that varies across a circle, and what their blur shows."""
+    corrected, focus = correct_defocus([image.observations for image in images], camera, patterns)
+    by_name = {own.image: own for own in focus}
+    return [
+        LabelledImage(
+            observations,
+            (*image.notes, *([own.note] if (own := by_name.get(observations.name)) and own.note else [])),
+            own,
+        )
+        for image, observations in zip(images, corrected, strict=True)
+    ]
 
 
 def label_single(name: str, group: str, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
@@ -115,11 +138,12 @@ def label_images(
                 jobs.append((image, predicted))
         first.append((found, arrangement))
     looks = look_again(jobs, camera, options, cache, workers)
-    return [
+    named = [
         each
         for found, arrangement in first
         for each in _without_outlying(_second(found, looks), arrangement, patterns, focal_px)[0]
     ]
+    return without_defocus(named, camera, patterns)
 
 
 def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:

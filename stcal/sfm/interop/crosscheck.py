@@ -14,7 +14,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.json import Part, ResultFile, read_json
 from stcal.parallel import Progress
 from stcal.report.text import number, text_table
-from stcal.sfm.adjust.calibration import Calibration, calibrate
+from stcal.sfm.adjust.calibration import Calibration, calibrate, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.refine import refine
@@ -301,7 +301,7 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
 def _camera_sigmas(a: Calibration, b: Calibration, run: SavedRun) -> dict[str, float]:
     """Differences of the cameras against the circles of their group, in their own σ: the groups' models laid on one
     another by all circles, which is the datum of the covariances."""
-    factor = run.faces.centre_sigma_factor or 1.0
+    factors = run.sigma_factors()
     ours = {model.group: model for model in b.models}
     found = {}
     for theirs in a.models:
@@ -312,7 +312,9 @@ def _camera_sigmas(a: Calibration, b: Calibration, run: SavedRun) -> dict[str, f
         both = [(place[label], i) for i, label in enumerate(model.labels) if label in place]
         rows = np.array(both, int).reshape(-1, 2).T
         laid = align_similarity(model.xyz_model[rows[1]], theirs.xyz_model[rows[0]])
-        covariance = dict(zip(model.images, free_network(model, run.camera, factor).pose_covariance(), strict=True))
+        covariance = dict(
+            zip(model.images, free_network(with_sigma(model, factors), run.camera).pose_covariance(), strict=True)
+        )
         poses = dict(zip(model.images, model.camera_from_model, strict=True))
         for name, pose in zip(theirs.images, theirs.camera_from_model, strict=True):
             if name in poses:

@@ -94,7 +94,7 @@ def calibrate_models(model: Path, run: SavedRun, solve: Chained = "chain") -> Ca
 def write_faces(path: Path, calibration: Calibration, run: SavedRun, solve: Chained = "chain") -> None:
     """``faces.json`` of models that were chained."""
     options = _options(run, solve)
-    faces = FacesFile.of(calibration.target, run.target, options, calibration.sigma_factor)
+    faces = FacesFile.of(calibration.target, run.target, options, calibration.sigma_factors.circles)
     save(path, json_text(faces.content()))
 
 

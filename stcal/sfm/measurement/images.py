@@ -17,9 +17,10 @@ from stcal.io.image_jobs import run_on_images
 from stcal.io.images import ImageFile, Skipped, find_images
 from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.data.model import ImageObservations, by_group
+from stcal.sfm.data.patterns import patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, copy_of, detect_files, load_image, sized_by
-from stcal.sfm.detect.labels import label_single
+from stcal.sfm.detect.labels import label_single, without_defocus
 from stcal.sfm.measurement.pose import PoseOptions, TargetPose, common_errors, measured_pose, resolved
 from stcal.sfm.measurement.target import TargetCircles
 from stcal.sfm.measurement.tracker import Tracker
@@ -138,7 +139,7 @@ def measure(
             detection = detect_files(
                 files, camera, design, board, options.ellipses, cache, options.workers, step, forms=False
             )
-        observations, notes = _labelled(detection.images, design)
+        observations, notes = _labelled(detection.images, detection.camera, design)
         prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
         result = measure_labelled(observations, detection.camera, target, options, prior)
         measured = tuple(replace(each, notes=notes[each.name]) for each in result.images)
@@ -154,9 +155,10 @@ def measure(
     return result
 
 
-def _labelled(images: Sequence[DetectedImage], design: TargetDesign):
+def _labelled(images: Sequence[DetectedImage], camera: Camera, design: TargetDesign):
     """Observations of all images, and the notes on each."""
     labelled = [label_single(i.file.name, i.file.group, i.detection, design) for i in images]
+    labelled = without_defocus(labelled, camera, patterns_of(design, None))
     return [each.observations for each in labelled], {each.observations.name: each.notes for each in labelled}
 
 

@@ -15,8 +15,9 @@ from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.images import grey_8bit, grey_fine
 from stcal.labels import Label
 from stcal.sfm.data.model import ImageObservations
-from stcal.sfm.data.patterns import MAX_TILT_RAD
+from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.group_geometry import Arrangement
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import LabelledImage, label_single, labelled_image
@@ -97,6 +98,7 @@ class Tracker:
         self.notes: tuple[str, ...] = ()
         self.searched = False
         self._planes = _target_from_face(target, self.design)
+        self._patterns = patterns_of(self.design, None)
         self.recent: tuple[Rigid, ...] = ()
         self._threads = ThreadpoolController()  # looked up once: it takes 2 ms
 
@@ -216,7 +218,8 @@ class Tracker:
         return predicted
 
     def _pose(self, seen: ImageObservations, camera: Camera) -> TargetPose | StcalError:
-        return measured_pose(seen, camera, self.target, self.pose_options, self.prior)
+        sharp = correct_defocus([seen], camera, self._patterns)[0][0]
+        return measured_pose(sharp, camera, self.target, self.pose_options, self.prior)
 
 
 def _target_from_face(target: TargetCircles, design: TargetDesign) -> dict[str, Rigid]:

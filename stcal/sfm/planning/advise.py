@@ -107,7 +107,7 @@ def known_of(run: SavedRun) -> Known:
         flatness_mm=run.options.flatness_mm,
         prior=again.prior,
         common=joint.board_common,
-        sigma0=joint.sigma0,
+        sigma0=joint.sigma_scale,
     )
     noise = CentreNoise.measured(joint.models, joint.camera, setup.radius_mm())
     return Known(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.camera.colmap_model))

@@ -112,7 +112,7 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
     save(out / BOARD, board_toml(result.board_design))
     report = judged(report_of(result).content())
     if result.target.target_from_face:  # a run of the board alone has no faces
-        options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factor
+        options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.circles
         faces = FacesFile.of(result.target, result.target_design, options, factor)
         save(out / "faces.json", json_text(faces.content()))
     write_report(out, report, out, reload_s)

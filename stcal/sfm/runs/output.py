@@ -8,6 +8,7 @@ import stcal
 from stcal.geometry.plane import fit_plane
 from stcal.labels import DotLabel
 from stcal.sfm.data.model import MIN_POINTS, GroupModel, ImageObservations
+from stcal.sfm.detect.defocus import Focus
 from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
 from stcal.sfm.runs.report import ReportFile
 from stcal.sfm.runs.result import RunResult
@@ -53,7 +54,9 @@ def report_of(result: RunResult) -> ReportFile:
                 "centre_sigma_rms_px": float(
                     np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models.values()]).mean())
                 ),
-                "sigma_factor": result.calibration.sigma_factor,
+                "sigma_factor": result.calibration.sigma_factors.all,
+                "circle_sigma_factor": result.calibration.sigma_factors.circles,
+                "dot_sigma_factor": result.calibration.sigma_factors.dots,
                 "scale_sigma_ppm": None if result.target.scale_sigma is None else 1e6 * result.target.scale_sigma,
                 "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
                 "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
@@ -83,6 +86,7 @@ def report_of(result: RunResult) -> ReportFile:
                 {"image_id": i, "name": image.name, "group": image.group, "circles": len(image)}
                 for i, image in enumerate(result.observations(), start=1)
             ],
+            "focus": [_focus(image.focus) for image in result.labelled if image.focus is not None],
             "scene": _scene(result),
         }
         | ({} if result.comparison is None else {"comparison": result.comparison})
@@ -98,6 +102,18 @@ def residuals_px(result: RunResult) -> list[np.ndarray]:
         for name, rows in zip(model.images, model.rows_by_image(), strict=True):
             by_image[name][model.keypoint[rows]] = residual[rows]
     return list(by_image.values())
+
+
+def _focus(focus: Focus) -> dict:
+    return {
+        "image": focus.image,
+        "focused_mm": focus.focused_mm,
+        "nearest_mm": focus.depth_mm[0],
+        "farthest_mm": focus.depth_mm[1],
+        "nearest_blur_px": focus.blur_px[0],
+        "farthest_blur_px": focus.blur_px[1],
+        "shift_px": focus.shift_px,
+    }
 
 
 def _final_models(result: RunResult) -> dict[str, GroupModel]:

@@ -43,6 +43,8 @@ class Summary(Part):
     residual_rms_px: float
     centre_sigma_rms_px: float
     sigma_factor: float
+    circle_sigma_factor: float
+    dot_sigma_factor: float
     scale_sigma_ppm: float | None
     sigma0: float | None
     redundancy: int | None
@@ -198,6 +200,16 @@ class ImageRow(Part):
     circles: int
 
 
+class FocusRow(Part):
+    image: str
+    focused_mm: float | None
+    nearest_mm: float
+    farthest_mm: float
+    nearest_blur_px: float
+    farthest_blur_px: float
+    shift_px: float
+
+
 class CameraInSpace(Part):
     image: str
     group: str
@@ -226,9 +238,10 @@ class ReportFile(ResultFile):
     summary: Summary = Field(
         description="counts: `files` (skipped ones included), `images`, `images_mapped`, `groups`, `faces`, "
         "`faces_not_seen`, `observations`; `residual_rms_px` per coordinate; `centre_sigma_rms_px` of the σ used; "
-        "`sigma_factor` by which the residuals of the single groups exceed the centres' own σ; `scale_sigma_ppm`: σ of "
-        "the target's size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
-        "moved a projection at most (settled: less than 1e-7); these four are null with `chain` and `paper`"
+        "`sigma_factor` by which the residuals of the single groups exceed the centres' own σ, `circle_sigma_factor` "
+        "of the circles of the faces and `dot_sigma_factor` of the dots, which multiply these σ; `scale_sigma_ppm`: σ "
+        "of the size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
+        "moved a projection at most (settled: less than 1e-6); these four are null with `chain` and `paper`"
     )
     faces: dict[ByFace, FaceRow] = Field(
         description="`target_from_face`, `translation_mm`, `angle_to_reference_deg`, `translation_sigma_um` and "
@@ -266,6 +279,13 @@ class ReportFile(ResultFile):
     )
     images: list[ImageRow] = Field(
         description="all images of the database in its order: `image_id`, `name`, `group`, `circles` labelled"
+    )
+    focus: list[FocusRow] = Field(
+        [],
+        description="blur of each `image` with enough circles: `focused_mm` distance of the plane of focus (null "
+        "where the image does not tell it), depths of the `nearest_mm` and `farthest_mm` circle and the blur there, "
+        "`nearest_blur_px` and `farthest_blur_px` (σ); `shift_px`: largest correction of a centre for blur that varies "
+        "across its circle, 0 where none is needed",
     )
     scene: Space = Field(
         description="target frame, mm: `cameras`: `image`, `group`, `position_mm`, `axes` (rows X, Y, Z of the "

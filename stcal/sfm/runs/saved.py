@@ -22,7 +22,7 @@ from stcal.io.design import load_board, load_target
 from stcal.io.files import BOARD, CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, read_bytes
 from stcal.io.json import Part, checked, read_json
 from stcal.labels import circle_labels
-from stcal.sfm.adjust.calibration import with_sigma
+from stcal.sfm.adjust.calibration import SigmaFactors, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.adjust.joint import Adjusted, adjusted
@@ -70,6 +70,12 @@ class SavedRun:
     def groups(self) -> dict[str, list[ImageObservations]]:
         """Returns the observations by group, in order."""
         return by_group(self.observations)
+
+    def sigma_factors(self) -> SigmaFactors:
+        """Returns the factors on the centres' own σ; the factor of all circles for a kind that an older run lacks."""
+        summary = self.report["summary"]
+        overall = summary["sigma_factor"]
+        return SigmaFactors(overall, *(summary.get(f"{kind}_sigma_factor", overall) for kind in ("circle", "dot")))
 
     def report_as(self, part: type[ReportPart]) -> ReportPart:
         """Returns the part of ``report.json`` that a command needs.
@@ -248,7 +254,7 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
         The adjustment finds no minimum.
     """
     read = read_model(run.folder / "target_model", run.observations, image_ids(run.observations), run.corrected_px)
-    models = [with_sigma(model, run.report["summary"]["sigma_factor"]) for model in read.in_mm()]
+    models = [with_sigma(model, run.sigma_factors()) for model in read.in_mm()]
     start = CalibratedTarget(
         run.faces.reference_face,
         run.faces.poses(),

@@ -29,6 +29,7 @@ def run_text(result: RunResult) -> str:
         lines += _group(solution, result.calibration.scales[solution.model.group].rms_mm())
     lines += result.notes
     lines += _noted(result.labelled)
+    lines += _defocus(result.labelled)
     if result.options.solve == "paper":
         lines.append(
             "as published, for comparison: centres of contours, alike in weight, without the eccentricity; faces are "
@@ -66,6 +67,20 @@ def _camera_taken_as_exact(camera: CalibratedCamera) -> str:
         f"the camera file states σ of its parameters ({focal:.2g} px of the focal length), and this run takes them as "
         "exact: no σ below holds them; --refine-camera adjusts the intrinsics within them and carries them into all σ"
     )
+
+
+def _defocus(labelled: Sequence[LabelledImage]) -> list[str]:
+    """Returns what was corrected for blur that varies across a circle, if anything was."""
+    corrected = [image.focus for image in labelled if image.focus is not None and image.focus.shift_px > 0]
+    if not corrected:
+        return []
+    most = max(corrected, key=lambda focus: focus.shift_px)
+    plane = "" if most.focused_mm is None else f", in focus at {most.focused_mm:.0f} mm"
+    return [
+        f"depth of field: centres of {len(corrected)} images corrected, by up to {most.shift_px:.4f} px ({most.image}: "
+        f"blur {most.blur_px[0]:.2f} px at {most.depth_mm[0]:.0f} mm, {most.blur_px[1]:.2f} at "
+        f"{most.depth_mm[1]:.0f} mm{plane})"
+    ]
 
 
 def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:

@@ -29,7 +29,8 @@ def group(labels_only):
 
 @pytest.fixture(scope="module")
 def network(group):
-    return free_network(*group, FACTOR)
+    model, camera = group
+    return free_network(replace(model, covariance_px2=FACTOR**2 * model.covariance_px2), camera)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +91,7 @@ def test_a_fault_of_one_image_is_found_there_and_nowhere_else(group):
     own = model.image_index == image
     stretched = model.measured_px.copy()
     stretched[own] += 1e-3 * (stretched[own] - camera.centre)
-    network = free_network(adjust(replace(model, measured_px=stretched), camera), camera, 1.0)
+    network = free_network(adjust(replace(model, measured_px=stretched), camera), camera)
     columns = network.model.whiten(network.model.corrected_px() - camera.centre)[:, :, None]
     normal, right = network.score_by_image(columns)
     statistics = [solve_score(n, r).statistic for n, r in zip(normal, right, strict=True)]

@@ -25,7 +25,7 @@ class Group:
         self.images = [o for o in seen if o.group == "12"]
         self.camera = scene.camera
         (model,) = labels_only.models(scene, self.images)
-        self.network = free_network(model.metric(Similarity(1.0, Rigid())), scene.camera, 1.0)
+        self.network = free_network(model.metric(Similarity(1.0, Rigid())), scene.camera)
 
     def check(self, uneven):
         """``uneven`` : whether a circle is, of its label and the image's number."""

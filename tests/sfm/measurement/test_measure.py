@@ -344,7 +344,7 @@ def test_faces_json_holds_the_covariance_of_all_circles_together(small_run):
     content = json.loads((small_run / "faces.json").read_text())
     target = read_target(small_run / "faces.json", reference_target())
     assert target.notes == ()
-    assert target.sigma_factor == json.loads((small_run / "report.json").read_text())["summary"]["sigma_factor"]
+    assert target.sigma_factor == json.loads((small_run / "report.json").read_text())["summary"]["circle_sigma_factor"]
     for label, i in target.place.items():
         block = target.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
         assert np.allclose(block, content["circle_covariance_mm2"][label], rtol=1e-9, atol=1e-18)

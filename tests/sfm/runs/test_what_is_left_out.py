@@ -9,7 +9,7 @@ import pytest
 
 from stcal.io.cameras.read import read_camera
 from stcal.sfm import RunOptions, run
-from stcal.sfm.adjust.calibration import image_sigma_factor, with_sigma
+from stcal.sfm.adjust.calibration import SigmaFactors, image_sigma_factors, with_sigma
 from stcal.sfm.adjust.joint import adjust_jointly
 from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -103,12 +103,14 @@ def test_the_redundancy_of_a_free_network(scene, labels_only):
 
     observed = labels_only.observations(scene, 0.005, np.random.default_rng(5))
     models = [refine(m, scene.camera, scene.target, scene.board).model for m in labels_only.models(scene, observed)]
-    assert image_sigma_factor(models, scene.camera) == pytest.approx(1.0, abs=0.05)
-    assert image_sigma_factor([with_sigma(m, 2.0) for m in models], scene.camera) == pytest.approx(0.5, abs=0.025)
+    assert image_sigma_factors(models, scene.camera).all == pytest.approx(1.0, abs=0.05)
+    factors = image_sigma_factors([with_sigma(m, SigmaFactors(0, 2.0, 4.0)) for m in models], scene.camera)
+    assert factors.circles == pytest.approx(0.5, abs=0.05)  # a third of the redundancy: ± 3 %
+    assert factors.dots == pytest.approx(0.25, abs=0.02)
 
 
 def test_sigma_follows_the_residuals_and_not_what_the_centres_claim(labels_only):
-    """All σ stated half as large, the board's too: σ₀ doubles and the faces' σ stay."""
+    """All σ stated too small, the board's too, and half as large again: σ₀ doubles and the faces' σ stay."""
     pairs = (("1", "2"), ("2", "3"))
     scene = make_scene(SceneOptions(seed=3, width=2592, height=1728, images_per_group=4, groups=pairs))
     observed = labels_only.observations(scene, 0.005, np.random.default_rng(6))
@@ -117,10 +119,13 @@ def test_sigma_follows_the_residuals_and_not_what_the_centres_claim(labels_only)
     from stcal.sfm.adjust.refine import eccentricity_px
 
     results = []
-    for factor in (1.0, 0.5):
+    for factor in (0.5, 0.25):
         board = replace(scene.board, sigma_mm=factor * scene.board.sigma_mm)
         models = [
-            with_sigma(replace(m, shift_px=eccentricity_px(m, scene.camera, radius, 1.0)), factor)
+            with_sigma(
+                replace(m, shift_px=eccentricity_px(m, scene.camera, radius, 1.0)),
+                SigmaFactors(factor, factor, factor),
+            )
             for m in labels_only.models(scene, observed)
         ]
         joint = adjust_jointly(models, board, scene.camera)

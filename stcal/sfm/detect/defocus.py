@@ -1,0 +1,282 @@
+"""Defocus: the blur of an image as a function of depth, and the shifts of centres that its variation causes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.errors import ConvergenceError, DegenerateError
+from stcal.geometry.camera import Camera
+from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
+from stcal.geometry.robust import huber_weights, ratio_limit, robust_sigma
+from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.patterns import Pattern
+
+MIN_PLANE = 5
+"""Smallest number of circles of a plane for its pose. Four determine it, a fifth allows a check."""
+MIN_CIRCLES = 12
+"""Smallest number of circles of an image for its law of blur, which has three parameters."""
+BY_CHANCE = 1e-6
+"""Share of images with even blur of which a law is found by chance."""
+RESPONSE, RESPONSE_OF_BLUR2 = 0.57, 13.0
+"""Shift of a centre as a multiple of the gradient of the squared blur, and its growth with the square of the blur over
+the smaller radius. From circles rendered through 400 points of a pupil (``scripts/studies/defocus_study.py``): radii of
+5 to 28 px, tilts of 15° to 72°, blur of up to half of the smaller radius."""
+RESPONSE_SIGMA = 0.15
+"""σ of this multiple, as a share of it: the scatter of the study, and pupils that are not round."""
+FAR_BLUR, FAR_SIGMA = 0.45, 0.5
+"""Where the blur is wider than this share of the smaller radius, the share is :data:`FAR_SIGMA`."""
+MAX_UNEXPLAINED = 0.5
+"""Largest scatter of the squared blur about its law, as a share of its scatter about their mean, that is not told."""
+TOLD_PX = 0.3
+"""Smallest variation of the blur, px, that is told if depth does not explain it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Focus:
+    """Blur in one image.
+
+    ``image`` : its name; ``focused_mm`` : distance of the plane of focus along the optical axis, None if the image does
+    not determine it; ``depth_mm`` : depths of the nearest and the farthest circle; ``blur_px`` : blur (σ) at these;
+    ``shift_px`` : largest correction of a centre, 0 if none is needed; ``note`` : what the blur shows that defocus does
+    not explain, empty by default.
+    """
+
+    image: str
+    focused_mm: float | None
+    depth_mm: tuple[float, float]
+    blur_px: tuple[float, float]
+    shift_px: float
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Views:
+    """The circles of one image whose plane has a pose: ``rows`` : (n,) among the image's circles; ``inverse_depth`` :
+    (n,) 1/mm; ``gradient`` : (n, 2) of the inverse depth by the ideal image coordinates, 1/(mm·px); ``blur2`` : (n,)
+    px²; ``response`` : (n,) of the centre, and its ``sigma`` : (n,) as a share."""
+
+    rows: np.ndarray
+    inverse_depth: np.ndarray
+    gradient: np.ndarray
+    blur2: np.ndarray
+    response: np.ndarray
+    sigma: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Law:
+    """Squared blur = c₀ + c₁ u + c₂ u², u the inverse depth about its mean, ``about``, in units of ``unit``.
+
+    This is σ₀² + a² (1/z − 1/z_f)²: the variance of a uniform disc, the image of the pupil, is proportional to the
+    square of its radius, and this to the difference of the inverse depths (thin lens). ``covariance`` : (3, 3) of the
+    coefficients; ``scatter`` : robust σ of the residuals, px²; ``plain`` : the same about a constant;
+    ``significant`` : whether depth explains the blur better than a constant does.
+    """
+
+    coefficients: np.ndarray
+    covariance: np.ndarray
+    about: float
+    unit: float
+    scatter: float
+    plain: float
+    significant: bool
+
+    def slope(self, inverse_depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the derivative of the squared blur by the inverse depth, px²·mm, and its σ."""
+        u = (inverse_depth - self.about) / self.unit
+        by = np.stack([np.zeros_like(u), np.ones_like(u), 2 * u], axis=1) / self.unit
+        return by @ self.coefficients, np.sqrt(np.einsum("ni,ij,nj->n", by, self.covariance, by))
+
+    def blur2(self, inverse_depth: np.ndarray) -> np.ndarray:
+        """Returns the squared blur, px²."""
+        u = (inverse_depth - self.about) / self.unit
+        return self.coefficients @ np.stack([np.ones_like(u), u, u * u])
+
+    def focused_mm(self) -> float | None:
+        """Returns the depth of least blur; None if the blur does not show one in front of the camera."""
+        _, slope, curvature = self.coefficients
+        if curvature <= 3 * np.sqrt(self.covariance[2, 2]):
+            return None
+        inverse = self.about - self.unit * slope / (2 * curvature)
+        return float(1 / inverse) if inverse > 0 else None
+
+
+def correct_defocus(
+    images: Sequence[ImageObservations], camera: Camera, patterns: Mapping[str, Pattern]
+) -> tuple[list[ImageObservations], tuple[Focus, ...]]:
+    """Returns the images with centres at which a lens with blur that is the same everywhere would show them.
+
+    Out of focus, blur varies with depth, and so across a tilted circle: a fit with one blur for each circle moves
+    towards the blurrier side. What is uncertain of the correction is added to the covariances.
+
+    Parameters
+    ----------
+    images
+        Labelled circles with their blur.
+    camera
+        Camera of the images.
+    patterns
+        Patterns of the faces and the board, by the plane of a label.
+
+    Returns
+    -------
+    images, focus
+        In the order of the images; ``focus`` only of images with enough circles.
+    """
+    focal_px = float(np.sqrt(camera.focal.prod()))
+    views = [_views_of(image, patterns, focal_px) for image in images]
+    laws = _laws(views)
+    corrected, focus = [], []
+    for image, own, law in zip(images, views, laws, strict=True):
+        if law is None:
+            corrected.append(image)
+            continue
+        moved, shift_px = _moved(image, own, law, camera, focal_px) if law.significant else (image, 0.0)
+        corrected.append(moved)
+        focus.append(_focus(image.name, own, law, shift_px))
+    return corrected, tuple(focus)
+
+
+def _views_of(image: ImageObservations, patterns: Mapping[str, Pattern], focal_px: float) -> _Views:
+    planes: dict[str, list[int]] = {}
+    for i, label in enumerate(image.labels):
+        if image.blur_px[i] > 0:
+            planes.setdefault(label.plane, []).append(i)
+    rows, inverse_depth, gradient = [], [], []
+    for plane, members in planes.items():
+        if len(members) < MIN_PLANE or plane not in patterns:
+            continue
+        pattern = patterns[plane]
+        place = {label: k for k, label in enumerate(pattern.labels)}
+        xy_mm, xy = pattern.xy_mm[[place[image.labels[i]] for i in members]], image.centre[members]
+        try:
+            pose = refine_planar_pose(camera_from_plane(fit_homography(xy_mm, xy)), xy_mm, xy)
+        except (ConvergenceError, DegenerateError):
+            continue
+        normal = pose.rotation[:, 2] / (pose.rotation[:, 2] @ pose.translation)
+        rows += members
+        inverse_depth.append(np.column_stack([xy, np.ones(len(xy))]) @ normal)
+        gradient.append(np.tile(normal[:2] / focal_px, (len(xy), 1)))
+    chosen = np.array(rows, int)
+    blur2 = image.blur_px[chosen] ** 2
+    smaller = np.linalg.svd(image.shape[chosen], compute_uv=False)[:, 1] * focal_px if rows else np.zeros(0)
+    wide2 = blur2 / smaller**2
+    return _Views(
+        chosen,
+        np.concatenate(inverse_depth) if rows else np.zeros(0),
+        np.concatenate(gradient) if rows else np.zeros((0, 2)),
+        blur2,
+        RESPONSE + RESPONSE_OF_BLUR2 * np.minimum(wide2, 1.0),
+        np.where(wide2 > FAR_BLUR**2, FAR_SIGMA, RESPONSE_SIGMA),
+    )
+
+
+def _laws(views: Sequence[_Views]) -> list[_Law | None]:
+    """Returns the law of each image, None of those with too few circles.
+
+    The curvature a² is a property of lens and aperture: that of each image is drawn towards the mean of all by as much
+    as their scatter allows (DerSimonian & Laird 1986, Control. Clin. Trials 7).
+    """
+    enough = [own for own in views if len(own.rows) >= MIN_CIRCLES]
+    if not enough:
+        return [None] * len(views)
+    unit = float(np.median([np.ptp(own.inverse_depth) for own in enough]))
+    unit = unit if unit > 0 else 1.0
+    alone = [_law(own, unit) for own in enough]
+    curvature = np.array([law.coefficients[2] for law in alone])
+    variance = np.array([law.covariance[2, 2] for law in alone])
+    if len(enough) >= 3 and (variance > 0).all():
+        prior = _mean_and_variance(curvature, variance)
+        alone = [_law(own, unit, prior) for own in enough]
+    laws = iter(alone)
+    return [next(laws) if len(own.rows) >= MIN_CIRCLES else None for own in views]
+
+
+def _mean_and_variance(values: np.ndarray, variances: np.ndarray) -> tuple[float, float]:
+    """Returns mean and variance of the distribution that values with these variances are drawn from."""
+    weight = 1 / variances
+    mean = float((weight * values).sum() / weight.sum())
+    excess = float((weight * (values - mean) ** 2).sum()) - (len(values) - 1)
+    between = max(0.0, excess / (weight.sum() - (weight**2).sum() / weight.sum()))
+    weight = 1 / (variances + between)
+    return float((weight * values).sum() / weight.sum()), between + 1 / float(weight.sum())
+
+
+def _law(own: _Views, unit: float, curvature: tuple[float, float] | None = None) -> _Law:
+    """Returns the law of one image by robust least squares, with mean and variance of the ``curvature`` of others."""
+    about = float(own.inverse_depth.mean())
+    u = (own.inverse_depth - about) / unit
+    rows = np.stack([np.ones_like(u), u, u * u], axis=1)
+    coefficients, inverse, scatter = _fitted(rows, own.blur2, curvature)
+    plain = float(robust_sigma(np.abs(own.blur2 - np.median(own.blur2))))
+    residual, deviation = (
+        np.minimum(np.abs(r), 3 * max(s, 1e-12))
+        for r, s in ((own.blur2 - rows @ coefficients, scatter), (own.blur2 - np.median(own.blur2), plain))
+    )
+    freedom = len(u) - 3
+    gain = float((deviation**2).sum() - (residual**2).sum())
+    significant = gain / 2 > ratio_limit(BY_CHANCE, 2, freedom) * float((residual**2).sum()) / freedom
+    return _Law(coefficients, inverse, about, unit, scatter, plain, bool(significant))
+
+
+def _fitted(
+    rows: np.ndarray, blur2: np.ndarray, curvature: tuple[float, float] | None
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Returns coefficients, their covariance, and the robust σ of the residuals."""
+    weight, scatter = np.ones(len(rows)), float(robust_sigma(np.abs(blur2 - np.median(blur2))))
+    coefficients, inverse = np.zeros(3), np.zeros((3, 3))
+    for _ in range(ROUNDS):
+        scale2 = max(scatter, LEAST_PX2) ** 2
+        normal, right = (rows.T * weight) @ rows / scale2, (rows.T * weight) @ blur2 / scale2
+        if curvature is not None:
+            normal[2, 2] += 1 / curvature[1]
+            right[2] += curvature[0] / curvature[1]
+        inverse = np.linalg.pinv(normal, hermitian=True)
+        coefficients = inverse @ right
+        length = np.abs(blur2 - rows @ coefficients)
+        scatter = float(robust_sigma(length, redundancy=1 - 3 / len(rows)))
+        weight = huber_weights(length / max(scatter, LEAST_PX2), HUBER)
+    return coefficients, inverse, scatter
+
+
+ROUNDS = 6
+"""Number of rounds of the robust fit: weights are settled to a per cent after four."""
+HUBER = 2.0
+"""Residual, in σ, beyond which the weight falls (Huber 1964)."""
+LEAST_PX2 = 1e-6
+"""Scatter of the squared blur, px², that counts as none."""
+
+
+def _moved(
+    image: ImageObservations, own: _Views, law: _Law, camera: Camera, focal_px: float
+) -> tuple[ImageObservations, float]:
+    """Returns the image with corrected centres, and the largest correction, px."""
+    slope, slope_sigma = law.slope(own.inverse_depth)
+    by_slope = own.response[:, None] * own.gradient
+    shift = slope[:, None] * by_slope
+    variance = slope_sigma**2 + (own.sigma * slope) ** 2
+    centre, centre_px = image.centre.copy(), image.centre_px.copy()
+    centre[own.rows] -= shift / focal_px
+    distorted, jacobian = camera.distort_jacobian(centre[own.rows])
+    centre_px[own.rows] = distorted * camera.focal + camera.centre
+    by_slope = (jacobian * camera.focal[:, None] / focal_px @ by_slope[..., None])[..., 0]
+    covariance = image.covariance_px2.copy()
+    covariance[own.rows] += variance[:, None, None] * by_slope[:, :, None] * by_slope[:, None, :]
+    moved = replace(image, centre=centre, centre_px=centre_px, covariance_px2=covariance)
+    return moved, float(np.linalg.norm(shift, axis=1).max())
+
+
+def _focus(image: str, own: _Views, law: _Law, shift_px: float) -> Focus:
+    near, far = own.inverse_depth.max(), own.inverse_depth.min()
+    ends = np.sqrt(np.maximum(law.blur2(np.array([near, far])), 0.0))
+    spread = float(np.ptp(np.percentile(np.sqrt(own.blur2), [5, 95])))
+    odd = law.significant and law.coefficients[2] < -3 * np.sqrt(law.covariance[2, 2])
+    note = ""
+    if spread > TOLD_PX and (odd or law.scatter > MAX_UNEXPLAINED * law.plain):
+        note = (
+            f"blur varies by {spread:.1f} px among its circles, and depth does not explain it: motion, a curved "
+            "plane of focus or dirt on the lens; centres may be off by more than their σ"
+        )
+    focused = law.focused_mm() if law.significant else None
+    return Focus(image, focused, (1 / float(near), 1 / float(far)), (float(ends[0]), float(ends[1])), shift_px, note)
