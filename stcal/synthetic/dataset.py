@@ -2,8 +2,9 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -15,7 +16,7 @@ from stcal.io.json import ByFace, ByGroup, ByImage, ByLabel, Pair, Part, Points,
 from stcal.labels import BOARD, Label
 from stcal.parallel import run_parallel
 from stcal.synthetic.observe import image_circles
-from stcal.synthetic.render import RenderOptions, encode, render
+from stcal.synthetic.render import RenderOptions, check_lens, encode, render
 from stcal.synthetic.scene import Scene
 
 FIRST_IMAGE = 1000
@@ -41,6 +42,21 @@ class TrueGroup(Part):
     images: dict[ByImage, TrueImage] = Field(description="`group/file` → what it shows")
 
 
+class TrueLens(Part):
+    f_number: float = Field(description="focal length / diameter of the aperture")
+    focal_mm: float = Field(description="focal length")
+    focus_mm: float = Field(description="depth of the plane of focus from the camera's centre")
+
+
+class TrueOptics(Part):
+    lens: TrueLens | None = Field(None, description="a thin lens; without it everything is in focus")
+    rim_mm: float | None = Field(
+        None,
+        description="depth of the faces' circles behind a rim, negative where they are raised; `circles` are those of "
+        "the face's surface all the same. The board's dots have none",
+    )
+
+
 class TruthFile(ResultFile):
     """Truth of a scene: mm, target frame, pixels from the centre of the top-left one. A ``faces.json`` is valid too."""
 
@@ -52,10 +68,17 @@ class TruthFile(ResultFile):
     target_from_face: dict[ByFace, Pose] = Field(description="three-point frame of each face")
     circles: dict[ByLabel, Vector3] = Field(description="`face:circle` → centre, target frame, mm")
     groups: dict[ByGroup, TrueGroup] | None = Field(None, description="by folder of `images`")
+    optics: TrueOptics | None = Field(None, description="of simulated sets with a thin lens or rims")
 
     @classmethod
-    def of(cls, scene: Scene, image_format: str = "jpg") -> "TruthFile":
+    def of(cls, scene: Scene, image_format: str = "jpg", options: RenderOptions | None = None) -> "TruthFile":
         """Returns the truth of a scene, with images named by :func:`image_name`."""
+        options = options or RenderOptions()
+        optics: dict[str, Any] = {}
+        if options.lens is not None:
+            optics["lens"] = TrueLens(**asdict(options.lens))
+        if options.rim_mm:
+            optics["rim_mm"] = options.rim_mm
         return cls(
             unit="mm",
             reference_face=scene.reference_face,
@@ -73,6 +96,7 @@ class TruthFile(ResultFile):
                 )
                 for name, group in scene.groups.items()
             },
+            **({"optics": TrueOptics(**optics)} if optics else {}),
         )
 
 
@@ -129,7 +153,7 @@ def write_dataset(
     Raises
     ------
     InputError
-        The folder is not empty or cannot be written, or the image format does not fit.
+        The folder is not empty or cannot be written, or the image format or the lens does not fit.
     """
     folder, options = Path(folder), render_options or RenderOptions()
     if image_format not in IMAGE_FORMATS:
@@ -144,8 +168,9 @@ def write_dataset(
         raise InputError(
             "E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give a new or an empty folder"
         )
+    check_lens(scene, options.lens)
     try:
-        truth = json.dumps(TruthFile.of(scene, image_format).content())
+        truth = json.dumps(TruthFile.of(scene, image_format, options).content())
         for group in scene.groups:
             (folder / "images" / group).mkdir(parents=True, exist_ok=True)
         write_cameras_txt(folder / "cameras.txt", scene.camera)

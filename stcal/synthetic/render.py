@@ -1,4 +1,4 @@
-"""Synthesis of photographs of a scene: circles by exact area coverage, lens blur, vignetting, background."""
+"""Synthesis of photographs of a scene: circles by exact area coverage, rims, lens blur, vignetting, background."""
 
 from dataclasses import dataclass
 
@@ -12,6 +12,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
 from stcal.synthetic.observe import ImageCircles, image_circles, rim_points
+from stcal.synthetic.optics import SHARP_PX, WIDEST_PX, ThinLens, blur_evenly, defocused
 from stcal.synthetic.scene import Group, Scene
 
 WALL_BEHIND_MM = 350.0
@@ -46,10 +47,13 @@ def look_of(polarity: Polarity) -> Look:
     return BRIGHT if polarity == "bright" else DARK
 
 
-def draw_background(scene: Scene, group: str, image: int, clutter: bool, scenery_seed: int) -> np.ndarray:
+def draw_background(
+    scene: Scene, group: str, image: int, clutter: bool, scenery_seed: int, lens: ThinLens | None = None
+) -> np.ndarray:
     """Draws the image without the circles, (height, width) uint8.
 
-    The scenery belongs to the group: all images of the group show the same scenery from different places.
+    The scenery belongs to the group: all images of the group show the same scenery from different places. A thin lens
+    blurs the wall by the circle of confusion at its middle, and target and plate by that at theirs.
     """
     g, look = scene.groups[group], look_of(scene.target.polarity)
     painter = _Painter(scene.camera, g.camera_from_target[image], look.wall)
@@ -60,9 +64,19 @@ def draw_background(scene: Scene, group: str, image: int, clutter: bool, scenery
         _draw_checker(painter, wall, look)
         _draw_lamps(painter, wall, look, rng)
         _draw_reflections(painter, scene, g, look)
+    outlines = [*(scene.face_outline(face) for face in g.faces), scene.board_outline(group)]
+    near_px = 0.0
+    if lens is not None:
+        near_px = float(
+            lens.confusion_px(scene.camera, (painter.camera_from_target @ np.vstack(outlines))[:, 2].mean())
+        )
+    if lens is not None and clutter:
+        far_px = float(lens.confusion_px(scene.camera, (painter.camera_from_target @ wall.translation)[2]))
+        # Once more blurred with the target, the wall has the variance of its own circle of confusion.
+        painter.canvas[:] = blur_evenly(painter.canvas, float(np.sqrt(max(far_px**2 - near_px**2, 0))))
     _draw_body(painter, scene, look)
     painter.polygons(_edges(scene.board_outline(group)), look_of(scene.board.polarity).plate)
-    return painter.canvas
+    return blur_evenly(painter.canvas, near_px)
 
 
 class _Painter:
@@ -185,6 +199,8 @@ SUBSAMPLES = 8
 FINE = 4
 """Number of squares per pixel side on which a circle is blurred."""
 RIM_REACH_PX = 1.5
+SPREAD_BY_DISTORTION = 1.3
+"""Largest factor by which the lens distortion may enlarge a circle of confusion."""
 STEEP_RAD = np.radians(75)
 FULL_SCALE = 255.0
 
@@ -213,6 +229,13 @@ class RenderOptions:
         8 or 16.
     seed : int
         Seed of noise and scenery, in addition to the seed of the scene.
+    lens : ThinLens, optional
+        Aperture and focus; without it everything is in focus. It needs a perspective camera.
+    rim_mm : float
+        Depth of the luminous discs of the faces behind rims of the same radius, cylindrical holes: what is seen is the
+        part of a disc that a camera sees through the hole's upper edge. A negative value raises the disc by that
+        height: its top shines, its wall is dark, and the circle simply lies higher. The stated true circles stay where
+        the face is. Dots of the board are printed and have no rim.
     """
 
     noise: float = 0.01
@@ -224,6 +247,8 @@ class RenderOptions:
     clutter: bool = False
     bit_depth: int = 8
     seed: int = 0
+    lens: ThinLens | None = None
+    rim_mm: float = 0.0
 
     def __post_init__(self):
         for name in ("noise", "blur_px", "vignetting", "gradient", "spread", "exposure"):
@@ -233,6 +258,32 @@ class RenderOptions:
                 )
         if self.bit_depth not in (8, 16):
             raise InputError("E-SIMULATE-OPTIONS", f"rendering: bit depth {self.bit_depth}, 8 or 16 needed")
+        if not np.isfinite(self.rim_mm):
+            raise InputError("E-SIMULATE-OPTIONS", f"rendering: rim_mm {self.rim_mm:g}, a finite number needed")
+
+
+def check_lens(scene: Scene, lens: ThinLens | None) -> None:
+    """Raises an error if the lens does not fit the scene's camera, or blurs a circle beyond what can be rendered."""
+    if lens is None:
+        return
+    if scene.camera.fisheye:
+        raise InputError(
+            "E-SIMULATE-OPTIONS",
+            "rendering: thin lens of an equidistant camera; a perspective camera needed, or leave the f-number out",
+        )
+    widest, at_mm = 0.0, lens.focus_mm
+    for name, group in scene.groups.items():
+        for image in range(len(group.camera_from_target)):
+            depth = image_circles(scene, name, image).xyz_camera[:, 2]
+            confusion = lens.confusion_px(scene.camera, depth)
+            if len(depth) and confusion.max() > widest:
+                widest, at_mm = float(confusion.max()), float(depth[confusion.argmax()])
+    if widest > WIDEST_PX:
+        raise InputError(
+            "E-SIMULATE-OPTIONS",
+            f"rendering: focused at {lens.focus_mm:g} mm, a circle at {at_mm:.0f} mm is blurred to a radius of "
+            f"{widest:.0f} px, at most {WIDEST_PX:g} possible; focus nearer to it, or take a larger f-number",
+        )
 
 
 def render(scene: Scene, group: str, image: int, options: RenderOptions | None = None) -> np.ndarray:
@@ -243,11 +294,13 @@ def render(scene: Scene, group: str, image: int, options: RenderOptions | None =
     options = options or RenderOptions()
     rng = np.random.default_rng([scene.seed, options.seed, 1 + list(scene.groups).index(group), image])
     circles = image_circles(scene, group, image)
-    picture = draw_background(scene, group, image, options.clutter, options.seed).astype(np.float32)
+    picture = draw_background(scene, group, image, options.clutter, options.seed, options.lens)
+    picture = picture.astype(np.float32)
     board, face = look_of(scene.board.polarity).circle, look_of(scene.target.polarity).circle
-    base = np.array([board if isinstance(label, DotLabel) else face for label in circles.labels])
+    dot = np.array([isinstance(label, DotLabel) for label in circles.labels], bool)
+    base = np.where(dot, board, face)
     levels = base * (1 + options.spread * rng.standard_normal(len(base)))
-    picture = _add_circles(picture, scene.camera, circles, levels, options.blur_px)
+    picture = _add_circles(picture, scene.camera, circles, levels, np.where(dot, 0.0, options.rim_mm), options)
     return _expose(picture, options, rng)
 
 
@@ -258,26 +311,41 @@ def encode(picture: np.ndarray, suffix: str, jpeg_quality: int = 95) -> bytes:
 
 
 def _add_circles(
-    picture: np.ndarray, camera: Camera, circles: ImageCircles, levels: np.ndarray, blur_px: float
+    picture: np.ndarray,
+    camera: Camera,
+    circles: ImageCircles,
+    levels: np.ndarray,
+    rim_mm: np.ndarray,
+    options: RenderOptions,
 ) -> np.ndarray:
     """Blurs the picture and adds the circles.
 
     The lens blurs before the sensor samples: blurring coverage per pixel instead would shift centres by up to
     0.004 px. Therefore each circle is blurred on a finer grid, and added; the background around it is even.
     """
-    rims = camera.project(rim_points(circles.xyz_camera, circles.normal_camera, circles.radius_mm))
-    margin = 2 + int(np.ceil(4 * blur_px))
+    blur_px, lens = options.blur_px, options.lens
+    top = circles.xyz_camera + np.maximum(-rim_mm, 0)[:, None] * circles.normal_camera
+    outlines = rim_points(top, circles.normal_camera, circles.radius_mm)
+    rims = camera.project(outlines)
+    confusion = np.zeros(len(levels)) if lens is None else lens.confusion_px(camera, outlines[..., 2]).max(1)
+    margin = (2 + np.ceil(4 * blur_px) + np.ceil(SPREAD_BY_DISTORTION * confusion)).astype(int)[:, None]
     low = np.maximum(np.floor(rims.min(1)).astype(int) - margin, 0)
     high = np.minimum(np.ceil(rims.max(1)).astype(int) + margin + 1, [camera.width, camera.height])
     light = np.zeros_like(picture)
-    for i, level in enumerate(levels):
+    for i in np.flatnonzero((high > low).all(1)):
         (x0, y0), (x1, y1) = low[i], high[i]
-        disc = circles.xyz_camera[i], circles.normal_camera[i], float(circles.radius_mm[i])
-        share = _fine_coverage(camera, (x0, y0, x1, y1), *disc, steep=circles.tilt_rad[i] > STEEP_RAD)
+        normal, radius = circles.normal_camera[i], float(circles.radius_mm[i])
+        planes = [top[i]] if rim_mm[i] <= 0 else [top[i], top[i] + rim_mm[i] * normal]
+        steep = circles.tilt_rad[i] > STEEP_RAD
+        shares = [_fine_coverage(camera, (x0, y0, x1, y1), plane, normal, radius, steep=steep) for plane in planes]
+        if lens is not None and confusion[i] > SHARP_PX:
+            share = defocused(shares, planes, normal, (x0, y0), FINE, camera, lens, blur_px)
+        else:
+            share = shares[0] if len(shares) == 1 else np.minimum(*shares)
         if blur_px > 0:
             share = cv2.GaussianBlur(share, (0, 0), blur_px * FINE, borderType=cv2.BORDER_REPLICATE)
         share = share.reshape(y1 - y0, FINE, x1 - x0, FINE).mean((1, 3))
-        light[y0:y1, x0:x1] += share * (np.float32(level) - picture[y0:y1, x0:x1])
+        light[y0:y1, x0:x1] += share * (np.float32(levels[i]) - picture[y0:y1, x0:x1])
     if blur_px > 0:
         picture = cv2.GaussianBlur(picture, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE)
     light += picture

@@ -20,8 +20,9 @@ __all__ = ["Group", "Scene", "SceneOptions", "make_scene", "nominal_target_from_
 
 FACE_MARGIN_MM = 15.0
 BOARD_MARGIN_MM = 15.0
-FOCAL_PER_WIDTH = 24 / 22.3
-"""Focal length in image widths of a 24 mm lens on a sensor 22.3 mm wide."""
+SENSOR_WIDTH_MM = 22.3
+FOCAL_PER_WIDTH = 24 / SENSOR_WIDTH_MM
+"""Focal length in image widths of a 24 mm lens on this sensor."""
 CONVEX_TOLERANCE_MM = 5.0
 
 

@@ -160,6 +160,27 @@ def test_simulate_with_the_camera_of_a_file(command, wedge, tmp_path):
     assert "two cameras" in err
 
 
+def test_simulate_with_lens_and_rim(command, tmp_path):
+    small = "--width", 324, "--images", 2, "--workers", 1
+    lens = "--f-number", 4, "--focus-mm", 900, "--rim-mm", 0.2
+    code, _, err = command("simulate", tmp_path / "data", *small, *lens)
+    assert code == 0, err
+    optics = json.loads((tmp_path / "data/truth.json").read_text())["optics"]
+    assert optics == {"lens": {"f_number": 4.0, "focal_mm": 24.0, "focus_mm": 900.0}, "rim_mm": 0.2}
+    camera = "--camera", tmp_path / "data/cameras.txt"
+    for options, names in (
+        (("--focus-mm", 900), "--f-number"),
+        (("--focal-mm", 50), "--f-number"),
+        (("--f-number", 4, *camera), "--focal-mm"),
+        (("--f-number", 4, "--fisheye", 120, "--distance", 500), "perspective"),
+        (("--f-number", 4, "--focus-mm", 20), "focal length"),
+    ):
+        code, _, err = command("simulate", tmp_path / "none", *small, *options)
+        assert (code, err.count("error:")) == (2, 1)
+        assert names in err
+    assert not (tmp_path / "none").exists()
+
+
 def test_simulate_says_which_faces_have_no_place(command, wedge, tmp_path):
     lines = wedge[1].read_text().splitlines()
     lines.remove(next(line for line in lines if line.startswith("rough_pose = { origin_mm = [116")))

@@ -15,6 +15,7 @@ from stcal.io.files import RUN_MARKER, json_text, real_place, save
 
 if TYPE_CHECKING:
     from stcal.design import BoardDesign, TargetDesign
+    from stcal.synthetic.optics import ThinLens
     from stcal.synthetic.scene import Scene, SceneOptions
 
 app = typer.Typer()
@@ -55,6 +56,24 @@ def simulate(
     ] = None,
     noise: Annotated[float, typer.Option(min=0, max=0.2, help="Add noise of this fraction of full scale.")] = 0.01,
     blur: Annotated[float, typer.Option(min=0, max=10, help="Blur by this standard deviation, px.")] = 0.7,
+    f_number: Annotated[
+        float | None,
+        typer.Option("--f-number", min=0.5, max=100, help="Use a thin lens of this f-number; all in focus if none."),
+    ] = None,
+    focus: Annotated[
+        float | None,
+        typer.Option("--focus-mm", min=10, max=1e7, help="Focus the thin lens at this depth; at --distance if none."),
+    ] = None,
+    focal: Annotated[
+        float | None,
+        typer.Option(
+            "--focal-mm", min=0.5, max=5000, help="Focal length of the thin lens; that on a 22.3 mm sensor if none."
+        ),
+    ] = None,
+    rim: Annotated[
+        float,
+        typer.Option("--rim-mm", min=-20, max=20, help="Put the faces' circles behind rims so high; raised if < 0."),
+    ] = 0.0,
     clutter: Annotated[bool, typer.Option("--clutter/--clean", help="Add lamps, discs and a checkered wall.")] = False,
     target: TargetFile = None,
     board: BoardFile = None,
@@ -92,12 +111,49 @@ def simulate(
     one_given = (target is None) != (board is None)  # both are the reference's where neither is
     with designs_told(target, board, with_target=one_given, with_board=one_given):
         scene = _scene(options, _designs(target, board, second_design), groups, camera, fisheye)
-    rendering = RenderOptions(noise=noise, blur_px=blur, clutter=clutter, bit_depth=16 if sixteen_bit else 8, seed=seed)
+    rendering = RenderOptions(
+        noise=noise,
+        blur_px=blur,
+        clutter=clutter,
+        bit_depth=16 if sixteen_bit else 8,
+        seed=seed,
+        lens=_lens(scene, f_number, focus, focal, distance, camera),
+        rim_mm=rim,
+    )
     kind = "png" if png or sixteen_bit else "jpg"
     with StageProgress() as progress:
         step = partial(progress, "render")
         paths = write_dataset(folder, scene, rendering, image_format=kind, workers=workers, progress=step)
     say(f"{len(paths)} images in {len(scene.groups)} groups: {folder}")
+
+
+def _lens(
+    scene: "Scene",
+    f_number: float | None,
+    focus_mm: float | None,
+    focal_mm: float | None,
+    distance_mm: float,
+    camera: Path | None,
+) -> "ThinLens | None":
+    """The thin lens of the options, or none; without ``focal_mm`` that of a sensor of the usual width."""
+    from stcal.synthetic.optics import ThinLens
+    from stcal.synthetic.scene import SENSOR_WIDTH_MM
+
+    if f_number is None:
+        for name, value in {"--focus-mm": focus_mm, "--focal-mm": focal_mm}.items():
+            if value is not None:
+                raise InputError(
+                    "E-OPTION-NEEDS", f"{name} {value:g}: only with a thin lens; add --f-number, or leave {name} out"
+                )
+        return None
+    if focal_mm is None and camera is not None:
+        raise InputError(
+            "E-OPTION-NEEDS",
+            f"--f-number {f_number:g}: camera file {camera} states no length in mm, which the aperture's diameter "
+            "needs; add --focal-mm",
+        )
+    usual_mm = round(float(scene.camera.focal.mean()) * SENSOR_WIDTH_MM / scene.camera.width, 6)
+    return ThinLens(f_number, usual_mm if focal_mm is None else focal_mm, distance_mm if focus_mm is None else focus_mm)
 
 
 def _designs(target: Path | None, board: Path | None, second_design: bool) -> "tuple[TargetDesign, BoardDesign]":
