@@ -262,7 +262,7 @@ def _faces(
 
 
 def _off(pose: Rigid, other: Rigid) -> np.ndarray:
-    """Returns the rotation vector (rad) and translation (mm) from ``other`` to ``pose``, in their common frame, (6,)."""
+    """Returns the rotation vector (rad) and translation (mm) from ``other`` to ``pose`` in their common frame, (6,)."""
     return Poses.of([pose]).difference(Poses.of([other]))[0]
 
 
