@@ -1,4 +1,4 @@
-"""``stcal camera``: camera files of other programs, shown, converted and compared."""
+"""Commands ``stcal camera``: camera files of other programs are shown, converted and compared."""
 
 from enum import StrEnum
 from pathlib import Path

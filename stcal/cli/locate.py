@@ -1,4 +1,4 @@
-"""``stcal locate``: a planar target of several tags, calibrated, found under any light, and judged."""
+"""Commands ``stcal locate``: a planar target of several tags is calibrated, located under any light, and judged."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -30,7 +30,7 @@ NOTHING_ACCEPTED = 3
 
 
 class MethodName(StrEnum):
-    """How the pose is found and judged."""
+    """Name of the method that finds and judges the pose."""
 
     joint = "joint"
     patent = "patent"

@@ -1,4 +1,4 @@
-"""``stcal register``: the transform between two instruments' frames from corresponding points."""
+"""Command ``stcal register``: the transform between two instruments' frames from corresponding points."""
 
 from dataclasses import replace
 from enum import StrEnum
@@ -111,7 +111,7 @@ def register(
     pairs = read_pairs(source)
     if not isinstance(source, Path) and any("cov_" in column for column in source.columns):
         say("note: the covariances of --a and --b are not used; the noise of the points is estimated")
-    allow_ambiguous |= robot_file is not None  # a bent arm may look like two motions; the kinematics tell
+    allow_ambiguous |= robot_file is not None  # a bent arm may look like two motions; the kinematics show it
     options = {"model": model.value, "method": method.value, "threshold_mm": threshold, "seed": seed}
     options |= {"liu2017_options": liu2017} if liu2017 else {}
     result = registered(
@@ -140,7 +140,7 @@ def register(
             if identified:
                 comments = [f"Identified from {name_of(source)}: {beside.identified.rank} parameters."]
                 write(identified, robot_toml(beside.identified.robot, comments))
-        except (DegenerateError, ConvergenceError) as error:  # the transform stands all the same
+        except (DegenerateError, ConvergenceError) as error:  # the transform is valid without it
             failed = error
     if out:
         write(out, content)

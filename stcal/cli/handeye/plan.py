@@ -1,4 +1,4 @@
-"""``stcal handeye plan``: which robot poses to take next."""
+"""Command ``stcal handeye plan``: choice of the next robot poses."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""``stcal handeye rig``: several cameras of one robot, solved together."""
+"""Command ``stcal handeye rig``: several cameras of one robot, solved together."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""``stcal robot compensate``: joint values that reach what was commanded."""
+"""Command ``stcal robot compensate``: joint values that reach commanded poses."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -26,7 +26,7 @@ from stcal.io.files import keep_apart
 
 
 class ExportAs(StrEnum):
-    """What files of controllers hold."""
+    """Content of the files for controllers."""
 
     joints = "joints"
     poses = "poses"

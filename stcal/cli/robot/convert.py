@@ -1,4 +1,4 @@
-"""Commands `robot init` and `robot convert`: robot files."""
+"""Commands ``stcal robot init`` and ``convert``: robot files."""
 
 from enum import StrEnum
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""``stcal-sfm budget``: the uncertainty budget of a finished run."""
+"""Command ``stcal-sfm budget``: the uncertainty budget of a finished run."""
 
 from pathlib import Path
 from typing import Annotated
@@ -88,12 +88,12 @@ def budget(
 
 
 def _require_pdf(page: Path | None, run: Path) -> None:
-    """Refuse, before the work, a PDF that has no page or no place.
+    """Refuses, before the work, a PDF without a page or a place.
 
     Raises
     ------
     InputError
-        Which, and what to do.
+        If there is no page, the page itself has the suffix of a PDF, or ``stcal[pdf]`` is not installed.
     """
     from stcal.report.page import require_pdf
 

@@ -1,4 +1,4 @@
-"""``stcal-sfm calibrate-camera``: intrinsics from photographs of the board."""
+"""Command ``stcal-sfm calibrate-camera``: intrinsics from photographs of the board."""
 
 from pathlib import Path
 from typing import Annotated
@@ -94,7 +94,7 @@ def calibrate_camera(
 
 
 def _one(images: Path, out: Path, target, board, model: str, json_file, report, workers) -> list[str]:
-    """What failed."""
+    """Calibrates one camera, and returns the failed checks."""
     from stcal.design import BoardDesign
     from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
@@ -123,7 +123,7 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
 
 
 def _rig(images: Path, out: Path, target, board, models, json_file, report, workers) -> list[str]:
-    """What failed."""
+    """Calibrates the cameras of a rig, and returns the failed checks."""
     from stcal.io.files import require_new_folder, save_folder
     from stcal.sfm.camera.file import RigCalibrationFile
     from stcal.sfm.camera.report import rig_page, rig_text

@@ -1,4 +1,4 @@
-"""``stcal-sfm plan``, ``advise``, ``watch`` and ``capture``: what to photograph, before, after and meanwhile."""
+"""Commands ``stcal-sfm plan``, ``advise``, ``watch`` and ``capture``: photographs before, during and after a run."""
 
 import sys
 from pathlib import Path
@@ -166,7 +166,7 @@ def watch(
 
 
 def _say_update(update: "Update") -> None:
-    """What was found in what came, σ so far, and what would help most."""
+    """Prints the circles found in new photographs, σ so far, and the view that would help most."""
     from stcal.sfm.planning.file import next_text
     from stcal.sfm.runs.text import found_lines, so_far_text
 

@@ -1,4 +1,4 @@
-"""``stcal-sfm``: what goes to and comes from COLMAP, and why something was left out."""
+"""Commands ``stcal-sfm`` for the exchange with COLMAP and other programs, and for images and circles left out."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -14,7 +14,7 @@ app = typer.Typer()
 
 
 class Chained(StrEnum):
-    """How groups that are solved by themselves are combined."""
+    """Way in which the faces of single groups are combined."""
 
     chain = "chain"
     paper = "paper"

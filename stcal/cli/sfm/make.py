@@ -1,4 +1,4 @@
-"""``stcal-sfm``: targets and boards to be made."""
+"""Commands ``stcal-sfm draw`` and ``design``: targets and boards to be made."""
 
 import os
 from functools import partial

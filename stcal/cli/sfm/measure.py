@@ -1,4 +1,4 @@
-"""``stcal-sfm measure``: the calibrated target at work."""
+"""Command ``stcal-sfm measure``: poses of the calibrated target in images."""
 
 import os
 import sys
