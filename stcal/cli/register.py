@@ -124,16 +124,18 @@ def register(
         allow_ambiguous=allow_ambiguous,
         lines=pairs.lines,
     )
-    found = findings(pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, result, pairs.weights, pairs.covariances)
-    say(registration_text(found))
+    registration = findings(
+        pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, result, pairs.weights, pairs.covariances
+    )
+    say(registration_text(registration))
     print_each(f"warning: {pairs.where}", result.notes)
-    content, sections, failed = RegistrationFile.of(found), [], None
+    content, sections, failed = RegistrationFile.of(registration), [], None
     if robot_file:
         from stcal.robot.kinematics.file import robot_toml
         from stcal.workflows.register_robot import compared, comparison_section, comparison_text, robot_part
 
         try:
-            beside = compared(pairs, source, robot_file, found, options, folds)
+            beside = compared(pairs, source, robot_file, registration, options, folds)
             say("", comparison_text(beside), sep="\n")
             content = content.model_copy(update={"robot": robot_part(beside)})
             sections.append(comparison_section(beside))
@@ -148,6 +150,6 @@ def register(
         if liu2017:
             limits = liu2017 if threshold is None else replace(liu2017, limit_mm=threshold)
             sections.insert(0, sample_size_section(sample_sizes(pairs.xyz_a, pairs.xyz_b, limits, seed), limits))
-        write(report, registration_page(found, sections))
+        write(report, registration_page(registration, sections))
     if failed is not None:
         raise failed

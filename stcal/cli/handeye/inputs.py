@@ -106,8 +106,8 @@ def source_of(
     from stcal.workflows.handeye.times import Timing
 
     if source is None and first is not None and second is not None:
-        told = two_files(first, second, key, said, quaternions, timing or Timing())
-        if told is not None:
-            return told
+        joined = two_files(first, second, key, said, quaternions, timing or Timing())
+        if joined is not None:
+            return joined
     prefixes = ("base_from_flange_", "camera_from_board_")
     return one_table(source, first, second, key, "POSES|IMAGES", prefixes, quaternions)

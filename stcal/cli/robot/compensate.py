@@ -111,9 +111,9 @@ def compensate(
 
         write(report, compensation_page(result, identified))
     for form, path in exports if result.found.usable.any() else ():
-        made = exported(result, identified, form, path, export_as.value, pulses)
-        write(path, made.text)
-        print_each("note", made.notes)
+        exported_file = exported(result, identified, form, path, export_as.value, pulses)
+        write(path, exported_file.text)
+        print_each("note", exported_file.notes)
     if not result.found.usable.any():
         raise DegenerateError(
             "E-ROBOT-UNREACHED", f"{wanted.where}: none of {len(result)} poses is reached; see the warnings above"

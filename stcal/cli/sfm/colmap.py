@@ -203,13 +203,13 @@ def pairs(
     from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
-    found = run_gates(saved, group)
-    for name, rows in found.items():
+    gates_by_group = run_gates(saved, group)
+    for name, rows in gates_by_group.items():
         images = len({image for row in rows for image in (row.score.first, row.score.second)})
         say(pairs_table(name, images, rows, len(rows) if everything else SHOWN_PAIRS), end="\n\n")
     say(limits_text(saved.options.pairs))
     if out:
-        write(out, PairsFile.of(found), "as JSON")
+        write(out, PairsFile.of(gates_by_group), "as JSON")
 
 
 @app.command()

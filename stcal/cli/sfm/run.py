@@ -213,11 +213,11 @@ def detect(
             "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
         )
     chosen_images(images, options.exclude)
-    given = {"images": images, "--camera": camera, "--target": target, "--board": board}
+    inputs = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with (
         designs_told(target, board),
         handed_over(scheduler, send_images),
-        run_folder(out, MarkerFile.of(images, None), given) as folder,
+        run_folder(out, MarkerFile.of(images, None), inputs) as folder,
         StageProgress() as progress,
     ):
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
