@@ -180,7 +180,7 @@ branches of 600 poses of five arms, found with 600 starts, 96 missed none, 48 th
 SAME_BRANCH = 1e-4
 """Joint vectors nearer than this (rad) are one solution."""
 SHORT = 0.1
-"""Up to this distance from the reference (rad) other branches are sought around the solution only, else everywhere."""
+"""Distance from the reference, rad, up to which other branches are sought around the solution only, else everywhere."""
 AS_GOOD = 2.0
 """Orientations (of arms that cannot choose them) off by up to so many times the least are as good."""
 GROUP = 2048
