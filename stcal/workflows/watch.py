@@ -215,7 +215,7 @@ def watch(
 
 
 def _stamps(images: Path) -> dict[str, tuple]:
-    """Returns size and time of each image file; empty where there is none yet."""
+    """Returns size and time of each image file; empty if there are no images yet."""
     stamps = {}
     try:
         files, _ = find_images(images)

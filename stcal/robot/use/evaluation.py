@@ -74,7 +74,7 @@ class Evaluated:
     residuals : (r, 3) or (r, 1) array
         Measured minus modelled position in the base's axes, or distance; mm.
     rotation_rad : (r,) array
-        Errors of orientations; empty where none were measured.
+        Errors of orientations; empty if none were measured.
     placed : tuple of Placed
         Base and tools.
     left : tuple of Finding or None
