@@ -1,5 +1,6 @@
 """The documents know every option of every command."""
 
+import ast
 import re
 from pathlib import Path
 
@@ -108,3 +109,117 @@ def test_each_error_has_a_code_and_each_code_one_exit_code():
             exits.setdefault(code, set()).add(getattr(stcal.errors, kind).exit_code)
     assert len(exits) > 300
     assert {code: found for code, found in exits.items() if len(found) > 1} == {}
+
+
+PREPOSITIONS = """
+about above across after against along among amid around as at before behind below beneath beside between beyond by
+despite during except for from in inside into like near of off on onto out outside over past per since than through
+till to toward towards under until up upon via with within without
+"""
+IRREGULAR = """
+begun bent born borne bound broken brought built bought caught chosen dealt done drawn driven fallen fed felt forgotten
+fought found frozen given gone grown heard held hidden kept known laid led lent lost made meant met paid said seen sent
+shown slid spent spoken stood struck stuck swept taken taught thought thrown told torn understood won worn woven written
+"""
+"""Past participles without -ed, except those that are nouns, adjectives or verbs as often (cut, left, set, run)."""
+NOUNS = """
+bearing bed beginning being building casting coating coupling drawing ending feed fitting heading king lighting mapping
+meaning morning mounting need opening padding painting reading rendering ring seed setting spacing speed spring string
+thing timing warning wing wiring
+"""
+FIRST_WORD = re.compile(r"[^\w`]*([A-Za-z]+)(?![\w`-])\W*(\w*)")
+"""A first word of letters only, and the next word. Names in ``code`` and compounds such as closed-form do not match."""
+
+
+def docstrings_of(source: str):
+    """(line, text) of the strings that document a module, class or function, and of those under an assignment."""
+    for node in ast.walk(ast.parse(source)):
+        body = getattr(node, "body", None)
+        for k, statement in enumerate(body if isinstance(body, list) else ()):
+            value = statement.value if isinstance(statement, ast.Expr) else None
+            documents = k == 0 or isinstance(body[k - 1], ast.Assign | ast.AnnAssign)
+            if documents and isinstance(value, ast.Constant) and isinstance(value.value, str):
+                yield statement.lineno, value.value
+
+
+def fragment(text: str) -> str:
+    """The preposition or bare participle that a text begins with; a word in -ing before *of* is a noun."""
+    match = FIRST_WORD.match(text)
+    word, following = (match[1].lower(), match[2].lower()) if match else ("", "")
+    if word in NOUNS.split():
+        return ""
+    past = word in IRREGULAR.split() or word.endswith("ed")
+    present = word.endswith("ing") and following not in ("of", "and", "or", "")
+    return word if past or present or word in PREPOSITIONS.split() else ""
+
+
+def fragments(source: str) -> list[str]:
+    return [f"line {line}: {text.strip()[:60]}" for line, text in docstrings_of(source) if fragment(text)]
+
+
+def test_docstrings_begin_with_a_sentence_or_a_noun():
+    files = sorted(ROOT.joinpath("stcal").rglob("*.py"))
+    assert len(files) > 100
+    found = {str(file.relative_to(ROOT)): fragments(file.read_text(encoding="utf-8")) for file in files}
+    assert {file: lines for file, lines in found.items() if lines} == {}
+
+
+FRAGMENTS = '''"""By medians."""
+A = 1
+"""Of a rim, px."""
+
+
+class B:
+    """Made anew."""
+
+    c: int
+    """… to here."""
+
+    def d(self):
+        """Measured once."""
+        return """of no matter"""
+
+    def e(self):
+        """Taking the last."""
+
+
+def f():
+    """Returns what is left."""
+'''
+
+
+def test_fragments_of_docstrings_are_found():
+    assert sorted(int(line.split(":")[0].removeprefix("line ")) for line in fragments(FRAGMENTS)) == [
+        1,
+        3,
+        7,
+        10,
+        13,
+        17,
+    ]
+
+
+def test_nouns_and_sentences_are_no_fragments():
+    for text in (
+        "Returns the poses.",
+        "Mapping of a group, and its notes.",
+        "Spacing between two lines of text.",
+        "Drawing as PDF.",
+        "Closed-form solutions.",
+        "``by`` : the unit.",
+        "Speed of a joint, rad/s.",
+        "Need of memory, bytes.",
+        "Left perturbation.",
+        "Set of rows that agree.",
+        "",
+    ):
+        assert fragment(text) == "", text
+    for text in (
+        "For messages.",
+        "without noise",
+        "Found by no one.",
+        "Solved again.",
+        "… as it is",
+        "Giving the pose.",
+    ):
+        assert fragment(text), text

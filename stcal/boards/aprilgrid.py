@@ -55,12 +55,12 @@ def _tags(image: np.ndarray, board: AprilGridDesign) -> tuple[Tags, str]:
     names = (board.dictionary,)
     if board.border_bits is not None:
         return find_tags(image, names, board.border_bits, joined=True), f"{board.border_bits}"
-    two = find_tags(image, names, KALIBR_BITS, joined=True)
-    if _own(two, board) >= ENOUGH_SHARE * len(board.tag_ids()):
-        return two, f"{KALIBR_BITS}"
-    one = find_tags(image, names, USUAL_BITS, joined=True)
-    holds = _own(two, board) > 0 and _own(two, board) >= TELLING_SHARE * _own(one, board)
-    return (two if holds else one), f"{USUAL_BITS} or {KALIBR_BITS}"
+    of_two_bits = find_tags(image, names, KALIBR_BITS, joined=True)
+    if _own(of_two_bits, board) >= ENOUGH_SHARE * len(board.tag_ids()):
+        return of_two_bits, f"{KALIBR_BITS}"
+    of_one_bit = find_tags(image, names, USUAL_BITS, joined=True)
+    two_bits_hold = _own(of_two_bits, board) > 0 and _own(of_two_bits, board) >= TELLING_SHARE * _own(of_one_bit, board)
+    return (of_two_bits if two_bits_hold else of_one_bit), f"{USUAL_BITS} or {KALIBR_BITS}"
 
 
 def _own(tags: Tags, board: AprilGridDesign) -> int:

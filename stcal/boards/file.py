@@ -51,11 +51,11 @@ def known_dictionary(name: str) -> str:
     """
     plain = name.strip().upper()
     plain = plain if plain.startswith("DICT_") else f"DICT_{plain}"
-    known = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
-    if plain not in known:
-        alike = sorted(k for k in known if k[5:9] == plain[5:9]) or sorted(known)
+    dictionaries = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
+    if plain not in dictionaries:
+        alike = sorted(k for k in dictionaries if k[5:9] == plain[5:9]) or sorted(dictionaries)
         raise ValueError(f"unknown dictionary; one of {', '.join(alike)} needed")
-    return known[plain]
+    return dictionaries[plain]
 
 
 Dictionary = Annotated[str, AfterValidator(known_dictionary)]

@@ -1,4 +1,4 @@
-"""``stcal camera``: camera files of other programs, shown, converted and compared."""
+"""Commands ``stcal camera``: camera files of other programs are shown, converted and compared."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -73,10 +73,10 @@ def convert(
             f"{out}: no form of suffix {out.suffix or 'none'}; give --form, or one of {', '.join(SUFFIXES)}",
         )
     camera = _camera(source, name, size)
-    made = written(camera, kind, name or "cam0")
+    converted = written(camera, kind, name or "cam0")
     say(f"{source}: {camera.colmap_model}, {camera.width}×{camera.height} px; written as {kind}")
-    print_each(f"note: not in {kind}", made.lost)
-    write(out, made.content)
+    print_each(f"note: not in {kind}", converted.lost)
+    write(out, converted.content)
 
 
 @app.command()
@@ -110,11 +110,11 @@ def compare(
     from stcal.report.camera import comparison_figure, comparison_text
     from stcal.report.figure import save
 
-    one, two = _camera(first, name, size), _camera(second, name, size)
-    found = camera_difference(one, two)
-    say("\n".join(comparison_text(found)))
+    first_camera, second_camera = _camera(first, name, size), _camera(second, name, size)
+    difference = camera_difference(first_camera, second_camera)
+    say("\n".join(comparison_text(difference)))
     if plot:
-        save(comparison_figure(found), plot)
+        save(comparison_figure(difference), plot)
         say(f"picture: {plot}")
 
 
@@ -126,18 +126,18 @@ def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
     from stcal.report.camera import exif_text, fitted_text
 
     if is_photograph(path):
-        taken = camera_of_photograph(path)
-        print_each("note", [exif_text(taken.told)])
-        return taken.camera
+        from_exif = camera_of_photograph(path)
+        print_each("note", [exif_text(from_exif.told)])
+        return from_exif.camera
     lens = read_lens(path, name)
-    given = size.lower().split("x") if size else ["0", "0"]
-    if len(given) != 2 or not all(side.isdigit() for side in given):
+    sides = size.lower().split("x") if size else ["0", "0"]
+    if len(sides) != 2 or not all(side.isdigit() for side in sides):
         raise InputError("E-OPTION-SIZE", f"--size {size}: two numbers with x between needed, such as 1920x1080")
-    width, height = lens.width or int(given[0]), lens.height or int(given[1])
+    width, height = lens.width or int(sides[0]), lens.height or int(sides[1])
     if not (width and height):
         raise InputError("E-CAMERA-SIZE", f"camera file {path}: states no image size; give it with --size WxH")
     if isinstance(lens, CameraModel):
         return lens.calibrated(width, height)
-    found = fit_lens(lens, width, height)
-    print_each("note", fitted_text(lens.called, found))
-    return found.camera
+    fitted = fit_lens(lens, width, height)
+    print_each("note", fitted_text(lens.called, fitted))
+    return fitted.camera

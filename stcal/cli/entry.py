@@ -1,4 +1,4 @@
-"""Where the commands begin: signals are answered in one line from the first moment, also while libraries load."""
+"""Entry points of the commands. Signals are answered in one line from the first moment, also while libraries load."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ import stcal
 from stcal.errors import NO_MEMORY, lacks_memory
 
 ADDRESS_SPACE = 800 << 20
-"""Bytes; NumPy, SciPy, OpenCV and pycolmap take 740 MB of it when they are loaded (`VmPeak`)."""
+"""Address space that loading needs, bytes. NumPy, SciPy, OpenCV and pycolmap take 740 MB of it (`VmPeak`)."""
 LOADING = {signal.SIGINT: ("interrupted", 130), signal.SIGTERM: ("terminated", 143)}
 
 
@@ -25,10 +25,10 @@ def main_sfm() -> None:
 
 
 def _run(name: str) -> None:
-    """A program, or its version alone, for which scripts need not wait until the commands are loaded.
+    """Runs a program. ``--version`` alone is answered at once, before the commands are loaded.
 
-    Once it has its exit code, signals change it no more. Python takes handlers away while it ends, and a signal would
-    then end a command, whose results are in place, as if it had failed.
+    Signals that come after the end of the program do not change its exit code. Python removes handlers while it ends,
+    and a signal would then end a command as if it had failed, although its results are in place.
     """
     try:
         if sys.argv[1:] == ["--version"]:
@@ -51,10 +51,10 @@ def _print_version() -> None:
 
 
 def _program() -> ModuleType:
-    """The commands, once they are loaded.
+    """Loads and returns the module of the commands.
 
-    OpenBLAS starts its threads when it is loaded, and sends its own process SIGINT, or tries for ever, where memory is
-    too little for them; the commands use one.
+    The commands use one thread of OpenBLAS. It starts its threads when it is loaded, and if memory is too little for
+    them, it sends its own process SIGINT, or tries for ever.
     """
     _answer()
     _require_address_space()
@@ -69,16 +69,18 @@ def _program() -> ModuleType:
 
 
 def _require_address_space() -> None:
-    """End where a limit of the system (`ulimit -v`) is below what loading takes: C libraries end the process then
-    without a word, or hang. Help and version load none of them."""
+    """Ends the program if a limit of the system (`ulimit -v`) is below the memory that loading needs.
+
+    C libraries would end the process without a message, or hang. Help and version load none of them.
+    """
     if sys.platform == "win32" or {"-h", "--help", "--version"} & set(sys.argv):
         return
     import resource
 
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if 0 <= limit < ADDRESS_SPACE:
-        said = f"error: {NO_MEMORY}: {limit >> 20} MB of address space allowed, {ADDRESS_SPACE >> 20} MB needed; "
-        os.write(sys.stderr.fileno(), f"{said}raise the limit (`ulimit -v`)\n".encode())
+        message = f"error: {NO_MEMORY}: {limit >> 20} MB of address space allowed, {ADDRESS_SPACE >> 20} MB needed; "
+        os.write(sys.stderr.fileno(), f"{message}raise the limit (`ulimit -v`)\n".encode())
         sys.exit(3)
 
 
@@ -88,7 +90,7 @@ def _answer() -> None:
 
 
 def _end(number: int, _) -> None:
-    """While nothing is done yet."""
-    said, code = LOADING[signal.Signals(number)]
-    os.write(sys.stderr.fileno(), f"{said}\n".encode())
+    """Ends the process at a signal while the commands are loaded."""
+    word, code = LOADING[signal.Signals(number)]
+    os.write(sys.stderr.fileno(), f"{word}\n".encode())
     os._exit(code)

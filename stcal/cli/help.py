@@ -1,4 +1,4 @@
-"""Help texts: plain, at once, and whole; options stand in panels, the ones that most calls need first."""
+"""Help texts in plain form and full length. Options are sorted into panels, those that most calls need first."""
 
 from typing import Any
 
@@ -35,13 +35,13 @@ PANELS = {
         *("de_bounds_deg", "de_bounds_mm", "de_population", "de_f", "de_cr", "de_lambda", "de_generations", "de_seed"),
     ),
 }
-"""Panels of the help text in their order, each with the names of its parameters. All other parameters are Input where
-they are paths to read, Output where they are paths to write, and Method else. Options that all commands have, such as
-``--quiet`` and ``--help``, are added without a panel; they are Output."""
+"""Panels of the help text in their order, each with the names of its parameters. All other parameters are in Input if
+they are paths to read, in Output if they are paths to write, and else in Method. Options of all commands, such as
+``--quiet`` and ``--help``, are added without a panel and shown in Output."""
 
 
 def panel_of(name: str, reads: bool, writes: bool) -> str:
-    """Panel of a parameter; ``reads``, ``writes`` : whether its value is a path that is read or written."""
+    """Returns the panel of a parameter. ``reads``, ``writes`` : whether its value is a path that is read or written."""
     for panel, names in PANELS.items():
         if name in names:
             return panel
@@ -52,7 +52,7 @@ class Command(TyperCommand):
     """A command whose help has its options in panels."""
 
     def format_options(self, ctx, formatter) -> None:
-        """Write arguments, then options panel by panel."""
+        """Writes the arguments, and then the options panel by panel."""
         arguments: list[tuple[str, str]] = []
         panels: dict[str, list[tuple[str, str]]] = {panel: [] for panel in PANELS}
         for param in self.get_params(ctx):
@@ -68,17 +68,21 @@ class Command(TyperCommand):
 
 
 class Commands(TyperGroup):
-    """A group whose help has the whole sentence of each command, and whose commands may have names of two words."""
+    """A group of commands, whose names may have two words. Its help has the whole sentence of each command."""
 
     def resolve_command(self, ctx, args):
-        """``handeye plan`` before ``handeye``, whose first argument is a file."""
+        """Resolves ``handeye plan`` before ``handeye``, whose first argument is a file."""
         if len(args) > 1 and self.get_command(ctx, two := " ".join(args[:2])) is not None:
             args = [two, *args[2:]]
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx, formatter) -> None:
-        """Name and help of each."""
+        """Writes the name and help of each command."""
         commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        rows = [(name, " ".join((each.help or "").split())) for name, each in commands if each and not each.hidden]
+        rows = [
+            (name, " ".join((command.help or "").split()))
+            for name, command in commands
+            if command and not command.hidden
+        ]
         with formatter.section("Commands"):
             formatter.write_dl(rows)

@@ -1,4 +1,4 @@
-"""``stcal locate``: a planar target of several tags, calibrated, found under any light, and judged."""
+"""Commands ``stcal locate``: a planar target of several tags is calibrated, located under any light, and judged."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -30,7 +30,7 @@ NOTHING_ACCEPTED = 3
 
 
 class MethodName(StrEnum):
-    """How the pose is found and judged."""
+    """Name of the method that finds and judges the pose."""
 
     joint = "joint"
     patent = "patent"
@@ -125,10 +125,10 @@ def calibrate(
     plan, design, model = load_plan(layout), load_flat_board(board), read_camera(camera)
     dictionaries = tuple(dict.fromkeys(dictionary for dictionary, _ in plan.tags))
     with StageProgress() as progress:
-        found = calibration_images(images, model, design, dictionaries, workers, progress)
-    result = calibrated(plan, found.views, found.tags, found.names, found.camera, found.symmetries)
+        observed = calibration_images(images, model, design, dictionaries, workers, progress)
+    result = calibrated(plan, observed.views, observed.tags, observed.names, observed.camera, observed.symmetries)
     say(calibrated_text(result))
-    print_each("left out", (*found.left_out, *result.left_out))
+    print_each("left out", (*observed.left_out, *result.left_out))
     print_each("warning", warnings(result, plan.tags))
     write(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
     if json_file:

@@ -1,4 +1,4 @@
-"""``stcal``, the umbrella command, and ``stcal-sfm``, its shortcut: errors become one line and an exit code."""
+"""The command ``stcal`` and its shortcut ``stcal-sfm``. Errors become one line and an exit code."""
 
 import json
 import os
@@ -20,10 +20,10 @@ from stcal.errors import NO_MEMORY, StcalError, lacks_memory
 
 INTERRUPTED, TERMINATED = 130, 143
 MESSAGE_CHARACTERS = 600
-"""Longest line of an error. Texts from files, which it may quote, can have any length."""
+"""Largest length of an error's line. Texts from files, which it may quote, can have any length."""
 RESUMED = {"run", "detect", "watch"}
-"""Commands that keep what they have done when they are interrupted."""
-# Of Click, which newer versions of Typer carry inside.
+"""Commands that keep finished detections when they are interrupted."""
+# The class is Click's, which newer versions of Typer contain.
 UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 app = typer.Typer(
@@ -53,10 +53,10 @@ def _version(
     if versions:
         from stcal.workflows.versions import environment
 
-        found = environment()
-        width = max(map(len, found))
-        for name, each in found.items():
-            say(f"{name:{width}}  {each}")
+        versions_by_name = environment()
+        width = max(map(len, versions_by_name))
+        for name, installed in versions_by_name.items():
+            say(f"{name:{width}}  {installed}")
         raise typer.Exit
 
 
@@ -118,20 +118,20 @@ def _guarded(application: typer.Typer) -> None:
 
 
 def _terminate(*_) -> NoReturn:
-    """SIGTERM ends a command as Ctrl-C does: results that are there stay, and no process is left behind."""
+    """Ends a command at SIGTERM as at Ctrl-C: existing results stay, and no process is left behind."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     raise _Terminated
 
 
 class _Terminated(BaseException):
-    """The process was asked to end."""
+    """The exception that SIGTERM raises."""
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    """One line of printable characters, and the exit code."""
+    """Prints the error as one line of printable characters, and ends with the exit code."""
     line = " ".join(printable(message).split())
-    part = (MESSAGE_CHARACTERS - len("error:  … ")) // 2
-    if len(line) > 2 * part:
-        line = f"{line[:part]} … {line[-part:]}"
+    half = (MESSAGE_CHARACTERS - len("error:  … ")) // 2
+    if len(line) > 2 * half:
+        line = f"{line[:half]} … {line[-half:]}"
     print(f"error: {line}", file=sys.stderr)
     sys.exit(code)

@@ -1,4 +1,4 @@
-"""Options that several commands share, and what they tell of designs."""
+"""Options that several commands share, and the notes on assumed designs."""
 
 import inspect
 import os
@@ -75,11 +75,11 @@ Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="Say more: each step, the time that stages take, what images show.")
 ]
 ALWAYS_NEW = ("export_database", "export_run")
-"""Commands that replace nothing in any case: what they write others work on."""
+"""Commands that never replace a file, as other programs work on their outputs."""
 WRITE_NOTHING = ("serve", "dry_run")
 """Options with which no output is written."""
 _replacing: ContextVar[bool] = ContextVar("_replacing", default=True)
-"""Whether a command's outputs may be there already."""
+"""Whether a command may replace existing outputs."""
 MOST_SEED = 2**63 - 1
 """Largest seed: other programs read seeds in result files as signed 64-bit integers."""
 Workers = Annotated[
@@ -101,7 +101,7 @@ SendImages = Annotated[
 
 
 class QuaternionOrder(StrEnum):
-    """What four columns of a quaternion hold."""
+    """Order of the four columns of a quaternion."""
 
     wxyz = "wxyz"
     xyzw = "xyzw"
@@ -176,7 +176,7 @@ def one_table(
     quaternions: "Order" = "wxyz",
     columns: Path | None = None,
 ) -> "Path | Table":
-    """The file that was named first; or --a and --b joined, with what was left out printed."""
+    """Returns the file given as argument, or the table of --a and --b joined. Notes on rows left out are printed."""
     tables = several_tables(given, first, [second] if second else [], key, what, prefixes, quaternions, columns)
     return tables[0] if isinstance(tables, list) else tables
 
@@ -191,7 +191,10 @@ def several_tables(
     quaternions: "Order" = "wxyz",
     columns: Path | None = None,
 ) -> "Path | Table | list[Table]":
-    """The file that was named first; or --a joined with each --b, with what was left out printed."""
+    """Returns the file given as argument, or a table for each --b joined with --a.
+
+    Notes on rows left out are printed.
+    """
     if (given is None) == (first is None) or (first is None) != (not seconds):
         raise InputError("E-OPTION-FILES", f"{what}: one file, or --a and --b with --key, needed")
     if given is not None:
@@ -203,29 +206,29 @@ def several_tables(
     from stcal.io.join import join
 
     joined = [join(str(first), str(second), key, prefixes, quaternions, columns) for second in seconds]
-    print_each("note", (note for each in joined for note in each.notes))
-    return [each.table for each in joined]
+    print_each("note", (note for result in joined for note in result.notes))
+    return [result.table for result in joined]
 
 
 def exports_of(words: Sequence[str], require_form: Callable[[str], None]) -> list[tuple[str, Path]]:
-    """(form, file) of each FORM=FILE of --export."""
-    found = []
+    """Returns form and file of each FORM=FILE of --export."""
+    exports = []
     for word in words:
         form, _, path = word.partition("=")
         require_form(form)
         if not path:
             raise InputError("E-OPTION-VALUE", f"--export {word}: no file; give {form}=FILE")
-        found.append((form, Path(path)))
-    return found
+        exports.append((form, Path(path)))
+    return exports
 
 
 def name_of(source: "Path | Table") -> str:
-    """Name of what :func:`one_table` returned, without its folder."""
+    """Returns the name, without folder, of a file or table from :func:`one_table`."""
     return source.name if isinstance(source, Path) else source.where
 
 
 def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextManager[None]:
-    """Return the context in which images are processed: on a Dask cluster, or by processes of this machine."""
+    """Returns the context in which images are processed: on a Dask cluster, or by processes of this machine."""
     if scheduler is None:
         if send_images:
             raise InputError("E-OPTION-NEEDS", "--send-images: only with --scheduler, to whose machines they are sent")
@@ -236,25 +239,25 @@ def handed_over(scheduler: str | None, send_images: bool) -> AbstractContextMana
 
 
 def require_passed(strict: bool, failed: Sequence[str], report: Path | None = None) -> None:
-    """Raise :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given."""
+    """Raises :class:`ChecksFailed` with the names of the failed checks if ``--strict`` was given."""
     if strict and failed:
-        more = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
+        others = f" and {len(failed) - 2} more" if len(failed) > 2 else ""
         where = f"; see {report}" if report else ""
         raise ChecksFailed(
             "E-CHECKS-FAILED",
-            f"--strict: failed: {', '.join(failed[:2])}{more}; results are written, do not use them{where}",
+            f"--strict: failed: {', '.join(failed[:2])}{others}; results are written, do not use them{where}",
         )
 
 
 def load_ahead(workers: int | None) -> None:
-    """Begin to load what processes need, while the command loads the same."""
+    """Begins to load the modules of the worker processes, while the command loads the same modules."""
     from stcal.parallel import load_ahead
 
     load_ahead(workers)
 
 
 def ellipse_options(min_diameter: float | None, max_diameter: float) -> "EllipseOptions":
-    """Sizes of the circles that detection seeks."""
+    """Returns the detection options for circles of these sizes."""
     from stcal.sfm.detect.circles.candidates import EllipseOptions
 
     if min_diameter is not None and max_diameter <= min_diameter:
@@ -265,7 +268,7 @@ def ellipse_options(min_diameter: float | None, max_diameter: float) -> "Ellipse
 
 
 def require_new(outputs: Sequence[tuple[str, Path]]) -> None:
-    """Refuse, before the work, outputs (option, path) that are there already, unless ``--overwrite`` was given."""
+    """Refuses, before the work, existing outputs (option, path), unless ``--overwrite`` was given."""
     for option, path in outputs:
         if not _replacing.get() and os.path.lexists(path) and not path.is_dir():
             where = f"{option} {path}" if option.startswith("-") else path
@@ -273,12 +276,11 @@ def require_new(outputs: Sequence[tuple[str, Path]]) -> None:
 
 
 def protect_outputs(application: typer.Typer) -> None:
-    """Let no command of an application write over what it was given to read, nor in silence over anything else.
+    """Prevents the commands of an application from overwriting their inputs, or other files without a request.
 
-    Every path among its parameters is an input, but those whose option says that it is ``writable``. What is there
-    already is replaced with ``--overwrite`` alone, which is added to the options of each command that writes a file, as
-    ``--quiet`` and ``--verbose`` are to all.
-    Standard output is that of ``--json -`` alone. Each option gets its panel of the help text.
+    Every path among the parameters is an input, except those whose option is ``writable``. Existing files are replaced
+    only with ``--overwrite``, an option that is added to each command that writes a file. ``--quiet`` and ``--verbose``
+    are added to all commands. Only ``--json -`` may use standard output. Each option gets its panel of the help text.
     """
     for command in application.registered_commands:
         if command.callback is not None:
@@ -310,9 +312,11 @@ def _protected(command: Callable) -> Callable:
             for path in (value if isinstance(value, list | tuple) else [value])
             if isinstance(path, Path)
         ]
-        written, read = ([(words[n], p) for n, p in paths if (n in outputs) == own] for own in (True, False))
-        alone = [option for option, path in written if path == STANDARD_OUTPUT]
-        for option in alone:
+        written, read = (
+            [(words[n], p) for n, p in paths if (n in outputs) == is_output] for is_output in (True, False)
+        )
+        to_stdout = [option for option, path in written if path == STANDARD_OUTPUT]
+        for option in to_stdout:
             if option != "--json":
                 raise InputError(
                     "E-OPTION-STDOUT", f"{option} -: only --json writes to standard output; give the name of a file"
@@ -323,19 +327,21 @@ def _protected(command: Callable) -> Callable:
         try:
             if command.__name__ not in ALWAYS_NEW and not any(given.get(name) for name in WRITE_NOTHING):
                 require_new(written)
-            with manner(quiet, verbose), said_apart() if alone else nullcontext():
+            with manner(quiet, verbose), said_apart() if to_stdout else nullcontext():
                 return command(**given)
         finally:
             _replacing.reset(token)
 
     checked.outputs = frozenset(outputs)  # type: ignore[attr-defined]
-    more = {"quiet": Quiet, "verbose": Verbose}
+    further = {"quiet": Quiet, "verbose": Verbose}
     if outputs and command.__name__ not in ALWAYS_NEW:
-        more = {"overwrite": Overwrite, **more}
-    added = [inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=a) for n, a in more.items()]
+        further = {"overwrite": Overwrite, **further}
+    added = [
+        inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=a) for n, a in further.items()
+    ]
     # Typer reads both.
     checked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore[attr-defined]
-    checked.__annotations__ = {**command.__annotations__, **more}
+    checked.__annotations__ = {**command.__annotations__, **further}
     return checked
 
 
@@ -343,15 +349,16 @@ def _protected(command: Callable) -> Callable:
 def designs_told(
     target: Path | None, board: Path | None, with_target: bool = True, with_board: bool = True
 ) -> Iterator[None]:
-    """Say which reference designs are assumed, and name them in what goes wrong meanwhile; say which faces of the
-    target's file are nearly alike.
+    """Prints which reference designs are assumed, and which faces of the target's file are nearly alike.
+
+    Errors within the context name the assumed designs.
 
     Parameters
     ----------
     target, board : path, optional
         Files that were given.
     with_target, with_board : bool
-        Whether the reference design stands in for a file that was not.
+        Whether the reference design replaces a file that was not given.
     """
     from stcal.io.design import target_of
     from stcal.sfm.detect.sightings import likeness_notes
@@ -359,8 +366,8 @@ def designs_told(
     if target is not None:
         print_each("note", likeness_notes(target_of(target)))
     assumed = assumed_designs(target is None and with_target, board is None and with_board)
-    for each in assumed:
-        say(f"assumed: {each}")
+    for design in assumed:
+        say(f"assumed: {design}")
     try:
         yield
     except StcalError as error:
@@ -370,15 +377,17 @@ def designs_told(
 
 
 def assumed_designs(target: bool, board: bool) -> list[str]:
-    """The reference target and board in a few words, with the options that name others."""
+    """Returns short descriptions of the reference target and board, with the options that name others."""
     from stcal.design import reference_board, reference_target
 
-    own, grid, words = reference_target(), reference_board(), []
+    reference, dots, words = reference_target(), reference_board(), []
     if target:
-        words.append(f"the reference target, {len(own.faces)} faces of {len(own.faces[0].ids)} circles (no --target)")
+        words.append(
+            f"the reference target, {len(reference.faces)} faces of {len(reference.faces[0].ids)} circles (no --target)"
+        )
     if board:
         words.append(
-            f"the reference board, {grid.rows}×{grid.columns} dots of radius {grid.radius_mm:g} mm, "
-            f"pitch {grid.pitch_mm:g} mm (no --board)"
+            f"the reference board, {dots.rows}×{dots.columns} dots of radius {dots.radius_mm:g} mm, "
+            f"pitch {dots.pitch_mm:g} mm (no --board)"
         )
     return words

@@ -1,4 +1,4 @@
-"""``stcal register``: the transform between two instruments' frames from corresponding points."""
+"""Command ``stcal register``: the transform between two instruments' frames from corresponding points."""
 
 from dataclasses import replace
 from enum import StrEnum
@@ -111,7 +111,7 @@ def register(
     pairs = read_pairs(source)
     if not isinstance(source, Path) and any("cov_" in column for column in source.columns):
         say("note: the covariances of --a and --b are not used; the noise of the points is estimated")
-    allow_ambiguous |= robot_file is not None  # a bent arm may look like two motions; the kinematics tell
+    allow_ambiguous |= robot_file is not None  # a bent arm may look like two motions; the kinematics show it
     options = {"model": model.value, "method": method.value, "threshold_mm": threshold, "seed": seed}
     options |= {"liu2017_options": liu2017} if liu2017 else {}
     result = registered(
@@ -124,23 +124,25 @@ def register(
         allow_ambiguous=allow_ambiguous,
         lines=pairs.lines,
     )
-    found = findings(pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, result, pairs.weights, pairs.covariances)
-    say(registration_text(found))
+    registration = findings(
+        pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, result, pairs.weights, pairs.covariances
+    )
+    say(registration_text(registration))
     print_each(f"warning: {pairs.where}", result.notes)
-    content, sections, failed = RegistrationFile.of(found), [], None
+    content, sections, failed = RegistrationFile.of(registration), [], None
     if robot_file:
         from stcal.robot.kinematics.file import robot_toml
         from stcal.workflows.register_robot import compared, comparison_section, comparison_text, robot_part
 
         try:
-            beside = compared(pairs, source, robot_file, found, options, folds)
+            beside = compared(pairs, source, robot_file, registration, options, folds)
             say("", comparison_text(beside), sep="\n")
             content = content.model_copy(update={"robot": robot_part(beside)})
             sections.append(comparison_section(beside))
             if identified:
                 comments = [f"Identified from {name_of(source)}: {beside.identified.rank} parameters."]
                 write(identified, robot_toml(beside.identified.robot, comments))
-        except (DegenerateError, ConvergenceError) as error:  # the transform stands all the same
+        except (DegenerateError, ConvergenceError) as error:  # the transform is valid without it
             failed = error
     if out:
         write(out, content)
@@ -148,6 +150,6 @@ def register(
         if liu2017:
             limits = liu2017 if threshold is None else replace(liu2017, limit_mm=threshold)
             sections.insert(0, sample_size_section(sample_sizes(pairs.xyz_a, pairs.xyz_b, limits, seed), limits))
-        write(report, registration_page(found, sections))
+        write(report, registration_page(registration, sections))
     if failed is not None:
         raise failed

@@ -1,5 +1,8 @@
-"""What commands say: results, in characters that a terminal prints and does not obey; progress of long work, on
-standard error; and the files they write, one of them to standard output where it is asked for there."""
+"""Output of the commands: printed results, the progress of long work, and files.
+
+Results have only characters that a terminal prints and does not execute. Progress goes to standard error. One JSON file
+may go to standard output.
+"""
 
 import json
 import os
@@ -44,12 +47,12 @@ VERDICTS = re.compile(
     r"(?m)(?P<before>^ *|^(?:verdict|split-half check): |(?<=checks: )\d+ |(?<=, )\d+ )"
     rf"(?P<word>{'|'.join(COLOURS)})(?=[:;,]| *$)"
 )
-"""Where such a word is one: before what it judges, after `verdict`, and in the counts of checks."""
+"""Places of a verdict's word: before the judged item, after `verdict`, and in the counts of checks."""
 
 
 @contextmanager
 def manner(quiet: bool, verbose: bool) -> Iterator[None]:
-    """What a command says meanwhile: nothing but warnings and errors, or more than usual."""
+    """Sets the verbosity within the context: warnings and errors only, or more than usual."""
     tokens = _quiet.set(quiet), _verbose.set(verbose)
     try:
         yield
@@ -59,13 +62,15 @@ def manner(quiet: bool, verbose: bool) -> Iterator[None]:
 
 
 def verbose() -> bool:
-    """Whether more than usual is to be said."""
+    """Returns whether more than usual is to be printed."""
     return _verbose.get()
 
 
 class StageProgress:
-    """A callable (stage, done, total): a bar on a terminal, plain lines otherwise, with the time left; nothing where
-    the command is quiet. Use as a context manager."""
+    """Progress of the stages of a command, as a context manager and callable (stage, done, total).
+
+    It shows a bar on a terminal, else plain lines, with the remaining time. It shows nothing if the command is quiet.
+    """
 
     def __init__(self):
         self.bar = None
@@ -101,23 +106,25 @@ class StageProgress:
         began = self.began.setdefault(stage, now)
         if done == total or (done and (now - self.last > LINE_EVERY_S or _verbose.get())):
             self.last = now
-            more = time_left(now - began, done, total)
+            suffix = time_left(now - began, done, total)
             if _verbose.get() and done == total:
-                more = f" in {now - began:.1f} s"
-            print(f"{stage}: {done} of {total}{more}", file=sys.stderr, flush=True)
+                suffix = f" in {now - began:.1f} s"
+            print(f"{stage}: {done} of {total}{suffix}", file=sys.stderr, flush=True)
 
 
 def time_left(taken_s: float, done: int, total: int) -> str:
-    """Remaining time in words, extrapolated from the items that are done; empty below ``LEFT_FROM_S``."""
-    left = taken_s / done * (total - done) if done else 0.0
-    if left < LEFT_FROM_S:
+    """Returns the remaining time in words, extrapolated from the finished items; empty below ``LEFT_FROM_S``."""
+    remaining_s = taken_s / done * (total - done) if done else 0.0
+    if remaining_s < LEFT_FROM_S:
         return ""
-    return f", about {left:.0f} s left" if left < 100 else f", about {left / 60:.0f} min left"
+    return f", about {remaining_s:.0f} s left" if remaining_s < 100 else f", about {remaining_s / 60:.0f} min left"
 
 
 def printable(text: str) -> str:
-    """Text without what a terminal would obey: a space stands for white space other than a line's end, a question mark
-    for each character that is not printed."""
+    """Returns the text without characters that a terminal would execute.
+
+    A space replaces white space other than a line's end, a question mark each character that cannot be printed.
+    """
     return "".join(c if c.isprintable() or c == "\n" else _instead(c) for c in text)
 
 
@@ -128,21 +135,21 @@ def _instead(character: str) -> str:
 
 
 def say(*values: object, sep: str = " ", end: str = "\n") -> None:
-    """Print, unless the command is quiet; names that come from files may hold any characters."""
+    """Prints the values, unless the command is quiet. Names from files may contain any characters."""
     if not _quiet.get():
         print(_coloured(printable(sep.join(map(str, values)))), end=end)
 
 
 def _coloured(text: str) -> str:
-    """Colour the words of verdicts if standard output is a terminal and `NO_COLOR` (no-color.org) is not set."""
+    """Colours the words of verdicts if standard output is a terminal and `NO_COLOR` (no-color.org) is not set."""
     if not sys.stdout.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text
-    return VERDICTS.sub(lambda found: f"{found['before']}\x1b[{COLOURS[found['word']]}m{found['word']}\x1b[0m", text)
+    return VERDICTS.sub(lambda match: f"{match['before']}\x1b[{COLOURS[match['word']]}m{match['word']}\x1b[0m", text)
 
 
 @contextmanager
 def said_apart() -> Iterator[None]:
-    """Keep standard output for the file that goes there; all that is said goes to standard error meanwhile."""
+    """Reserves standard output for a file. All other output goes to standard error within the context."""
     token = _taker.set(sys.stdout)
     try:
         with redirect_stdout(sys.stderr):
@@ -152,7 +159,7 @@ def said_apart() -> Iterator[None]:
 
 
 def write(path: Path, content, said: str = "written") -> None:
-    """Save text, bytes, or a dict or result file as JSON, and say so; or give JSON to standard output, ``-``."""
+    """Saves text, bytes, or a dict or result file as JSON, and prints the path; ``-`` is standard output."""
     if path == STANDARD_OUTPUT and (taker := _taker.get()) is not None:
         taker.write(_escaped(files.json_text(content), taker.encoding or "ascii"))
         taker.flush()
@@ -162,13 +169,13 @@ def write(path: Path, content, said: str = "written") -> None:
 
 
 def _escaped(text: str, encoding: str) -> str:
-    """JSON whose strings have ``\\u....`` in place of what a terminal would obey, or what the encoding has not."""
-    whole = encoding.lower().replace("-", "") == "utf8"
-    return re.sub(r"[^ -~\n]", lambda c: c[0] if whole and c[0].isprintable() else json.dumps(c[0])[1:-1], text)
+    """Returns JSON with ``\\u....`` for characters that a terminal would execute, or that the encoding lacks."""
+    is_utf8 = encoding.lower().replace("-", "") == "utf8"
+    return re.sub(r"[^ -~\n]", lambda c: c[0] if is_utf8 and c[0].isprintable() else json.dumps(c[0])[1:-1], text)
 
 
 def print_each(said: str, lines: Iterable[object]) -> None:
-    """Each on a line of its own, after the word."""
+    """Prints each on a line of its own, after the word ``said``."""
     for line in lines:
         if _quiet.get() and said.startswith("warning"):
             sys.stderr.write(f"{printable(f'{said}: {line}')}\n")

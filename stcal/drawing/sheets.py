@@ -121,7 +121,7 @@ class _Way:
 def _ways(part: Part, paper: str) -> list[_Way]:
     """Return the layouts of a part: portrait and landscape, with the table beside and below."""
     ways = []
-    taken = np.array([shape.box() for shape in part.pattern()])
+    boxes = np.array([shape.box() for shape in part.pattern()])
     for below, turned in product((True, False), (False, True)):
         width, height = PAPERS[paper]
         size = (height, width) if turned else (width, height)
@@ -129,7 +129,7 @@ def _ways(part: Part, paper: str) -> list[_Way]:
         box = extent(shapes)
         room = np.array(size) - FURNITURE
         across, down = (
-            seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), taken[:, :, k]) for k in (0, 1)
+            seams_between(float(box[0, k]), float(box[1, k]), float(room[k]), boxes[:, :, k]) for k in (0, 1)
         )
         ways.append(_Way(shapes, box, size, (across, down)))
     return ways

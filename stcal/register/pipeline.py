@@ -1,4 +1,4 @@
-"""Registration of two instruments from corresponding points: the calls in order; read this first."""
+"""Registration of two instruments from corresponding points: all steps in order. Read this file first."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -32,7 +32,7 @@ from stcal.register.judge.notes import Subject, notes_of
 
 METHODS = ("robust", "least-squares", "liu2017")
 NEAREST_MM = 1e-9
-"""Smallest threshold, mm: it is the precision of a double, with points as far as 1e12 mm."""
+"""Smallest threshold, mm: the precision of a double for points at a distance up to 1e12 mm."""
 SUSPICIOUS_SHARE = 0.5
 SUSPICIOUS_SIGMA = 0.05
 """Inlier share below which, and σ as a fraction of the points' RMS distance from their centroid above which, a mirrored
@@ -55,7 +55,7 @@ def register(
     liu2017_options: Liu2017Options | None = None,
     lines: Sequence[int] | None = None,
 ) -> Registration:
-    """b_from_a from corresponding points of two frames, some of which may be wrong.
+    """Returns b_from_a from corresponding points of two frames, some of which may be wrong.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(1)
@@ -77,21 +77,21 @@ def register(
     method : str
         ``robust``, ``least-squares`` or ``liu2017``.
     threshold_mm : float, optional
-        Inliers are nearer than this; estimated from the data where not given (``liu2017``: instead of its limit).
+        Largest distance of inliers; estimated from the data if not given (``liu2017``: in place of its limit).
     weights : (n,) array, optional
-        ~ 1/σ², positive.
+        Weights, proportional to 1/σ², positive.
     covariances : (n, 3, 3) or (n,) array, optional
         Covariance, or variance per axis, of b − b_from_a a in frame b, mm².
     seed : int
-        Of the random samples; the same seed gives the same answer.
+        Seed of the random samples; the same seed gives the same result.
     folds : int
-        Of the cross-validation; 0 for none.
+        Number of folds of the cross-validation; 0 for none.
     allow_ambiguous : bool
-        Give the transform of the more points where another one is about as good, instead of an error.
+        Whether to return the transform of the larger set if another one is about as good, instead of an error.
     liu2017_options : Liu2017Options, optional
-        For the method ``liu2017`` only.
+        Options of the method ``liu2017``.
     lines : sequence of int, optional
-        Lines of a file that messages name the points by; else rows, from 1.
+        Lines of a file by which messages name the points; by default rows, from 1.
 
     Returns
     -------
@@ -100,11 +100,11 @@ def register(
     Raises
     ------
     InputError
-        Shapes, values or options that cannot be used; units or axes of the two frames that do not fit together.
+        If shapes, values or options are invalid, or units or axes of the two frames do not fit together.
     DegenerateError
-        The points do not determine the model; none agree beyond chance; two transforms are about as good.
+        If the points do not determine the model, none agree beyond chance, or two transforms are about as good.
     ConvergenceError
-        A fit with covariances did not settle.
+        If a fit with covariances did not converge.
     """
     problem = _checked(xyz_a, xyz_b, model, method, threshold_mm, weights, covariances)
     if problem.model.name == "rigid":
@@ -209,7 +209,7 @@ def _held_out(problem: Problem, again: Callable[[Problem], Fitted], inliers: np.
 
 
 def _check_geometry(problem: Problem, method: str, fitted: Fitted, lines: Sequence[int] | None) -> None:
-    """Refuse mirrored frames, and points that do not determine the model; the baseline runs as it was published."""
+    """Refuses mirrored frames, and points that do not determine the model. The baseline runs as published."""
     if method == "liu2017":
         return
     inside = problem[fitted.inliers]
@@ -220,7 +220,7 @@ def _check_geometry(problem: Problem, method: str, fitted: Fitted, lines: Sequen
 
 
 def _beside(inside: Problem, fitted: Fitted) -> tuple[Wider | None, Shifted | None]:
-    """A wider model that explains the inliers, and those of them that are shifted together."""
+    """Returns a wider model that explains the inliers, and the inliers that are shifted together."""
     other = wider(inside, fitted.transform)
     if other is None:
         return None, shifted_rows(inside, fitted.transform)
@@ -248,7 +248,7 @@ def _liu2017(problem: Problem, options: Liu2017Options, seed: int) -> Fitted:
 
 
 def _robust(problem: Problem, threshold: float | None, seed: int) -> tuple[Fitted, Fitted | None]:
-    """The fit, and another one that other points agree on."""
+    """Returns the fit, and another fit on which other points agree."""
     try:
         fitted = robust_fit(problem, threshold, seed)
         _check_chance(problem, fitted)
@@ -273,7 +273,7 @@ def _robust(problem: Problem, threshold: float | None, seed: int) -> tuple[Fitte
 
 
 def _as_assigned(problem: Problem, group: np.ndarray, threshold: float | None) -> Fitted:
-    """The fit to a group too near the other one for a threshold between them: that of its own σ reaches into it."""
+    """Returns the fit to a group that no threshold separates from the other, as its own σ reaches into that group."""
     part = problem[group]
     transform = part.fit()
     square = part.squares(transform)
@@ -291,7 +291,7 @@ def _check_chance(problem: Problem, fitted: Fitted) -> None:
 
 
 def _check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, threshold: float | None, seed: int) -> None:
-    """Refuse points of which far more agree, or far better, when a is mirrored."""
+    """Refuses points of which far more agree, or agree far better, if a is mirrored."""
     if problem.model.name == "affine":
         return
     flip = np.array([1, 1, -1.0])

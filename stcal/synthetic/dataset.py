@@ -1,4 +1,4 @@
-"""Rendered data sets in a folder, with their truth."""
+"""Data sets of rendered images in a folder, with their truth."""
 
 import json
 from collections.abc import Callable

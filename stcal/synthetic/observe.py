@@ -91,11 +91,11 @@ def _whole(camera: Camera, xyz, normal, radius, centre_px: np.ndarray) -> np.nda
     """Returns the mask of the circles whose rims lie in the image. Only rims near its border are computed."""
     size = np.array([camera.width, camera.height])
     reach = NEAR_BORDER * camera.focal.max() * radius / np.maximum(xyz[:, 2], radius)
-    whole = ((centre_px > reach[:, None]) & (centre_px < size - 1 - reach[:, None])).all(1)
-    near = np.flatnonzero(~whole)
+    inside = ((centre_px > reach[:, None]) & (centre_px < size - 1 - reach[:, None])).all(1)
+    near = np.flatnonzero(~inside)
     rim = camera.project(rim_points(xyz[near], normal[near], radius[near]))
-    whole[near] = ((rim > 0) & (rim < size - 1)).all((1, 2))
-    return whole
+    inside[near] = ((rim > 0) & (rim < size - 1)).all((1, 2))
+    return inside
 
 
 def rim_points(xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, count: int = RIM_POINTS) -> np.ndarray:

@@ -156,9 +156,9 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
     few, board_ids = "fewer than 4 corners of the ChArUco board", board.tag_ids()
     if not ids:
         return f"{few}: no tag of {board.dictionary}"
-    if others := [tag for tag in ids if tag not in board_ids]:
+    if foreign := [tag for tag in ids if tag not in board_ids]:
         extent = f"{len(board_ids)} on a board of {board.rows}×{board.columns}"
-        return f"{few}: tag {max(others)} of {board.dictionary}, of {extent}" + (
+        return f"{few}: tag {max(foreign)} of {board.dictionary}, of {extent}" + (
             f" from {board_ids[0]}" if board_ids[0] else ""
         )
     return (

@@ -59,7 +59,7 @@ def calibrate_camera_by_corners(
     colmap_model
         COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``.
     workers
-        Processes; one per core where None.
+        Number of processes; one per core if None.
     progress
         Called with (stage, done, total).
 
@@ -140,7 +140,7 @@ def _observations(files: list[ImageFile], views: dict[str, BoardView], grid: Boa
 
 RIG_FILE, CHAIN_FILE = "rig.json", "camchain.yaml"
 TAKEN = ("rig", "camchain")
-"""Camera names whose files would overwrite these files."""
+"""Names that a camera must not have, as its files would overwrite other files."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""A calibration that takes its photographs itself: after each, the circles in it, its sharpness, and σ so far."""
+"""Calibration that takes its photographs itself and reports the circles, sharpness and σ after each."""
 
 import math
 import re
@@ -53,7 +53,7 @@ class Trigger:
     count : int, optional
         Number of photographs after which it ends.
     every_s : float, optional
-        Interval; at each line of ``keys`` where None.
+        Interval; if None, a photograph is taken at each line of ``keys``.
     keys : text stream
         The trigger ends with this stream.
     say : callable
@@ -99,7 +99,7 @@ def photograph(
     group : str
         Name of the group, in which only the camera moves. Its folder may hold earlier photographs, which stay.
     exposure : float, optional
-        In the driver's unit; unchanged where None.
+        Exposure in the driver's unit; unchanged if None.
     settle_s : float
         Time that the camera is given before each photograph, s.
     ready : callable

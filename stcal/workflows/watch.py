@@ -1,4 +1,4 @@
-"""A calibration that grows while photographs are taken: after each, its circles, σ so far, and the best next view."""
+"""Calibration that grows while photographs are taken and reports circles, σ and the best next view after each."""
 
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -36,7 +36,7 @@ class WatchOptions:
     interval_s : float
         Interval at which the folder is looked at, s; a photograph counts when it has not changed between two looks.
     idle_s : float, optional
-        Time without a new photograph after which watching ends, s; never where None.
+        Time without a new photograph after which watching ends, s; never if None.
     views : int
         Number of views to advise after each run; none where 0.
     run : RunOptions
@@ -172,9 +172,9 @@ def watch(
     out : path
         The run's folder: new, empty, or of an earlier run. Its page reloads itself, until another run is written there.
     target, board : paths or designs
-        The reference design where None.
+        Designs, or files of them; the reference design if None.
     options : WatchOptions, optional
-        The defaults where None.
+        The defaults if None.
     progress : callable, optional
         Called with (stage, done, total).
     sleep : callable, optional
@@ -197,25 +197,25 @@ def watch(
         raise InputError(
             "E-IMAGES-FOLDER", f"image folder {images}: not there; give the folder that photographs come into"
         )
-    known: dict[str, tuple] = {}
-    before: dict[str, tuple] = {}
-    quiet = 0.0
-    while options.idle_s is None or quiet < options.idle_s:
-        now = _stamps(images)
-        complete = {name: stamp for name, stamp in now.items() if before.get(name) == stamp}
-        before = now
-        if not complete or complete == known:
+    processed: dict[str, tuple] = {}
+    last_stamps: dict[str, tuple] = {}
+    idle_s = 0.0
+    while options.idle_s is None or idle_s < options.idle_s:
+        stamps = _stamps(images)
+        complete = {name: stamp for name, stamp in stamps.items() if last_stamps.get(name) == stamp}
+        last_stamps = stamps
+        if not complete or complete == processed:
             sleep(options.interval_s)
-            quiet += options.interval_s
+            idle_s += options.interval_s
             continue
-        gone = tuple(name for name in known if name not in now)
-        came = {name for name, stamp in complete.items() if known.get(name) != stamp}
-        known, quiet = complete, 0.0
-        yield growing.update(len(complete), came, gone, progress)
+        removed = tuple(name for name in processed if name not in stamps)
+        added = {name for name, stamp in complete.items() if processed.get(name) != stamp}
+        processed, idle_s = complete, 0.0
+        yield growing.update(len(complete), added, removed, progress)
 
 
 def _stamps(images: Path) -> dict[str, tuple]:
-    """Returns size and time of each image file; empty where there is none yet."""
+    """Returns size and time of each image file; empty if there are no images yet."""
     stamps = {}
     try:
         files, _ = find_images(images)

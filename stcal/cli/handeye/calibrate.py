@@ -1,4 +1,4 @@
-"""``stcal handeye``: where the camera sits on the robot's flange, or beside the robot, and how well that is known."""
+"""Command ``stcal handeye``: the pose of a camera on the robot's flange, or beside the robot, with its uncertainty."""
 
 import math
 from enum import StrEnum
@@ -53,7 +53,7 @@ SCALED = ("pose", "reprojection")
 
 
 class CameraFrameName(StrEnum):
-    """Which of ROS's two frames of a camera."""
+    """Name of one of ROS's two frames of a camera."""
 
     optical = "optical"
     link = "link"
@@ -261,9 +261,9 @@ def handeye(
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
-    said = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
+    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
     timing = Timing(time_tolerance, image_times, time_offset)
-    pairs = source_of(source, first, second, key, said, quaternions.value, timing)
+    pairs = source_of(source, first, second, key, statements, quaternions.value, timing)
     folder = isinstance(pairs, Path) and pairs.is_dir()
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
@@ -301,23 +301,25 @@ def handeye(
         seed=de_seed,
     )
     if dry_run:
-        say("\n".join(understood(pairs, poses, camera, board, quaternions.value, said, timing, robot_model)))
+        say("\n".join(understood(pairs, poses, camera, board, quaternions.value, statements, timing, robot_model)))
         return
     with StageProgress() as progress:
-        given = read_input(pairs, poses, camera, board, workers, progress, quaternions.value, said, timing, robot_model)
-        for line in given.understood:
+        inputs = read_input(
+            pairs, poses, camera, board, workers, progress, quaternions.value, statements, timing, robot_model
+        )
+        for line in inputs.understood:
             say(line)
-        with_scale = with_scale or given.unit_mm is not None
+        with_scale = with_scale or inputs.unit_mm is not None
         options = HandEyeOptions(
-            noise, given.prior if refine_camera else None, with_scale, given.symmetries, four_dof, evolution
+            noise, inputs.prior if refine_camera else None, with_scale, inputs.symmetries, four_dof, evolution
         )
         validation = Splits(splits, held_out, seed, workers, motions_held_out)
         if method is None and not (refine_camera or with_scale or four_dof):
             method = AUTO
-        chosen, offset = setup_of(said, given.setup, given.where), None
+        chosen, offset = setup_of(statements, inputs.setup, inputs.where), None
         if time_offset:
-            given, options, offset = at_offset(given, chosen, options)
-        outcome = with_offset(calibrate(given, chosen, method, options, validation, progress), offset)
+            inputs, options, offset = at_offset(inputs, chosen, options)
+        outcome = with_offset(calibrate(inputs, chosen, method, options, validation, progress), offset)
     result = outcome.result
     say(outcome_text(outcome))
     for option, given_, able in (("--with-scale", with_scale, SCALED), ("--refine-camera", refine_camera, SCALED[1:])):
@@ -339,8 +341,8 @@ def handeye(
         write(path, exported(result, form, path.stem, parent, child, camera_frame.value))
     if camera_out:
         _save_camera(camera_out, outcome)
-    if robot_out and given.arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
-        save_robot(robot_out, given.arm.identified(result.reprojection.arm))
+    if robot_out and inputs.arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
+        save_robot(robot_out, inputs.arm.identified(result.reprojection.arm))
         say(f"written: {robot_out}")
     if json_file:
         write(json_file, HandEyeFile.of(outcome, whole=True))
@@ -350,7 +352,7 @@ def handeye(
 def _require_arm(
     folder: bool, method: str | None, four_dof: bool, with_kinematics: Path | None, robot_out: Path | None
 ) -> None:
-    """Options of the arm go together."""
+    """Checks that the options of the arm are compatible."""
     if robot_out and not with_kinematics:
         raise InputError(
             "E-OPTION-NEEDS", "--robot-out: only with --with-kinematics; the robot is as its file says else"
@@ -373,7 +375,7 @@ def _require_arm(
 def _require_fitting(
     of_poses: bool, method: str | None, refine_camera: bool, camera_out: Path | None, with_arm: bool
 ) -> None:
-    """Options of the camera and the method go together."""
+    """Checks that the options of camera and method are compatible."""
     from stcal.handeye import METHODS
     from stcal.workflows.handeye.calibrate import ALL
 
@@ -398,7 +400,7 @@ def _require_frames(
     child: str,
     camera_frame: "CameraFrame",
 ) -> None:
-    """Frames are named only where there are any, and each has a name of its own."""
+    """Checks that frames are named only for outputs with frames, and that their names differ."""
     from stcal.handeye.report.export import ROS_FORMS, frame_names, require_frame_names
 
     if (parent or child or camera_frame != "optical") and not (ros or any(form in ROS_FORMS for form, _ in exports)):
@@ -411,7 +413,7 @@ def _require_frames(
 
 
 def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
-    """``±``, ``X,Y,Z,±`` or ``closed-form,±``."""
+    """Returns the bounds in a text like ``±``, ``X,Y,Z,±`` or ``closed-form,±``."""
     from stcal.handeye.methods.evolution import Bounds
 
     if text is None:
@@ -421,14 +423,14 @@ def _bounds(option: str, text: str | None, factor: float) -> "Bounds | None":
         half_width = factor * float(half)
         if about == ["closed-form"]:
             return Bounds(half_width, None)
-        x, y, z = (factor * float(each) for each in about or "000")
+        x, y, z = (factor * float(number) for number in about or "000")
         return Bounds(half_width, (x, y, z))
     except ValueError as error:
         raise InputError("E-OPTION-VALUE", f"{option} {text}: one number, X,Y,Z,± or closed-form,± needed") from error
 
 
 def _evolution(method: str | None, **given) -> "EvolutionOptions":
-    """Options of differential evolution, those that were given."""
+    """Returns the options of differential evolution, with defaults for those that were not given."""
     from stcal.handeye import EvolutionOptions
     from stcal.workflows.handeye.calibrate import ALL
 
@@ -441,13 +443,15 @@ def _evolution(method: str | None, **given) -> "EvolutionOptions":
 def _save_camera(path: Path, outcome: "Outcome") -> None:
     from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 
-    found = outcome.result.reprojection
-    if found is None:
+    reprojection = outcome.result.reprojection
+    if reprojection is None:
         raise InputError(
             "E-OPTION-METHOD", f"--camera-out: {outcome.result.method} does not adjust the camera; leave --method out"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_cameras_txt(path, CalibratedCamera.of(found.camera, outcome.colmap_model, found.camera_covariance))
+    write_cameras_txt(
+        path, CalibratedCamera.of(reprojection.camera, outcome.colmap_model, reprojection.camera_covariance)
+    )
     say(f"written: {path}")
 
 

@@ -1,4 +1,4 @@
-"""What the commands of hand-eye read, and the options that say it."""
+"""Inputs of the commands of hand-eye, and their options."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class SetupName(StrEnum):
-    """What carries the camera."""
+    """Name of the setup, by the carrier of the camera."""
 
     in_hand = "eye-in-hand"
     to_hand = "eye-to-hand"
@@ -101,13 +101,13 @@ def source_of(
     quaternions: "Order",
     timing: "Timing | None" = None,
 ) -> "Source":
-    """The file or folder that was named first; or --a and --b joined, whatever their formats."""
+    """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
     from stcal.workflows.handeye.inputs import two_files
     from stcal.workflows.handeye.times import Timing
 
     if source is None and first is not None and second is not None:
-        told = two_files(first, second, key, said, quaternions, timing or Timing())
-        if told is not None:
-            return told
+        joined = two_files(first, second, key, said, quaternions, timing or Timing())
+        if joined is not None:
+            return joined
     prefixes = ("base_from_flange_", "camera_from_board_")
     return one_table(source, first, second, key, "POSES|IMAGES", prefixes, quaternions)

@@ -1,4 +1,4 @@
-"""``stcal handeye plan``: which robot poses to take next."""
+"""Command ``stcal handeye plan``: choice of the next robot poses."""
 
 from pathlib import Path
 from typing import Annotated
@@ -64,19 +64,19 @@ def plan(
     from stcal.workflows.handeye.inputs import read_input, setup_of
     from stcal.workflows.handeye.plan import plan_next
 
-    said = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
-    pairs = source_of(source, first, second, key, said, quaternions.value)
+    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
+    pairs = source_of(source, first, second, key, statements, quaternions.value)
     robot = load_robot(robot_file) if robot_file else None
     with StageProgress() as progress:
-        given = read_input(pairs, poses, camera, board, workers, progress, quaternions.value, said)
-    for line in given.understood:
+        inputs = read_input(pairs, poses, camera, board, workers, progress, quaternions.value, statements)
+    for line in inputs.understood:
         say(line)
-    found = plan_next(given, setup_of(said, given.setup, given.where), count, robot, seed)
-    say(planned_text(found.result, found.poses, found.joints))
-    for name, reason in given.left_out:
+    planned = plan_next(inputs, setup_of(statements, inputs.setup, inputs.where), count, robot, seed)
+    say(planned_text(planned.result, planned.poses, planned.joints))
+    for name, reason in inputs.left_out:
         say(f"left out {name}: {reason}")
-    print_each("note", found.notes)
+    print_each("note", planned.notes)
     if out:
-        write(out, planned_csv(found.poses, found.joints))
+        write(out, planned_csv(planned.poses, planned.joints))
     if json_file:
-        write(json_file, planned_file(found.result, found.poses, found.joints))
+        write(json_file, planned_file(planned.result, planned.poses, planned.joints))

@@ -1,4 +1,4 @@
-"""``stcal handeye rig``: several cameras of one robot, solved together."""
+"""Command ``stcal handeye rig``: several cameras of one robot, solved together."""
 
 from pathlib import Path
 from typing import Annotated
@@ -73,12 +73,12 @@ def rig(
     files = read_rig_file(rig_file)
     written = {"--out": out, "--json": json_file, "--report": report}
     keep_apart([(name, path) for name, path in written.items() if path], files.read())
-    said = Said.of_options(rotation or [], length_unit or [], poses_are or [], None)
+    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], None)
     with StageProgress() as progress:
-        given = read_rig(files, workers, progress, quaternions.value, said, time_tolerance)
-        print_each("understood", given.understood)
+        inputs = read_rig(files, workers, progress, quaternions.value, statements, time_tolerance)
+        print_each("understood", inputs.understood)
         validation = Splits(splits, held_out, seed, workers)
-        outcome = calibrate_rig(given, refine_camera, with_scale, validation, progress)
+        outcome = calibrate_rig(inputs, refine_camera, with_scale, validation, progress)
     say(rig_text(outcome))
     for name, what, why in outcome.left_out():
         say(f"left out {name}: {what}: {why}")

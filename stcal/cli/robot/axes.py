@@ -1,4 +1,4 @@
-"""``stcal robot axes``: the axis method."""
+"""Command ``stcal robot axes``: the axis method."""
 
 import math
 from pathlib import Path
@@ -86,7 +86,7 @@ def axes(
 
 
 def _length(text: str, data: "Measurements") -> float | None:
-    """Distance of virtual reflectors, mm; None for positions alone."""
+    """Returns the distance of virtual reflectors, mm; None for positions alone."""
     from stcal.robot.axes.sweeps import length_of
 
     if text in ("auto", "off"):

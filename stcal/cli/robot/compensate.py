@@ -1,4 +1,4 @@
-"""``stcal robot compensate``: joint values that reach what was commanded."""
+"""Command ``stcal robot compensate``: joint values that reach commanded poses."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -26,7 +26,7 @@ from stcal.io.files import keep_apart
 
 
 class ExportAs(StrEnum):
-    """What files of controllers hold."""
+    """Content of the files for controllers."""
 
     joints = "joints"
     poses = "poses"
@@ -111,9 +111,9 @@ def compensate(
 
         write(report, compensation_page(result, identified))
     for form, path in exports if result.found.usable.any() else ():
-        made = exported(result, identified, form, path, export_as.value, pulses)
-        write(path, made.text)
-        print_each("note", made.notes)
+        exported_file = exported(result, identified, form, path, export_as.value, pulses)
+        write(path, exported_file.text)
+        print_each("note", exported_file.notes)
     if not result.found.usable.any():
         raise DegenerateError(
             "E-ROBOT-UNREACHED", f"{wanted.where}: none of {len(result)} poses is reached; see the warnings above"

@@ -1,4 +1,4 @@
-"""Commands `robot init` and `robot convert`: robot files."""
+"""Commands ``stcal robot init`` and ``convert``: robot files."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -54,11 +54,11 @@ def convert(
             f"{source}, {out}: both are {'URDF' if _is_xml(source) else 'robot files'}; one of each needed",
         )
     if _is_xml(source):
-        found = load_urdf(source, from_link, to_link or "", convention.value)
-        joints = ", ".join(found.joints)
-        say(f"robot {found.robot.name}: {len(found.joints)} joints from {found.from_link} to {found.to_link}: {joints}")
-        print_each(f"note: {source}", found.notes)
-        write(out, robot_toml(found.robot, [f"From {source.name}, {found.from_link} to {found.to_link}: {joints}."]))
+        urdf = load_urdf(source, from_link, to_link or "", convention.value)
+        joints = ", ".join(urdf.joints)
+        say(f"robot {urdf.robot.name}: {len(urdf.joints)} joints from {urdf.from_link} to {urdf.to_link}: {joints}")
+        print_each(f"note: {source}", urdf.notes)
+        write(out, robot_toml(urdf.robot, [f"From {source.name}, {urdf.from_link} to {urdf.to_link}: {joints}."]))
         return
     if from_link or to_link or convention is not ConventionName.standard:
         raise InputError(

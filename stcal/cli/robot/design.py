@@ -1,4 +1,4 @@
-"""``stcal robot design``: measurement poses."""
+"""Command ``stcal robot design``: choice of measurement poses."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -12,7 +12,7 @@ from stcal.errors import InputError
 
 
 class ObservedKind(StrEnum):
-    """What the instrument measures."""
+    """Quantity that the instrument measures."""
 
     pose = "pose"
     position = "position"

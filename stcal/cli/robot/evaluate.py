@@ -1,4 +1,4 @@
-"""Commands `robot evaluate` and `robot verify`: robots judged on new measurements."""
+"""Commands ``stcal robot evaluate`` and ``verify``: robots are judged by new measurements."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -24,7 +24,7 @@ from stcal.errors import InputError
 
 
 class RefitParts(StrEnum):
-    """What is fitted anew."""
+    """Transforms that are fitted again to the new measurements."""
 
     none = "none"
     base = "base"

@@ -1,4 +1,4 @@
-"""``stcal robot from-photos``: from photographs of the target on an arm to joint values, in one command."""
+"""Command ``stcal robot from-photos``: joint values from photographs of the target on an arm."""
 
 from pathlib import Path
 from typing import Annotated

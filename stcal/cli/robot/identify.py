@@ -1,4 +1,4 @@
-"""``stcal robot identify``: kinematics from poses, positions or distances."""
+"""Command ``stcal robot identify``: kinematics from poses, positions or distances."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -26,7 +26,7 @@ from stcal.cli.terminal import say, write
 
 
 class Kind(StrEnum):
-    """What is taken of the measurements."""
+    """Quantity that is used of the measurements."""
 
     pose = "pose"
     position = "position"

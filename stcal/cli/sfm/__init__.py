@@ -1,4 +1,4 @@
-"""``stcal-sfm``: from images to the calibrated target, and all that goes with it."""
+"""Commands ``stcal-sfm``: calibration of a target from images, and related tasks."""
 
 import typer
 

@@ -1,4 +1,4 @@
-"""``stcal-sfm budget``: the uncertainty budget of a finished run."""
+"""Command ``stcal-sfm budget``: the uncertainty budget of a finished run."""
 
 from pathlib import Path
 from typing import Annotated
@@ -69,14 +69,16 @@ def budget(
             "E-OPTION-NEEDS",
             f"--lengths-statement {lengths_statement}: of a second calibration; give it with --lengths",
         )
-    found, tests = budget_of_run(saved, stated), []
+    computed, tests = budget_of_run(saved, stated), []
     if check_lengths is not None:
-        tests.append(against_stated(found, check_lengths))
+        tests.append(against_stated(computed, check_lengths))
     if lengths is not None:
         second = load_run(lengths)
-        its = statement_of(second.board.stated, lengths_statement or statement)
-        tests.append(against_run(found, budget_of_run(second, its), lengths, (saved.board, second.board)))
-    file = BudgetFile.of(found, saved, verify(run), tests)
+        statement_of_second = statement_of(second.board.stated, lengths_statement or statement)
+        tests.append(
+            against_run(computed, budget_of_run(second, statement_of_second), lengths, (saved.board, second.board))
+        )
+    file = BudgetFile.of(computed, saved, verify(run), tests)
     say(budget_text(file))
     if out:
         write(out, file, "as JSON")
@@ -88,12 +90,12 @@ def budget(
 
 
 def _require_pdf(page: Path | None, run: Path) -> None:
-    """Refuse, before the work, a PDF that has no page or no place.
+    """Refuses, before the work, a PDF without a page or a place.
 
     Raises
     ------
     InputError
-        Which, and what to do.
+        If there is no page, the page itself has the suffix of a PDF, or ``stcal[pdf]`` is not installed.
     """
     from stcal.report.page import require_pdf
 

@@ -1,4 +1,4 @@
-"""``stcal-sfm calibrate-camera``: intrinsics from photographs of the board."""
+"""Command ``stcal-sfm calibrate-camera``: intrinsics from photographs of the board."""
 
 from pathlib import Path
 from typing import Annotated
@@ -94,7 +94,7 @@ def calibrate_camera(
 
 
 def _one(images: Path, out: Path, target, board, model: str, json_file, report, workers) -> list[str]:
-    """What failed."""
+    """Calibrates one camera, and returns the failed checks."""
     from stcal.design import BoardDesign
     from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
@@ -109,8 +109,8 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
             result = calibrate(images, target, board, model, workers=workers, progress=progress)
         else:
             result = calibrate_camera_by_corners(images, board, model, workers, progress)
-    own = result.intrinsics
-    write_cameras_txt(out, CalibratedCamera.of(own.camera, own.colmap_model, own.covariance))
+    intrinsics = result.intrinsics
+    write_cameras_txt(out, CalibratedCamera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance))
     summary = CalibrationFile.of(result)
     say(calibration_text(result, summary))
     say(f"camera file: {out}")
@@ -123,7 +123,7 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
 
 
 def _rig(images: Path, out: Path, target, board, models, json_file, report, workers) -> list[str]:
-    """What failed."""
+    """Calibrates the cameras of a rig, and returns the failed checks."""
     from stcal.io.files import require_new_folder, save_folder
     from stcal.sfm.camera.file import RigCalibrationFile
     from stcal.sfm.camera.report import rig_page, rig_text
@@ -131,15 +131,19 @@ def _rig(images: Path, out: Path, target, board, models, json_file, report, work
 
     require_new_folder(out, images)
     with StageProgress() as progress:
-        found = calibrate_rig_from_photographs(images, target, board, models, workers, progress)
-    files, missing = files_of(found)
+        calibration = calibrate_rig_from_photographs(images, target, board, models, workers, progress)
+    files, missing = files_of(calibration)
     save_folder(out, files)
-    say(rig_text(found))
+    say(rig_text(calibration))
     print_each("note", missing)
     say(f"rig: {out}: {', '.join(files)}")
     if json_file:
-        write(json_file, RigCalibrationFile.of(found), "figures and checks")
+        write(json_file, RigCalibrationFile.of(calibration), "figures and checks")
     if report:
-        write(report, rig_page(found, str(images)), "report")
-    each = zip(found.names, found.cameras, strict=True)
-    return [f"split-half check of {name}" for name, own in each if own.split and own.split.verdict == "failed"]
+        write(report, rig_page(calibration, str(images)), "report")
+    named_cameras = zip(calibration.names, calibration.cameras, strict=True)
+    return [
+        f"split-half check of {name}"
+        for name, single in named_cameras
+        if single.split and single.split.verdict == "failed"
+    ]

@@ -1,4 +1,4 @@
-"""``stcal-sfm plan``, ``advise``, ``watch`` and ``capture``: what to photograph, before, after and meanwhile."""
+"""Commands ``stcal-sfm plan``, ``advise``, ``watch`` and ``capture``: photographs before, during and after a run."""
 
 import sys
 from pathlib import Path
@@ -117,9 +117,9 @@ def advise(
     saved = load_run(run)
     if doubt := doubts(saved):
         say(f"warning: {doubt}")
-    known = known_of(saved)
+    geometry = known_of(saved)
     with StageProgress() as progress:
-        advice = advice_for(known, count, progress)
+        advice = advice_for(geometry, count, progress)
     say(advice_text(advice))
     if out:
         write(out, AdviceFile.of_advice(advice), "as JSON")
@@ -166,7 +166,7 @@ def watch(
 
 
 def _say_update(update: "Update") -> None:
-    """What was found in what came, σ so far, and what would help most."""
+    """Prints the circles found in new photographs, σ so far, and the view that would help most."""
     from stcal.sfm.planning.file import next_text
     from stcal.sfm.runs.text import found_lines, so_far_text
 
@@ -246,8 +246,8 @@ def capture(
     try:
         say(f"{source.name}; report: {out / 'report.html'}")
         with designs_told(target, board):
-            for taken in photograph(source, growing, group, exposure, settle, trigger.ready):
-                say(f"taken {taken.name}: {taken.light()}")
-                _say_update(taken.update)
+            for photo in photograph(source, growing, group, exposure, settle, trigger.ready):
+                say(f"taken {photo.name}: {photo.light()}")
+                _say_update(photo.update)
     finally:
         source.close()

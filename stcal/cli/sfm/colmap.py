@@ -1,4 +1,4 @@
-"""``stcal-sfm``: what goes to and comes from COLMAP, and why something was left out."""
+"""Commands ``stcal-sfm`` for the exchange with COLMAP and other programs, and for images and circles left out."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -14,7 +14,7 @@ app = typer.Typer()
 
 
 class Chained(StrEnum):
-    """How groups that are solved by themselves are combined."""
+    """Way in which the faces of single groups are combined."""
 
     chain = "chain"
     paper = "paper"
@@ -203,13 +203,13 @@ def pairs(
     from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
-    found = run_gates(saved, group)
-    for name, rows in found.items():
+    gates_by_group = run_gates(saved, group)
+    for name, rows in gates_by_group.items():
         images = len({image for row in rows for image in (row.score.first, row.score.second)})
         say(pairs_table(name, images, rows, len(rows) if everything else SHOWN_PAIRS), end="\n\n")
     say(limits_text(saved.options.pairs))
     if out:
-        write(out, PairsFile.of(found), "as JSON")
+        write(out, PairsFile.of(gates_by_group), "as JSON")
 
 
 @app.command()

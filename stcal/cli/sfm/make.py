@@ -1,4 +1,4 @@
-"""``stcal-sfm``: targets and boards to be made."""
+"""Commands ``stcal-sfm draw`` and ``design``: targets and boards to be made."""
 
 import os
 from functools import partial
@@ -94,14 +94,14 @@ def design(
     model = read_camera(camera) if camera else None
     options = MakeOptions(size_of(size), circles, radius, distance, width, model, "bright" if bright else "dark", seed)
     with StageProgress() as progress:
-        made = make_target(options, partial(progress, "hide"))
-    target = made.pattern.target
+        product = make_target(options, partial(progress, "hide"))
+    target = product.pattern.target
     noise, source = expected_noise()
     planned = PlanOptions(images=images, distance_mm=distance, width=width, camera=model, noise=noise, seed=seed)
-    forecast = plan(planned, target, board or made.board, target.rough_poses())
+    forecast = plan(planned, target, board or product.board, target.rough_poses())
     save(target_file, target_toml(target))
-    say(f"{made_text(made)}\n{target_file}")
+    say(f"{made_text(product)}\n{target_file}")
     if board is None:
-        save(board_file, board_toml(made.board))
+        save(board_file, board_toml(product.board))
         say(board_file)
     say(f"\n{plan_text(forecast, source)}")

@@ -1,4 +1,4 @@
-"""``stcal-sfm measure``: the calibrated target at work."""
+"""Command ``stcal-sfm measure``: poses of the calibrated target in images."""
 
 import os
 import sys
@@ -115,10 +115,10 @@ def measure(
             "--send-images": send_images,
             "--strict": strict,
         }
-        if given := [name for name, value in alone.items() if value]:
+        if conflicting := [name for name, value in alone.items() if value]:
             raise InputError(
                 "E-OPTION-CONFLICT",
-                f"--serve and {given[0]}: images come over HTTP, one answer each; leave {given[0]} out",
+                f"--serve and {conflicting[0]}: images come over HTTP, one answer each; leave {conflicting[0]} out",
             )
         ellipses = ellipse_options(min_diameter, max_diameter)
         _serve(camera, faces, target, board, sigma_factor, ellipses, (host, port, max_megabytes, workers))
@@ -138,7 +138,7 @@ def measure(
         if path is not None and not path.parent.is_dir():
             raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
     design = target_of(target)
-    known = read_target(faces, design)
+    circles = read_target(faces, design)
     table = read_table(joints, "joints") if joints else None
     options = work.MeasureOptions(
         PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipse_options(min_diameter, max_diameter), workers
@@ -146,7 +146,7 @@ def measure(
     told = designs_told(target, board, with_board=False)
     with told, handed_over(scheduler, send_images), StageProgress() as progress:
         result = work.measure(
-            images, read_camera(camera), known, design, load_board(board) if board else None, options, progress
+            images, read_camera(camera), circles, design, load_board(board) if board else None, options, progress
         )
     text, apart = output.poses_csv(result, table)
     say(output.measure_text(result))
@@ -158,7 +158,7 @@ def measure(
         from stcal.sfm.measurement.report import measure_page
 
         write(report, measure_page(result, str(images)), "report")
-    failed = [each.name for each in result.images if fit_verdict(each.pose) == "failed"]
+    failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
     require_passed(strict, [f"χ² of {name}" for name in failed], report)
 
 
@@ -171,9 +171,9 @@ def _serve(camera, faces, target, board, sigma_factor, ellipses, listen) -> None
 
     host, port, max_megabytes, workers = listen
     workers = workers or os.cpu_count() or 1
-    known = replace(read_target(faces, design := target_of(target)), design=design)
+    circles = replace(read_target(faces, design := target_of(target)), design=design)
     setting = Setting(
-        known,
+        circles,
         read_camera(camera),
         load_board(board) if board else None,
         PoseOptions(sigma_factor=sigma_factor),

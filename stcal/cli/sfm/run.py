@@ -1,4 +1,4 @@
-"""``run``, ``detect``, ``verify``: from images to the calibrated target."""
+"""Commands ``stcal-sfm run``, ``detect``, ``verify`` and ``report``: calibration of the target from images."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -34,27 +34,27 @@ app = typer.Typer()
 
 
 class Frame(StrEnum):
-    """How a face's frame is laid."""
+    """Definition of a face's frame."""
 
     plane = "plane"
     three_point = "three-point"
 
 
 class PairsChoice(StrEnum):
-    """Which pairs of images are matched."""
+    """Choice of the pairs of images that are matched."""
 
     all = "all"
     sparse = "sparse"
 
 
 class ComparedWith(StrEnum):
-    """What a run's answer is compared with."""
+    """Method with which a run's result is compared."""
 
     paper = "paper"
 
 
 class Solve(StrEnum):
-    """How the groups are solved."""
+    """Way in which the groups are solved."""
 
     joint = "joint"
     chain = "chain"
@@ -213,11 +213,11 @@ def detect(
             "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
         )
     chosen_images(images, options.exclude)
-    given = {"images": images, "--camera": camera, "--target": target, "--board": board}
+    inputs = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with (
         designs_told(target, board),
         handed_over(scheduler, send_images),
-        run_folder(out, MarkerFile.of(images, None), given) as folder,
+        run_folder(out, MarkerFile.of(images, None), inputs) as folder,
         StageProgress() as progress,
     ):
         detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)

@@ -1,4 +1,4 @@
-"""``stcal-sfm``: designs to edit, simulated data sets, and runs against a known truth."""
+"""Commands ``stcal-sfm init``, ``simulate``, ``compare`` and ``demo``: designs to edit, and data with known truth."""
 
 import tempfile
 from dataclasses import replace
@@ -108,7 +108,7 @@ def simulate(
     )
     if second_design and (target or board):
         raise InputError("E-OPTION-CONFLICT", "--second-design and --target or --board: two designs; give one of them")
-    one_given = (target is None) != (board is None)  # both are the reference's where neither is
+    one_given = (target is None) != (board is None)  # both are the reference's if neither is given
     with designs_told(target, board, with_target=one_given, with_board=one_given):
         scene = _scene(options, _designs(target, board, second_design), groups, camera, fisheye)
     rendering = RenderOptions(
@@ -157,7 +157,7 @@ def _lens(
 
 
 def _designs(target: Path | None, board: Path | None, second_design: bool) -> "tuple[TargetDesign, BoardDesign]":
-    """Those of files, of the reference, or the second ones."""
+    """Returns the designs of the files, the reference designs, or the second designs."""
     from stcal.io.design import board_of, target_of
     from stcal.synthetic.scene import second_design as other
 
@@ -171,7 +171,7 @@ def _scene(
     camera: Path | None,
     fisheye: float | None,
 ) -> "Scene":
-    """The designs, with faces at their rough poses, before the camera of a file or one that the options describe."""
+    """Returns a scene of the designs, with faces at their rough poses, before the camera of a file or the options."""
     from stcal.io.cameras.read import read_camera
     from stcal.sfm.planning.nominal import nominal_poses
     from stcal.sfm.planning.session import pairs_of_faces

@@ -1,4 +1,4 @@
-"""Closed-form methods of OpenCV by their authors' names, and linear solutions of the loop from subsets of the poses."""
+"""OpenCV's closed-form methods by their authors' names, and linear solutions of the loop from subsets of the poses."""
 
 from dataclasses import replace
 

@@ -1,1 +1,1 @@
-"""Fits of the three models, the search for what agrees, and what the answer is worth."""
+"""Fits of the three models, the search for a consensus, and the uncertainty of the result."""

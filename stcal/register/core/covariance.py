@@ -25,9 +25,9 @@ class Covariance:
     matrix : (p, p) array
         Parameters as of :func:`~stcal.register.core.models.unit_covariance`.
     scaled : bool
-        Whether it rests on the residuals; False where it rests on the σ given.
+        Whether it is derived from the residuals; False if it is derived from the given σ.
     redundancy : float
-        Degrees of freedom of the σ that it rests on; infinite where that was given.
+        Degrees of freedom of the σ that it is derived from; infinite if this σ was given.
     """
 
     matrix: Array
@@ -49,20 +49,20 @@ def kept_variance(cut: float) -> float:
 
 
 def sigma_within(square_sum: float, model: Model, count: int, threshold: float) -> float:
-    """σ of points whose residuals were cut off.
+    """Estimates σ of points from residuals that were cut off at a threshold.
 
-    Those within c σ hold only the share χ²₅(c²)/χ²₃(c²) of their variance: σ solves s² = σ² χ²₅/χ²₃ at c = t/σ. Below
-    c = 1 they fill the sphere all but evenly and say nothing about σ.
+    Residuals within c σ hold only the share χ²₅(c²)/χ²₃(c²) of their variance: σ solves s² = σ² χ²₅/χ²₃ at c = t/σ.
+    Below c = 1 the points fill the sphere almost uniformly and give no information on σ.
 
     Parameters
     ----------
     square_sum : float
-        Of the residuals of the points used, mm².
+        Square sum of the residuals of the points used, mm².
     model : Model
     count : int
-        Points used.
+        Number of points used.
     threshold : float
-        Where residuals were cut off, mm; infinite where nowhere.
+        Threshold at which residuals were cut off, mm; infinite if none was.
 
     Returns
     -------
@@ -84,20 +84,20 @@ def sigma_within(square_sum: float, model: Model, count: int, threshold: float) 
 
 
 def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold: float) -> Covariance:
-    """Covariance of a fit.
+    """Returns the covariance of a fit.
 
-    σ given with the data stands unless χ² contradicts it. Cutting at c σ costs: the estimate's variance grows by
-    χ²₃(c²)/χ²₅(c²) (that of an M-estimator with hard rejection).
+    A given σ is kept unless χ² contradicts it. Cutting off at c σ increases the variance of the estimate by the factor
+    χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection.
 
     Parameters
     ----------
     inliers : Problem
-        The points that the transform is fitted to.
+        Points that the transform is fitted to.
     b_from_a : Transform
     sigma : float
-        Estimated, mm of a point of mean σ.
+        Estimated σ, mm of a point of mean σ.
     threshold : float
-        Where residuals were cut off, mm; infinite where nowhere.
+        Threshold at which residuals were cut off, mm; infinite if none was.
 
     Returns
     -------
@@ -118,7 +118,7 @@ def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold
 
 
 def shifted_too(covariance: Covariance, off_mm: np.ndarray) -> Covariance:
-    """Returns the covariance of a fit between two groups of points: a common shift (3,), mm, is added as an error."""
+    """Adds a common shift (3,), mm, as an error to the covariance of a fit between two groups of points."""
     p = len(covariance.matrix)
     by_step = np.zeros(p)
     by_step[slice(3, None, 4) if p == 12 else slice(3, 6)] = off_mm

@@ -17,9 +17,9 @@ from stcal.geometry.rigid import Affine
 from stcal.parallel import one_thread
 
 SIZES = range(4, 41, 2)
-"""N of the paper's figure 6."""
+"""Sizes N of a sample in the paper's figure 6."""
 SWEEP_TRIES = 200
-"""Samples of each size there."""
+"""Number of samples of each size for this figure."""
 ASSUMED = (
     "liu2017: eqs. 8 and 9 are not legible in the source; taken as: the share of inliers among the points outside the "
     "sample, and the variance of their distances"
@@ -28,25 +28,25 @@ ASSUMED = (
 
 @dataclass(frozen=True, slots=True)
 class Liu2017Options:
-    """What the method of Liu et al. (2017) leaves to choose; the defaults are of the paper's best range.
+    """Options of the method of Liu et al. (2017). The defaults are in the paper's best range.
 
     Parameters
     ----------
     sample : int
-        N, the points of a sample; 4 … 40 in the paper, best 30–36.
+        Number N of points of a sample; 4 … 40 in the paper, best 30–36.
     limit_mm : float
-        Inliers are nearer; 0.18 … 0.23 in the paper.
+        Largest distance of an inlier; 0.18 … 0.23 in the paper.
     share : float
-        Of inliers among the points outside the sample, above which a sample is acceptable.
+        Share of inliers among the points outside the sample, above which a sample is acceptable.
     orthogonal_within : float
         Largest entry of |RᵀR − 1| that passes; not stated in the paper.
     tries : int
-        Samples drawn; not stated in the paper.
+        Number of samples drawn; not stated in the paper.
 
     Raises
     ------
     InputError
-        A sample of fewer than four points, or a number that is not positive.
+        If a sample has fewer than four points, or a number is not positive.
     """
 
     sample: int = 30
@@ -73,19 +73,19 @@ class Liu2017Options:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Liu2017Result:
-    """What the method gives.
+    """Result of the method.
 
     Parameters
     ----------
     b_from_a : Affine
     sample : (N,) int array
-        Rows of the winner.
+        Rows of the best sample.
     inliers : (n,) bool array
-        Points within the limit, of the sample too.
+        Points within the limit, including those of the sample.
     acceptable : int
-        How many samples were.
+        Number of acceptable samples.
     shares : (tries,) array
-        Of inliers outside each sample, NaN where screened out.
+        Share of inliers outside each sample, NaN if the sample was screened out.
     """
 
     b_from_a: Affine
@@ -96,9 +96,9 @@ class Liu2017Result:
 
 
 def affine_least_squares(xyz_a: np.ndarray, xyz_b: np.ndarray) -> Affine:
-    """b_from_a of twelve parameters as in the paper's eqs. 5–6; coplanar points are not refused.
+    """Returns b_from_a of twelve parameters as in the paper's eqs. 5–6. Coplanar points are not refused.
 
-    Coplanar points leave it free off their plane: there it may be wrong by metres.
+    Coplanar points leave it undetermined off their plane, where it may be wrong by metres.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def affine_least_squares(xyz_a: np.ndarray, xyz_b: np.ndarray) -> Affine:
 
 
 def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int = 0) -> Liu2017Result:
-    """b_from_a by the paper's method.
+    """Returns b_from_a by the paper's method.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
         mm; row i of both is the same point.
     options : Liu2017Options
     seed : int
-        Of the random samples.
+        Seed of the random samples.
 
     Returns
     -------
@@ -132,7 +132,7 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
     Raises
     ------
     DegenerateError
-        Too few points, or no sample acceptable.
+        If there are too few points, or no sample is acceptable.
     """
     count, size = len(xyz_a), options.sample
     if count <= size:
@@ -164,8 +164,9 @@ def liu2017(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed:
 
 
 def _orthogonal_samples(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int):
-    """Number of each try whose 3×3 part is orthogonal enough, with its sample, transform, errors of all points (n,),
-    and which points are outside the sample."""
+    """Yields the tries whose 3×3 part is orthogonal enough.
+
+    Each has its number, sample, transform, errors of all points (n,), and mask of the points outside the sample."""
     rng, count = np.random.default_rng(seed), len(xyz_a)
     for i in range(options.tries):
         sample = rng.choice(count, options.sample, replace=False)
@@ -178,8 +179,11 @@ def _orthogonal_samples(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Op
 
 @dataclass(frozen=True, slots=True)
 class SampleSize:
-    """What samples of ``points`` points give: ``best`` and ``median`` share of the other points within the limit (NaN
-    where none is), ``orthogonal`` : how many of the ``tries`` were; ``acceptable`` : how many of those."""
+    """Results for samples of ``points`` points.
+
+    ``best``, ``median`` : share of the other points within the limit, NaN if no sample is orthogonal; ``orthogonal`` :
+    number of orthogonal samples among the ``tries``; ``acceptable`` : number of acceptable ones among these.
+    """
 
     points: int
     best: float
@@ -191,18 +195,20 @@ class SampleSize:
 
 @one_thread()
 def sample_sizes(xyz_a: np.ndarray, xyz_b: np.ndarray, options: Liu2017Options, seed: int = 0) -> list[SampleSize]:
-    """The paper's figure 6: samples of every even size from 4 to 40, as far as there are points; arguments as of
-    :func:`liu2017`."""
-    found = []
+    """Returns the data of the paper's figure 6: samples of every even size from 4 to 40, as far as there are points.
+
+    Arguments are those of :func:`liu2017`.
+    """
+    sizes = []
     for points in SIZES:
         if points < len(xyz_a):
-            own = replace(options, sample=points, tries=min(options.tries, SWEEP_TRIES))
+            swept = replace(options, sample=points, tries=min(options.tries, SWEEP_TRIES))
             shares = np.array(
                 [
-                    (error < own.limit_mm)[outside].mean()
-                    for _, (_, _, error, outside) in _orthogonal_samples(xyz_a, xyz_b, own, seed)
+                    (error < swept.limit_mm)[outside].mean()
+                    for _, (_, _, error, outside) in _orthogonal_samples(xyz_a, xyz_b, swept, seed)
                 ]
             )
             best, median = (float(shares.max()), float(np.median(shares))) if len(shares) else (np.nan, np.nan)
-            found.append(SampleSize(points, best, median, len(shares), int((shares > own.share).sum()), own.tries))
-    return found
+            sizes.append(SampleSize(points, best, median, len(shares), int((shares > swept.share).sum()), swept.tries))
+    return sizes

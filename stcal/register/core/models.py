@@ -1,6 +1,6 @@
 """The three models of a registration – rigid, similarity, affine – and their weighted least-squares fits.
 
-Residuals are b − b_from_a a in frame b. What noise they have is given by ``precision``: None for equal and isotropic,
+Residuals are b − b_from_a a in frame b. ``precision`` describes their noise: None for equal and isotropic noise,
 (n,) for weights 1/σ², (n, 3, 3) for inverse covariances.
 """
 
@@ -17,23 +17,23 @@ from stcal.geometry.rigid import Affine, Rigid, Similarity, skew
 Transform = Rigid | Similarity | Affine
 
 EXACT = 1e-11
-"""σ below this share of the coordinates' size is rounding of numbers."""
+"""Relative σ, as a share of the coordinates' size, below which residuals are rounding errors."""
 CHUNK = 100_000
-"""Points at once where a Jacobian of every point is held."""
+"""Number of points processed at once if a Jacobian of every point is held."""
 
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A kind of transform.
+    """A model of a transform.
 
     Parameters
     ----------
     name : str
         ``rigid``, ``similarity`` or ``affine``.
     parameters : int
-        How many it has.
+        Number of parameters.
     sample : int
-        The fewest point pairs that determine them.
+        Least number of point pairs that determines them.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Model:
 
     @property
     def needed(self) -> int:
-        """The fewest point pairs of a fit with redundancy."""
+        """Least number of point pairs of a fit with redundancy."""
         return max(self.sample, self.parameters // 3 + 1)
 
     def redundancy(self, n: int) -> int:
@@ -54,7 +54,7 @@ MODELS = {m.name: m for m in (Model("rigid", 6, 3), Model("similarity", 7, 3), M
 
 
 def parts(transform: Transform) -> tuple[np.ndarray, np.ndarray]:
-    """Linear part (3, 3) and translation (3,)."""
+    """Returns the linear part (3, 3) and the translation (3,)."""
     if isinstance(transform, Rigid):
         return transform.rotation, transform.translation
     if isinstance(transform, Similarity):
@@ -63,9 +63,9 @@ def parts(transform: Transform) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarray | None = None) -> Transform:
-    """b_from_a that minimises Σ rᵢᵀ Pᵢ rᵢ.
+    """Returns the b_from_a that minimises Σ rᵢᵀ Pᵢ rᵢ.
 
-    In closed form where noise is isotropic; with inverse covariances by descent from there.
+    The solution is in closed form for isotropic noise. With inverse covariances a descent starts from there.
 
     Parameters
     ----------
@@ -82,9 +82,9 @@ def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarra
     Raises
     ------
     DegenerateError
-        Too few points, collinear ones, or coplanar ones for the affine model.
+        If there are too few points, collinear ones, or coplanar ones for the affine model.
     ConvergenceError
-        No minimum is reached.
+        If no minimum is reached.
     """
     weights = precision
     if precision is not None and precision.ndim == 3:
@@ -94,16 +94,16 @@ def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarra
     if precision is None or weights is None or precision.ndim == 1:
         return start
     origin = weights @ xyz_a / weights.sum()
-    found = minimise(
+    fitted = minimise(
         start,
         lambda transform: _about(model, transform, origin, xyz_a, precision, xyz_b),
         lambda transform, step: _moved(transform, origin, step),
     )
-    return found.required("registration", "are the covariances true, or some of them huge?").state
+    return fitted.required("registration", "are the covariances true, or some of them huge?").state
 
 
 def squares(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.ndarray:
-    """rᵀ P r, (n,), of residuals (n, 3)."""
+    """Returns rᵀ P r, (n,), of residuals (n, 3)."""
     if precision is not None and precision.ndim == 3:
         return np.einsum("ni,nij,nj->n", residuals, precision, residuals)
     plain = np.einsum("ni,ni->n", residuals, residuals)
@@ -111,14 +111,14 @@ def squares(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.nd
 
 
 def rounding_mm(xyz_a: np.ndarray, xyz_b: np.ndarray) -> float:
-    """What of residuals rounding of numbers may make; of most points, whatever the size of wrong ones."""
+    """Returns the rounding error of residuals, mm. It is robust against wrong points of any size."""
     return EXACT * float(max(np.median(np.maximum.reduce(np.abs(xyz.T))) for xyz in (xyz_a, xyz_b)))
 
 
 def unit_covariance(
     model: Model, transform: Transform, xyz_a: np.ndarray, precision: np.ndarray | None = None
 ) -> np.ndarray:
-    """Covariance of a fit's parameters at unit noise (1 mm, or the covariances that ``precision`` inverts).
+    """Returns the covariance of a fit's parameters at unit noise (1 mm, or the covariances that ``precision`` inverts).
 
     Parameters of a left perturbation in frame b: rotation vector (rad) and translation (mm), R' = exp(w) R and
     t' = t + dt; then for a similarity its relative scale, s' = s (1 + ds). Affine: rows of the 3×4 matrix.
@@ -129,9 +129,9 @@ def unit_covariance(
     transform : Rigid, Similarity or Affine
         b_from_a.
     xyz_a : (n, 3) array
-        The points fitted, mm.
+        Points that were fitted, mm.
     precision : (n,) or (n, 3, 3) array, optional
-        As of :func:`fit`.
+        Precision as in :func:`fit`.
 
     Returns
     -------
@@ -147,19 +147,19 @@ def unit_covariance(
 def leverages(
     model: Model, transform: Transform, xyz_a: np.ndarray, used: np.ndarray, precision: np.ndarray | None = None
 ) -> np.ndarray:
-    """What the uncertainty of the fit adds to every point's residual.
+    """Returns the uncertainty that the fit adds to every point's residual.
 
     H = Lᵀ J N⁻¹ Jᵀ L with P = L Lᵀ: whitened residuals Lᵀ r have covariance 1 − H for points that were used and 1 + H
-    for others. An eigenvalue of 1 is a direction in which no other point checks this one.
+    for others. An eigenvalue of 1 marks a direction in which no other point checks this one.
 
     Parameters
     ----------
     model, transform, precision :
-        As of :func:`unit_covariance`.
+        As in :func:`unit_covariance`.
     xyz_a : (n, 3) array
         All points, mm.
     used : (n,) bool array
-        Those that were fitted.
+        Mask of the points that were fitted.
 
     Returns
     -------
@@ -179,7 +179,7 @@ def leverages(
 
 
 def whitened(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.ndarray:
-    """Lᵀ r, (n, 3), of residuals (n, 3), with P = L Lᵀ."""
+    """Returns Lᵀ r, (n, 3), of residuals (n, 3), with P = L Lᵀ."""
     if precision is None:
         return residuals
     if precision.ndim == 1:
@@ -188,7 +188,7 @@ def whitened(residuals: np.ndarray, precision: np.ndarray | None = None) -> np.n
 
 
 def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fits to many minimal samples at once. What degenerate samples give is finite and wrong.
+    """Fits many minimal samples at once. Results for degenerate samples are finite and wrong.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.n
     -------
     linear : (s, 3, 3) array
     translation : (s, 3) array
-        Of b_from_a, mm.
+        Translation of b_from_a, mm.
     """
     mean_a, mean_b = xyz_a.mean(1), xyz_b.mean(1)
     a, b = xyz_a - mean_a[:, None], xyz_b - mean_b[:, None]
@@ -215,7 +215,7 @@ def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.n
 
 
 def jacobian(model: Model, transform: Transform, from_origin: np.ndarray) -> np.ndarray:
-    """Derivative of b_from_a a by the parameters (see :func:`unit_covariance`) about a point of a.
+    """Returns the derivative of b_from_a a by the parameters (see :func:`unit_covariance`) about a point of a.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ def jacobian(model: Model, transform: Transform, from_origin: np.ndarray) -> np.
 def _normal(
     model: Model, transform: Transform, xyz_a: np.ndarray, precision: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Origin in a (the points' weighted mean), and the normal matrix (p, p) about it."""
+    """Returns the origin in a, which is the points' weighted mean, and the normal matrix (p, p) about it."""
     if precision is None or precision.ndim == 1:
         weights = np.ones(len(xyz_a)) if precision is None else precision
         origin = weights @ xyz_a / weights.sum()
@@ -291,7 +291,7 @@ def _isotropic_normal(model: Model, transform: Transform, from_origin: np.ndarra
 
 
 def _to_origin(model: Model, transform: Transform, origin: np.ndarray) -> np.ndarray:
-    """(p, p): parameters about a's origin of those about the point ``origin`` of a."""
+    """Returns the matrix (p, p) from parameters about the point ``origin`` of a to parameters about a's origin."""
     change = np.eye(model.parameters)
     if model.name == "affine":
         for row in range(3):
@@ -305,7 +305,7 @@ def _to_origin(model: Model, transform: Transform, origin: np.ndarray) -> np.nda
 
 
 def _moved(transform: Transform, origin: np.ndarray, step: np.ndarray) -> Transform:
-    """The transform after a step of the parameters about ``origin``."""
+    """Returns the transform after a step of the parameters about ``origin``."""
     if isinstance(transform, Affine):
         rows = step.reshape(3, 4)
         linear = transform.linear + rows[:, :3]

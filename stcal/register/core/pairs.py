@@ -1,4 +1,4 @@
-"""Corresponding points of two instruments: their files, and the noise they are known to have."""
+"""Pairs of points of two instruments: their files and their noise."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,31 +15,31 @@ from stcal.register.core.models import Model, Transform, fit, rounding_mm, squar
 WHAT = "point pairs"
 AXES = OF_POINT.names
 COVARIANCE = tuple(f"cov_{a}_{b}" for i, a in enumerate(AXES) for b in AXES[i:])
-"""Upper triangle, mm², of the covariance of b − b_from_a a in frame b."""
+"""Names of the upper triangle, mm², of the covariance of b − b_from_a a in frame b."""
 KINDS = "weight, sigma_mm, or cov_x_x … cov_z_z"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """The corresponding points of two frames, as read from a file, with weights, covariances or neither.
+    """Pairs of points of two frames from a file, with weights, covariances or neither.
 
     Parameters
     ----------
     where : str
-        The file.
+        Name of the file.
     lines : sequence of n int
-        Its lines.
+        Lines of the file.
     xyz_a, xyz_b : (n, 3) arrays
-        mm, each in its own frame; row i of both is the same point.
+        Points in mm, each in its own frame; row i of both is the same point.
     weights : (n,) array or None
-        ~ 1/σ².
+        Weights, proportional to 1/σ².
     covariances : (n, 3, 3) or (n,) array, or None
         Covariances, or variances per axis, of b − b_from_a a in frame b, mm².
 
     Raises
     ------
     InputError
-        Shapes that do not fit, or values that are not finite.
+        If shapes do not fit, or values are not finite.
     """
 
     where: str
@@ -64,7 +64,7 @@ class Pairs:
 
 
 def read_pairs(path: str | Path | Table) -> Pairs:
-    """Read ``ax_mm, ay_mm, az_mm, bx_mm, by_mm, bz_mm`` and what noise they have (form: ``data_layout.md``).
+    """Reads ``ax_mm, ay_mm, az_mm, bx_mm, by_mm, bz_mm`` and the stated noise (form: ``data_layout.md``).
 
     Parameters
     ----------
@@ -78,8 +78,8 @@ def read_pairs(path: str | Path | Table) -> Pairs:
     Raises
     ------
     InputError
-        Missing columns, or bad rows: text, values that are not finite, a pair twice, weights or σ that are not
-        positive; the message names the line.
+        If columns are missing or a row is invalid: text, values that are not finite, a repeated pair, weights or σ that
+        are not positive. The message names the line.
     """
     table = read_table(path, WHAT)
     xyz_a, xyz_b = table.points("a"), table.points("b")
@@ -108,7 +108,10 @@ def read_pairs(path: str | Path | Table) -> Pairs:
 
 
 def _no_pair_twice(table: Table, rows: np.ndarray) -> None:
-    """Equal rows have equal sums of any weights: one sort, and no table of a million tuples."""
+    """Refuses a repeated pair.
+
+    Equal rows have equal sums for any weights, so that one sort replaces a table of a million tuples.
+    """
     key = rows @ np.random.default_rng(0).uniform(1, 2, rows.shape[1])
     order = np.argsort(key, kind="stable")
     near = np.flatnonzero(np.diff(key[order]) == 0)
@@ -151,7 +154,7 @@ def _covariances(table: Table) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointNoise:
-    """What is known of the residuals' noise.
+    """Noise of the residuals, as far as it is stated.
 
     Inverse covariances are scaled so that a point of mean σ (the RMS of all σ) has σ = 1: whitened residuals are
     millimetres of such a point.
@@ -159,9 +162,9 @@ class PointNoise:
     Parameters
     ----------
     precision : (n,) or (n, 3, 3) array, or None
-        Inverse variances or covariances at mean σ 1, frame b; None where all noise is equal and isotropic.
+        Inverse variances or covariances at mean σ 1, frame b; None if all noise is equal and isotropic.
     sigma_mm : float or None
-        That mean σ where it was given in mm.
+        Mean σ if it was given in mm.
     """
 
     precision: np.ndarray | None = None
@@ -174,7 +177,7 @@ class PointNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Point pairs of one model. Neither copied nor checked: subsets are taken in inner loops.
+    """Point pairs and a model. They are neither copied nor checked, as subsets are taken in inner loops.
 
     Parameters
     ----------
@@ -193,7 +196,7 @@ class Problem:
         return len(self.xyz_a)
 
     def __getitem__(self, rows: np.ndarray) -> "Problem":
-        """The point pairs chosen by a mask or by indices."""
+        """Returns the point pairs selected by a mask or by indices."""
         return Problem(self.model, self.xyz_a[rows], self.xyz_b[rows], self.noise[rows])
 
     @property
@@ -202,35 +205,35 @@ class Problem:
         return self.model.redundancy(len(self))
 
     def fit(self) -> Transform:
-        """b_from_a of least squares; errors as of :func:`~stcal.register.core.models.fit`."""
+        """Returns the least-squares b_from_a; errors as in :func:`~stcal.register.core.models.fit`."""
         return fit(self.model, self.xyz_a, self.xyz_b, self.noise.precision)
 
     def residuals(self, b_from_a: Transform) -> np.ndarray:
-        """(n, 3) b − b_from_a a, mm, frame b."""
+        """Returns b − b_from_a a, (n, 3) mm, frame b."""
         return self.xyz_b - b_from_a @ self.xyz_a
 
     def squares(self, b_from_a: Transform) -> np.ndarray:
-        """(n,) rᵀ P r, mm² of a point of mean σ."""
+        """Returns rᵀ P r, (n,), mm² of a point of mean σ."""
         return squares(self.residuals(b_from_a), self.noise.precision)
 
     def whitened(self, b_from_a: Transform) -> np.ndarray:
-        """(n, 3) residuals, mm of a point of mean σ."""
+        """Returns the whitened residuals (n, 3), mm of a point of mean σ."""
         return whitened(self.residuals(b_from_a), self.noise.precision)
 
     def rounding_mm(self) -> float:
-        """What of residuals rounding of numbers may make."""
+        """Returns the part of residuals that rounding may cause, mm."""
         return rounding_mm(self.xyz_a, self.xyz_b)
 
 
 def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None) -> PointNoise:
-    """The noise that weights or covariances state.
+    """Returns the noise that weights or covariances state.
 
     Parameters
     ----------
     n : int
         Number of point pairs.
     weights : (n,) array, optional
-        ~ 1/σ².
+        Weights, proportional to 1/σ².
     covariances : (n, 3, 3) or (n,) array, optional
         Covariances, or variances per axis, of b − b_from_a a in frame b, mm².
 
@@ -241,7 +244,7 @@ def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None)
     Raises
     ------
     InputError
-        Both given, another shape, or weights and covariances that are not positive.
+        If both are given, a shape is wrong, or weights or covariances are not positive.
     """
     if weights is not None and covariances is not None:
         raise InputError("E-REGISTER-WEIGHTS", "registration: weights and covariances given; give only one of them")
@@ -262,7 +265,7 @@ def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None)
 
 
 def _require_positive(given: np.ndarray, name: str) -> None:
-    """Refuse weights or variances (n,), or covariances (n, 3, 3), that are not positive."""
+    """Refuses weights or variances (n,), or covariances (n, 3, 3), that are not positive."""
     if given.ndim == 3:
         fault = first_fault(given, OF_POINT, definite=True)
         trouble = fault and f"row {fault.row + 1}: {fault.reason}"

@@ -12,7 +12,7 @@ from stcal.register.core.models import Transform
 
 @dataclass(frozen=True, slots=True)
 class ErrorFigures:
-    """Figures of the lengths |b − b_from_a a| of some points' errors; NaN where there are no points.
+    """Summary of the lengths |b − b_from_a a| of points' errors; NaN if there are no points.
 
     Parameters
     ----------
@@ -40,9 +40,9 @@ class HeldOutPoints:
     Parameters
     ----------
     folds : int
-        Parts, each left out once.
+        Number of parts, each of which is left out once.
     rows : (m,) int array
-        Indices of the points tried (a sample where there are very many).
+        Indices of the tested points, a sample of very many.
     error_mm : (m,) array
     of_inliers, of_all : ErrorFigures
     """
@@ -60,12 +60,12 @@ class HeldOutPoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """Another transform, which fits other points as well as the one found fits its own.
+    """Another transform that fits other points as well as the result fits its own.
 
     Parameters
     ----------
     b_from_a : Rigid, Similarity or Affine
-        As of :class:`Registration`.
+        Transform as in :class:`Registration`.
     rows : (m,) int array
         Indices of its points.
     apart_mm : float
@@ -93,33 +93,33 @@ class Registration:
         ``rigid``, ``similarity`` or ``affine``; ``robust``, ``least-squares`` or ``liu2017``.
     b_from_a : Rigid, Similarity or Affine
     covariance : (6, 6), (7, 7) or (12, 12) array
-        Of a left perturbation in frame b: rotation vector (rad), translation (mm), and a similarity's relative scale;
-        affine: the rows of the 3×4 matrix. σ is estimated with ``redundancy`` degrees of freedom: a region of
-        confidence takes its bound from F(p, redundancy), not from χ².
+        Covariance of a left perturbation in frame b: rotation vector (rad), translation (mm), and a similarity's
+        relative scale; affine: rows of the 3×4 matrix. σ is estimated with ``redundancy`` degrees of freedom, so that a
+        confidence region takes its bound from F(p, redundancy), not from χ².
     inliers : (n,) bool array
-        The points that the transform is fitted to.
+        Points that the transform is fitted to.
     residuals : (n, 3) array
         b − b_from_a a of all points, mm, frame b.
     sigma_mm : float
-        σ per axis of a residual; of points of different σ their RMS.
+        σ per axis of a residual; the RMS for points of different σ.
     sigma_factor : float or None
-        By how much the inliers' residuals exceed the σ given with the data; None where none was given. The covariance
-        is scaled by it only where the data contradict the σ given (``scaled``).
+        Ratio of the inliers' residuals to the σ given with the data; None if none was given. The covariance is scaled
+        by it only if the data contradict the given σ (``scaled``).
     scaled : bool
-        Whether the covariance rests on the residuals; False where it rests on the σ given.
+        Whether the covariance is derived from the residuals; False if it is derived from the given σ.
     redundancy : float
-        Degrees of freedom of the σ that the covariance rests on; infinite where that was given.
+        Degrees of freedom of the σ that the covariance is derived from; infinite if this σ was given.
     threshold_mm : float or None
-        Inliers are nearer than this (a point of the σ above; at the points' middle); None without a threshold.
+        Largest distance of inliers, for a point of the σ above at the points' middle; None without a threshold.
     held_out : HeldOutPoints or None
-        None where not asked for, or with too few points.
+        Cross-validation; None if it was not requested, or there are too few points.
     ambiguous : bool
-        The alternative is about as good.
+        Whether the alternative is about as good.
     alternative : Alternative or None
     notes : tuple of str
-        What to look at.
+        Notes on what the user should check.
     seed, samples : int
-        Of the random samples, and how many were drawn; 0 where all there are were tried.
+        Seed and number of the random samples; 0 samples if all possible ones were tried.
     """
 
     model: str
@@ -151,18 +151,18 @@ class Registration:
 
     @property
     def inlier_errors(self) -> ErrorFigures:
-        """Error figures of the inliers' residuals."""
+        """Summary of the inliers' residuals."""
         return ErrorFigures.of(np.linalg.norm(self.residuals[self.inliers], axis=1))
 
     @property
     def outliers(self) -> np.ndarray:
-        """Indices of the points that are no inliers, the farthest first."""
+        """Indices of the outliers, the farthest first."""
         rows = np.flatnonzero(~self.inliers)
         return rows[np.argsort(-np.linalg.norm(self.residuals[rows], axis=1), kind="stable")]
 
 
 TRIED = 20_000
-"""Largest number of points that are all cross-validated; of more points a sample is, whose errors are known to 1 %."""
+"""Largest number of points that are all cross-validated. Of more, a sample is, whose errors are known to 1 %."""
 
 
 def held_out(
@@ -174,27 +174,27 @@ def held_out(
     least: int,
     seed: int,
 ) -> HeldOutPoints | None:
-    """Errors of points left out of the fit in turn.
+    """Returns the errors of points that are left out of the fit in turn.
 
     Parameters
     ----------
     fit_rows : callable
-        The fit to the rows given, b_from_a; a fold whose fit fails is left out of the figures.
+        Fit to given rows, b_from_a. A fold whose fit fails is left out of the summary.
     xyz_a, xyz_b : (n, 3) arrays
         mm; row i of both is the same point.
     inliers : (n,) bool array
-        Of the fit to all.
+        Inliers of the fit to all points.
     folds : int
-        Parts to leave out, one at a time.
+        Number of parts to leave out, one at a time.
     least : int
-        The fewest points to fit.
+        Least number of points of a fit.
     seed : int
-        Of the division into parts.
+        Seed of the division into parts.
 
     Returns
     -------
     HeldOutPoints or None
-        None with too few points for a fit to the others, or where every fold's fit fails.
+        None if there are too few points for a fit to the others, or the fit of every fold fails.
     """
     rng = np.random.default_rng([seed, 2])
     sample = np.sort(rng.permutation(len(xyz_a))[:TRIED])

@@ -1,12 +1,12 @@
 """The robust method: consensus of a subset, then σ, inliers and the final fit over all points together.
 
-1. Consensus (``search.py``), again within its own set until nothing contradicts one σ there any more.
-2. Fit, σ, inliers in turn until the set stays: a point is an outlier when its residual, with what the fit's own
-   uncertainty adds (deletion residual), exceeds the F(3, ν) bound that a set of clean points exceeds anywhere in one
-   case of a thousand (5 σ for a hundred points); or when it exceeds the threshold given.
-3. Whether that consensus can be chance: a-contrario again, now against points that lie anywhere among the others
+1. A consensus (``search.py``) is searched, and again within itself until its points are consistent with one σ.
+2. Fit, σ and inliers are updated in turn until the set stays the same. A point is an outlier if its residual, with the
+   fit's own uncertainty (deletion residual), exceeds the F(3, ν) bound that any point of a clean set exceeds in one
+   case of a thousand (5 σ for a hundred points), or if it exceeds the given threshold.
+3. The consensus is tested for chance: a-contrario again, now against points that lie anywhere among the others
    (Moisan & Stival 2004).
-4. Whether other points agree as well on another transform.
+4. The other points are searched for another transform on which they agree as well.
 """
 
 from dataclasses import dataclass
@@ -22,31 +22,31 @@ from stcal.register.core.pairs import Problem
 from stcal.register.core.search import FALSE_ALARMS, LEAST_REDUNDANCY, Consensus, by_scale, by_threshold, search
 
 SUBSET = 500
-"""Samples are scored on so many points: σ is then known to 2 %, shares to 2 %."""
+"""Number of points on which samples are scored. It gives σ and shares to 2 %."""
 CLEAN_SETS_WITH_OUTLIER = 0.001
-"""Sets without outliers in which one point or more is called one."""
+"""Probability that a clean set has any point that is called an outlier."""
 LEVERAGE_UP_TO = 10_000
 """Largest number of points for which leverage is considered; beyond it the fit's uncertainty adds under 0.02 % to a
 residual."""
 MAX_ROUNDS = 50
 """Largest number of iterations of fit, σ and inliers; a set that recurs ends them earlier."""
 NESTED = 6
-"""Consensus within a consensus: gross errors hide smaller ones."""
+"""Depth of consensus within a consensus, as gross errors hide smaller ones."""
 BY_CHANCE = 0.01
-"""Sets that random points would give and that are taken for a transform: so many in one file."""
+"""Largest number of false alarms of a consensus that is accepted, per file."""
 DISTINCT = 5.0
-"""σ between two transforms; nearer ones are one."""
+"""Least distance between two distinct transforms, in σ."""
 MOST_OF_REST = 0.5
-"""Fraction of the outliers that must agree with another transform. A few of many outliers always lie near some
+"""Least share of the outliers that must agree on another transform. A few of many outliers always lie near some
 transform by chance; half of them do not."""
 AS_GOOD = 0.5
-"""A second transform with this share of the points of the one found makes the answer ambiguous: with up to 60 % wrong
-points, all in one other motion, the true ones are 40 : 60 of the wrong."""
+"""Share of the result's points with which a second transform makes the result ambiguous. If 60 % of the points are
+wrong and all in one other motion, the true ones are 40 : 60 of the wrong."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
-    """A transform and the points that agree on it.
+    """A transform with the points that agree on it.
 
     Parameters
     ----------
@@ -54,11 +54,11 @@ class Fitted:
         b_from_a.
     inliers : (n,) bool array
     sigma : float
-        Per axis, mm of a point of mean σ.
+        σ per axis, mm of a point of mean σ.
     threshold : float
-        Inliers are nearer, mm of a point of mean σ; infinite where nothing was cut off.
+        Largest distance of inliers, mm of a point of mean σ; infinite if no residual was cut off.
     samples : int
-        Random samples drawn; 0 when none, or all there are.
+        Number of random samples; 0 if none or all possible ones were tried.
     """
 
     transform: Transform
@@ -69,15 +69,15 @@ class Fitted:
 
 
 def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) -> Fitted:
-    """Transform, inliers and σ.
+    """Returns the transform with its inliers and σ.
 
     Parameters
     ----------
     problem : Problem
     threshold : float, optional
-        Inliers are nearer, mm of a point of mean σ; estimated where not given.
+        Largest distance of inliers, mm of a point of mean σ; estimated if not given.
     seed : int
-        Of the random samples.
+        Seed of the random samples.
 
     Returns
     -------
@@ -86,21 +86,21 @@ def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) 
     Raises
     ------
     DegenerateError
-        Too few points agree, or none that could not by chance.
+        If too few points agree, or no more than could agree by chance.
     ConvergenceError
-        A fit with covariances did not settle.
+        If a fit with covariances did not converge.
     """
     rng = np.random.default_rng(seed)
     count = len(problem)
-    part = problem if count <= SUBSET else problem[np.sort(rng.choice(count, SUBSET, replace=False))]
+    subset = problem if count <= SUBSET else problem[np.sort(rng.choice(count, SUBSET, replace=False))]
     if threshold is None:
-        inliers, samples = _consensus(part, rng)
+        inliers, samples = _consensus(subset, rng)
     else:
-        found = search(part, by_threshold(threshold), rng)
-        if found is None:
+        consensus = search(subset, by_threshold(threshold), rng)
+        if consensus is None:
             raise _too_few_agree(problem.model, count, threshold)
-        inliers, samples = found.inliers, found.samples
-    start = settled(part, inliers, threshold, samples)
+        inliers, samples = consensus.inliers, consensus.samples
+    start = settled(subset, inliers, threshold, samples)
     if count > SUBSET:
         near = problem.squares(start.transform) <= start.threshold**2
         start = settled(problem, near, threshold, samples)
@@ -108,22 +108,22 @@ def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) 
 
 
 def _consensus(problem: Problem, rng: np.random.Generator) -> tuple[np.ndarray, int]:
-    """Mask of the points that agree, and samples drawn."""
+    """Returns the mask of the points that agree, and the number of samples."""
     rows, samples = np.arange(len(problem)), 0
     model = problem.model
     for _ in range(NESTED):
         if len(rows) <= model.sample or model.redundancy(len(rows) - 1) <= 0:
             break
-        part = problem[rows]
-        total = part.squares(part.fit()).sum()
-        if total <= len(rows) * part.rounding_mm() ** 2:
+        subset = problem[rows]
+        total = subset.squares(subset.fit()).sum()
+        if total <= len(rows) * subset.rounding_mm() ** 2:
             break
-        found = search(part, by_scale(model, len(rows), total), rng)
-        samples += found.samples if found is not None else 0
-        if found is None or found.value > np.log(FALSE_ALARMS):
+        consensus = search(subset, by_scale(model, len(rows), total), rng)
+        samples += consensus.samples if consensus is not None else 0
+        if consensus is None or consensus.value > np.log(FALSE_ALARMS):
             break
-        _check_trust(model, found)
-        rows = rows[found.inliers]
+        _check_trust(model, consensus)
+        rows = rows[consensus.inliers]
     mask = np.zeros(len(problem), bool)
     mask[rows] = True
     return mask, samples
@@ -151,15 +151,15 @@ def _too_few_agree(model: Model, count: int, threshold: float | None) -> Degener
 
 
 def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samples: int = 0) -> Fitted:
-    """Fit, σ and inliers in turn until the set stays, or comes again: then the larger of those in the cycle.
+    """Updates fit, σ and inliers in turn until the set stays the same. Of a cycle of sets the largest is returned.
 
     Parameters
     ----------
     problem : Problem
     inliers : (n,) bool array
-        To begin with.
+        First set of inliers.
     threshold, samples :
-        As of :func:`robust_fit` and :class:`Fitted`.
+        As in :func:`robust_fit` and :class:`Fitted`.
 
     Returns
     -------
@@ -168,10 +168,10 @@ def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samp
     Raises
     ------
     DegenerateError
-        Too few points agree.
+        If too few points agree.
     """
     model = problem.model
-    seen: dict[bytes, Fitted] = {}
+    fit_of_set: dict[bytes, Fitted] = {}
     floor = problem.rounding_mm()
     for _ in range(MAX_ROUNDS):
         count = int(inliers.sum())
@@ -185,23 +185,23 @@ def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samp
         else:
             cut, chosen = _chosen(problem, transform, square, inliers, sigma)
         key = np.packbits(inliers).tobytes()
-        if key in seen:
-            cycle = list(seen)
-            return max((seen[k] for k in cycle[cycle.index(key) :]), key=lambda f: f.inliers.sum())
-        seen[key] = Fitted(transform, inliers, sigma, cut, samples)
-        # no test that leaves too few to judge by
+        if key in fit_of_set:
+            cycle = list(fit_of_set)
+            return max((fit_of_set[k] for k in cycle[cycle.index(key) :]), key=lambda f: f.inliers.sum())
+        fit_of_set[key] = Fitted(transform, inliers, sigma, cut, samples)
+        # a test that leaves too few points is not applied
         enough = min(LEAST_REDUNDANCY, model.redundancy(count))
         too_few = threshold is None and model.redundancy(int(chosen.sum())) < enough
         if too_few or (chosen == inliers).all():
-            return seen[key]
+            return fit_of_set[key]
         inliers = chosen
-    return max(seen.values(), key=lambda f: f.inliers.sum())
+    return max(fit_of_set.values(), key=lambda f: f.inliers.sum())
 
 
 def _chosen(
     problem: Problem, transform: Transform, square: np.ndarray, used: np.ndarray, sigma: float
 ) -> tuple[float, np.ndarray]:
-    """The threshold at the middle of the points, mm, and who passes the test."""
+    """Returns the threshold at the middle of the points, mm, and the mask of the points that pass the test."""
     total, redundancy = len(problem), problem.model.redundancy(int(used.sum()))
     beyond = CLEAN_SETS_WITH_OUTLIER / total
     outside = 3 * sigma**2 * ratio_limit(beyond, 3, redundancy)
@@ -216,7 +216,7 @@ def _chosen(
 
 
 def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -> np.ndarray:
-    """Squares of each point's residual from a fit without it.
+    """Returns the squares of each point's residual from a fit without this point.
 
     r (1 − H)⁻¹ r for points that were used, r (1 + H)⁻¹ r for others, with whitened residuals r and H of
     :func:`~stcal.register.core.models.leverages` (Cook & Weisberg 1982, Residuals and Influence in Regression).
@@ -225,7 +225,7 @@ def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -
     ----------
     problem : Problem
     transform : Rigid, Similarity or Affine
-        The fit to the points used.
+        Fit to the points used.
     used : (n,) bool array
 
     Returns
@@ -241,7 +241,7 @@ def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -
 
 
 def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -> float:
-    """How many sets would agree so well were the points anywhere among the others.
+    """Returns the logarithm of the number of sets that would agree as well if the points lay anywhere among the others.
 
     Moisan & Stival's (2004) number of false alarms, (n − m) C(n, k) C(k, m) αᵏ⁻ᵐ, least over k; α(r) is the share of a
     box that a cube of half side r takes, at most 1 along each axis.
@@ -251,7 +251,7 @@ def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -
     problem : Problem
     fitted : Fitted
     extent : (3,) array, optional
-        Sides of that box, mm; else those of the inliers along their principal axes (thin where they are coplanar).
+        Sides of this box, mm; by default those of the inliers along their principal axes (thin if they are coplanar).
 
     Returns
     -------
@@ -260,12 +260,12 @@ def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -
     """
     model, every = problem.model, len(problem)
     rows = np.arange(every)[:: max(1, every // LEVERAGE_UP_TO)]
-    part = problem[rows]
+    share = problem[rows]
     count, k = len(rows), np.arange(model.sample + 1, len(rows) + 1)
     if not len(k):
         return 0.0
-    order = np.sort(np.linalg.norm(part.residuals(fitted.transform), axis=1))
-    sides = np.ptp(_along_axes(part.xyz_b[fitted.inliers[rows]]), axis=0) if extent is None else extent
+    order = np.sort(np.linalg.norm(share.residuals(fitted.transform), axis=1))
+    sides = np.ptp(_along_axes(share.xyz_b[fitted.inliers[rows]]), axis=0) if extent is None else extent
     alpha = np.minimum(1, 2 * order[k - 1, None] / np.maximum(sides, 1e-300)).prod(1)
     choices = gammaln(count + 1) - gammaln(count - k + 1) - gammaln(model.sample + 1) - gammaln(k - model.sample + 1)
     value = np.log(count - model.sample) + choices + (k - model.sample) * np.log(np.maximum(alpha, 1e-300))
@@ -273,26 +273,26 @@ def chance(problem: Problem, fitted: Fitted, extent: np.ndarray | None = None) -
 
 
 def _along_axes(points: np.ndarray) -> np.ndarray:
-    """Points along their own principal axes."""
+    """Returns the points along their own principal axes."""
     centred = points - points.mean(0)
     return centred @ np.linalg.eigh(centred.T @ centred)[1]
 
 
 def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | None:
-    """What the outliers agree on, within the same threshold.
+    """Returns the transform on which the outliers agree within the same threshold.
 
     Parameters
     ----------
     problem : Problem
     fitted : Fitted
-        The transform found.
+        Transform of the inliers.
     seed : int
-        As of :func:`robust_fit`.
+        Seed as in :func:`robust_fit`.
 
     Returns
     -------
     Fitted or None
-        None where they agree on nothing beyond chance.
+        None if the outliers agree no better than by chance.
     """
     model = problem.model
     outside = np.flatnonzero(~fitted.inliers)
@@ -303,29 +303,29 @@ def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | Non
     redundancy = model.redundancy(int(fitted.inliers.sum()))
     # σ may be so large
     threshold = fitted.threshold * float(np.sqrt(redundancy / chdtri(redundancy, 1 - FALSE_ALARMS)))
-    found = search(problem[tried], by_threshold(threshold), rng)
-    if found is None or found.inliers.sum() <= model.sample:
+    consensus = search(problem[tried], by_threshold(threshold), rng)
+    if consensus is None or consensus.inliers.sum() <= model.sample:
         return None
-    transform = problem[tried[found.inliers]].fit()
-    rest = problem[outside]
-    near = rest.squares(transform) <= threshold**2
-    if near.sum() <= model.sample or near.sum() < min(MOST_OF_REST * len(rest), AS_GOOD * fitted.inliers.sum()):
+    transform = problem[tried[consensus.inliers]].fit()
+    outliers = problem[outside]
+    near = outliers.squares(transform) <= threshold**2
+    if near.sum() <= model.sample or near.sum() < min(MOST_OF_REST * len(outliers), AS_GOOD * fitted.inliers.sum()):
         return None
-    own = rest.xyz_a[near]
-    if np.sqrt(((transform @ own - fitted.transform @ own) ** 2).sum(1).mean()) < DISTINCT * fitted.sigma:
+    points = outliers.xyz_a[near]
+    if np.sqrt(((transform @ points - fitted.transform @ points) ** 2).sum(1).mean()) < DISTINCT * fitted.sigma:
         return None  # good points that a tight threshold cut off
     # wrong points lie anywhere as far off the transform found as the farthest of them
-    off = np.linalg.norm(rest.residuals(fitted.transform), axis=1).max()
+    off = np.linalg.norm(outliers.residuals(fitted.transform), axis=1).max()
     alone = Fitted(transform, near, fitted.sigma, threshold)
-    if chance(rest, alone, np.full(3, 2 * off)) > np.log(BY_CHANCE):
+    if chance(outliers, alone, np.full(3, 2 * off)) > np.log(BY_CHANCE):
         return None
     mask = np.zeros(len(problem), bool)
     mask[outside[near]] = True
-    return Fitted(transform, mask, fitted.sigma, threshold, found.samples)
+    return Fitted(transform, mask, fitted.sigma, threshold, consensus.samples)
 
 
 def turn_between(one: Transform, two: Transform) -> float:
-    """Angle between the rotations of two rigid or similarity transforms, rad."""
+    """Returns the angle between the rotations of two rigid or similarity transforms, rad."""
     (a, _), (b, _) = parts(one), parts(two)
     cosine = (np.trace(a @ b.T) / np.cbrt(np.linalg.det(a) * np.linalg.det(b)) - 1) / 2
     return float(np.arccos(np.clip(cosine, -1, 1)))

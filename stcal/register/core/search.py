@@ -1,4 +1,4 @@
-"""Which point pairs agree on one transform: random minimal samples, scored, the best refined by concentration.
+"""Search for point pairs that agree on one transform: random minimal samples are scored, the best are concentrated.
 
 The score needs no threshold. For a transform and the k points nearest to it, x = RSS_k / RSS_n compares their square
 sum with that of the least-squares fit to all n. Were all residuals Gaussian of one σ, x would follow
@@ -30,21 +30,21 @@ LEAST_REDUNDANCY = 6
 MISSED = 1e-9
 """Chance that no sample is free of outliers, for which the number of samples is chosen."""
 LEAST_SHARE = 0.25
-"""Samples are drawn until a consensus of this share cannot have been missed; below it may be."""
+"""Smallest share of a consensus that the number of samples is chosen to find. A smaller one may be missed."""
 CLEAN_PER_WIDE = 3
 """Number of clean samples assumed for each one wide enough to lead to the optimum; measured: every second one does."""
 EXHAUSTIVE = 2000
-"""Up to so many samples are all tried (23 points rigidly)."""
+"""Largest number of possible samples that are all tried (23 points rigidly)."""
 BATCH = 500
-"""Samples scored at once."""
+"""Number of samples scored at once."""
 MOST_SAMPLES = 20_000
 """Largest number of samples, above any need: ``LEAST_SHARE`` takes 3900 samples of three points, 15 900 of four."""
 REFINED = 6
-"""So many of the best samples of a batch are refined."""
+"""Number of the best samples of a batch that are refined."""
 MAX_STEPS = 30
 """Largest number of concentration steps. They end after a few: each lowers the score, and the sets are finite."""
 TINY = 1e-24
-"""Square sums below this share of the points' own are rounding."""
+"""Relative square sums, as a share of the points' own, below which they are rounding errors."""
 
 Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Score of squared distances (s, n): value of each row (less is better), and the largest square in the row's set."""
@@ -52,15 +52,15 @@ Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
-    """A set of points that agree.
+    """A set of points that agree on a transform.
 
     Parameters
     ----------
     inliers : (n,) bool array
     value : float
-        Its score, less is better.
+        Score, less is better.
     samples : int
-        How many were drawn; 0 when all there are were tried.
+        Number of samples; 0 if all possible ones were tried.
     """
 
     inliers: np.ndarray
@@ -69,9 +69,12 @@ class Consensus:
 
 
 def by_scale(model: Model, count: int, total: float) -> Score:
-    """Logarithm of the number of false alarms; ``total`` : square sum of the least-squares fit to all points."""
+    """Returns the score by number of false alarms, a logarithm.
+
+    ``total`` : square sum of the least-squares fit to all.
+    """
     k = np.arange(model.sample, count)
-    k = k[3 * k > model.parameters]  # smaller sets than can be trusted are looked for too: then nothing is
+    k = k[3 * k > model.parameters]  # sets too small to be trusted are scored, too; if one wins, the result is refused
     a, b = (3 * k - model.parameters) / 2, 3 * (count - k) / 2
     tests = np.log(len(k)) + gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1)
 
@@ -87,14 +90,20 @@ def by_scale(model: Model, count: int, total: float) -> Score:
 
 
 def chernoff(share: float | np.ndarray, a: float | np.ndarray, b: float | np.ndarray) -> np.ndarray:
-    """Chernoff's bound of log P(Beta(a, b) ≤ share): (x (a + b)/a)ᵃ ((1 − x)(a + b)/b)ᵇ below a/(a + b), else 1."""
+    """Returns Chernoff's bound of log P(Beta(a, b) ≤ share).
+
+    The bound of P is (x (a + b)/a)ᵃ ((1 − x)(a + b)/b)ᵇ below a/(a + b), else 1.
+    """
     limit = a / (a + b)
     share = np.clip(share, TINY, limit)
     return a * np.log(share / limit) + b * np.log((1 - share) / (1 - limit))
 
 
 def by_share(model: Model, count: int) -> Score:
-    """Least trimmed squares of the larger half, the one with the highest breakdown point (Rousseeuw 1984)."""
+    """Returns the score by least trimmed squares of the larger half.
+
+    Its breakdown point is highest (Rousseeuw 1984).
+    """
     k = max((count + model.parameters // 3 + 1) // 2, model.sample + 1)
 
     def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -105,7 +114,7 @@ def by_share(model: Model, count: int) -> Score:
 
 
 def by_threshold(threshold: float) -> Score:
-    """Square sum cut off at the threshold (MSAC, Torr & Zisserman 2000)."""
+    """Returns the score by the square sum, cut off at the threshold (MSAC, Torr & Zisserman 2000)."""
 
     def score(square: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.minimum(square, threshold**2).sum(1), np.full(len(square), threshold**2)
@@ -114,19 +123,19 @@ def by_threshold(threshold: float) -> Score:
 
 
 def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensus | None:
-    """The best set that random samples lead to.
+    """Returns the best set that random samples lead to.
 
     Parameters
     ----------
     problem : Problem
     score : Score
-        See :func:`by_scale`, :func:`by_share` and :func:`by_threshold`.
+        Score as in :func:`by_scale`, :func:`by_share` and :func:`by_threshold`.
     rng : numpy.random.Generator
 
     Returns
     -------
     Consensus or None
-        None where no sample gives one of enough points.
+        None if no sample leads to a set of enough points.
     """
     count, size = len(problem), problem.model.sample
     drawn, needed, best = 0, 1.0, None
@@ -158,7 +167,7 @@ def _best_of(problem: Problem, score: Score, samples: np.ndarray) -> Consensus |
 
 
 def _concentrated(problem: Problem, score: Score, inliers: np.ndarray) -> Consensus | None:
-    """Fit and choose anew until the score falls no more."""
+    """Alternates between fitting and selecting the set until the score decreases no more."""
     best = None
     for _ in range(MAX_STEPS):
         if inliers.sum() < problem.model.sample:
@@ -194,6 +203,6 @@ def _all_samples(count: int, size: int) -> np.ndarray:
 
 
 def _random_samples(count: int, size: int, rng: np.random.Generator) -> np.ndarray:
-    """(s, size) indices, different in each sample."""
+    """Returns random indices (s, size), all different within each sample."""
     drawn = np.sort(rng.integers(count, size=(BATCH, size)), axis=1)
     return drawn[(np.diff(drawn, axis=1) > 0).all(1)]

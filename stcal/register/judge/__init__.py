@@ -1,1 +1,1 @@
-"""Whether the points can tell what is asked of them, and mistakes that they show."""
+"""Checks whether the points determine the transform, and of mistakes in the data."""

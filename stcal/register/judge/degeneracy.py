@@ -1,4 +1,4 @@
-"""Whether the points can tell what is asked of them: lines, planes, symmetric layouts."""
+"""Checks whether the points determine the transform: lines, planes, symmetric layouts."""
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
@@ -13,28 +13,28 @@ from stcal.geometry.align import best_rotations
 from stcal.register.core.models import Model
 
 WIDER_THAN = 10.0
-"""Points must spread √Σd² ≥ 10 σ off a line (affine: off a plane): the turn about it then has σ ≤ 0.1 rad."""
+"""Least spread √Σd² of points off a line (affine: off a plane), in σ. The turn about it then has σ ≤ 0.1 rad."""
 SYMMETRY_UP_TO = 200
-"""Points; larger sets are clouds, not layouts with labels."""
+"""Largest number of points checked for symmetry. Larger sets are clouds, not layouts with labels."""
 SHOWN = 6
-"""Points of a cycle that a note names."""
+"""Number of points of a cycle that a note names."""
 
 Namer = Callable[[int], str]
 
 
 def spreads(xyz: np.ndarray) -> np.ndarray:
-    """(3,) root square sums of centred points along their principal axes, the longest first, mm."""
+    """Returns the root square sums (3,) of centred points along their principal axes, the longest first, mm."""
     centred = xyz - xyz.mean(0)
     return np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred)[::-1], 0))
 
 
 def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
-    """Refuse points that do not determine the model at their σ.
+    """Refuses points that do not determine the model at their σ.
 
     Raises
     ------
     DegenerateError
-        Along a line; for the affine model also in a plane.
+        If they lie along a line, or in a plane for the affine model.
     """
     n, spread = len(xyz_a), spreads(xyz_a)
     needed = WIDER_THAN * sigma_mm
@@ -56,12 +56,12 @@ def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
 
 
 def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndarray:
-    """Indices of points without any one of which the others would be refused by :func:`check_extent`."""
+    """Returns the points without each of which the others would be refused by :func:`check_extent`, as indices."""
     n = len(xyz_a)
     centred = xyz_a - xyz_a.mean(0)
     scatter = centred.T @ centred
     held = np.linalg.eigvalsh(scatter)[: 1 if model.name == "affine" else 2].sum()
-    taken = n / (n - 1) * (centred**2).sum(1)  # more no point takes off these eigenvalues: few need be looked at
+    taken = n / (n - 1) * (centred**2).sum(1)  # upper bound of a point's part of these eigenvalues: few pass it
     rows = np.flatnonzero(held - taken < (1 + 1e-6) * (WIDER_THAN * sigma_mm) ** 2 + 1e-9 * np.trace(scatter))
     own = centred[rows]
     values = np.maximum(np.linalg.eigvalsh(scatter - n / (n - 1) * own[:, :, None] * own[:, None, :]), 0)
@@ -70,12 +70,13 @@ def single_supports(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> np.ndar
 
 
 def check_supports(model: Model, xyz_a: np.ndarray, inliers: np.ndarray, sigma_mm: float, name: Namer) -> None:
-    """Refuse a set with outliers in which one point alone tells a turn: any wrong point would have fitted there.
+    """Refuses a set with outliers in which a single point determines a turn, as any wrong point would have fitted
+    there.
 
     Raises
     ------
     DegenerateError
-        Without that point the others would be refused by :func:`check_extent`.
+        If the others would be refused by :func:`check_extent` without that point.
     """
     rows = np.flatnonzero(inliers)
     alone = single_supports(model, xyz_a[rows], sigma_mm)
@@ -89,16 +90,16 @@ def check_supports(model: Model, xyz_a: np.ndarray, inliers: np.ndarray, sigma_m
 
 
 def row_name(row: int, lines: Sequence[int] | None) -> str:
-    """A point's name for messages: its line in the file, else its row from 1."""
+    """Returns a point's name for messages: its line in the file, else its row from 1."""
     return f"row {row + 1}" if lines is None else f"line {lines[row]}"
 
 
 def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] | None:
-    """A turn that maps the points onto themselves but not each onto itself: its angle (rad) and the permutation (n,).
+    """Returns a turn that maps the points onto themselves but not each onto itself: angle (rad), permutation (n,).
 
     Candidates map the point farthest from the centroid and one off that line to others at the same distances. Of
-    several turns the one of the smallest misfit is given; None where there is none, or points are too near for the
-    tolerance.
+    several turns the one with the smallest misfit is returned. The result is None if there is no turn, or points are
+    too close together for the tolerance.
     """
     n = len(xyz)
     if not 3 <= n <= SYMMETRY_UP_TO:
@@ -133,12 +134,12 @@ def symmetry(xyz: np.ndarray, tolerance_mm: float) -> tuple[float, np.ndarray] |
 
 
 def _nearest(tree: KDTree, xyz: np.ndarray) -> np.ndarray:
-    """(n,) indices of the tree's points nearest to points (n, 3)."""
+    """Returns the indices (n,) of the tree's points nearest to points (n, 3)."""
     return np.asarray(tree.query(xyz)[1])
 
 
 def symmetry_note(found: tuple[float, np.ndarray], rows: np.ndarray, name: Namer) -> str:
-    """One line: the turn and what it exchanges."""
+    """Returns one line on the turn and the points that it exchanges."""
     angle, to = found
     start = int(np.flatnonzero(to != np.arange(len(to)))[0])
     cycle, at = [start], int(to[start])

@@ -1,4 +1,4 @@
-"""Whether points that agree on one transform are two groups, each with a transform of its own or shifted."""
+"""Checks whether points that agree on one transform are two groups, with transforms of their own or shifted."""
 
 from dataclasses import dataclass, replace
 
@@ -13,16 +13,16 @@ from stcal.register.core.search import FALSE_ALARMS, by_share, chernoff, search
 from stcal.register.judge.mistakes import FEWEST_NEIGHBOURS, neighbours_alike
 
 TRIED = 200
-"""Points that are looked at: a shift of 4 σ of half of them is seen then."""
+"""Largest number of points that are examined. It shows a shift of half of them by 4 σ."""
 MAX_ROUNDS = 30
 """Largest number of rounds of assigning and fitting; each lowers the sum of squares, so that they end earlier."""
 FEW = 16
-"""Points up to which square sums take the place of determinants (see above)."""
+"""Largest number of points for which square sums replace determinants (see above)."""
 SPHERICAL = 0.1
 """Significance level of anisotropic noise. It detects half of the sets of 16 points whose noise is three times as
 large along one axis; in the other sets the effect is too weak to mislead."""
 TOGETHER = 0.01
-"""Chance of scattered groups to seem to lie together."""
+"""Probability that scattered groups seem to lie together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,9 +32,9 @@ class Groups:
     Parameters
     ----------
     transforms : two Rigid, Similarity or Affine
-        Of the larger group and of the other.
+        Transforms of the larger group and of the other one.
     in_space : bool
-        Whether place tells the group, which speaks for a bent frame and not for two motions.
+        Whether the place determines the group, which indicates a bent frame and not two motions.
     """
 
     transforms: tuple[Transform, Transform]
@@ -43,7 +43,10 @@ class Groups:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Assignment:
-    """``first`` : (n,) mask of the first group; the transforms of both; ``total`` : their square sum."""
+    """Assignment of points to two groups.
+
+    ``first`` : (n,) mask of the first group; ``total`` : square sum of both fits.
+    """
 
     first: np.ndarray
     transforms: tuple[Transform, Transform]
@@ -51,7 +54,7 @@ class _Assignment:
 
 
 def two_groups(problem: Problem, rng: np.random.Generator) -> Groups | None:
-    """The two transforms of points that fall into two groups.
+    """Returns the two transforms of points that fall into two groups.
 
     Parameters
     ----------
@@ -61,34 +64,34 @@ def two_groups(problem: Problem, rng: np.random.Generator) -> Groups | None:
     Returns
     -------
     Groups or None
-        None where one transform explains the points as well.
+        None if one transform explains the points as well.
     """
     n, model = len(problem), problem.model
-    part = problem if n <= TRIED else problem[np.sort(rng.choice(np.arange(n), TRIED, replace=False))]
-    n = len(part)
+    points = problem if n <= TRIED else problem[np.sort(rng.choice(np.arange(n), TRIED, replace=False))]
+    n = len(points)
     if n < 2 * (model.sample + 1):
         return None
     try:
-        whole = part.whitened(part.fit())
-        found = _assigned(part, rng)
+        single = points.whitened(points.fit())
+        assigned = _assigned(points, rng)
     except (DegenerateError, ConvergenceError):
         return None
-    if found is None or np.abs(whole).max() <= part.rounding_mm():
+    if assigned is None or np.abs(single).max() <= points.rounding_mm():
         return None
-    first, (one, two) = found.first, found.transforms
-    parted = np.where(first[:, None], part.whitened(one), part.whitened(two))
-    if (n - 1) * np.log(2) + _log_chance(model, whole, parted) > np.log(FALSE_ALARMS):
+    first, (one, two) = assigned.first, assigned.transforms
+    parted = np.where(first[:, None], points.whitened(one), points.whitened(two))
+    if (n - 1) * np.log(2) + _log_chance(model, single, parted) > np.log(FALSE_ALARMS):
         return None
     if first.sum() < n / 2:
-        return Groups((two, one), lies_together(part.xyz_a, ~first))
-    return Groups((one, two), lies_together(part.xyz_a, first))
+        return Groups((two, one), lies_together(points.xyz_a, ~first))
+    return Groups((one, two), lies_together(points.xyz_a, first))
 
 
 def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
-    """Bound of the logarithm of the chance of residuals (n, 3) to shrink so when groups chosen beforehand are parted.
+    """Returns a bound of the log probability that parting into given groups shrinks residuals (n, 3) that much.
 
-    0 where noise along the loudest axis enters the fit, and with it the quiet ones, by more than these have: the ratio
-    of their variances is then above n / 2, and determinants tell nothing.
+    It is 0 if noise along the loudest axis enters the fit and exceeds the noise of the quiet axes there: the ratio of
+    their variances is then above n / 2, and determinants give no information.
     """
     n, per_axis = len(whole), model.parameters / 3
     one, two = whole.T @ whole, parted.T @ parted
@@ -103,13 +106,13 @@ def _log_chance(model: Model, whole: np.ndarray, parted: np.ndarray) -> float:
 
 
 def sphericity(scatter: np.ndarray, redundancy: float) -> float:
-    """p-value of equal noise along all axes (Mauchly 1940, with Bartlett's factor)."""
+    """Returns the p-value of equal noise along all axes (Mauchly 1940, with Bartlett's factor)."""
     w = np.linalg.slogdet(scatter)[1] - 3 * np.log(np.trace(scatter) / 3)
     return float(chdtrc(5, max(-(redundancy - 23 / 18) * w, 0.0)))
 
 
 def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> float:
-    """Chernoff's bound of log P(Λ ≤ exp(log_ratio)) of Wilks' Λ(3, of_error, of_hypothesis).
+    """Returns Chernoff's bound of log P(Λ ≤ exp(log_ratio)) for Wilks' Λ(3, of_error, of_hypothesis).
 
     Λ is a product of independent Beta((νₑ − i)/2, νₕ/2), i = 0, 1, 2 (Anderson 2003, th. 8.4.1); the bound is the least
     of λᵗ E[Λ⁻ᵗ] over t.
@@ -121,7 +124,7 @@ def wilks_bound(log_ratio: float, of_error: float, of_hypothesis: float) -> floa
 
 
 def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
-    """Whether neighbours are in the same group more often than chance would have it."""
+    """Returns whether neighbours are in the same group more often than by chance."""
     nearest = np.asarray(KDTree(xyz_a).query(xyz_a, k=2)[1])[:, 1]
     same = int((group[nearest] == group).sum())
     share = group.mean()
@@ -129,18 +132,18 @@ def lies_together(xyz_a: np.ndarray, group: np.ndarray) -> bool:
 
 
 def _assigned(problem: Problem, rng: np.random.Generator) -> _Assignment | None:
-    """Both groups; None where one becomes too small."""
+    """Returns both groups, or None if one becomes too small."""
     model, n = problem.model, len(problem)
     core = search(problem, by_share(model, n), rng)
     if core is None:
         return None
-    rest = np.flatnonzero(~core.inliers)
-    if len(rest) <= model.sample:
+    others = np.flatnonzero(~core.inliers)
+    if len(others) <= model.sample:
         return None
-    inner = search(problem[rest], by_share(model, len(rest)), rng)
+    inner = search(problem[others], by_share(model, len(others)), rng)
     if inner is None:
         return None
-    first, second = core.inliers, np.isin(np.arange(n), rest[inner.inliers])
+    first, second = core.inliers, np.isin(np.arange(n), others[inner.inliers])
     best = None
     for _ in range(MAX_ROUNDS):
         if min(first.sum(), second.sum()) <= model.sample:
@@ -157,28 +160,28 @@ def _assigned(problem: Problem, rng: np.random.Generator) -> _Assignment | None:
 
 
 NEEDED, ALONG = 14.5, 9.2
-"""Gain in log likelihood that is needed: along any direction, and along the first principal axis."""
+"""Least gain in log likelihood: along any direction, and along the first principal axis."""
 LEAST_SHARE = 0.15
 """Smallest fraction of the points in a group."""
 ROUNDS = 60
 NARROWEST = 0.01
-"""Variance of a group over that of all, along the shift."""
+"""Smallest ratio of a group's variance to the variance of all points, along the shift."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shifted:
-    """Points of which some are shifted against the others.
+    """Points of which some are shifted relative to the others.
 
     Parameters
     ----------
     rows : (m,) int array
-        Indices of the fewer.
+        Indices of the smaller group.
     count : int
-        Of all points.
+        Number of all points.
     by_mm : (3,) array
-        Their shift against the others, frame b.
+        Shift of the smaller group relative to the others, frame b.
     together : bool
-        Whether they lie together in space.
+        Whether the smaller group lies together in space.
     """
 
     rows: np.ndarray
@@ -187,24 +190,24 @@ class Shifted:
     together: bool
 
     def off_mm(self) -> np.ndarray:
-        """(3,) how far the transform lies off that of the fewer, if these are the right ones."""
+        """Returns the deviation (3,) of the transform from that of the smaller group, if the smaller group is right."""
         return (1 - len(self.rows) / self.count) * self.by_mm
 
 
 def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
-    """The rows that are shifted together.
+    """Returns the rows that are shifted together.
 
     Parameters
     ----------
     problem : Problem
-        Points that agree.
+        Points that agree on one transform.
     transform : Transform
-        Their fit.
+        Fit to these points.
 
     Returns
     -------
     Shifted or None
-        None where one group explains the residuals, where a bent frame does, or with too few points.
+        None if one group or a bent frame explains the residuals, or there are too few points.
     """
     count = len(problem)
     residuals = problem.whitened(transform)
@@ -231,7 +234,10 @@ def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Parted:
-    """``gain`` of log likelihood by two groups, ``axis`` of the shift, ``border`` between them along it."""
+    """Division into two groups.
+
+    ``gain`` : of log likelihood; ``axis`` : of the shift; ``border`` : between them along it.
+    """
 
     gain: float
     axis: np.ndarray
@@ -239,8 +245,10 @@ class _Parted:
 
 
 def _clear(unit: np.ndarray, axes: np.ndarray) -> _Parted | None:
-    """Two groups of residuals (n, 3) of unit scatter that chance does not make; ``axes`` : principal ones before they
-    were scaled, in columns, the longest last."""
+    """Returns a division of residuals (n, 3) of unit scatter into two groups that is not due to chance, or None.
+
+    ``axes`` : principal axes before the residuals were scaled, as columns, the longest last.
+    """
     best = max((_parted(unit, axis) for axis in (*_by_kurtosis(unit).T, *axes.T)), key=lambda found: found.gain)
     across = unit - (unit @ best.axis)[:, None] * best.axis
     rest = max(_parted(across, axis).gain for axis in _by_kurtosis(across).T[1:])
@@ -253,7 +261,10 @@ def _clear(unit: np.ndarray, axes: np.ndarray) -> _Parted | None:
 
 
 def _by_kurtosis(unit: np.ndarray) -> np.ndarray:
-    """(3, 3) directions in columns, that of the least kurtosis first of those in which points vary (Cardoso 1989)."""
+    """Returns directions as columns (3, 3), by ascending kurtosis (Cardoso 1989).
+
+    Directions without variance come first.
+    """
     return np.linalg.eigh((unit * (unit**2).sum(1)[:, None]).T @ unit)[1]
 
 

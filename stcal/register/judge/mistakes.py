@@ -1,4 +1,4 @@
-"""Mistakes that the data show: units, mirrored axes, exchanged rows, scale, and residuals alike at neighbours."""
+"""Mistakes that the data show: units, mirrored axes, exchanged rows, scale, and correlated residuals of neighbours."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,31 +19,31 @@ from stcal.register.core.robust import BY_CHANCE, Fitted
 Namer = Callable[[int], str]
 
 UNITS = {1000.0: ("m", "m"), 25.4: ("inches", "in"), 10.0: ("cm", "cm")}
-"""Millimetres in a unit: its name and the suffix of its columns."""
+"""Units by their length in mm, with name and suffix of their columns."""
 UNIT_WITHIN = 0.08
-"""Outliers move the median ratio of distances by a few per cent; the factors are far apart."""
+"""Relative tolerance of the ratio. Outliers move the median ratio by a few per cent; the factors are far apart."""
 PAIRS = 4000
 """Number of pairs of points whose distances are compared."""
 MIRROR_RATIO = 4.0
 """Ratio of misfits that indicates a mirrored frame. Mirrored points fit a mirrored frame to noise, and a correct frame
 only to their thickness; bent frames never gain so much."""
 MIRROR_CHANCE = 1e-4
-"""Right frames called mirrored, were their points thick only by noise: so many."""
+"""Probability of calling right frames mirrored if the points had thickness only by noise."""
 NAMED_BELOW_RAD = np.radians(15)
-"""A sign or an exchange of axes is named when it leaves the frames turned by less: then it is what was meant."""
+"""Largest remaining turn of the frames with which a change of sign or exchange of axes is named as the likely cause."""
 SHOWN = 5
-"""Rows that a note names."""
+"""Number of rows that a note names."""
 LOOKED_AT = 10_000
-"""Outliers; what slips they show, the others show too."""
+"""Largest number of outliers that are examined. More would show the same mistakes."""
 
 
 def check_units(xyz_a: np.ndarray, xyz_b: np.ndarray, seed: int) -> None:
-    """Refuse frames whose distances differ by the ratio of two units.
+    """Refuses frames whose distances differ by the ratio of two units.
 
     Raises
     ------
     InputError
-        The median ratio of distances between the same two points in b and a is that of a unit.
+        If the median ratio of distances between the same two points in b and a is the ratio of two units.
     """
     rng = np.random.default_rng([seed, 3])
     i, j = rng.integers(len(xyz_a), size=(2, PAIRS))
@@ -64,23 +64,24 @@ def check_units(xyz_a: np.ndarray, xyz_b: np.ndarray, seed: int) -> None:
 
 
 def mirrored_ratio(xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[float, np.ndarray]:
-    """Square sum of the best rotation over that of the best reflection, and the reflection (3, 3), b from a."""
+    """Returns the square sum of the best rotation over that of the best reflection, and this reflection (3, 3)."""
     a, b = xyz_a - xyz_a.mean(0), xyz_b - xyz_b.mean(0)
-    whole = (a**2).sum() + (b**2).sum()
+    total = (a**2).sum() + (b**2).sum()
     flip = np.array([1, 1, -1.0])
-    proper = whole - 2 * best_rotations(b.T @ a)[1]
+    proper = total - 2 * best_rotations(b.T @ a)[1]
     turn, product = best_rotations(b.T @ (a * flip))
-    floor = 1e-20 * whole  # rounding of exact data
-    return float(max(proper, floor) / max(whole - 2 * product, floor)), turn * flip
+    floor = 1e-20 * total  # rounding of exact data
+    return float(max(proper, floor) / max(total - 2 * product, floor)), turn * flip
 
 
 def check_mirrored(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> None:
-    """Refuse points (n, 3) that a reflection explains far better than any rotation.
+    """Refuses points (n, 3) that a reflection explains far better than any rotation.
 
     Raises
     ------
     InputError
-        With the axis to change where one sign or exchange leaves the frames nearly parallel.
+        If they are. The message names the axis to change, if one change of sign or exchange makes the frames nearly
+        parallel.
     """
     if model.name == "affine" or len(xyz_a) <= model.sample:
         return
@@ -91,7 +92,7 @@ def check_mirrored(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> None:
 
 
 def mirrored_error(reflection: np.ndarray, agree: int, count: int, times: float) -> InputError:
-    """What to say of mirrored data; ``reflection`` : (3, 3), b from a, determinant −1."""
+    """Returns the error for mirrored data. ``reflection`` : (3, 3), b from a, determinant −1."""
     axes = "xyz"
     mends = {f"the sign of a{axis}": np.diag([-1.0 if axis == other else 1.0 for other in axes]) for axis in axes}
     for i, j in ((0, 1), (1, 2), (0, 2)):
@@ -111,7 +112,7 @@ def mirrored_error(reflection: np.ndarray, agree: int, count: int, times: float)
 
 
 def outlier_notes(problem: Problem, fitted: Fitted, name: Namer) -> list[str]:
-    """Outliers that a slip explains: exchanged rows, or another unit."""
+    """Returns notes on outliers that a slip explains: exchanged rows, or another unit."""
     rows = np.flatnonzero(~fitted.inliers)[:LOOKED_AT]
     if not len(rows):
         return []
@@ -147,16 +148,16 @@ def _more(count: int) -> str:
 
 
 SCALE_BY_CHANCE = 1e-4
-"""Frames of one scale called of two: so many."""
+"""Probability of finding two scales in frames of one scale."""
 MATTERS = 0.1
-"""Share of the noise's σ by which the wider model must lower it: less is seen in many points, and moves none."""
+"""Least relative decrease of the noise's σ by the wider model. Many points show less, but it matters for none."""
 THERMAL = 5e-4
-"""Relative: 45 K in steel, 20 K in aluminium; what is more has another cause."""
+"""Largest relative scale that temperature may cause: 45 K in steel, 20 K in aluminium."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Wider:
-    """The wider model that explains the points: ``transform``, σ of a coordinate by it, and what is to be said."""
+    """A wider model that explains the points: its ``transform``, σ of a coordinate with it, and the message."""
 
     problem: Problem
     transform: Transform
@@ -165,40 +166,40 @@ class Wider:
 
 
 def wider(problem: Problem, transform: Transform) -> Wider | None:
-    """The narrowest model wider than the problem's own that explains its points better, more than chance does.
+    """Returns the narrowest wider model that explains the points better than the problem's own, beyond chance.
 
     Parameters
     ----------
     problem : Problem
-        Points that agree.
+        Points that agree on one transform.
     transform : Transform
-        Their fit.
+        Fit to these points.
 
     Returns
     -------
     Wider or None
-        None where the problem's own model is enough.
+        None if the problem's own model is sufficient.
     """
-    narrow, found = (problem, transform), None
+    narrow, best = (problem, transform), None
     for name in {"rigid": ("similarity", "affine"), "similarity": ("affine",), "affine": ()}[problem.model.name]:
         model = MODELS[name]
         if len(problem) < model.needed + 1:
             break
-        other = replace(problem, model=model)
+        candidate = replace(problem, model=model)
         try:
-            fitted = other.fit()
+            fitted = candidate.fit()
         except StcalError:  # coplanar points have no affine transform
             break
-        before, after = _square(*narrow), _square(other, fitted)
-        more, left = model.parameters - narrow[0].model.parameters, other.redundancy
+        before, after = _square(*narrow), _square(candidate, fitted)
+        extra, redundancy = model.parameters - narrow[0].model.parameters, candidate.redundancy
         rounding = 3 * len(problem) * problem.rounding_mm() ** 2
-        gain = (before - after) / more / max(after / left, rounding / left)
-        sigma = np.sqrt(max(after, 0) / left)
+        gain = (before - after) / extra / max(after / redundancy, rounding / redundancy)
+        sigma = np.sqrt(max(after, 0) / redundancy)
         enough = sigma < (1 - MATTERS) * np.sqrt(before / narrow[0].redundancy)
-        if before > rounding and gain > ratio_limit(SCALE_BY_CHANCE, more, left) and enough:
-            narrow = other, fitted
-            found = Wider(other, fitted, float(sigma), _said(other, fitted, float(sigma)))
-    return found
+        if before > rounding and gain > ratio_limit(SCALE_BY_CHANCE, extra, redundancy) and enough:
+            narrow = candidate, fitted
+            best = Wider(candidate, fitted, float(sigma), _said(candidate, fitted, float(sigma)))
+    return best
 
 
 def _square(problem: Problem, transform: Transform) -> float:
@@ -206,7 +207,7 @@ def _square(problem: Problem, transform: Transform) -> float:
 
 
 def _said(problem: Problem, transform: Transform, sigma_mm: float) -> str:
-    """What lengths in b are of those in a, the likely cause, and what to do."""
+    """Returns a text on the ratio of lengths in b to those in a, the likely cause, and the remedy."""
     covariance = sigma_mm**2 * unit_covariance(problem.model, transform, problem.xyz_a, problem.noise.precision)
     if isinstance(transform, Similarity):
         scale, sigma = transform.scale, transform.scale * float(np.sqrt(covariance[6, 6]))
@@ -228,18 +229,19 @@ def _said(problem: Problem, transform: Transform, sigma_mm: float) -> str:
 
 
 NEIGHBOURS = 2000
-"""Number of points whose residuals are compared with the nearest neighbour's …"""
+"""Largest number of points whose residuals are compared with the nearest neighbour's."""
 FEWEST_NEIGHBOURS = 20
-"""… and of no fewer: the sum of fewer products is not normal."""
+"""Least number of points for this comparison, as the sum of fewer products is not normal."""
 BY_NEIGHBOURS = 1e-4
-"""Clean data called bent: so many."""
+"""Probability of calling clean data bent."""
 
 
 def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
-    """Whether points (n, 3) have residuals (n, 3) in common with their nearest neighbours, more than chance has it.
+    """Returns whether residuals (n, 3) at points (n, 3) correlate with those at their nearest neighbours, beyond
+    chance.
 
-    Of independent ones the products r · r' of neighbours have mean zero (a little less after a fit), and their sum is
-    normal with the variance Σ (r · r')².
+    The products r · r' of independent neighbours have mean zero (a little less after a fit), and their sum is normal
+    with the variance Σ (r · r')².
     """
     rows = slice(None, None, max(1, len(xyz_a) // NEIGHBOURS))
     xyz, r = xyz_a[rows], residuals[rows]

@@ -1,4 +1,4 @@
-"""What a user should look at, one line each."""
+"""Notes on what a user should check, one line each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,16 +18,16 @@ from stcal.register.judge.groups import Shifted
 from stcal.register.judge.mistakes import SHOWN, UNIT_WITHIN, UNITS, Wider, neighbours_alike, outlier_notes
 
 LOW_REDUNDANCY = 6
-"""Degrees of freedom below which σ is uncertain by more than 30 %."""
+"""Degrees of freedom below which the relative uncertainty of σ exceeds 30 %."""
 MAJORITY = 0.5
 """Fraction of the point pairs below which a note says that few agree."""
 TIGHT = 2.5
-"""A threshold of 2.5 σ cuts off a tenth of the good points; below it the covariance of few points is too small."""
+"""Threshold in σ below which the covariance of few points is too small. 2.5 σ cuts off a tenth of the good points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Subject:
-    """What there is to judge.
+    """A registration to judge.
 
     Parameters
     ----------
@@ -36,14 +36,14 @@ class Subject:
     fitted : Fitted
     alternative : Alternative or None
     ambiguous : bool
-        The alternative is about as good.
+        Whether the alternative is about as good.
     other : Wider or None
         A wider model that explains the points.
     shifted : Shifted or None
         Inliers that are shifted together.
     covariance : Covariance
     factor : float or None
-        By which residuals exceed the σ given; None where none was given.
+        Ratio of the residuals to the given σ; None if none was given.
     lines : sequence of int, optional
         Lines of the file that name the points.
     """
@@ -60,12 +60,12 @@ class Subject:
     lines: Sequence[int] | None
 
     def name(self, row: int) -> str:
-        """A point's name for messages."""
+        """Returns a point's name for messages."""
         return row_name(row, self.lines)
 
 
 def notes_of(subject: Subject) -> list[str]:
-    """The lines."""
+    """Returns all notes."""
     other = subject.other
     sigma = subject.fitted.sigma if other is None else other.sigma_mm
     notes = [*_agreement(subject), *_noise(subject, other), *_layout(subject, sigma)]
@@ -94,7 +94,7 @@ def _agreement(subject: Subject) -> list[str]:
 
 
 def _far_rows(subject: Subject) -> list[str]:
-    """Rows that the robust method would look at."""
+    """Returns notes on rows that the robust method would examine."""
     problem = subject.problem
     redundancy = problem.redundancy
     square = squares(problem.residuals(subject.fitted.transform))
@@ -128,7 +128,7 @@ def _noise(subject: Subject, other: Wider | None) -> list[str]:
             f"residuals exceed the σ given {subject.factor:.3g} times, which chance does not explain; the covariance "
             "is scaled by it"
         )
-    enough = inside.model.sample + 1  # of so many, any but one fit: which one is wrong their residuals do not tell
+    enough = inside.model.sample + 1  # all but any one of so many fit: their residuals cannot show which one is wrong
     if len(inside) <= enough and subject.covariance.scaled:
         more = enough + 2 - len(inside)
         notes.append(f"of {len(inside)} points one that is wrong cannot be told from the others: measure {more} more")
@@ -157,7 +157,7 @@ def _two_groups(subject: Subject, shifted: Shifted) -> str:
 
 
 def _layout(subject: Subject, sigma: float) -> list[str]:
-    """``sigma`` : of a coordinate, by a model that explains the points."""
+    """Returns notes on the layout of the points. ``sigma`` : of a coordinate, by a model that explains the points."""
     model, fitted, notes = subject.problem.model, subject.fitted, []
     rows = np.flatnonzero(fitted.inliers)
     inside, transform = subject.problem.xyz_a[rows], fitted.transform

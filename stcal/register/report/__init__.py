@@ -1,1 +1,1 @@
-"""A registration for people and for programs."""
+"""Results of a registration as text, page, pictures and file."""

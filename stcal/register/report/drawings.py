@@ -11,7 +11,7 @@ VIEWS = ((0, 1), (0, 2), (1, 2))
 """Horizontal and vertical axis of each view."""
 MOST_ARROWS = 1500
 ARROW_SHARE, FEW = 0.12, 80
-"""Fraction of the picture's side for the inliers' RMS residual, and the number of points above which it shrinks."""
+"""Length of the inliers' RMS residual as a share of the picture's side; number of points above which it shrinks."""
 LONGEST_SHARE = 0.3
 """Longest arrow of an outlier, as a fraction of the picture's side; longer arrows are cut off."""
 MOST_LABELS = 60
@@ -21,7 +21,7 @@ MARGIN = 0.25
 
 
 def space_figure(found: Findings):
-    """Three views of the points in frame b with their residuals; and by how much these are enlarged."""
+    """Returns three views of the points in frame b with their residuals, and the factor by which these are enlarged."""
     result = found.registration
     rows = _shown(found)
     place = result.b_from_a @ found.xyz_a[rows]
@@ -69,7 +69,7 @@ def space_figure(found: Findings):
 
 
 def field_figure(found: Findings, field: Field):
-    """Planes through the middle of the points with the error to expect; None where the points have no width."""
+    """Returns planes through the middle of the points with the expected error; None if the points have no width."""
     own = found.xyz_a[field.rows]
     low, high = own.min(0), own.max(0)
     if (high - low).min() < 1e-3 * (high - low).max():
@@ -106,7 +106,7 @@ def field_figure(found: Findings, field: Field):
 
 
 def errors_figure(found: Findings, reach: Cubes):
-    """Lengths of residuals against the side of the cube about the middle that a point lies on."""
+    """Returns a figure of the residuals' lengths against the side of the cube about the middle that a point lies on."""
     result = found.registration
     rows = _shown(found)
     side = 2 * np.abs(found.xyz_a[rows] - reach.middle).max(1)
@@ -137,7 +137,7 @@ def errors_figure(found: Findings, reach: Cubes):
 
 
 def _shown(found: Findings) -> np.ndarray:
-    """All rows, or the outliers (of very many, some) and as many others as can be told apart."""
+    """Returns all rows; of many, the outliers (a part of very many) and as many others as can be distinguished."""
     result = found.registration
     if len(result) <= MOST_ARROWS:
         return np.arange(len(result))
@@ -146,7 +146,7 @@ def _shown(found: Findings) -> np.ndarray:
 
 
 def _frame(axes, frame: str, i: int, j: int, middle: np.ndarray, reach: np.ndarray) -> None:
-    """Limits of equal scale that hold ``middle`` ± ``reach``."""
+    """Sets limits of equal scale that hold ``middle`` ± ``reach``."""
     width, height = axes.get_position().size * axes.figure.get_size_inches()
     per_inch = max(reach[i] / width, reach[j] / height)
     axes.set_xlim(middle[i] - per_inch * width, middle[i] + per_inch * width)
@@ -159,7 +159,7 @@ def _frame(axes, frame: str, i: int, j: int, middle: np.ndarray, reach: np.ndarr
 
 
 def sample_size_figure(sizes: list[SampleSize], share: float):
-    """Best and median share of inliers against the size of the sample; the share asked for, dashed."""
+    """Returns a figure of the best and median share of inliers by size of the sample. The requested share is dashed."""
     figure = new_figure(6.4, 2.9)
     axes = figure.add_axes((0.1, 0.17, 0.87, 0.78))
     points = [each.points for each in sizes]

@@ -1,4 +1,4 @@
-"""What a registration found, for programs: the keys of ``data_layout.md``."""
+"""Result file of a registration: the keys of ``data_layout.md``."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -21,13 +21,13 @@ NAMES = {
 }
 UNIT = {"r": "rad", "s": "1", "m": "1"}
 GRID = 7
-"""Places along each side of the grid of the field, over the box of the points and …"""
+"""Number of places along each side of the grid of the field."""
 MARGIN = 0.25
-"""… so much of its sides beyond it."""
+"""Margin of this grid beyond the box of the points, as a share of its sides."""
 
 
 def matrix_of(transform: Transform) -> np.ndarray:
-    """(4, 4)."""
+    """Returns the transform as a matrix (4, 4)."""
     whole = np.eye(4)
     whole[:3, :3], whole[:3, 3] = parts(transform)
     return whole
@@ -199,7 +199,7 @@ class RegistrationFile(ResultFile):
 
     @classmethod
     def of(cls, found: Findings) -> "RegistrationFile":
-        """The file of a registration."""
+        """Returns the file of a registration."""
         result, lines = found.registration, found.lines
         names = NAMES[len(result.covariance)]
         same = ("model", "method", "covariance", "sigma_mm", "sigma_factor", "scaled", "threshold_mm", "ambiguous")
@@ -231,7 +231,7 @@ class RegistrationFile(ResultFile):
 
 
 def _scale(transform: Transform) -> dict[str, Any]:
-    """What the matrix hides: scale of a similarity, shear and scales of an affine transform."""
+    """Returns the values that a matrix hides: scale of a similarity, shear and scales of an affine transform."""
     if isinstance(transform, Rigid):
         return {}
     if isinstance(transform, Affine):
@@ -290,7 +290,7 @@ def _field(field: ResidualField, found: Findings) -> FieldPart:
 
 
 def grid_of(own: np.ndarray) -> np.ndarray:
-    """(g, 3) places in and around the points used (n, 3), frame a, mm."""
+    """Returns places (g, 3) in and around the points used (n, 3), frame a, mm."""
     low, high = own.min(0), own.max(0)
     side = MARGIN * (high - low)
     axes = [np.linspace(a, b, GRID) if b > a else [a] for a, b in zip(low - side, high + side, strict=True)]

@@ -1,4 +1,4 @@
-"""What a registration found, as text and as a page."""
+"""Text and page of a registration."""
 
 from itertools import pairwise
 
@@ -18,15 +18,15 @@ from stcal.report.page import Sections, render
 from stcal.report.text import NONE, number, text_table
 
 FEW_ROWS = 24
-"""Up to so many every row is listed, else the outliers and …"""
+"""Largest number of rows that are all listed. Of more, only the outliers and some inliers are."""
 WORST = 5
-"""… so many of the inliers, those with the largest residuals."""
+"""Number of inliers that are then listed, those with the largest residuals."""
 MOST_OUTLIERS = 30
 ROWS_ON_PAGE = 2000
 
 
 def registration_text(found: Findings) -> str:
-    """Tables for the terminal."""
+    """Returns the tables for the terminal."""
     result = found.registration
     lines = [_heading(found), "", "b_from_a, mm", *matrix_lines(matrix_of(result.b_from_a)), *_parts_lines(found), ""]
     heads = ["<mm", "points", "mean", "RMS", "max"]
@@ -37,7 +37,7 @@ def registration_text(found: Findings) -> str:
 
 
 def sample_size_section(sizes: list[SampleSize], options: Liu2017Options) -> tuple[str, str, Markup]:
-    """The paper's figure 6 on these points, for the page."""
+    """Returns the paper's figure 6 for these points, as a section of the page."""
     rows = [
         [
             str(each.points),
@@ -58,12 +58,12 @@ def sample_size_section(sizes: list[SampleSize], options: Liu2017Options) -> tup
 
 
 def matrix_lines(matrix: np.ndarray) -> list[str]:
-    """A 4×4 matrix, row by row."""
+    """Returns a 4×4 matrix as text, row by row."""
     return ["  " + "".join(f"{v:14.9f}" for v in row[:3]) + f"{row[3]:16.4f}" for row in matrix]
 
 
 def matrix_rows(matrix: np.ndarray) -> list[list[str]]:
-    """The same for a page: what becomes of the axes and the origin."""
+    """Returns a 4×4 matrix for a page: the images of the axes and the origin."""
     return [[axis, *(f"{v:.9f}" for v in row[:3]), f"{row[3]:.4f}"] for axis, row in zip("xyz ", matrix, strict=True)]
 
 
@@ -76,7 +76,7 @@ def _heading(found: Findings) -> str:
 
 
 def _parts_lines(found: Findings) -> list[str]:
-    """σ of the transform, and what else it holds."""
+    """Returns lines on σ of the transform, and on its scale or shear."""
     result, lines = found.registration, []
     sigma = np.sqrt(np.diag(result.covariance))
     if isinstance(result.b_from_a, Affine):
@@ -94,7 +94,7 @@ def _parts_lines(found: Findings) -> list[str]:
 
 
 def _error_cells(found: Findings) -> list[list[str]]:
-    """Name, points, mean, RMS, maximum."""
+    """Returns cells with name, points, mean, RMS, maximum."""
     result, held = found.registration, found.registration.held_out
     rows = [_figures("residuals of the inliers", result.inlier_errors)]
     if held is not None:
@@ -130,7 +130,7 @@ def _row_lines(found: Findings) -> list[str]:
 
 
 def field_sentence(field: Field) -> str:
-    """Whether residuals are more than noise, in a sentence."""
+    """Returns a sentence on whether residuals are more than noise."""
     if not field.seen:
         return (
             f"no systematic residuals seen: they look like noise of σ {field.noise_mm:.3g} mm "
@@ -151,7 +151,7 @@ def _field_lines(found: Findings) -> list[str]:
 
 
 def shells(reach: Cubes) -> list[str]:
-    """``inner 200 mm``, ``200 … 300 mm`` …."""
+    """Returns names of the cubes: ``inner 200 mm``, ``200 … 300 mm`` …."""
     sides = [f"{side:g}" for side in reach.sides_mm]
     return [f"inner {sides[0]} mm"] + [f"{a} … {b} mm" for a, b in pairwise(sides)]
 
@@ -182,7 +182,7 @@ def holds(reach: Cubes) -> list[str]:
 
 @one_thread()
 def registration_page(found: Findings, more: Sections = ()) -> str:
-    """The report page; ``more`` sections stand before the rows."""
+    """Returns the report page. ``more`` : sections to insert before the rows."""
     result = found.registration
     space, enlarged = space_figure(found)
     field = None if found.field is None else field_figure(found, found.field)
@@ -209,7 +209,7 @@ def registration_page(found: Findings, more: Sections = ()) -> str:
 
 
 def _headline(found: Findings) -> list[tuple[str, str, str]]:
-    """(value, unit, what it is) of the tiles."""
+    """Returns value, unit and meaning of each tile."""
     result, errors = found.registration, found.registration.inlier_errors
     tiles = [(f"{result.inliers.sum()} / {len(result)}", "", "inliers of the point pairs")]
     tiles.append((f"{errors.rms_mm:.3g} mm", "", f"RMS residual of the inliers, at most {errors.max_mm:.3g} mm"))
@@ -222,7 +222,7 @@ def _headline(found: Findings) -> list[tuple[str, str, str]]:
 
 
 def _cubes(found: Findings, reach: Cubes) -> dict:
-    """Errors in cubes as the template shows them."""
+    """Returns errors in cubes in the form of the template."""
     rows = []
     for side, row in zip(reach.sides_mm, reach.errors, strict=True):
         errors = [[str(e.points), number(e.mean_mm, 4), number(e.max_mm, 4)] if e else ["0", NONE, NONE] for e in row]
@@ -237,7 +237,7 @@ def _cubes(found: Findings, reach: Cubes) -> dict:
 
 
 def _row(found: Findings, row: int, length: np.ndarray) -> list[str]:
-    """Cells of a row; ``length`` : (n,) of all residuals."""
+    """Returns the cells of a row. ``length`` : (n,) of all residuals."""
     result = found.registration
     kind = "inlier" if result.inliers[row] else "outlier"
     values = [number(v, 4) for v in (*result.residuals[row], length[row])]

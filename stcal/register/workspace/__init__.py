@@ -1,1 +1,1 @@
-"""Where a registration holds."""
+"""Range of validity of a registration."""

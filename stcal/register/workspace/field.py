@@ -1,4 +1,4 @@
-"""Where a registration holds: the systematic part of its residuals over the workspace, and errors around cubes."""
+"""Range of validity of a registration: systematic residuals over the workspace, and errors around cubes."""
 
 from dataclasses import dataclass
 
@@ -16,13 +16,13 @@ from stcal.register.core.pairs import Problem, noise_of
 from stcal.register.core.result import ErrorFigures, Registration, held_out
 
 MOST_POINTS = 500
-"""The model of more points is of so many of them, evenly chosen: its cost grows with the third power."""
+"""Largest number of points of the model, evenly chosen from more, as its cost grows with the third power."""
 SEEN_AT = 0.01
-"""A systematic part is declared in so many of registrations whose residuals are noise."""
+"""Probability of declaring a systematic part if residuals are noise."""
 LENGTHS, RATIOS = 12, np.geomspace(1e-3, 1e7, 41)
-"""Lengths tried before refinement, and variances of f over that of the noise."""
+"""Number of lengths tried before refinement, and tried ratios of the variance of f to that of the noise."""
 WILD = 0.01
-"""Clean sets in which one point or more is taken for wild."""
+"""Probability that a clean set has any point that is taken for an outlier of the field."""
 ROUNDS = 5
 _LAPACK = ("sytrd", "sytrd_lwork", "ormqr", "pttrf", "pttrs")
 _sytrd, _sytrd_lwork, _ormqr, _pttrf, _pttrs = get_lapack_funcs(_LAPACK, dtype=np.float64)
@@ -32,11 +32,11 @@ _sytrd, _sytrd_lwork, _ormqr, _pttrf, _pttrs = get_lapack_funcs(_LAPACK, dtype=n
 class Field:
     """Systematic residuals b − b_from_a a over the workspace, frame b's axes, at places in frame a.
 
-    ``length_mm`` : over which they change; ``size_mm`` : RMS length of them at the points; ``noise_mm`` : σ per axis of
-    what is left; ``p_value`` : of so much of it by chance; ``rows`` : (m,) of the points used;
-    ``taken_back`` : outliers of the registration that follow the field of the others; ``plain_mm``, ``corrected_mm`` :
-    (m,) errors of points by the transform, and by transform and field, fitted to the others; ``sigma_ratio`` : RMS of
-    the latter over their σ, about 1 when the field's σ are true.
+    ``length_mm`` : distance over which they change; ``size_mm`` : their RMS length at the points; ``noise_mm`` : σ per
+    axis of the remaining noise; ``p_value`` : probability of such a part by chance; ``rows`` : (m,) rows of the points
+    used; ``taken_back`` : outliers of the registration that follow the field of the others; ``plain_mm``,
+    ``corrected_mm`` : (m,) errors of points by the transform, and by transform and field, each fitted to the other
+    points; ``sigma_ratio`` : RMS ratio of the latter to their σ, about 1 if the field's σ are true.
     """
 
     length_mm: float
@@ -60,13 +60,13 @@ class Field:
         return self.p_value < SEEN_AT
 
     def at(self, xyz_a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Systematic error (g, 3) to expect of the transform at places (g, 3), mm, and its covariance (g, 3, 3)."""
+        """Returns the expected systematic error (g, 3) of the transform at places (g, 3), and its covariance, mm."""
         return self._solved.at(np.asarray(xyz_a, float))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solved:
-    """What predictions need: places (m, 3), C⁻¹ (m, m) of unit noise, and what follows from it."""
+    """Data of predictions: places (m, 3), C⁻¹ (m, m) of unit noise, and quantities derived from it."""
 
     model: Model
     transform: Transform
@@ -93,31 +93,31 @@ def residual_field(
     weights: np.ndarray | None = None,
     covariances: np.ndarray | None = None,
 ) -> Field | None:
-    """The systematic part of the residuals of the inliers and of outliers that follow it; None with too few points.
+    """Returns the systematic part of the residuals of inliers and of outliers that follow it; None for too few points.
 
-    Arguments as of :func:`stcal.register.pipeline`; of covariances the mean variance of each point counts.
+    Arguments are those of :func:`stcal.register.pipeline`. Of covariances only the mean variance of each point is used.
     """
     a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
     model = MODELS[registration.model]
     variance = _relative_variances(len(a), weights, covariances)
     used = registration.inliers.copy()
-    taken = np.zeros(0, int)
+    followers = np.zeros(0, int)
     for _ in range(ROUNDS):
         rows = _few(np.flatnonzero(used))
         if model.redundancy(len(rows)) < 2 * model.parameters:
             return None
-        found = _Likelihood.of(model, registration.b_from_a, a[rows], b[rows], variance[rows])
-        field = _field(found, rows, taken)
-        more = _followers(field, a, b - registration.b_from_a @ a, variance, used)
-        if not len(more):
+        likelihood = _Likelihood.of(model, registration.b_from_a, a[rows], b[rows], variance[rows])
+        field = _field(likelihood, rows, followers)
+        added = _followers(field, a, b - registration.b_from_a @ a, variance, used)
+        if not len(added):
             return field
-        used[more] = True
-        taken = np.sort(np.concatenate([taken, more]))
+        used[added] = True
+        followers = np.sort(np.concatenate([followers, added]))
     return field
 
 
 def _relative_variances(n: int, weights, covariances) -> np.ndarray:
-    """(n,) of the noise, over that of a point of mean σ."""
+    """Returns the variances of the noise (n,) relative to a point of mean σ."""
     precision = noise_of(n, weights, covariances).precision
     if precision is None:
         return np.ones(n)
@@ -129,7 +129,7 @@ def _few(rows: np.ndarray) -> np.ndarray:
 
 
 def _followers(field: Field, a, residuals, variance, used) -> np.ndarray:
-    """Points not used that lie where the field says, and not where the transform says."""
+    """Returns the unused points that agree with the field but not with the transform."""
     rows = _few(np.flatnonzero(~used))
     if not field.seen or not len(rows):
         return np.zeros(0, int)
@@ -144,14 +144,17 @@ def _followers(field: Field, a, residuals, variance, used) -> np.ndarray:
 
 
 def _matern(distance: np.ndarray) -> np.ndarray:
-    """Matérn 5/2 of distances over the length."""
+    """Returns Matérn's 5/2 function of distances over the length."""
     scaled = np.sqrt(5) * distance
     return (1 + scaled + scaled**2 / 3) * np.exp(-scaled)
 
 
 def _tridiagonal(matrix: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Q T Qᵀ = ``matrix`` (m, m), symmetric: diagonal of T, what stands beside it, and Qᵀ ``columns`` (m, k). A quarter
-    of the time of eigenvectors, and 1 + r T is solved for any r in one pass."""
+    """Decomposes a symmetric ``matrix`` (m, m) into Q T Qᵀ.
+
+    Returns the diagonal of T, its off-diagonal, and Qᵀ ``columns`` (m, k). It takes a quarter of the time of
+    eigenvectors, and 1 + r T is solved for any r in one pass.
+    """
     m, k = columns.shape
     work = int(_sytrd_lwork(m, lower=1)[0])
     reflectors, diagonal, beside, scale, _ = _sytrd(matrix, lower=1, lwork=work)
@@ -160,14 +163,14 @@ def _tridiagonal(matrix: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _motions(model: Model, transform: Transform, xyz_a: np.ndarray, about: np.ndarray) -> np.ndarray:
-    """What small motions of the transform add to residuals, (m, 3, p), in numbers about 1."""
+    """Returns the residuals due to small motions of the transform, (m, 3, p), for parameters scaled to about 1."""
     origin = about.mean(0)
     extent = float(np.abs(about - origin).max())
     return jacobian(model, transform, xyz_a - origin) / np.where(_in_mm(model), extent, 1.0)
 
 
 def _in_mm(model: Model) -> np.ndarray:
-    """Parameters whose motions grow with the distance from the origin."""
+    """Returns the mask of the parameters whose motions grow with the distance from the origin."""
     if model.name == "affine":
         return np.tile([True, True, True, False], 3)
     return np.array([True] * 3 + [False] * 3 + [True])[: model.parameters]
@@ -175,8 +178,11 @@ def _in_mm(model: Model) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Likelihood:
-    """The restricted likelihood of length and variance ratio. ``y`` : (m, 3) residuals, ``motions`` : (m, 3, p), both
-    over the root of the points' relative variance ``variance`` : (m,)."""
+    """The restricted likelihood of length and variance ratio.
+
+    ``y`` : (m, 3) residuals; ``motions`` : (m, 3, p); both are divided by the root of the points' relative variance
+    ``variance`` : (m,).
+    """
 
     model: Model
     transform: Transform
@@ -194,7 +200,7 @@ class _Likelihood:
         return cls(model, transform, xyz_a, variance, y, motions, cdist(xyz_a, xyz_a))
 
     def best(self) -> tuple[float, float, float, float]:
-        """Length, ratio, −2 log L there, and without f."""
+        """Returns the best length and ratio, −2 log L there, and −2 log L without f."""
         nearest = KDTree(self.xyz_a).query(self.xyz_a, k=2)[0][:, 1]
         low, high = max(np.median(nearest), 1e-6 * self.distance.max()), 2 * self.distance.max()
         lengths = np.geomspace(low, high, LENGTHS)
@@ -209,7 +215,7 @@ class _Likelihood:
         return length, ratio, value, without
 
     def _at_length(self, length: float) -> tuple[float, float, float]:
-        """−2 log L at the best ratio, that ratio, and −2 log L without f."""
+        """Returns −2 log L at the best ratio, that ratio, and −2 log L without f."""
         root = np.sqrt(self.variance)
         m, _, p = self.motions.shape
         columns = np.concatenate([self.motions, self.y[:, :, None]], axis=2).reshape(m, -1)
@@ -258,7 +264,7 @@ class _Kriged:
         return cls(np.diag(inverse), of_y, of_motions, spread, beta, left, variance)
 
     def left_out(self) -> tuple[np.ndarray, float]:
-        """Errors (m,) of each point by the model of the others, and their RMS over their σ.
+        """Returns the errors (m,) of each point by the model of the others, and the RMS ratio to their σ.
 
         (Q⁻¹)ᵢᵢ⁻¹ … of Q = C⁻¹ − C⁻¹J(JᵀC⁻¹J)⁻¹JᵀC⁻¹, in blocks of a point's three components (Dubrule 1983).
         """
@@ -285,26 +291,26 @@ def _field(found: _Likelihood, rows: np.ndarray, taken: np.ndarray) -> Field:
 
 
 SHARES = (0.25, 0.5, 0.75, 1.0)
-"""Sides of the cubes, of that which holds all points."""
+"""Sides of the cubes relative to the cube that holds all points."""
 LEAST_POINTS = 10
-"""Fewest points in the inner cube: 30 coordinates for the six parameters of a rigid transform."""
+"""Least number of points in the inner cube: 30 coordinates for the six parameters of a rigid transform."""
 DIGITS = 2
 """Significant digits of the outer side, which is rounded up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cubes:
-    """Errors by where the transform was fitted and where it is used.
+    """Errors by the region of the fit and the region of use.
 
     Parameters
     ----------
     middle : (3,) array
-        mm, frame a; cubes stand along its axes.
+        Centre of the cubes, mm, frame a; cubes are aligned with its axes.
     sides_mm : (k,) array
-        Growing.
+        Sides of the cubes, increasing.
     errors : k tuples of k ErrorFigures
-        ``errors[i][j]`` : fitted to the points in cube i, of the points in cube j that are not in cube j − 1; those
-        that the fit used are held out in turn. None where there are none.
+        ``errors[i][j]`` : errors of the fit to the points in cube i, at the points in cube j that are not in cube j −
+        1. Points of the fit are held out in turn. None if there are no such points.
     """
 
     middle: Array
@@ -325,20 +331,20 @@ def cubes(
     covariances: np.ndarray | None = None,
     folds: int = 6,
 ) -> Cubes | None:
-    """Fits of the registration's model in cubes about the middle of its inliers.
+    """Fits the registration's model in cubes about the middle of its inliers.
 
     Parameters
     ----------
     registration : Registration
     xyz_a, xyz_b, weights, covariances, folds :
-        As of :func:`stcal.register.register`.
+        As in :func:`stcal.register.register`.
     taken_back : (m,) int array, optional
-        Indices of outliers that count too.
+        Indices of outliers that are included.
 
     Returns
     -------
     Cubes or None
-        None where there are too few points.
+        None if there are too few points.
     """
     used = registration.inliers.copy()
     used[np.zeros(0, int) if taken_back is None else taken_back] = True
@@ -373,7 +379,7 @@ def cubes(
 
 
 def _errors(problem: Problem, inside: np.ndarray, folds: int, seed: int) -> np.ndarray:
-    """(n,) of all points, mm, of the fit to those ``inside``, (n,) mask, which are held out in turn."""
+    """Returns the errors (n,) of all points, mm, for the fit to the points ``inside``. These are held out in turn."""
     cube = problem[inside]
     error = np.linalg.norm(problem.residuals(cube.fit()), axis=1)
 

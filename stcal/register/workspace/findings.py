@@ -1,4 +1,4 @@
-"""A registration with all that is told of it: the points' lines, the residual field, the cubes."""
+"""A registration with the data of its report: the points' lines, the residual field, the cubes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,8 +14,11 @@ from stcal.register.workspace.field import Cubes, Field, cubes, residual_field
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
-    """``where`` : the file; ``lines`` : (n,) its lines; ``xyz_a`` : (n, 3) mm; ``field``, ``cubes`` : None where the
-    points are too few."""
+    """A registration and its checks.
+
+    ``where`` : the file; ``lines`` : (n,) its lines; ``xyz_a`` : (n, 3) mm; ``field``, ``cubes`` : None if there are
+    too few points.
+    """
 
     where: str
     lines: Sequence[int]
@@ -29,15 +32,15 @@ class Findings:
 
     @property
     def length_mm(self) -> np.ndarray:
-        """(n,) of the residuals."""
+        """Lengths (n,) of the residuals, mm."""
         return np.linalg.norm(self.registration.residuals, axis=1)
 
     def middle(self) -> np.ndarray:
-        """(3,) of the inliers, frame a, mm."""
+        """Middle (3,) of the inliers, frame a, mm."""
         return self.xyz_a[self.registration.inliers].mean(0)
 
     def sigma_mm_at(self, xyz_a: np.ndarray) -> np.ndarray:
-        """(3,) σ that the transform's covariance makes at a point of frame a, along b's axes."""
+        """Returns σ (3,) by the transform's covariance at a point of frame a, along b's axes."""
         found = self.registration
         by_step = jacobian(MODELS[found.model], found.b_from_a, xyz_a[None])[0]
         return np.sqrt(np.diag(by_step @ found.covariance @ by_step.T).clip(0))
@@ -53,7 +56,7 @@ def findings(
     weights: np.ndarray | None = None,
     covariances: np.ndarray | None = None,
 ) -> Findings:
-    """The residual field and the cubes of a registration; arguments as of :func:`stcal.register.pipeline`."""
+    """Returns a registration with its residual field and cubes. Arguments as in :func:`stcal.register.pipeline`."""
     field = residual_field(registration, xyz_a, xyz_b, weights, covariances)
     back = None if field is None else field.taken_back
     reach = cubes(registration, xyz_a, xyz_b, back, weights, covariances)

@@ -16,7 +16,7 @@ PAYLOAD = "payload_kg"
 APPROACH = "approach"
 DIRECTIONS = (-1.0, 0.0, 1.0)
 MOST_KG = 1e4
-"""Arms carry up to 2.3 t."""
+"""Largest mass at a flange. Arms carry up to 2.3 t."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,7 +150,7 @@ _KNOWN = re.compile(
     "target|status|from_row|pose|image|name|scene|set|line|station|faces|circles|rms_px|chi2_per_dof|error_mm|"
     "error_deg|(commanded|nominal)_.*"
 )
-"""Columns that the robot commands and ``stcal-sfm measure`` write. Not every command reads them; none reports them."""
+"""Columns that robot commands and ``stcal-sfm measure`` write. No command reports them as unread."""
 
 
 def oriented(table: Table, rotation: str | None = None) -> tuple[Poses | None, tuple[str, ...], tuple[str, ...]]:

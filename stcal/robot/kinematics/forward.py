@@ -14,11 +14,14 @@ from stcal.robot.kinematics.model import Chain, Elasticity, Robot
 
 GRAVITY_M_S2 = 9.80665
 CHUNK = 8192
-"""Joint vectors at a time: their frames, 96 bytes each, stay in a processor's cache of a megabyte."""
+"""Number of joint vectors processed at a time.
+
+Their frames, 96 bytes each, stay in a processor's cache of a megabyte.
+"""
 
 
 def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | None = None) -> Poses:
-    """base_from_tool of each joint vector.
+    """Returns base_from_tool of each joint vector.
 
     Parameters
     ----------
@@ -46,7 +49,7 @@ def forward(robot: Robot, q: ArrayLike, tool: str = "", payload_kg: ArrayLike | 
 
 
 def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
-    """Geometric Jacobian: derivative of base_from_tool by the controller's values.
+    """Returns the geometric Jacobian: the derivative of base_from_tool by the controller's values.
 
     Parameters
     ----------
@@ -76,7 +79,7 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
 
 
 def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> Poses:
-    """world_from_flange of joint vectors (m, n).
+    """Returns world_from_flange of joint vectors (m, n).
 
     Raises
     ------
@@ -95,7 +98,7 @@ def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) ->
 
 
 def carried_poses(chain: Chain, q: np.ndarray, targets: Sequence[str], conditions: Conditions = USUAL) -> Poses:
-    """world_from_flange, the flange being that of the joint that carries each row's target, of joint vectors (m, n)."""
+    """Returns world_from_flange of joint vectors (m, n), for the flange that carries each row's target."""
     if chain.grown is None:
         return flange_poses(chain, q, conditions)
     carrier = np.array([chain.carrier(name) for name in targets])
@@ -108,7 +111,7 @@ def carried_poses(chain: Chain, q: np.ndarray, targets: Sequence[str], condition
 
 
 def joint_frames(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> tuple[np.ndarray, np.ndarray]:
-    """world_from_joint of each joint before it moves: rotations (n, m, 3, 3) and origins (n, m, 3)."""
+    """Returns world_from_joint of each joint before its own motion: rotations (n, m, 3, 3) and origins (n, m, 3)."""
     n, m = len(chain), len(q)
     rotation, origin = np.empty((n, m, 3, 3)), np.empty((n, m, 3))
 
@@ -120,7 +123,7 @@ def joint_frames(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) ->
 
 
 def links(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> tuple[np.ndarray, np.ndarray]:
-    """world_from_link of each link as its joint has moved it: rotations (n, m, 3, 3) and origins (n, m, 3)."""
+    """Returns world_from_link of each link after its joint's motion: rotations (n, m, 3, 3) and origins (n, m, 3)."""
     rotation, origin = joint_frames(chain, q, conditions)
     angle = np.where(chain.prismatic, 0.0, q @ chain.coupling.T).T[:, :, None]
     x, y, z = np.moveaxis(rotation, 3, 0)
@@ -131,8 +134,10 @@ def links(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> tuple[
 def torques(
     chain: Chain, q: np.ndarray, rotation: np.ndarray, origin: np.ndarray, conditions: Conditions = USUAL
 ) -> np.ndarray:
-    """(n, m, 3) N m of gravity about each joint, in the world's axes; ``rotation`` (n, m, 3, 3), ``origin`` (n, m, 3):
-    of :func:`links` at joint vectors (m, n)."""
+    """Returns the torque of gravity about each joint, (n, m, 3) N m, in the world's axes.
+
+    ``rotation`` : (n, m, 3, 3), ``origin`` : (n, m, 3), from :func:`links` at joint vectors (m, n).
+    """
     elasticity = _elasticity(chain)
     carried = chain.gathered((rotation @ elasticity.moment[:, None, :, None])[:, :, :, 0])
     mass = conditions.payload_kg
@@ -166,7 +171,7 @@ def waves(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def _turning(chain: Chain) -> np.ndarray:
-    """(n, N) angles of the joints by values of the controller's revolute ones; others are not turned."""
+    """Returns the derivatives (n, N) of the joints' angles by the controller's values; 0 for prismatic ones."""
     return np.where(chain.prismatic[:, None] | chain.prismatic, 0.0, chain.coupling)
 
 
@@ -193,8 +198,10 @@ def _elasticity(chain: Chain) -> Elasticity:
 def _walk(
     chain: Chain, joints: Sequence[int], q: np.ndarray, conditions: Conditions = USUAL, visit=None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Axes (3 axes, 3 components, m) and origin (3, m) after the last of ``joints``, of which each follows those that
-    carry it; ``visit`` sees each frame unmoved."""
+    """Returns the axes (3 axes, 3 components, m) and origin (3, m) after the last of ``joints``.
+
+    Each joint follows those that carry it. ``visit`` is called with each frame before the joint's motion.
+    """
     m = len(q)
     give = None
     if chain.elasticity is not None:
@@ -225,7 +232,8 @@ def _walk(
 
 
 def chain_parameters(chain: Chain) -> list[tuple[int, int]]:
-    """(joint, component) of the minimal parameters of the chain's axes; component 0–5 is rx, ry, rz, tx, ty, tz.
+    """Returns (joint, component) of the minimal parameters of the chain's axes; component 0–5 is rx, ry, rz, tx, ty,
+    tz.
 
     An axis is a line: of the six small motions of a joint's frame, turning about it and sliding along it are passed on
     to what follows, and of a prismatic joint only its direction counts. With the six of one tool this makes the
@@ -236,7 +244,10 @@ def chain_parameters(chain: Chain) -> list[tuple[int, int]]:
 
 
 def chain_jacobian(chain: Chain, q: np.ndarray, tip: Poses, conditions: Conditions = USUAL) -> np.ndarray:
-    """Derivative of poses ``tip`` (world_from_tool) by :func:`chain_parameters`, (m, 6, k), in the world's axes."""
+    """Returns the derivative (m, 6, k) of poses ``tip`` by :func:`chain_parameters`, in the world's axes.
+
+    ``tip`` : world_from_tool.
+    """
     rotation, origin = joint_frames(chain, q, conditions)
     joint, component = np.array(chain_parameters(chain)).T
     direction = rotation[joint, :, :, component % 3]  # (k, m, 3)
@@ -254,8 +265,10 @@ def elasticity_jacobian(
     conditions: Conditions = USUAL,
     hysteresis: bool = False,
 ) -> np.ndarray:
-    """Derivative of poses ``tip`` (world_from_tool of ``targets``) by :func:`elasticity_values`, in the
-    world's axes, (m, 6, 9 n or 10 n)."""
+    """Returns the derivative of poses ``tip`` by :func:`elasticity_values`, (m, 6, 9 n or 10 n), in the world's axes.
+
+    ``tip`` : world_from_tool of ``targets``.
+    """
     elasticity = _elasticity(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
     torque, z = torques(chain, q, rotation, origin, conditions), rotation[..., 2]
@@ -283,8 +296,11 @@ def elasticity_jacobian(
 def elasticity_curvature(
     chain: Chain, q: np.ndarray, tip: Poses, targets: Sequence[str], pull: np.ndarray, conditions: Conditions = USUAL
 ) -> np.ndarray:
-    """Second derivative, (9 n, 9 n), of the sum of ``pull`` (m, 6) times :func:`elasticity_jacobian`'s motions: of
-    products of compliance and moment."""
+    """Returns the second derivative (9 n, 9 n) of the sum of ``pull`` (m, 6) times :func:`elasticity_jacobian`'s
+    motions.
+
+    Only products of compliance and moment have one.
+    """
     elasticity, n = _elasticity(chain), len(chain)
     rotation, origin = links(replace(chain, elasticity=None), q)
     z = rotation[..., 2]
@@ -300,12 +316,12 @@ def elasticity_curvature(
 
 
 def _by_moment(chain: Chain, rotation: np.ndarray, elasticity: Elasticity) -> np.ndarray:
-    """(n, m, 3, 3) torque, in the world's axes, by each link's moment."""
+    """Returns the derivative (n, m, 3, 3) of the torque, in the world's axes, by each link's moment."""
     return np.cross(rotation, (chain.rotation[0] @ elasticity.gravity)[:, None], axisa=2, axisb=0, axisc=2)
 
 
 def elasticity_values(elasticity: Elasticity, hysteresis: bool = False) -> np.ndarray:
-    """(9 n,) compliance, moment and periodic of all joints, each row by row; (10 n,) with ``hysteresis``."""
+    """Returns compliance, moment and periodic of all joints, each row by row, (9 n,), or (10 n,) with hysteresis."""
     parts = [elasticity.compliance.ravel(), elasticity.moment.ravel(), elasticity.periodic.ravel()]
     return np.concatenate([*parts, *([elasticity.hysteresis] if hysteresis else [])])
 
@@ -324,7 +340,7 @@ def with_values(elasticity: Elasticity, values: np.ndarray) -> Elasticity:
 
 
 def moved_chain(chain: Chain, step: np.ndarray) -> Chain:
-    """The chain after small motions along :func:`chain_parameters`, (k,)."""
+    """Returns the chain after small motions along :func:`chain_parameters`, (k,)."""
     twist = np.zeros((len(chain), 6))
     for value, (i, c) in zip(step, chain_parameters(chain), strict=True):
         twist[i, c] = value
@@ -334,7 +350,7 @@ def moved_chain(chain: Chain, step: np.ndarray) -> Chain:
 
 
 def _orthogonal(rotation: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) with the rounding of products taken away (one step of Newton's iteration for the polar factor)."""
+    """Removes rounding errors from rotations (n, 3, 3), by one step of Newton's iteration for the polar factor."""
     return 1.5 * rotation - 0.5 * rotation @ np.swapaxes(rotation, 1, 2) @ rotation
 
 

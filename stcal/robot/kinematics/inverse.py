@@ -168,23 +168,23 @@ def _position_exact(problem: InverseProblem, poses: Poses, q: np.ndarray, bounds
 
 
 WITHIN_MM, WITHIN_RAD = 1e-9, 1e-12
-"""A pose is reached: far below any measurement, well above the rounding of a chain of some metres."""
+"""Errors below which a pose counts as reached: far below any measurement, above the rounding of a chain of metres."""
 LIMIT_SLACK = 1e-9
-"""Joint limits may be exceeded by this rounding, rad (or shares of the reach)."""
+"""Largest excess over joint limits that counts as rounding, rad (or shares of the reach)."""
 SINGULAR = 1e-5
 """Smallest singular value (no unit) below which joint values are not determined. At a fold the error is the square of
 what the joints are off, so that an error of 1e-12 leaves 1e-6: the joints cannot be found nearer to the fold."""
 POOL, STARTS = 4096, 96
-"""Joint vectors over the range from which starts are taken, and starts for each pose: those of nearest pose. Of 2738
+"""Number of joint vectors over the range, and number of the nearest of them that are starts for each pose. Of 2738
 branches of 600 poses of five arms, found with 600 starts, 96 missed none, 48 three, 32 twenty-eight."""
 SAME_BRANCH = 1e-4
-"""Joint vectors nearer than this (rad) are one solution."""
+"""Distance of joint vectors, rad, below which they are one solution."""
 SHORT = 0.1
-"""Up to this distance from the reference (rad) other branches are sought around the solution only, else everywhere."""
+"""Distance from the reference, rad, up to which other branches are sought around the solution only, else everywhere."""
 AS_GOOD = 2.0
-"""Orientations (of arms that cannot choose them) off by up to so many times the least are as good."""
+"""Largest ratio of an orientation error to the least one that counts as equally good, for arms with few joints."""
 GROUP = 2048
-"""Poses at a time when all branches are sought."""
+"""Number of poses processed at a time if all branches are sought."""
 
 REACHED, ORIENTATION, SINGULAR_POSE = "reached", "orientation", "singular"
 LIMIT, UNREACHABLE = "limit", "unreachable"
@@ -223,14 +223,14 @@ class Inverse:
 
     @property
     def usable(self) -> np.ndarray:
-        """(m,) whether the tool is where it was wanted: reached, singular, or orientation."""
+        """Mask (m,) of poses with the tool at the wanted place: reached, singular, or orientation."""
         return np.array([s in (REACHED, SINGULAR_POSE, ORIENTATION) for s in self.status], bool)
 
 
 def inverse(
     robot: Robot, poses: Poses, near: ArrayLike | None = None, tool: str = "", payload_kg: float | None = None
 ) -> Inverse:
-    """Joint vectors q that bring the tool to ``poses``: forward(robot, q) = base_from_tool.
+    """Returns joint vectors q that bring the tool to ``poses``: forward(robot, q) = base_from_tool.
 
     Of all branches and turns within the joint limits, the one nearest to ``near`` (Euclidean distance, rad, prismatic
     joints in shares of the reach). Where the step from ``near`` is so short that no other branch can be
@@ -292,7 +292,7 @@ def inverse(
 
 
 def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
-    """All joint vectors within the limits that bring the tool to ``pose``, one for each branch.
+    """Returns all joint vectors within the limits that bring the tool to ``pose``, one for each branch.
 
     Turns by 2π are one branch: the value nearest to the middle of the limits stands for them. At a singular pose, where
     there is a continuum of solutions, some of them. Found by many starts, the same ones every time.
@@ -331,7 +331,7 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
 
 
 def _from_near(problem: InverseProblem, poses: Poses, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Joint vectors (m, n) by descent from ``near`` (m, n), and which (m,) are sure to be the nearest solutions."""
+    """Returns joint vectors (m, n) by descent from ``near``, and a mask (m,) of those that are surely nearest."""
     isolated = len(problem.unit) <= 6
     bounds = None if isolated else problem.bounds
     q = solve(problem, poses, near if isolated else problem.clipped(near), bounds)
@@ -390,7 +390,7 @@ def _every_solution(problem: InverseProblem, poses: Poses, more: np.ndarray | No
 
 
 def _embedded(poses: Poses, reach: float) -> np.ndarray:
-    """(m, 12) points whose distances are those of poses: chord of the rotation and shares of the reach."""
+    """Returns points (m, 12) whose distances are those of poses: chord of the rotation and shares of the reach."""
     return np.hstack([poses.rotation.reshape(-1, 9) / np.sqrt(2), poses.translation / reach])
 
 
@@ -435,7 +435,7 @@ def _distinct(solutions: np.ndarray) -> np.ndarray:
 
 
 def _turned(problem: InverseProblem, q: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Joint values turned by 2π as near to ``near`` as the limits allow, and whether (m,) they are within these."""
+    """Returns joint values turned by 2π to be nearest to ``near`` within limits, and a mask (m,) of those within."""
     low, high = problem.bounds.T
     turn = 2 * np.pi
     turned = q + turn * np.round((near - q) / turn)
@@ -447,7 +447,7 @@ def _turned(problem: InverseProblem, q: np.ndarray, near: np.ndarray) -> tuple[n
 
 
 def _is_nearest(problem: InverseProblem, q: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """(m,) whether no other solution can be as near to ``near`` as q.
+    """Returns a mask (m,) of the joint vectors q that are surely the solutions nearest to ``near``.
 
     A solution is the only one within 2σ/K, σ being the smallest singular value of the Jacobian there and K a Lipschitz
     constant of the Jacobian (the mean value theorem; Newton–Kantorovich). In the embedding of :func:`_embedded` the

@@ -25,19 +25,19 @@ from stcal.robot.kinematics.model import Robot
 
 WHAT = "robot data"
 STATUS, AMBIGUOUS = "status", "ambiguous"
-"""Column and word of ``stcal-sfm measure``."""
+"""Column ``status`` of ``stcal-sfm measure``, and its word for an undecided pose."""
 MAX_TURNS = 4
-"""Joint values beyond so many turns are degrees in a column of radians."""
+"""Largest joint value in turns. Larger ones are degrees in a column of radians."""
 LONGEST_TOOL_MM = 10_000.0
-"""What a target may be from the flange, beyond all that the arm reaches: no tool is as long."""
+"""Longest possible tool, by which a target may be farther than the arm reaches."""
 ORIENTATION = "columns qw, qx, qy, qz, or angles like w_deg, p_deg, r_deg,"
 FARTHEST = {"mm": 1e7, "rad": 100 * 2 * np.pi}
-"""10 km and a hundred turns: what is beyond is no length and no joint value."""
+"""Largest possible length and joint value: 10 km and a hundred turns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurements:
-    """What an instrument saw at m joint vectors: poses, positions, or distances between positions.
+    """Measurements of an instrument at m joint vectors: poses, positions, or distances between positions.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class Measurements:
         return len(self.q)
 
     def __getitem__(self, index) -> "Measurements":
-        """Rows by a mask, slice or list; not for distances, which refer to one another."""
+        """Returns rows by a mask, slice or list. Distances cannot be selected, as they refer to one another."""
         if self.distances is not None:
             raise InputError(
                 "E-MEASURED-DISTANCES", f"{self.where}: distances refer to other rows, so that rows cannot be taken out"
@@ -123,13 +123,13 @@ class Measurements:
         )
 
     def by_station(self) -> dict[str, np.ndarray]:
-        """(m,) which rows each station has; that of most rows first."""
+        """Returns a mask (m,) of the rows of each station, by name, the one with most rows first."""
         names = np.array(self.stations)
         found = {name: names == name for name in dict.fromkeys(self.stations)}
         return dict(sorted(found.items(), key=lambda item: -item[1].sum()))
 
     def own_covariance(self) -> np.ndarray:
-        """(m, 6, 6) of what each pose errs by itself."""
+        """Returns the covariances (m, 6, 6) of the independent errors of poses, without the common ones."""
         if self.covariance is None:
             raise InputError(
                 "E-MEASURED-NO-COVARIANCE", f"{self.where}: poses without covariance; columns of it needed"
@@ -139,13 +139,13 @@ class Measurements:
         return self.covariance - self.common @ np.swapaxes(self.common, 1, 2)
 
     def points(self) -> np.ndarray:
-        """(m, 3) positions as measured, mm."""
+        """Returns the measured positions (m, 3), mm."""
         if self.positions is None:
             raise InputError("E-MEASURED-DISTANCES", f"{self.where}: distances only; columns x_mm, y_mm, z_mm needed")
         return self.positions
 
     def poses(self) -> Poses:
-        """world_from_tool as measured."""
+        """Returns the measured poses world_from_tool."""
         if self.rotations is None:
             raise InputError(
                 "E-MEASURED-NO-ORIENTATION", f"{self.where}: positions without orientation; {ORIENTATION} needed"
@@ -153,7 +153,7 @@ class Measurements:
         return Poses(self.rotations, self.points())
 
     def lengths(self) -> tuple[np.ndarray, np.ndarray]:
-        """(m,) distances as measured, mm, and (m,) the rows that they start from."""
+        """Returns the measured distances (m,), mm, and the rows (m,) at which they start."""
         if self.distances is None or self.from_row is None:
             raise InputError("E-MEASURED-KIND", f"{self.where}: positions, not distances; column distance_mm needed")
         return self.distances, self.from_row
@@ -166,7 +166,7 @@ def read_measurements(
     rotation: str | None = None,
     payload_kg: float | None = None,
 ) -> Measurements:
-    """Read joint values with positions, poses or distances.
+    """Reads joint values with positions, poses or distances.
 
     Poses of which their ``status`` says that another one fits the image as well, and copies of a row, are left out with
     a note; columns that are not read are named in one.
@@ -231,12 +231,12 @@ def read_measurements(
 
 
 def targets_of(table: Table) -> tuple[str, ...]:
-    """(m,) names of column ``target``; where there is none, that of the robot's only one."""
+    """Returns the names (m,) of column ``target``, or of the robot's only target if there is no such column."""
     return tuple(table.text("target")) if "target" in table else ("",) * len(table)
 
 
 def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
-    """No value (m,) or (m, k) beyond what can be."""
+    """Refuses values (m,) or (m, k) beyond possible ones."""
     bad = np.flatnonzero((np.abs(values).reshape(len(values), -1) > FARTHEST[unit]).any(axis=1))
     if len(bad):
         raise InputError(
@@ -247,7 +247,7 @@ def within(table: Table, name: str, values: np.ndarray, unit: str) -> None:
 
 
 def _in_reach(data: Measurements, robot: Robot) -> None:
-    """No position farther from the middle one than the arm can put it."""
+    """Refuses positions farther from the middle one than arm and tool allow."""
     away = np.linalg.norm(data.points() - np.median(data.points(), axis=0), axis=1)
     reach = max(reach_mm(robot, tool) for tool in robot.tools)
     worst = int(away.argmax())
@@ -288,7 +288,7 @@ def _usable(data: Measurements, table: Table) -> Measurements:
 
 
 def joint_values(table: Table, robot: Robot) -> np.ndarray:
-    """(m, n) of columns ``q1_deg`` … (``_rad``; ``_mm``, ``_m`` for prismatic joints)."""
+    """Returns the joint values (m, n) of columns ``q1_deg`` … (``_rad``; ``_mm``, ``_m`` for prismatic joints)."""
     n = len(robot.rows)
     if any(name.startswith(f"q{n + 1}_") for name in table.columns):
         raise InputError(
@@ -312,7 +312,7 @@ def joint_values(table: Table, robot: Robot) -> np.ndarray:
 
 
 def _from_rows(table: Table) -> np.ndarray:
-    """Row that each distance starts from: column ``from_row``, counted from 1 as the rows stand; else the first."""
+    """Returns the row at which each distance starts: column ``from_row``, counted from 1, or the first row."""
     if "from_row" not in table:
         return np.zeros(len(table), int)
     rows = table.numbers("from_row")

@@ -1,1 +1,1 @@
-"""An identified robot at work: compensation, verification, poses to measure at."""
+"""Use of an identified robot: compensation, verification, measurement poses."""

@@ -31,20 +31,24 @@ from stcal.robot.use.targets import (
 )
 
 ISOLATED = 6
-"""Joints, up to which solutions are isolated: another one is another configuration."""
+"""Largest number of joints with isolated solutions, of which another one is another configuration."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stayed:
-    """``found`` : solutions, none of another configuration than that of the joint values they are near to; ``beyond`` :
-    by row what stands against it, such as ``"J4 at 190.2°, limit 190°"``."""
+    """Solutions without changes of configuration.
+
+    ``found`` : solutions, each in the configuration of the joint values that it is near to; ``beyond`` : by row the
+    limits that prevent this, such as ``"J4 at 190.2°, limit 190°"``.
+    """
 
     found: Inverse
     beyond: dict[int, str]
 
 
 def stayed(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, found: Inverse, rows: np.ndarray) -> Stayed:
-    """Solutions ``found`` near to ``near`` (m, n), looked at once more in ``rows``: without limits.
+    """Checks solutions ``found`` near to ``near`` (m, n) for changes of configuration, by solving ``rows`` without
+    limits.
 
     A row whose nearest solution of all is beyond the limits gets the status ``limit`` and joint values at the limit.
     """
@@ -77,7 +81,7 @@ def _between(robot: Robot, limits: np.ndarray) -> Robot:
 
 
 def _beyond(robot: Robot, q: np.ndarray) -> str:
-    """Which joints of (n,) are beyond their limits, and by what; empty where none is."""
+    """Returns the joints of (n,) that are beyond their limits, with both values, as text; empty if there is none."""
     said = []
     for number, (value, joint) in enumerate(zip(q.tolist(), robot.joints, strict=True), 1):
         limit = min(max(value, joint.lower), joint.upper)
@@ -88,9 +92,12 @@ def _beyond(robot: Robot, q: np.ndarray) -> str:
 
 
 FAR_RAD = np.radians(1.0)
-"""Arms are made to milliradians; a joint that has to move by more than this does so because others cannot."""
+"""Largest usual motion of a joint, as arms are made to milliradians.
+
+A joint moves by more only if others cannot move.
+"""
 AMPLIFIED = 10.0
-"""A joint that moves by so many times what the pose is off, in rad, does so because the arm is near a singular pose."""
+"""Ratio of a joint's motion to the error of the pose, in rad, from which the arm is near a singular pose."""
 SAME_TOOL_MM, SAME_TOOL_RAD = 20.0, np.radians(5)
 """Largest plausible deviation of a tool from its drawing, mm and rad."""
 MEANING = {
@@ -145,12 +152,11 @@ class Compensated:
         return len(self.found)
 
     def compared(self) -> np.ndarray:
-        """(m,) rows that both robots reach."""
+        """Mask (m,) of the rows that both robots reach."""
         return self.found.usable & self.nominal.usable if self.nominal else np.zeros(len(self), bool)
 
     def notes(self) -> list[str]:
-        """Every row that is not simply reached, or only a long way from the nominal joint values, by its line; before
-        them what is doubtful of targets and robots."""
+        """Returns doubts about targets and robots, then notes on rows not simply reached or far from nominal values."""
         return [*self.doubts, *self._not_simply_reached(), *self._far_moved()]
 
     def _far_moved(self) -> list[str]:
@@ -181,8 +187,11 @@ class Compensated:
 
 
 def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple[Robot, Robot, tuple[str, ...]]:
-    """Both robots, with the same tools where theirs cannot be: the identified one's, unless joint values beside the
-    poses show that these are of the nominal one's; and what was taken."""
+    """Returns both robots with the same tools, and notes on tools that differ.
+
+    The identified robot's tool replaces a tool that differs too much. The nominal one is taken instead if joint values
+    beside the poses show that the poses are of this tool.
+    """
     apart = {}
     for name in dict.fromkeys(targets.tools):
         own, other = identified.tool(name), nominal.tools.get(name)
@@ -215,7 +224,7 @@ def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple
 
 @one_thread()
 def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None) -> Compensated:
-    """Joint values for the commanded poses, by the identified robot and beside it by the nominal one.
+    """Returns joint values for the commanded poses, by the identified robot and by the nominal one.
 
     Of several branches the one nearest to the nominal joint values, or without a nominal robot to the commanded ones;
     never another one because that is beyond a limit. Where neither is known the first pose gets the one nearest to the
@@ -289,7 +298,7 @@ def _built(robot: Robot) -> list[tuple[str, int]]:
 
 
 def _rigid(robot: Robot, targets: Targets) -> tuple[str, ...]:
-    """A note where the robot knows nothing of what a load does."""
+    """Returns a note if the robot's model has no elasticity, although loads are stated."""
     return targets.conditions.ignored(f"robot {robot.name}") if robot.elasticity is None else ()
 
 
@@ -322,17 +331,17 @@ def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
 
 
 def joint_columns(robot: Robot) -> list[str]:
-    """``q1_deg`` … and ``q3_mm`` of prismatic joints."""
+    """Returns the column names ``q1_deg`` …, and ``q3_mm`` for prismatic joints."""
     return [f"q{i}_{'mm' if sliding else 'deg'}" for i, sliding in enumerate(robot.prismatic, 1)]
 
 
 def joint_cells(robot: Robot, q: np.ndarray) -> list[str]:
-    """One joint vector in the units of :func:`joint_columns`, to nine decimals (a millionth of a µm of arc)."""
+    """Returns a joint vector in the units of :func:`joint_columns`, to nine decimals (a millionth of a µm of arc)."""
     return [f"{value:.9f}" for value in np.where(robot.prismatic, q, np.degrees(q))]
 
 
 def compensated_csv(result: Compensated, robot: Robot) -> str:
-    """The table of ``--out`` (form: ``data_layout.md``); joint values of poses that are not reached are left empty."""
+    """Returns the table of ``--out`` (form: ``data_layout.md``). Joint values of poses not reached are empty."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     columns = joint_columns(robot)
@@ -404,7 +413,7 @@ def compensation_file(result: Compensated, robot: Robot) -> CompensationFile:
 
 
 def compensated_text(result: Compensated, robot: Robot, most: int = 60) -> str:
-    """Nominal and compensated side by side, for the terminal; of more than ``most`` rows the first."""
+    """Returns nominal and compensated values side by side for the terminal, for the first ``most`` rows."""
     digits = np.where(robot.prismatic, 4, 5)
     unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
     width = 12
@@ -429,7 +438,7 @@ def compensated_text(result: Compensated, robot: Robot, most: int = 60) -> str:
 
 
 def compensated_summary(result: Compensated) -> list[str]:
-    """Sentences on all poses together."""
+    """Returns sentences on all poses together."""
     m = len(result)
     good = int(result.found.usable.sum())
     lines = [f"{good} of {m} poses reached by the identified robot"]

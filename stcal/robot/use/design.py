@@ -31,13 +31,13 @@ from stcal.robot.use.files import DesignFile
 RANDOM_SETS = 20
 """Number of random sets for comparison; their median is known to a quarter of their standard deviation."""
 DRAWS = 200
-"""So many joint vectors are drawn for each candidate that is wanted in the box before it counts as out of reach."""
+"""Number of joint vectors drawn for each candidate in the box, before the box counts as out of reach."""
 SWEEPS = 20
-"""Passes over the whole set; after 2 to 6 nothing helps any more."""
+"""Largest number of passes over the whole set. No exchange helps any more after 2 to 6."""
 GAIN = 1e-9
-"""Least growth of log det that counts."""
+"""Least growth of log det that counts as an improvement."""
 TEST_POSES = 200
-"""Random poses at which the identified robot's position is predicted."""
+"""Number of random poses at which the identified robot's position is predicted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -82,7 +82,7 @@ class PoseDesign:
 
 @dataclass(frozen=True, slots=True)
 class DesignOptions:
-    """What :func:`design` chooses among, and for which instrument.
+    """Options of :func:`design`: candidates and instrument.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class DesignOptions:
 
 @one_thread()
 def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
-    """Choose poses for the identification of ``robot``, the same for the same seed.
+    """Chooses poses for the identification of ``robot``, the same for the same seed.
 
     D-optimal: the volume of the ellipsoid of the parameters' uncertainty is small.
 
@@ -199,7 +199,10 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
 
 
 def _prediction(robot: Robot, q: np.ndarray, options: DesignOptions) -> np.ndarray:
-    """Derivative (m, 3, k) of the tool's position by all parameters; its orientation, if any, does not move it."""
+    """Returns the derivative (m, 3, k) of the tool's position by all parameters.
+
+    The tool's rotation does not move it.
+    """
     positions = identification_jacobian(robot, q, "position", tool=options.tool)
     if options.observe == "position":
         return positions
@@ -207,7 +210,7 @@ def _prediction(robot: Robot, q: np.ndarray, options: DesignOptions) -> np.ndarr
 
 
 def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) -> np.ndarray:
-    """(candidates, n) uniform over the joint limits (one turn where unlimited), with the tool in the box."""
+    """Returns random joint vectors (candidates, n) within limits (one turn if unlimited), with the tool in the box."""
     low, high = robot.limits().T
     open_ended = robot.prismatic & ~np.isfinite(high - low)
     if open_ended.any():
@@ -239,14 +242,15 @@ def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) 
 
 
 def _seen_part(rows: np.ndarray) -> tuple[int, np.ndarray]:
-    """How many combinations of parameters the candidates show, and these: (k, seen) orthonormal columns."""
+    """Returns the number of combinations of parameters that the candidates show, and these as columns (k, seen)."""
     _, sigma, vt = np.linalg.svd(np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r"))
     seen = int((sigma > SEEN * sigma[0]).sum())
     return seen, vt[:seen].T
 
 
 def choose(rows: np.ndarray, count: int) -> tuple[np.ndarray, int]:
-    """``count`` of m candidates with rows (m, r, k) for which det Σ JᵀJ is large; and the number of exchanges.
+    """Chooses ``count`` of m candidates with rows (m, r, k) for a large det Σ JᵀJ. Returns them and the number of
+    exchanges.
 
     Greedy from next to no information (a millionth of the candidates' mean), then exchange of each pose for the best
     other one until nothing helps. No pose is taken twice.
@@ -281,7 +285,7 @@ def choose(rows: np.ndarray, count: int) -> tuple[np.ndarray, int]:
 
 
 def _gains(rows: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """(m,) growth of log det of the information with each candidate."""
+    """Returns the growth (m,) of log det of the information with each candidate."""
     inner = np.einsum("mri,mji->mrj", rows @ inverse, rows)
     r = np.arange(inner.shape[1])
     inner[:, r, r] += 1
@@ -289,13 +293,13 @@ def _gains(rows: np.ndarray, inverse: np.ndarray) -> np.ndarray:
 
 
 def _updated(inverse: np.ndarray, rows: np.ndarray, sign: float) -> np.ndarray:
-    """Inverse information after rows (r, k) are added (+1) or taken away (−1)."""
+    """Returns the inverse information after rows (r, k) are added (+1) or removed (−1)."""
     half = inverse @ rows.T
     return inverse - half @ np.linalg.solve(sign * np.eye(len(rows)) + rows @ half, half.T)
 
 
 def _predicted_mm(rows: np.ndarray, predict: np.ndarray) -> float:
-    """σ of predicted positions, RMS per axis, mm; infinite where the set leaves something open."""
+    """Returns σ of predicted positions, RMS per axis, mm; infinite if the set leaves a parameter undetermined."""
     _, sigma, vt = np.linalg.svd(rows.reshape(-1, rows.shape[2]), full_matrices=False)
     if len(sigma) < rows.shape[2] or sigma[-1] <= SEEN * sigma[0]:
         return float("inf")
@@ -303,7 +307,7 @@ def _predicted_mm(rows: np.ndarray, predict: np.ndarray) -> float:
 
 
 def design_csv(result: PoseDesign, robot: Robot) -> str:
-    """The table of ``--out`` (form: ``data_layout.md``)."""
+    """Returns the table of ``--out`` (form: ``data_layout.md``)."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["pose", *joint_columns(robot), *(f"nominal_{c}" for c in POSE)])
@@ -331,7 +335,7 @@ def design_file(result: PoseDesign) -> DesignFile:
 
 
 def design_text(result: PoseDesign) -> str:
-    """The comparison for the terminal."""
+    """Returns the comparison for the terminal."""
     lines = [
         f"{len(result.q)} poses for {result.seen} parameters, {result.exchanges} exchanges after the greedy choice"
     ]

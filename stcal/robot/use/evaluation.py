@@ -1,4 +1,4 @@
-"""How far several robot files are off on measurements that they were not made from, row by row, and by what."""
+"""Evaluation of robot files by measurements that they were not made from: errors by row, and their causes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -32,16 +32,16 @@ from stcal.robot.kinematics.model import Robot
 
 Refit = Literal["none", "base", "tool", "base-tool"]
 FALSE_ALARM, SURELY = 1e-3, 1.5
-"""Probability that one row of a set of normal errors is longer than the limit of which ``SURELY`` times makes an error
-certain: what a model leaves has longer tails than noise. 8 σ of 50 positions."""
+"""False-alarm probability of one row in a set with normal errors. An error beyond ``SURELY`` times this limit is always
+gross, as residuals of a model have longer tails than noise: 8 σ for 50 positions."""
 LEAST_MM = 1e-3
-"""Shorter errors are never wrong: no instrument tells them."""
+"""Error below which a row is never wrong, as no instrument shows less."""
 ROUNDS = 5
 """Largest number of rounds of fitting without gross errors; one or two are usually enough."""
 UNSEEN = 1e-12
-"""Share of what each parameter is seen by alone; of a direction that is seen less, σ is huge."""
+"""Relative visibility of a direction of parameters below which its σ is set to a huge value."""
 CHANCE = 0.05
-"""Probability of calling one of equal robots better."""
+"""Probability of calling one of two equal robots better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Figures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluated:
-    """One robot on the r observations.
+    """Errors of one robot at the r observations.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Evaluated:
     residuals : (r, 3) or (r, 1) array
         Measured minus modelled position in the base's axes, or distance; mm.
     rotation_rad : (r,) array
-        Errors of orientations; empty where none were measured.
+        Errors of orientations; empty if none were measured.
     placed : tuple of Placed
         Base and tools.
     left : tuple of Finding or None
@@ -93,14 +93,16 @@ class Evaluated:
 
     @property
     def errors_mm(self) -> np.ndarray:
-        """(r,)"""
+        """Lengths (r,) of the position errors, mm."""
         return position_errors(self.residuals)
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Mean error of ``worse`` less that of ``better`` on the same rows, its σ, and the probability of as much by
-    chance, times the number of comparisons."""
+    """Difference of the mean errors of ``worse`` and ``better`` on the same rows.
+
+    ``sigma_mm`` : its σ; ``p`` : probability of as much by chance, times the number of comparisons.
+    """
 
     better: str
     worse: str
@@ -139,7 +141,7 @@ class Evaluation:
 
     @property
     def best(self) -> str:
-        """Name of the robot that is better than all others by more than chance; empty where none is."""
+        """Name of the robot that is better than all others beyond chance; empty if there is none."""
         return self.differences[0].better if self.differences and all(d.real for d in self.differences) else ""
 
     def line(self, row: int) -> int:
@@ -148,7 +150,7 @@ class Evaluation:
 
 
 def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "base-tool") -> Evaluation:
-    """Errors of robots on measurements, base and tools fitted or not.
+    """Returns the errors of robots at measurements, with base and tools fitted or not.
 
     Parameters
     ----------
@@ -204,8 +206,10 @@ def _enough(seen: Observed, fit: Fit) -> None:
 
 
 def _fitted(robots: list[Robot], data: Measurements, seen: Observed, fit: Fit) -> tuple[list[State], np.ndarray]:
-    """States of all robots, and which rows (r,) no robot explains; to those nothing is fitted, but distances, which
-    refer to one another, are all used."""
+    """Returns the states of all robots, and the mask (r,) of rows that no robot explains.
+
+    Such rows are left out of the fit. Distances are all used, as they refer to one another.
+    """
     wrong = np.zeros(len(seen), bool)
     freedom = WIDTH[seen.kind] * len(seen) - _parameters(seen, fit)
     for _ in range(ROUNDS):
@@ -251,7 +255,7 @@ def _evaluated(robot: Robot, state: State, seen: Observed, fit: Fit, wrong: np.n
 
 
 def _derivatives(state: State, base: Rigid, seen: Observed, fit: Fit) -> np.ndarray:
-    """(r, w, k) by the base, turns about its origin over shifts, and by the tools' points."""
+    """Returns the derivatives (r, w, k) by the base, turns about its origin over shifts, and by the tools' points."""
     parts = [np.zeros((len(seen), WIDTH[seen.kind], 0))]
     tip = tips_of(state, seen.data)
     if "base" in fit and seen.kind != "distance":

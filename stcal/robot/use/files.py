@@ -1,4 +1,4 @@
-"""What ``evaluate``, ``compensate``, ``verify`` and ``design`` write with ``--json``."""
+"""Result files of ``evaluate``, ``compensate``, ``verify`` and ``design``, written with ``--json``."""
 
 from typing import Annotated, Literal
 

@@ -27,11 +27,14 @@ from stcal.robot.use.files import EvaluationFile
 from stcal.robot.use.verification import Verification
 
 MOST_ROWS = 500
-"""Rows of a table on a page; more are in the CSV file."""
+"""Largest number of rows of a table on a page. The CSV file has all."""
 
 
 def verification_figure(result: Verification):
-    """Absolute distance error of each pose, a line for each set, and its mean (the paper's fig. 8)."""
+    """Returns a plot of the absolute distance error of each pose and its mean, a line for each set (the paper's fig.
+
+    8).
+    """
     figure = new_figure(7.5, 3.4)
     axes = figure.add_axes((0.09, 0.16, 0.89, 0.7))
     at = np.arange(2, len(result.poses) + 1)
@@ -49,7 +52,7 @@ def verification_figure(result: Verification):
 
 
 def figure_bytes(figure, kind: str) -> bytes:
-    """The figure as ``png`` or ``svg``, the same bytes for the same figure."""
+    """Returns the figure as ``png`` or ``svg``. Equal figures give equal bytes."""
     import matplotlib
 
     stream = io.BytesIO()
@@ -60,7 +63,7 @@ def figure_bytes(figure, kind: str) -> bytes:
 
 
 def verification_page(result: Verification) -> str:
-    """The report of ``verify``."""
+    """Returns the report page of ``verify``."""
     rows = []
     for k, each in enumerate(result.sets):
         reduced = result.reduction(k) if k else {}
@@ -80,7 +83,7 @@ def verification_page(result: Verification) -> str:
 
 
 def compensation_page(result: Compensated, robot: Robot) -> str:
-    """The report of ``compensate``."""
+    """Returns the report page of ``compensate``."""
     return render(
         "robot/use/compensation.html.jinja",
         robot=robot.name,
@@ -106,7 +109,7 @@ def _before_plot(result: Compensated) -> str:
 
 
 def _pose_by_pose(axes, limits: tuple[float, float], what: str) -> None:
-    """Axes of an error of each pose."""
+    """Sets up the axes for an error of each pose."""
     axes.set_xlim(*limits)
     axes.set_ylim(0, None)
     calm(axes)
@@ -145,7 +148,7 @@ def _colours(count: int) -> list[str]:
 
 
 def design_page(result: PoseDesign, robot: Robot) -> str:
-    """The report of ``design``."""
+    """Returns the report page of ``design``."""
     known = np.isfinite(result.random_sigma_mm)
     return render(
         "robot/use/design.html.jinja",
@@ -198,7 +201,7 @@ def _index_figure(result: PoseDesign):
 
 
 def _places(result: PoseDesign, up: int) -> str:
-    """Plot of the tool's positions and z axes: x against the coordinate ``up``."""
+    """Returns a plot of the tool's positions and z axes: x against the coordinate ``up``."""
     at, z = result.poses.translation[:, [0, up]], result.poses.rotation[:, [0, up], 2]
     length = 0.12 * float(np.ptp(result.poses.translation, axis=0).max())
     figure = new_figure(5, 4.2)
@@ -214,9 +217,9 @@ def _places(result: PoseDesign, up: int) -> str:
 
 
 MOST_WRONG = 10
-"""Wrong rows that are named in the terminal."""
+"""Largest number of wrong rows that are named in the terminal."""
 FAR_APART = 5
-"""Ratio of robots' median errors from which they are drawn on a logarithmic axis."""
+"""Ratio of robots' median errors above which the axis is logarithmic."""
 FITTED = {
     "none": "base and tool as the files have them",
     "base": "base fitted, tool as the files have it",
@@ -228,7 +231,7 @@ HEADS = ("rows", "mean", "median", "RMS", "95 %", "max")
 
 
 def names_of(files: Sequence[Path]) -> list[str]:
-    """Names of robots by their files: an identified robot keeps the name of the nominal one."""
+    """Returns names of robots by their files. An identified robot keeps the name of the nominal one."""
     stems, whole = [file.stem for file in files], [str(file) for file in files]
     if len(set(whole)) < len(whole):
         again = next(name for name in whole if whole.count(name) > 1)
@@ -237,19 +240,19 @@ def names_of(files: Sequence[Path]) -> list[str]:
 
 
 def evaluated_text(result: Evaluation) -> str:
-    """Tables and sentences for the terminal."""
+    """Returns tables and sentences for the terminal."""
     lines = [f"{observations(result)}; {FITTED[result.refit]}", "", *text_table(_table(result), gap=2), ""]
     return "\n".join(lines + notes(result))
 
 
 def observations(result: Evaluation) -> str:
-    """How many of what."""
+    """Returns the file with the number and kind of its observations, as text."""
     kind = "pose" if result.seen.data.rotations is not None else result.seen.kind
     return f"{result.seen.data.where}: {len(result.seen)} {kind}s"
 
 
 def _table(result: Evaluation) -> list[list[str]]:
-    """Heads, and lines of the robots with all rows, and without the wrong ones where there are any."""
+    """Returns a heading and rows of the robots, for all observations, and without the wrong ones if there are any."""
     turned = len(result.robots[0].rotation_rad) > 0
     rows = [["<error, mm", *HEADS, *(("orientation, deg: RMS", "max") if turned else ())]]
     parts = {"": np.ones(len(result.wrong), bool)}
@@ -267,7 +270,7 @@ def _table(result: Evaluation) -> list[list[str]]:
 
 
 def notes(result: Evaluation) -> list[str]:
-    """Which robot is better, which rows no robot explains, and what residuals go with."""
+    """Returns notes on the better robot, on rows that no robot explains, and on the causes of residuals."""
     return [
         *_verdicts(result),
         *_wrong(result),
@@ -288,7 +291,7 @@ def _verdicts(result: Evaluation) -> list[str]:
 
 
 def _rigid(result: Evaluation) -> list[str]:
-    """Robots that know nothing of what loads do."""
+    """Returns notes on robots without elasticity."""
     rigid = (each.robot.name for each in result.robots if each.robot.elasticity is None)
     return [note for name in rigid for note in result.seen.data.conditions.ignored(f"robot {name}")]
 
@@ -308,7 +311,7 @@ def _wrong(result: Evaluation) -> list[str]:
 
 
 def left_lines(each: Evaluated) -> list[str]:
-    """What the residuals of a robot go with."""
+    """Returns lines on the causes of a robot's residuals."""
     if each.left is None:
         return ["too few rows to tell what the residuals go with"]
     if not each.left:
@@ -323,7 +326,7 @@ def left_lines(each: Evaluated) -> list[str]:
 
 
 def evaluated_csv(result: Evaluation) -> str:
-    """The table of ``--out`` (form: ``data_layout.md``)."""
+    """Returns the table of ``--out`` (form: ``data_layout.md``)."""
     data, robots = result.seen.data, result.robots
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
@@ -396,7 +399,7 @@ def evaluation_file(result: Evaluation) -> EvaluationFile:
 
 
 def evaluation_page(result: Evaluation) -> str:
-    """The report page."""
+    """Returns the report page of ``evaluate``."""
     points = result.seen.kind != "distance"
     heads, *rows = _table(result)
     return render(
@@ -423,14 +426,14 @@ def evaluation_page(result: Evaluation) -> str:
 
 
 def _drawn(result: Evaluation, each: Evaluated) -> Drawn:
-    """What pictures are of."""
+    """Returns the data of the pictures."""
     base = each.robot.world_from_base
     found = each.residuals @ base.rotation.T if each.residuals.shape[1] == 3 else each.residuals
     return Drawn(each.state, base, result.seen, found, ~result.wrong, _colour(result, each))
 
 
 def _directions(result: Evaluation, each: Evaluated) -> list[list[str]]:
-    """Mean with its standard error, RMS and largest residual along directions of the base."""
+    """Returns mean with its standard error, RMS and largest residual along directions of the base."""
     good, place = ~result.wrong, _place(result, each)
     out = place[:, :2] / np.maximum(np.linalg.norm(place[:, :2], axis=1), 1e-9)[:, None]
     x, y, z = each.residuals.T
@@ -447,7 +450,7 @@ def _directions(result: Evaluation, each: Evaluated) -> list[list[str]]:
 
 
 def _place(result: Evaluation, each: Evaluated) -> np.ndarray:
-    """(r, 3) of the tool in the robot's base, mm."""
+    """Returns the positions (r, 3) of the tool in the robot's base, mm."""
     data = result.seen.data
     return each.robot.world_from_base.inverse() @ tips_of(each.state, data).translation
 
@@ -457,7 +460,7 @@ def _colour(result: Evaluation, each: Evaluated) -> str:
 
 
 def _errors(axes, result: Evaluation, at: dict[int, np.ndarray], label: str) -> None:
-    """Errors of all robots over ``at`` (by the robot's place), unexplained rows ringed; logarithmic where needed."""
+    """Plots the errors of all robots over ``at``, by row, with unexplained rows ringed, logarithmically if needed."""
     every = np.concatenate([each.errors_mm for each in result.robots])
     few = len(result.wrong) <= 200
     for k, each in enumerate(result.robots):

@@ -1,4 +1,4 @@
-"""Target poses commanded by a file, and whether they and the nominal robot can be meant as they stand."""
+"""Targets commanded by a file, and checks whether they and the nominal robot can be meant as stated."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,7 +21,7 @@ from stcal.robot.kinematics.model import Robot
 
 WHAT = "targets"
 NAMES = ("pose", "image", "name", "scene", PAYLOAD)
-"""Columns that say which pose a row is of, where they are there: kept in what is computed of it."""
+"""Columns that name a pose. They are copied to the result if they exist."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +65,7 @@ class Targets:
         return len(self.lines)
 
     def __getitem__(self, rows: np.ndarray) -> "Targets":
-        """Some of them, by their indices."""
+        """Returns the targets of these indices."""
         return Targets(
             self.where,
             [self.lines[i] for i in rows],
@@ -78,7 +78,7 @@ class Targets:
         )
 
     def joints(self) -> np.ndarray:
-        """(m, n) commanded joint values, rad or mm; refused where there are none."""
+        """Returns the commanded joint values (m, n), rad or mm. Raises an error if there are none."""
         if self.q is None:
             raise InputError(
                 "E-TARGETS-NO-JOINTS", f"{self.where}: poses without joint values; columns q1_deg … needed"
@@ -93,7 +93,7 @@ def read_targets(
     rotation: str | None = None,
     payload_kg: float | None = None,
 ) -> Targets:
-    """Read commanded poses, or joint values that command them.
+    """Reads commanded poses, or joint values that command them.
 
     Parameters
     ----------
@@ -160,13 +160,13 @@ def read_targets(
 
 
 def rows_by_tool(targets: Targets) -> list[tuple[str, np.ndarray]]:
-    """Names of tools, each with its rows."""
+    """Returns the names of tools, each with its rows."""
     names = np.array(targets.tools, dtype=object)
     return [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(targets.tools)]
 
 
 def rows_alike(targets: Targets) -> list[tuple[str, float | None, np.ndarray]]:
-    """Names of tools and masses at the flange (None: the robot's), each two with their rows."""
+    """Returns the pairs of tool and mass at the flange (None: the robot's), each with its rows."""
     mass = targets.conditions.payload_kg
     if mass is None:
         return [(name, None, rows) for name, rows in rows_by_tool(targets)]
@@ -178,7 +178,7 @@ def rows_alike(targets: Targets) -> list[tuple[str, float | None, np.ndarray]]:
 
 
 def poses_of(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
-    """base_from_tool of joint values (m, n), with each row's tool and load."""
+    """Returns base_from_tool of joint values (m, n), with each row's tool and load."""
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
     for name, mass, rows in rows_alike(targets):
         part = forward(robot, q[rows], name, mass)
@@ -187,7 +187,7 @@ def poses_of(robot: Robot, targets: Targets, q: np.ndarray) -> Poses:
 
 
 def joints_of(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | None) -> Inverse:
-    """Joint values that bring each row's tool to ``poses``, near to ``near`` (m, n)."""
+    """Returns joint values that bring each row's tool to ``poses``, near to ``near`` (m, n)."""
     m = len(poses)
     q, status = np.empty((m, len(robot.rows))), np.empty(m, object)
     error_mm, error_rad = np.empty(m), np.empty(m)
@@ -199,21 +199,21 @@ def joints_of(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray | N
 
 
 UNITS = ("m", "in")
-"""What columns of mm may hold; of micrometres no arm would reach anything, and a tenth, of cm, may be meant."""
+"""Possible units of columns of mm. In micrometres no arm would reach a pose, and cm differ by a factor of ten only."""
 USUAL_SHARE = 0.01
-"""Usual error as a fraction of the reach: ten times the manufacturing tolerance, or all zeros off by half a degree."""
+"""Usual error as a share of the reach: ten times the manufacturing tolerance, or all zeros off by half a degree."""
 SAMPLE = 50
-"""Joint vectors at which two robots are compared."""
+"""Number of joint vectors at which two robots are compared."""
 DOUBTED, LEAST, TRIED = 0.25, 4, 8
-"""Share and number of targets out of reach from which on another convention is looked for, and how many it must bring
-within reach, all of them: by chance each is, half the time, so that one of six conventions is in 2 of 100 sets of 8."""
+"""Share and number of targets out of reach from which another convention is tried, and the number that it must all
+bring within reach. By chance each is, half the time, so that one of six conventions is in 2 of 100 sets of 8."""
 PAIRED = 0.01
-"""Distance, shares of the reach and chords of the rotation, of poses that are those of joint values in other rows."""
+"""Largest distance of poses that belong to joint values in other rows, as shares of the reach and chords of turns."""
 INVERSE = "poses were inverse (base seen from the tool); give the tool in the base's frame"
 
 
 def robots_apart(identified: Robot, nominal: Robot) -> str:
-    """A doubt whether two files are of one robot; empty where they well may be.
+    """Returns a doubt whether two files are of one robot; empty if they may be.
 
     Their flanges are compared over the joints' ranges; arms are made to a thousandth of their reach, and files of one
     arm state the same base and flange, whichever tool they have.
@@ -253,7 +253,7 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
 
 
 def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
-    """Whether joint values beside them confirm the poses, and what is doubtful about them.
+    """Returns whether joint values beside the poses confirm them, and doubts about the poses.
 
     Parameters
     ----------
@@ -294,9 +294,9 @@ def _rms(shift: np.ndarray) -> float:
 
 
 def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: float, reach: float) -> None:
-    """Refuse poses to which the joint values would lead but for a frequent mistake.
+    """Refuses poses that the joint values would reach except for a frequent mistake.
 
-    One row beside the right place by chance: within 5 % of the reach and 11°, once in 10⁶.
+    The probability that one row is near the right place by chance, within 5 % of the reach and 11°, is 10⁻⁶.
     """
     for reason, meant, of in _guesses(robot, targets, poses, q):
         off = meant.difference(of)
@@ -310,7 +310,7 @@ def _explain(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray, own: f
 
 
 def _guesses(robot: Robot, targets: Targets, poses: Poses, q: np.ndarray) -> Iterator[tuple[str, Poses, Poses]]:
-    """Frequent mistakes: what would be right, with poses and joint values' poses as if it were."""
+    """Yields frequent mistakes: the remedy, with the poses and the joint values' poses after it."""
     reached = poses_of(robot, targets, q)
     for unit in UNITS:
         yield (
@@ -343,8 +343,10 @@ def _paired(targets: Targets, poses: Poses, reached: Poses, reach: float) -> Pos
 
 
 def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ...]:
-    """Joint values that lead to other poses, by (m, 6); none of the same joint values in all rows, which only choose a
-    branch."""
+    """Returns a note on joint values that lead to other poses by (m, 6).
+
+    There is none for the same joint values in all rows, which only choose a branch.
+    """
     mm, rad = np.linalg.norm(off[:, 3:], axis=1), np.linalg.norm(off[:, :3], axis=1)
     away = (mm > FITS * reach) | (rad > TURNED_RAD)
     if not away.any() or targets.q is None or (len(off) > 1 and not np.ptp(targets.q, axis=0).any()):
@@ -357,8 +359,10 @@ def _elsewhere(targets: Targets, off: np.ndarray, reach: float) -> tuple[str, ..
 
 
 def _near_base(robot: Robot, targets: Targets, poses: Poses) -> tuple[str, ...]:
-    """Where all poses are so near to the base's origin that those in metres or inches would be within reach too: an
-    arm has its foot there. 3 m in metres are 3 mm, in inches 118."""
+    """Returns a note if all poses are so near to the base's origin that metres or inches would also be within reach.
+
+    The foot of an arm is there. 3 m in metres are 3 mm, in inches 118.
+    """
     far = float(np.linalg.norm(poses.translation, axis=1).max())
     reach = max(reach_mm(robot, name) for name in set(targets.tools)) + _base_mm(robot)
     fitting = [unit for unit in UNITS if 0 < far * LENGTHS[unit] <= reach]
@@ -377,7 +381,7 @@ def _base_mm(robot: Robot) -> float:
 
 
 def out_of_reach(robot: Robot, targets: Targets, found: Inverse) -> tuple[str, ...]:
-    """Where many poses are out of reach that all would be within in another convention."""
+    """Returns a note if many poses are out of reach, and all of them would be within in another convention."""
     lost = np.flatnonzero(~found.usable)
     if targets.poses is None or len(lost) < max(LEAST, DOUBTED * len(found)):
         return ()

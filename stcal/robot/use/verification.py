@@ -22,10 +22,13 @@ WHAT = "measured positions"
 SAME_MM = 1e-6
 """Distance below which two commanded positions count as the same command; it covers the rounding of printed numbers."""
 MISSES, MISSES_MM = 0.05, 20.0
-"""Share of the commanded distances, and mm, RMS of all pairs, by which measured ones miss them: arms err by under 1 %
-of their 2 m, and a robot model that is not the arm's, or rows in another order, by more."""
+"""Largest RMS deviation of measured from commanded distances of all pairs, as a share and in mm. Arms err by under 1 %
+of their 2 m. Another robot's model, or rows in another order, cause more."""
 SCALE_WITHIN = 0.01
-"""Arms are off by parts of a thousand; measured distances off by more in common are of another unit or other poses."""
+"""Largest relative difference of scale.
+
+Arms are off by parts of a thousand; more indicates another unit or other poses.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +120,7 @@ class Verification:
 
 
 def read_measured(path: str | Path | Table) -> MeasuredPoses:
-    """Read commanded and measured positions.
+    """Reads commanded and measured positions.
 
     Parameters
     ----------
@@ -144,7 +147,7 @@ def read_measured(path: str | Path | Table) -> MeasuredPoses:
 
 
 def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[str, ...]:
-    """Names of poses: column ``pose``; else equal commanded positions are one pose, a second time in a set another."""
+    """Returns the names of poses from column ``pose``, or else by equal commanded positions, counted within a set."""
     if "pose" in table:
         names = tuple(table.text("pose"))
         seen: dict[tuple[str, str], int] = {}
@@ -169,7 +172,7 @@ def _names(table: Table, sets: tuple[str, ...], commanded: np.ndarray) -> tuple[
 
 
 def verify(data: MeasuredPoses) -> Verification:
-    """Distance errors of each set, over the poses that all sets have.
+    """Returns the distance errors of each set, over the poses that all sets have.
 
     Distances from the first position need no common frame of robot and instrument (Zhang & Wei 2017, section 4.3).
 
@@ -246,7 +249,7 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray) -> SetResult:
 
 
 def verified_text(result: Verification) -> str:
-    """The table for the terminal."""
+    """Returns the table for the terminal."""
     rows = [["<", "mean mm", "std mm", "max mm", "all pairs RMS mm"]]
     for k, result_of_set in enumerate(result.sets):
         rows.append([result_of_set.name, *(number(v, 4) for v in result_of_set.figures().values())])

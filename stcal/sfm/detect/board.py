@@ -1,4 +1,4 @@
-"""The dot board: a grid is grown from neighbour to neighbour, fitted by a homography, and numbered.
+"""Detection of the dot board: a grid is grown from neighbour to neighbour, fitted by a homography, and numbered.
 
 A plain board looks the same after half a turn (a square one after a quarter), and a hidden strip may leave open
 which rows or columns are seen. A reading therefore carries every numbering that fits the image; the group decides
@@ -127,19 +127,19 @@ def _grow(candidates: Candidates, links, steps, seed: int, free) -> dict[int, tu
     """Returns cells (u, v) by candidate, grown from neighbour to neighbour; the steps are updated on the way."""
     start = np.array(steps[seed])
     for axis, (ahead, behind) in enumerate(((0, 2), (1, 3))):
-        found = [
+        steps_at_seed = [
             s * (candidates.xy[links[seed][d]] - candidates.xy[seed])
             for d, s in ((ahead, 1), (behind, -1))
             if links[seed][d] >= 0
         ]
-        if found:
-            start[:, axis] = np.mean(found, axis=0)
+        if steps_at_seed:
+            start[:, axis] = np.mean(steps_at_seed, axis=0)
     across = np.linalg.solve(candidates.shape[seed], start)
     lengths = np.linalg.norm(across, axis=0)
     if abs(across[:, 0] @ across[:, 1]) > MAX_COSINE * lengths.prod() or lengths.max() > DIAGONAL * lengths.min():
         return {}
     cells = {int(seed): (0, 0)}
-    taken = {(0, 0)}
+    taken_cells = {(0, 0)}
     queue = [(int(seed), start)]
     for node, step in queue:
         u, v = cells[node]
@@ -147,19 +147,19 @@ def _grow(candidates: Candidates, links, steps, seed: int, free) -> dict[int, tu
         _, index = candidates.tree.query(candidates.xy[node] + ahead)
         largest, smallest = singular_values(np.linalg.solve(candidates.shape[node], candidates.shape[index]))
         for side, (du, dv) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
-            other = int(index[side])
+            neighbour = int(index[side])
             cell = (u + du, v + dv)
-            if cell in taken or other in cells or not free[other]:
+            if cell in taken_cells or neighbour in cells or not free[neighbour]:
                 continue
             # Distances are judged along the step itself: the other step may be foreshortened.
-            error = np.linalg.solve(step, candidates.xy[other] - candidates.xy[node] - ahead[side])
+            error = np.linalg.solve(step, candidates.xy[neighbour] - candidates.xy[node] - ahead[side])
             if np.abs(error).max() > STEP_TOLERANCE or largest[side] > 2 or smallest[side] < 0.5:
                 continue
             moved = step.copy()
-            moved[:, side % 2] = (candidates.xy[other] - candidates.xy[node]) * (1 if side < 2 else -1)
-            cells[other] = cell
-            taken.add(cell)
-            queue.append((other, 0.5 * (moved + step)))
+            moved[:, side % 2] = (candidates.xy[neighbour] - candidates.xy[node]) * (1 if side < 2 else -1)
+            cells[neighbour] = cell
+            taken_cells.add(cell)
+            queue.append((neighbour, 0.5 * (moved + step)))
     return cells
 
 
@@ -254,11 +254,13 @@ def _place(
             at_corner = (column_row == board.corner[::-1]).all(1)
             if (large != at_corner)[inside].any():
                 continue
-        back = (all_cells - offset) @ rotation
-        seen = np.zeros_like(has_dot)
-        seen[tuple(column_row[inside, ::-1].T)] = True
-        missing = ~seen[tuple(all_cells[:, ::-1].T)]
-        expected = _inside_image(apply_homography(homography, back[missing]), homography, back[missing], image_corners)
+        grid_cells = (all_cells - offset) @ rotation
+        occupied = np.zeros_like(has_dot)
+        occupied[tuple(column_row[inside, ::-1].T)] = True
+        missing = ~occupied[tuple(all_cells[:, ::-1].T)]
+        expected = _inside_image(
+            apply_homography(homography, grid_cells[missing]), homography, grid_cells[missing], image_corners
+        )
         unexplained = int(expected.sum() + outside_count)
         placements.append(_Placement(unexplained, inside, column_row[:, ::-1], index))
     return placements

@@ -1,7 +1,7 @@
-"""Photographs of the board alone: no face tells from which end a plain board is numbered, the camera's way does.
+"""Labels for photographs of the board alone. No face shows how a plain board is numbered, so the camera's motion does.
 
 A plain board looks the same after half a turn (a square one after a quarter). Within a group its images are numbered so
-that the camera turns least from each to its nearest neighbour; which end the first one starts from is a convention.
+that the camera turns least from each image to its nearest neighbour. The numbering of the first image is a convention.
 """
 
 import numpy as np
@@ -22,13 +22,20 @@ UNNUMBERED = "left out, show the whole board, or a face with it"
 
 
 def is_board_alone(detection: DetectionResult) -> bool:
-    """Whether the photographs show the board and nothing that could be a face: no image has one, and beside boards half
-    of the images have fewer outlines like circles than name one."""
-    found = [each.detection for each in detection.images]
-    if not any(each.boards for each in found) or any(each.faces or each.open_faces for each in found):
+    """Returns whether the photographs show the board and nothing that could be a face.
+
+    No image may have a face, and outside of boards half of the images must have fewer outlines than identify a face.
+    """
+    detections = [detection_of_image.detection for detection_of_image in detection.images]
+    if not any(detection_of_image.boards for detection_of_image in detections) or any(
+        detection_of_image.faces or detection_of_image.open_faces for detection_of_image in detections
+    ):
         return False
-    others = [each.candidates - sum(len(board.rows) for board in each.boards) for each in found]
-    return float(np.median(others)) < MIN_EXPECTED
+    outside_boards = [
+        detection_of_image.candidates - sum(len(board.rows) for board in detection_of_image.boards)
+        for detection_of_image in detections
+    ]
+    return float(np.median(outside_boards)) < MIN_EXPECTED
 
 
 def label_boards(detection: DetectionResult, target: TargetDesign, board: BoardDesign) -> list[LabelledImage]:
@@ -80,31 +87,33 @@ def _is_symmetry(difference: Rigid, board: BoardDesign) -> bool:
 
 
 def _numbered(views: list[list[PlaneView] | str]) -> tuple[dict[int, PlaneView], dict[int, str]]:
-    """The numbering of each image that turns the camera least from one that is numbered, the nearest image first; and
-    why others have none."""
-    reasons = {i: own for i, own in enumerate(views) if isinstance(own, str) and own}
-    left = {i: own for i, own in enumerate(views) if not isinstance(own, str)}
-    if not left:
+    """Returns the numbering of each image, and the reasons why others have none.
+
+    Images are numbered one after the other: next is the image whose camera turns least from a numbered one.
+    """
+    reasons = {i: numberings for i, numberings in enumerate(views) if isinstance(numberings, str) and numberings}
+    open_images = {i: numberings for i, numberings in enumerate(views) if not isinstance(numberings, str)}
+    if not open_images:
         return {}, reasons
-    first = max(left, key=lambda i: len(left[i][0].rows))
-    chosen = {first: left.pop(first)[0]}
-    while left:
+    first = max(open_images, key=lambda i: len(open_images[i][0].rows))
+    numbered = {first: open_images.pop(first)[0]}
+    while open_images:
         turns = {
-            (i, k): min(_turn_rad(view, other) for other in chosen.values())
-            for i, own in left.items()
-            for k, view in enumerate(own)
+            (i, k): min(_turn_rad(view, other) for other in numbered.values())
+            for i, numberings in open_images.items()
+            for k, view in enumerate(numberings)
         }
         i, k = min(turns, key=lambda key: turns[key])
-        own = left.pop(i)
-        others = [turns[i, m] for m in range(len(own)) if m != k]
-        if others and min(others) - turns[i, k] < CLEAR_RAD:
+        numberings = open_images.pop(i)
+        rivals = [turns[i, m] for m in range(len(numberings)) if m != k]
+        if rivals and min(rivals) - turns[i, k] < CLEAR_RAD:
             reasons[i] = (
                 f"board numbered from either end: the camera is turned by {np.degrees(turns[i, k]):.0f}° or "
-                f"{np.degrees(min(others)):.0f}° from the nearest image; left out, add views in between, or show a face"
+                f"{np.degrees(min(rivals)):.0f}° from the nearest image; left out, add views in between, or show a face"
             )
         else:
-            chosen[i] = own[k]
-    return chosen, reasons
+            numbered[i] = numberings[k]
+    return numbered, reasons
 
 
 def _turn_rad(view: PlaneView, other: PlaneView) -> float:

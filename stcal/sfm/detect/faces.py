@@ -162,7 +162,7 @@ def _circles(target: TargetDesign) -> _Circles:
 @lru_cache(maxsize=8)
 def _pairs(target: TargetDesign) -> _Pairs:
     width = min(SUPPORT + 2, max(len(face.ids) for face in target.faces))
-    found: dict[tuple, list] = {}
+    occurrences: dict[tuple, list] = {}
     for number, face in enumerate(target.faces):
         distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
         for row in np.argsort(distance, axis=1, kind="stable"):
@@ -170,21 +170,21 @@ def _pairs(target: TargetDesign) -> _Pairs:
             offset, radius = face.xy_mm[near] - face.xy_mm[near[0]], face.radius_mm[near]
             same = (*np.round(offset, 6).ravel(), *np.round(radius, 6))
             for second in range(1, min(NEIGHBOURS_IN_DESIGN, len(near) - 1) + 1):
-                found.setdefault((second, *same), [offset, radius, []])[2].append((number, near))
-    offsets, radii = np.zeros((len(found), width, 2)), np.ones((len(found), width))
-    there = np.zeros((len(found), width), bool)
-    for i, (offset, radius, _) in enumerate(found.values()):
-        offsets[i, : len(radius)], radii[i, : len(radius)], there[i, : len(radius)] = offset, radius, True
-    uses = [use for _, _, uses in found.values() for use in uses]
+                occurrences.setdefault((second, *same), [offset, radius, []])[2].append((number, near))
+    offsets, radii = np.zeros((len(occurrences), width, 2)), np.ones((len(occurrences), width))
+    exists = np.zeros((len(occurrences), width), bool)
+    for i, (offset, radius, _) in enumerate(occurrences.values()):
+        offsets[i, : len(radius)], radii[i, : len(radius)], exists[i, : len(radius)] = offset, radius, True
+    uses = [use for _, _, uses in occurrences.values() for use in uses]
     circles = np.full((len(uses), width), -1)
     for i, (_, near) in enumerate(uses):
         circles[i, : len(near)] = near
     return _Pairs(
         offsets,
         radii,
-        there,
-        np.array([second for second, *_ in found], int),
-        np.cumsum([0, *(len(uses) for _, _, uses in found.values())]),
+        exists,
+        np.array([second for second, *_ in occurrences], int),
+        np.cumsum([0, *(len(uses) for _, _, uses in occurrences.values())]),
         np.array([number for number, _ in uses], int),
         circles,
     )
@@ -220,10 +220,10 @@ class FaceFinder:
                 wanted = is_open & ((tries < MAX_TRIES) & ~explained)[starts.origin]
                 wanted[list(grown)] = False
                 grown |= self._grown(candidates, starts, starts.unlike(rank, wanted))
-            found, number = grown[rank], int(starts.face[rank])
+            match, number = grown[rank], int(starts.face[rank])
             face = self.target.faces[number]
-            if found is not None and _seen_from_outside(found[1], face):
-                readings.append(FaceReading(face, _of_one_size(candidates, face, *found), found[1]))
+            if match is not None and _seen_from_outside(match[1], face):
+                readings.append(FaceReading(face, _of_one_size(candidates, face, *match), match[1]))
                 is_open[starts.agree(number, readings[-1].index)] = False
         return _decide(readings, self.target)
 
@@ -232,10 +232,10 @@ class FaceFinder:
         circles = _circles(self.target)
         index = np.stack([starts.index(rank, circles.radius.shape[1]) for rank in ranks])
         face = starts.face[ranks]
-        found = grow_matches(candidates, index, circles.xy[face], circles.radius[face])
+        matches = grow_matches(candidates, index, circles.xy[face], circles.radius[face])
         size = [len(self.target.faces[number].ids) for number in face.tolist()]
         return {
-            rank: (found.index[i, : size[i]], found.homography[i]) if found.holds[i] else None
+            rank: (matches.index[i, : size[i]], matches.homography[i]) if matches.holds[i] else None
             for i, rank in enumerate(ranks)
         }
 
@@ -259,14 +259,14 @@ class FaceFinder:
         linear = candidates.shape[first[row]] @ _turn(neighbour[pair] * [1, -1], step[row]) * [1, -1]
         support = _support(candidates, pairs, pair, candidates.xy[first[row]], linear)
         hits = (support >= 0).sum(1)
-        kept = np.flatnonzero(hits >= 2 + MIN_SUPPORT)
-        origin = first[row[kept]]
-        best = np.lexsort((-candidates.contrast[origin], -hits[kept]))
-        kept, origin = kept[best], origin[best]
-        begin, count = pairs.uses[pair[kept]], np.diff(pairs.uses)[pair[kept]]
+        supported = np.flatnonzero(hits >= 2 + MIN_SUPPORT)
+        origin = first[row[supported]]
+        best = np.lexsort((-candidates.contrast[origin], -hits[supported]))
+        supported, origin = supported[best], origin[best]
+        begin, count = pairs.uses[pair[supported]], np.diff(pairs.uses)[pair[supported]]
         use = np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
         return _Starts(
-            np.repeat(origin, count), pairs.face[use], pairs.circles[use], np.repeat(support[kept], count, axis=0)
+            np.repeat(origin, count), pairs.face[use], pairs.circles[use], np.repeat(support[supported], count, axis=0)
         )
 
 

@@ -16,7 +16,10 @@ from stcal.sfm.data.patterns import Pattern
 from stcal.sfm.detect.sightings import PlaneView, Readings, flipped_pose
 
 HUBER_PX = 1.5
-"""Residuals beyond this have less weight: they are not errors of centring but deviations of printed planes."""
+"""Residual beyond which an observation loses weight.
+
+Such residuals are deviations of printed planes, not of centres.
+"""
 SETTLED = 1e-4
 """Relative decrease of χ² at convergence. A prediction to a fraction of a pixel is sufficient."""
 MAX_STEPS = 30
@@ -117,22 +120,25 @@ class _Linear:
 
 
 MAX_SHIFT_PITCHES = 0.3
-"""Largest deviation of a plane from its place in an image's first pose, in steps of the pattern; a wrong numbering
-of the board is one off."""
+"""Largest deviation of a plane from its place in an image's first pose, in steps of the pattern. A wrong numbering of
+the board deviates by a whole step."""
 MAX_SEEDS = 8
 """Largest number of start images, until one explains everything."""
 MIN_MIRRORED = 0.5
-"""Share of an image's circles that are where the group has one when the image is turned back."""
+"""Least share of a mirrored image's circles that coincide with circles of the group when the image is turned back."""
 MAX_OFF_PITCHES = 0.12
-"""Largest deviation of a reading's circles after the adjustment, in steps of the pattern (median): of the
-reference target 3 mm, where a design is off by tenths and a wrong numbering by a whole step."""
+"""Largest median deviation of a reading's circles after the adjustment, in steps of the pattern: 3 mm for the reference
+target. A design deviates by tenths of a step, a wrong numbering by a whole one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrangement:
-    """``group_from_plane`` by plane; ``camera_from_group`` by image; ``views`` : accepted, by image; ``contradicted`` :
-    readings that do not fit, by image; ``open`` : boards of which several numberings fit, by image; ``reflected`` :
-    what is a plane's image in a mirror, by image; ``foreign`` : what is at another place than in other groups."""
+    """Rigid arrangement of the planes of a group, with the poses of its images.
+
+    ``group_from_plane`` : by plane; ``camera_from_group`` : by image. By image, too: ``views`` : accepted readings;
+    ``contradicted`` : readings that do not fit; ``open`` : boards with several numberings that fit; ``reflected`` :
+    readings of a plane's mirror image; ``foreign`` : readings of a plane that other groups have at another place.
+    """
 
     group_from_plane: dict[str, Rigid]
     camera_from_group: dict[int, Rigid]
@@ -143,7 +149,7 @@ class Arrangement:
     foreign: dict[int, tuple[PlaneView, ...]] = field(default_factory=dict)
 
     def without(self, planes: set[str]) -> tuple["Arrangement", dict[int, tuple[PlaneView, ...]]]:
-        """The arrangement without some planes, and what was read as theirs, by image."""
+        """Returns the arrangement without some planes, and the removed readings by image."""
         gone = {i: tuple(v for v in views if v.plane in planes) for i, views in self.views.items()}
         rest = replace(
             self,
@@ -169,15 +175,15 @@ def arrange(
     patterns
         Circles of each plane.
     step_mm
-        Of the patterns, from circle to circle: what a wrong reading is off by at least.
+        Distance between neighbouring circles, the least error of a wrong reading.
     focal_px
-        Of the camera.
+        Focal length of the camera.
     """
     total = sum(len(views[0].rows) for readings in images for views in readings if views[0].named)
     best = Arrangement({}, {}, {})
     for i, reading in _seeds(images):
         if any(reading is view for view in best.views.get(i, ())):
-            continue  # it would come to the same
+            continue  # a start with this image gives the same arrangement
         found = _adjusted(_grown(images, i, reading, MAX_SHIFT_PITCHES * step_mm), focal_px)
         found = _without_reflections(_checked(images, found, step_mm), patterns, MAX_SHIFT_PITCHES * step_mm)
         if found.explained() > best.explained():
@@ -188,73 +194,78 @@ def arrange(
 
 
 def across_groups(groups: Sequence[Arrangement], patterns: dict[str, Pattern], reach_mm: float) -> list[Arrangement]:
-    """The arrangements of all groups, held against each other: the faces stand to one another alike in all of them.
+    """Compares the arrangements of all groups, as the faces of a target have the same relative poses in all of them.
 
-    A face that a group has elsewhere than most circles of the others goes out there, and comes in where its place is
-    known from them, whether the group read it or not: the second look will tell. What is then known of the target also
-    tells the image in a mirror of a face that the group does not show.
+    A face is removed from a group in which its place differs from that in most groups. A face is added to a group if
+    its place is known from other groups, even if no image of the group has a reading of it: the second look decides.
+    The places of all faces then also identify the mirror image of a face that a group does not show.
     """
-    faces = [_as_faces(each) for each in groups]
+    faces = [_as_faces(group) for group in groups]
     best: Arrangement = Arrangement({}, {}, {})
     for i, view in _seeds(faces):
-        found = _grown(faces, i, view, reach_mm)
-        if found.explained() > best.explained():
-            best = found
+        grown = _grown(faces, i, view, reach_mm)
+        if grown.explained() > best.explained():
+            best = grown
     settled = []
-    for i, each in enumerate(groups):
+    for i, group in enumerate(groups):
         if i not in best.views:
-            settled.append(each)
+            settled.append(group)
             continue
         agreed = {view.plane for view in best.views[i]}
-        rest, foreign = each.without({p for p in each.group_from_plane if p != BOARD} - agreed)
+        reduced, foreign = group.without({p for p in group.group_from_plane if p != BOARD} - agreed)
         pose = best.camera_from_group[i]
         known = {p: pose @ target_from_face for p, target_from_face in best.group_from_plane.items()}
-        settled.append(replace(rest, group_from_plane=known | rest.group_from_plane, foreign=foreign))
-    cleared = [_without_reflections(each, patterns, reach_mm) for each in settled]
-    gone = [s.group_from_plane.keys() - c.group_from_plane.keys() for s, c in zip(settled, cleared, strict=True)]
-    if not any(gone):
+        settled.append(replace(reduced, group_from_plane=known | reduced.group_from_plane, foreign=foreign))
+    cleared = [_without_reflections(group, patterns, reach_mm) for group in settled]
+    reflections = [s.group_from_plane.keys() - c.group_from_plane.keys() for s, c in zip(settled, cleared, strict=True)]
+    if not any(reflections):
         return settled
-    real = [replace(g.without(set(p))[0], reflected=c.reflected) for g, p, c in zip(groups, gone, cleared, strict=True)]
-    return across_groups(real, patterns, reach_mm)
+    without_reflections = [
+        replace(g.without(set(p))[0], reflected=c.reflected)
+        for g, p, c in zip(groups, reflections, cleared, strict=True)
+    ]
+    return across_groups(without_reflections, patterns, reach_mm)
 
 
 def _as_faces(group: Arrangement) -> list[Readings]:
-    """A group as if it were an image: its faces, with as many rows as circles were seen."""
-    seen: dict[str, list[PlaneView]] = {}
+    """Returns the faces of a group in the form of an image's readings, with a row for each observed circle."""
+    views_of_plane: dict[str, list[PlaneView]] = {}
     for views in group.views.values():
         for view in views:
             if view.plane != BOARD:
-                seen.setdefault(view.plane, []).append(view)
-    found = []
-    for plane, views in seen.items():
+                views_of_plane.setdefault(view.plane, []).append(view)
+    faces = []
+    for plane, views in views_of_plane.items():
         if plane in group.group_from_plane:
             rows = np.concatenate([view.rows for view in views])
             first = max(views, key=lambda view: len(view.rows))
             area = sum(view.area for view in views)
             pose = group.group_from_plane[plane]
-            found.append([replace(first, rows=rows, area=area, camera_from_plane=pose, named=True)])
-    return found
+            faces.append([replace(first, rows=rows, area=area, camera_from_plane=pose, named=True)])
+    return faces
 
 
 def _seeds(images: Sequence[list[Readings]]) -> list[tuple[int, PlaneView]]:
-    """Readings to start from, of the image that is most certain of itself first: its board, or its largest face, in
-    every way to read it."""
-    found = []
+    """Returns readings to start from, with all alternatives: the board of an image, or its largest face.
+
+    The readings of the most reliable image come first.
+    """
+    candidates = []
     for i, readings in enumerate(images):
         boards = [views for views in readings if views[0].plane == BOARD]
         faces = [views for views in readings if views[0].plane != BOARD and views[0].named]
         if boards or faces:
             first = max(boards or faces, key=lambda views: len(views[0].rows))
             circles = sum(len(views[0].rows) for views in boards + faces)
-            found.append(((not boards, not faces, len(first), -len(faces), -circles), i, first))
-    found.sort(key=lambda each: each[:2])
-    return [(i, view) for _, i, views in found[:MAX_SEEDS] for view in views]
+            candidates.append(((not boards, not faces, len(first), -len(faces), -circles), i, first))
+    candidates.sort(key=lambda each: each[:2])
+    return [(i, view) for _, i, views in candidates[:MAX_SEEDS] for view in views]
 
 
 def _grown(images: Sequence[list[Readings]], seed: int, view: PlaneView, reach_mm: float) -> Arrangement:
     """Grows the arrangement from one image to all images that share planes with placed ones."""
     known = {view.plane: Rigid()}
-    # Where the first image's numbering is a convention, another image alone cannot say which it is.
+    # If the numbering of the first image is a convention, the board alone cannot place another image.
     by_convention = view.plane == BOARD and len(_same_circles(images[seed], view)) > 1
     while True:
         placed = {i: found for i, r in enumerate(images) if (found := _placed(r, known, reach_mm, by_convention))}
@@ -272,17 +283,22 @@ def _same_circles(readings: list[Readings], view: PlaneView) -> Readings:
 
 
 def _with_seed(readings: list[Readings], view: PlaneView, known: dict[str, Rigid], reach_mm: float):
-    """The first image, held to the reading that the arrangement began with."""
+    """Returns pose and readings of the first image, with the reading that the arrangement was started from."""
     pose = view.camera_from_plane @ known[view.plane].inverse()
-    own = _same_circles(readings, view)
-    others, _ = _agreeing([views for views in readings if views is not own], pose, known, reach_mm, {view.plane})
+    alternatives = _same_circles(readings, view)
+    others, _ = _agreeing(
+        [views for views in readings if views is not alternatives], pose, known, reach_mm, {view.plane}
+    )
     return pose, [view, *others]
 
 
 def _placed(readings: list[Readings], known: dict[str, Rigid], reach_mm: float, by_convention: bool):
-    """Pose of an image and the readings that agree with it: that of most planes, faces before the board; None where
-    nothing known is seen, or several poses fit alike."""
-    best, rank, rivals = None, (0, 0, 0), 0
+    """Returns the pose of an image and the readings that agree with it, or None.
+
+    The pose with the most planes is taken, and of these the one with the most faces. The result is None if the image
+    has no known plane, or several poses fit equally well.
+    """
+    best, best_score, rivals = None, (0, 0, 0), 0
     for views in readings:
         for view in views:
             if view.plane not in known:
@@ -291,10 +307,10 @@ def _placed(readings: list[Readings], known: dict[str, Rigid], reach_mm: float, 
             others, _ = _agreeing([v for v in readings if v is not views], pose, known, reach_mm, {view.plane})
             agreed = [view, *others]
             faces = sum(v.plane != BOARD and v.named for v in agreed)
-            own = (len(agreed), faces, sum(len(v.rows) for v in agreed))
-            if own > rank:
-                best, rank, rivals = (pose, agreed), own, 0
-            elif own == rank:
+            score = (len(agreed), faces, sum(len(v.rows) for v in agreed))
+            if score > best_score:
+                best, best_score, rivals = (pose, agreed), score, 0
+            elif score == best_score:
                 rivals += best is None or not _alike(best[0], pose, agreed[0], reach_mm)
     if best is None or (rivals and (len(best[1]) == 1 or not all(v.named for v in best[1]))):
         return None
@@ -340,8 +356,10 @@ def _shift_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]
 
 
 def _new_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], reach_mm: float) -> dict[str, Rigid]:
-    """Poses of planes that are not known yet, each where it takes up most of the placed images: a second target behind
-    may be seen as often, but is smaller."""
+    """Returns poses of unknown planes, each at the place with the largest area in the placed images.
+
+    A second target in the background may be seen as often, but is smaller.
+    """
     new = {}
     for plane, found in _unknown_planes(images, placed, known, named=True).items():
         support = _together(found, reach_mm) @ np.array([view.area for _, view, _ in found])
@@ -350,8 +368,10 @@ def _new_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid
 
 
 def _agreed_plane(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], reach_mm: float):
-    """A plane that no image names by itself, where most images agree on one place for it: two at least, and more than
-    on any other plane that the same circles may be."""
+    """Returns a plane that no image alone can name, and its pose, or an empty dict.
+
+    At least two images must agree on its place, and more than for any other plane that the same circles may be.
+    """
     ranked = []
     for plane, found in _unknown_planes(images, placed, known, named=False).items():
         together = _together(found, reach_mm)
@@ -368,7 +388,7 @@ def _agreed_plane(images: Sequence[list[Readings]], placed, known: dict[str, Rig
 def _unknown_planes(images: Sequence[list[Readings]], placed, known: dict[str, Rigid], named: bool):
     """Returns (image, view, group_from_plane) by unknown plane, of the placed images' readings that are named, or of
     those that are not named and agree with no known plane."""
-    seen: dict[str, list[tuple[int, PlaneView, Rigid]]] = {}
+    unknown: dict[str, list[tuple[int, PlaneView, Rigid]]] = {}
     for i, (pose, agreed) in placed.items():
         for views in images[i]:
             if any(view is each for view in views for each in agreed):
@@ -376,8 +396,8 @@ def _unknown_planes(images: Sequence[list[Readings]], placed, known: dict[str, R
             for view in views:
                 if view.plane not in known and view.named == named:
                     group_from_plane = pose.inverse() @ view.camera_from_plane
-                    seen.setdefault(view.plane, []).append((i, view, group_from_plane))
-    return seen
+                    unknown.setdefault(view.plane, []).append((i, view, group_from_plane))
+    return unknown
 
 
 def _together(found: list[tuple[int, PlaneView, Rigid]], reach_mm: float) -> np.ndarray:
@@ -417,42 +437,44 @@ def _checked(images: Sequence[list[Readings]], found: Arrangement, step_mm: floa
     for i, pose in found.camera_from_group.items():
         agreed, ambiguous = _agreeing(images[i], pose, found.group_from_plane, MAX_SHIFT_PITCHES * step_mm, set())
         views[i] = tuple(v for v in agreed if _off_mm(v, pose, found.group_from_plane) < MAX_OFF_PITCHES * step_mm)
-        kept = [id(v) for v in views[i]]
-        rest = [r for r in images[i] if not any(id(v) in kept for v in r)]
-        contradicted[i] = tuple(r for r in rest if not any(r is each for each in ambiguous))
+        accepted_ids = [id(v) for v in views[i]]
+        others = [r for r in images[i] if not any(id(v) in accepted_ids for v in r)]
+        contradicted[i] = tuple(r for r in others if not any(r is each for each in ambiguous))
         unsettled[i] = tuple(ambiguous)
     return replace(found, views=views, contradicted=contradicted, open=unsettled)
 
 
 def _off_mm(view: PlaneView, camera_from_group: Rigid, known: dict[str, Rigid]) -> float:
-    """Median distance of the circles from where the arrangement has them, at their distance from the camera."""
+    """Returns the median distance of circles from their places in the arrangement, at the depth of these places."""
     xyz = camera_from_group @ (known[view.plane] @ view.xyz_mm())
     return float(np.median(np.linalg.norm(view.xy * xyz[:, 2:] - xyz[:, :2], axis=1)))
 
 
 def _without_reflections(found: Arrangement, patterns: dict[str, Pattern], reach_mm: float) -> Arrangement:
-    """The arrangement without planes that are the image of another one in a mirror: the mirror lies half way, and who
-    sees them stands on the other one's side. (Two faces of a box may be each other's mirror images too, but whoever
-    sees one stands on its side.)"""
+    """Removes planes that are the mirror image of another one.
+
+    The mirror lies half way between the two, and cameras that see the image stand on the side of the real plane. (Two
+    faces of a box may be each other's mirror images, too, but a camera that sees a face stands on its side.)
+    """
     for real, image in permutations([p for p in found.group_from_plane if p != BOARD], 2):
         if not _reflected(found, patterns, real, image, reach_mm):
             continue
-        found, gone = found.without({image})
-        found = replace(found, reflected={i: found.reflected.get(i, ()) + views for i, views in gone.items()})
+        found, removed = found.without({image})
+        found = replace(found, reflected={i: found.reflected.get(i, ()) + views for i, views in removed.items()})
     return found
 
 
 def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, image: str, reach_mm: float) -> bool:
     if not {real, image} <= found.group_from_plane.keys() or len(patterns[real].labels) != len(patterns[image].labels):
         return False
-    own, other = (found.group_from_plane[p] @ patterns[p].xyz_mm() for p in (real, image))
-    between = own.mean(0) - other.mean(0)
+    xyz_real, xyz_image = (found.group_from_plane[p] @ patterns[p].xyz_mm() for p in (real, image))
+    between = xyz_real.mean(0) - xyz_image.mean(0)
     if np.linalg.norm(between) < reach_mm:
         return False
-    normal, middle = between / np.linalg.norm(between), (own.mean(0) + other.mean(0)) / 2
-    turned = own - 2 * ((own - middle) @ normal)[:, None] * normal
-    apart, at = KDTree(other).query(turned)
-    if apart.max() > reach_mm or len(np.unique(at)) < len(other):
+    normal, middle = between / np.linalg.norm(between), (xyz_real.mean(0) + xyz_image.mean(0)) / 2
+    mirrored = xyz_real - 2 * ((xyz_real - middle) @ normal)[:, None] * normal
+    apart, at = KDTree(xyz_image).query(mirrored)
+    if apart.max() > reach_mm or len(np.unique(at)) < len(xyz_image):
         return False
     seen_by = [i for i, views in found.views.items() if any(v.plane == image for v in views)]
     sides = [(found.camera_from_group[i].inverse().translation - middle) @ normal > 0 for i in seen_by]
@@ -462,8 +484,11 @@ def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, imag
 def mirrored_images(
     found: Arrangement, images: Sequence[list[Readings]], patterns: dict[str, Pattern], reach_mm: float
 ) -> list[int]:
-    """Images of a group that are mirrored, though each of their faces passes for another one: what they show as the
-    board contradicts the group, and turned back it puts their circles where the group has those of its faces."""
+    """Returns the mirrored images of a group whose faces all pass for other faces.
+
+    The reading of the board in such an image contradicts the group. Turned back, the image has its circles where the
+    group has the circles of its faces.
+    """
     return [
         i
         for i, contradicted in found.contradicted.items()
@@ -477,9 +502,9 @@ def mirrored_images(
 
 
 def _is_mirrored(found: Arrangement, readings: list[Readings], board: PlaneView, patterns, reach_mm: float) -> bool:
-    seen = [views[0].xy for views in readings if views[0].plane != BOARD]
+    measured = [views[0].xy for views in readings if views[0].plane != BOARD]
     pose = flipped_pose(board, patterns[BOARD].xy_mm)
-    if BOARD not in found.group_from_plane or not seen or pose is None:
+    if BOARD not in found.group_from_plane or not measured or pose is None:
         return False
     camera_from_group = pose @ found.group_from_plane[BOARD].inverse()
     planes = [camera_from_group @ (p @ patterns[k].xyz_mm()) for k, p in found.group_from_plane.items() if k != BOARD]
@@ -487,5 +512,5 @@ def _is_mirrored(found: Arrangement, readings: list[Readings], board: PlaneView,
     xyz = xyz[xyz[:, 2] > 0]
     if not len(xyz):
         return False
-    apart, at = KDTree(xyz[:, :2] / xyz[:, 2:]).query(np.concatenate(seen) * [-1, 1])
+    apart, at = KDTree(xyz[:, :2] / xyz[:, 2:]).query(np.concatenate(measured) * [-1, 1])
     return bool(np.mean(apart * xyz[at, 2] < reach_mm) > MIN_MIRRORED)

@@ -91,32 +91,32 @@ def detect_image(
 ) -> ImageDetection:
     """Finds and measures all circles of the target and the board in one grey image of the camera's size."""
     reading = read_image(grey_8bit(image), camera, target, board, options)
-    scaled = grey_fine(image)
+    grey = grey_fine(image)
     named, refused, boards = reading.faces.faces, reading.faces.refused, reading.boards
     of_board = board.polarity if board else target.polarity
     free, dots = reading.free, reading.found[of_board]
     patterns = [_Pattern(target.polarity, free.select(each.used()), each.labels()) for each in named]
     patterns += [_Pattern(target.polarity, free.select(own := each.used()), [NAMELESS] * len(own)) for each in refused]
     patterns += [_Pattern(of_board, dots.select(own := each.candidates), [DOT] * len(own)) for each in boards]
-    measured = _measured(scaled, camera, patterns, reading.found)
+    measured = _measured(grey, camera, patterns, reading.found)
     notes = [_untried_note(reading)] if reading.untried else []
     for pattern, centres in zip(patterns, measured, strict=True):
         notes += [_rim_note(pattern.names[i], centres.rim[i]) for i in np.flatnonzero(~centres.ok).tolist()]
     ends = np.cumsum([0, *(int(centres.ok.sum()) for centres in measured)])
-    seen = [(centres.ok, np.arange(*rows)) for centres, rows in zip(measured, pairwise(ends), strict=True)]
+    measured_rows = [(centres.ok, np.arange(*rows)) for centres, rows in zip(measured, pairwise(ends), strict=True)]
     first, second = len(named), len(named) + len(refused)
     faces, open_faces, board_sightings = [], [], []
-    for each, (ok, rows) in zip(named, seen[:first], strict=True):
+    for each, (ok, rows) in zip(named, measured_rows[:first], strict=True):
         faces.append(FaceSighting(each.face.id, rows, np.flatnonzero(each.index >= 0)[ok]))
-    for each, (ok, rows) in zip(refused, seen[first:second], strict=True):
+    for each, (ok, rows) in zip(refused, measured_rows[first:second], strict=True):
         row = np.full(len(reading.free), -1)
         row[each.used()[ok]] = rows
         open_faces.append(tuple(_sighting(own, row) for own in each.readings))
-    for each, (ok, rows) in zip(boards, seen[second:], strict=True):
+    for each, (ok, rows) in zip(boards, measured_rows[second:], strict=True):
         board_sightings.append(BoardSighting(rows, each.numberings[:, ok], each.unlikely[:, ok]))
     return ImageDetection(
         Centres.concatenate(
-            [centres.select(np.flatnonzero(centres.ok)) for centres in measured] or [_nothing(scaled, camera, free)]
+            [centres.select(np.flatnonzero(centres.ok)) for centres in measured] or [_nothing(grey, camera, free)]
         ),
         tuple(faces),
         tuple(board_sightings),

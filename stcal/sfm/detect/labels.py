@@ -1,5 +1,8 @@
-"""Labels of all circles: what each image reads by itself, held against the arrangement of its group, then a second look
-for what the group says must be in view."""
+"""Labels of all circles.
+
+Readings of single images are compared with the arrangement of their group. A second look then searches the circles that
+must be in view according to the group.
+"""
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -35,9 +38,9 @@ from stcal.sfm.detect.predict import (
 from stcal.sfm.detect.sightings import ImageDetection, PlaneView, Readings, likely_views, open_face_note, readings_of
 
 MIN_EXPECTED = 6
-"""Circles that other images must show before their absence says anything: as many as name a face."""
+"""Least number of circles that other images must show for their absence to count: as many as identify a face."""
 MIN_CONFIRMED = 0.2
-"""Share of them that is found at least; a face of which less is seen twice could not be mapped either."""
+"""Least share of these circles that must be found. A face of which two images show less could not be mapped either."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +103,7 @@ def without_defocus(
 
 
 def label_single(name: str, group: str, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
-    """The faces of one image that stands for itself, where the target may move from image to image."""
+    """Returns the faces of a single image, for a target that may move from image to image."""
     labels, rows = detection.labelled_rows(target)
     repeated = [f"{what} found more than once; left out" for what in detection.repeated]
     unnamed = [open_face_note(len(faces[0].rows), (each.face for each in faces)) for faces in detection.open_faces]
@@ -122,28 +125,28 @@ def label_images(
     camera = detection.camera
     groups = _groups(detection)
     patterns = patterns_of(target, board)
-    first: list[tuple[list[LabelledImage], Arrangement]] = []
+    first_looks: list[tuple[list[LabelledImage], Arrangement]] = []
     jobs: list[tuple[DetectedImage, PredictedCircles]] = []
     focal_px = float(np.sqrt(camera.focal.prod()))
-    labelled = label_groups([named for _, named in groups], target, board, focal_px)
-    for (members, _), (found, arrangement) in zip(groups, labelled, strict=True):
-        found, arrangement = _without_outlying(found, arrangement, patterns, focal_px)
-        for i, (image, each) in enumerate(zip(members, found, strict=True)):
-            predicted = predict_circles(arrangement, i, each.observations.labels, target, board, camera)
+    labelled_groups = label_groups([named for _, named in groups], target, board, focal_px)
+    for (members, _), (images_of_group, arrangement) in zip(groups, labelled_groups, strict=True):
+        images_of_group, arrangement = _without_outlying(images_of_group, arrangement, patterns, focal_px)
+        for i, (image, image_labels) in enumerate(zip(members, images_of_group, strict=True)):
+            predicted = predict_circles(arrangement, i, image_labels.observations.labels, target, board, camera)
             if predicted is None:
                 continue
-            wrong = contradictions(predicted, each.observations, camera)
-            found[i] = each.without(wrong, contradicted_notes(wrong))
+            wrong = contradictions(predicted, image_labels.observations, camera)
+            images_of_group[i] = image_labels.without(wrong, contradicted_notes(wrong))
             if predicted.wanted.any():
                 jobs.append((image, predicted))
-        first.append((found, arrangement))
+        first_looks.append((images_of_group, arrangement))
     looks = look_again(jobs, camera, options, cache, workers)
-    named = [
-        each
-        for found, arrangement in first
-        for each in _without_outlying(_second(found, looks), arrangement, patterns, focal_px)[0]
+    labelled_images = [
+        image_labels
+        for images_of_group, arrangement in first_looks
+        for image_labels in _without_outlying(_second(images_of_group, looks), arrangement, patterns, focal_px)[0]
     ]
-    return without_defocus(named, camera, patterns)
+    return without_defocus(labelled_images, camera, patterns)
 
 
 def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDesign | None) -> list[LabelledImage]:
@@ -157,11 +160,11 @@ def label_once(detection: DetectionResult, target: TargetDesign, board: BoardDes
 
 
 def _groups(detection: DetectionResult) -> list[tuple[list[DetectedImage], list[tuple[str, str, ImageDetection]]]]:
-    """Images of each group; and (name, group, detection) of them."""
+    """Returns the images of each group, and their (name, group, detection)."""
     groups: dict[str, list[DetectedImage]] = {}
     for image in detection.images:
         groups.setdefault(image.file.group, []).append(image)
-    return [(own, [(i.file.name, i.file.group, i.detection) for i in own]) for own in groups.values()]
+    return [(members, [(i.file.name, i.file.group, i.detection) for i in members]) for members in groups.values()]
 
 
 def _without_outlying(
@@ -174,35 +177,37 @@ def _without_outlying(
 
 
 def _second(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[LabelledImage]:
-    """A group's images with what the second look found; without the faces that only one image read and that are not
-    there where other images must show them."""
+    """Adds the circles of the second look to a group's images, and removes faces that it does not confirm.
+
+    A face is not confirmed if a single image shows it, and other images that must show it do not.
+    """
     images = []
-    for each in group:
-        look = looks.get(each.observations.name)
-        images.append(each if look is None else each.plus(look.labels, look.centres, missed_notes(look.missed)))
-    for face, seen, expected in _unconfirmed(group, looks):
+    for image in group:
+        look = looks.get(image.observations.name)
+        images.append(image if look is None else image.plus(look.labels, look.centres, missed_notes(look.missed)))
+    for face, found, expected in _unconfirmed(group, looks):
         note = (
-            f"face {face}: read in one image of the group alone, {seen} of {expected} of its circles found that other "
+            f"face {face}: read in one image of the group alone, {found} of {expected} of its circles found that other "
             "images must show; left out, it is a reflection or another object, or hidden there"
         )
-        for i, each in enumerate(images):
-            own = [label for label in each.observations.labels if label.plane == face]
-            images[i] = each.without(own, [note])
+        for i, image in enumerate(images):
+            labels_of_face = [label for label in image.observations.labels if label.plane == face]
+            images[i] = image.without(labels_of_face, [note])
     return images
 
 
 def _unconfirmed(group: list[LabelledImage], looks: dict[str, SecondLook]) -> list[tuple[str, int, int]]:
-    """Faces that one image alone reads and others contradict: (face, circles found in these, circles expected)."""
-    read = Counter(face for each in group for face in each.observations.face_ids())
-    found = []
+    """Returns unconfirmed faces of single images, with the numbers of circles found and expected in other images."""
+    read = Counter(face for image in group for face in image.observations.face_ids())
+    unconfirmed = []
     for face in [face for face, images in read.items() if images == 1]:
         others = [e.observations.name for e in group if face not in e.observations.face_ids()]
-        own = [looks[name] for name in others if name in looks]
-        seen = sum(label.plane == face for look in own for label in look.labels)
-        expected = seen + sum(label.plane == face for look in own for label in look.missed)
-        if expected >= MIN_EXPECTED and seen < MIN_CONFIRMED * expected:
-            found.append((face, seen, expected))
-    return found
+        looks_of_others = [looks[name] for name in others if name in looks]
+        confirmed = sum(label.plane == face for look in looks_of_others for label in look.labels)
+        expected = confirmed + sum(label.plane == face for look in looks_of_others for label in look.missed)
+        if expected >= MIN_EXPECTED and confirmed < MIN_CONFIRMED * expected:
+            unconfirmed.append((face, confirmed, expected))
+    return unconfirmed
 
 
 def label_groups(
@@ -211,33 +216,35 @@ def label_groups(
     board: BoardDesign | None,
     focal_px: float,
 ) -> list[tuple[list[LabelledImage], Arrangement]]:
-    """Label the images (name, group, detection) of all groups, each with the arrangement that its labels keep to."""
+    """Labels the images (name, group, detection) of all groups. Each group has the arrangement of its labels."""
     patterns = patterns_of(target, board)
     step = step_mm(target, board)
     readings = [[[] if d.mirrored else readings_of(d, target, board) for _, _, d in images] for images in groups]
     reach = MAX_SHIFT_PITCHES * step
-    alone = [_arranged(own, patterns, step, focal_px) for own in readings]
+    alone = [_arranged(readings_of_group, patterns, step, focal_px) for readings_of_group in readings]
     mirrored = [mirrored_images(*each, patterns, reach) for each in zip(alone, readings, strict=True)]
-    for group, gone in enumerate(mirrored):
-        if gone:
-            readings[group] = [[] if i in gone else each for i, each in enumerate(readings[group])]
+    for group, mirrored_rows in enumerate(mirrored):
+        if mirrored_rows:
+            readings[group] = [[] if i in mirrored_rows else each for i, each in enumerate(readings[group])]
             alone[group] = _arranged(readings[group], patterns, step, focal_px)
-    found = []
-    for images, own, gone, arrangement in zip(
+    labelled_groups = []
+    for images, readings_of_group, mirrored_rows, arrangement in zip(
         groups, readings, mirrored, across_groups(alone, patterns, reach), strict=True
     ):
         labelled = [
-            _mirrored(*each, "the board") if i in gone else _labelled(*each, likely_views(own[i]), arrangement, i)
+            _mirrored(*each, "the board")
+            if i in mirrored_rows
+            else _labelled(*each, likely_views(readings_of_group[i]), arrangement, i)
             for i, each in enumerate(images)
         ]
-        found.append((labelled, arrangement))
-    return found
+        labelled_groups.append((labelled, arrangement))
+    return labelled_groups
 
 
 def _arranged(
     readings: list[list[Readings]], patterns: dict[str, Pattern], step: float, focal_px: float
 ) -> Arrangement:
-    """The arrangement of one group; of readings by which dots are covered only where these explain more."""
+    """Returns the arrangement of one group. Readings with covered dots are used only if they explain more circles."""
     likely = arrange([likely_views(each) for each in readings], patterns, step, focal_px)
     if not any(likely.contradicted.values()):
         return likely
@@ -295,7 +302,7 @@ def _once(view: PlaneView, readings: list[Readings]) -> bool:
 
 
 OF_A_BOARD, OF_A_FACE = ("a board of ", "board of "), ("a pattern ",)
-"""How notes begin that leave a whole board or face out of an image."""
+"""Beginnings of notes on a whole board or face that is left out of an image."""
 
 
 def leaves_a_board_out(note: str) -> bool:
@@ -304,7 +311,7 @@ def leaves_a_board_out(note: str) -> bool:
 
 
 def leaves_a_pattern_out(note: str) -> bool:
-    """Whether a note is of a whole face or board, not of single circles or of the image."""
+    """Returns whether a note concerns a whole face or board, not single circles or the image."""
     return note.startswith(OF_A_BOARD + OF_A_FACE)
 
 
@@ -312,9 +319,9 @@ def _contradiction(views: Readings) -> str:
     view = views[0]
     if not view.named:
         return _open(views)
-    what = f"a board of {len(view.rows)} dots" if view.plane == BOARD else f"a pattern like face {view.plane}"
+    name = f"a board of {len(view.rows)} dots" if view.plane == BOARD else f"a pattern like face {view.plane}"
     return (
-        f"{what}: not where the group's other images see it; left out, it is a reflection or another object, or check "
+        f"{name}: not where the group's other images see it; left out, it is a reflection or another object, or check "
         "that nothing was moved"
     )
 

@@ -13,15 +13,19 @@ from stcal.sfm.data.patterns import Pattern
 from stcal.sfm.detect.group_geometry import Arrangement, PlaneBundle
 
 MIN_LIMIT_PX = 0.5
-"""What is nearer to its place is never outlying: centres of clear circles are good to hundredths, designs to tenths."""
+"""Largest deviation that never counts as outlying.
+
+Centres of clear circles are good to hundredths, designs to tenths.
+"""
 BEYOND = 4.0
-"""Times the median of the plane's circles: 4.7 σ of normal errors, of which one in 60 000 is longer."""
+"""Factor on the median deviation of the plane's circles: 4.7 σ of normal errors, exceeded by one in 60 000."""
 BEYOND_SIGMA = 6.0
 """Smallest outlying distance in σ of the centre."""
 MIN_USUAL = 6
-"""Circles of a plane that have a pose of their own and say what is usual; fewer are held to what others say of both."""
+"""Least number of circles for a plane's own pose and median. Circles of other planes
+are judged by the poses and the median of all."""
 ALIKE = 0.5
-"""Share of its distance by which another image may have a circle elsewhere, for it to be off alike."""
+"""Relative difference up to which a circle's deviation in another image counts as the same."""
 MAX_ROUNDS = 10
 
 
@@ -33,18 +37,18 @@ def outlying_circles(
     Parameters
     ----------
     arrangement
-        Of the group, near its minimum.
+        Arrangement of the group, near its minimum.
     images
         All labelled circles of the group's images.
     patterns
         Circles of each plane.
     focal_px
-        Of the camera.
+        Focal length of the camera.
 
     Returns
     -------
     arrangement
-        The same object where nothing is outlying.
+        Adjusted arrangement; the same object if no circle is outlying.
     outlying
         Reasons by image and label.
     """
@@ -102,15 +106,15 @@ class _Circles:
                 patterns[plane].labels, patterns[plane].xyz_mm(), patterns[plane].radius_mm, strict=True
             )
         }
-        rows, seen = [], []
+        rows, columns = [], []
         for a, i in enumerate(names):
             sigma = images[i].sigma_px()
             for k, label in enumerate(images[i].labels):
                 if label in design:
                     rows.append((i, label))
-                    seen.append((a, planes.index(label.plane), *images[i].centre[k], sigma[k], *design[label]))
-        table = np.array(seen, float).reshape(-1, 9)
-        found = cls(
+                    columns.append((a, planes.index(label.plane), *images[i].centre[k], sigma[k], *design[label]))
+        table = np.array(columns, float).reshape(-1, 9)
+        circles = cls(
             rows,
             table[:, 0].astype(int),
             table[:, 1].astype(int),
@@ -121,7 +125,9 @@ class _Circles:
             PoseStack.of(*arrangement.camera_from_group.values()),
             PoseStack.of(*arrangement.group_from_plane.values()),
         )
-        return replace(found, centre_px=found.centre_px - found._eccentricity_px(table[:, 8])) if rows else found
+        return (
+            replace(circles, centre_px=circles.centre_px - circles._eccentricity_px(table[:, 8])) if rows else circles
+        )
 
     def rearranged(self, arrangement: Arrangement) -> Arrangement:
         """Returns the arrangement with these poses."""
@@ -175,26 +181,28 @@ class _Circles:
 def _worst(circles: _Circles, keep: np.ndarray) -> dict[int, str]:
     """Returns the worst outlying circle to ``keep`` of each plane and image, as it biases the others."""
     shift, by_place = circles.off_px()
-    off, limit = np.linalg.norm(shift, axis=1), np.maximum(MIN_LIMIT_PX, BEYOND_SIGMA * circles.sigma_px)
+    off_px, limit = np.linalg.norm(shift, axis=1), np.maximum(MIN_LIMIT_PX, BEYOND_SIGMA * circles.sigma_px)
     alone, enough = circles.in_one_image(), circles.enough()
-    usual = np.full(len(off), np.median(off[keep]))
+    usual = np.full(len(off_px), np.median(off_px[keep]))
     for plane in np.unique(circles.plane[keep & enough]):
-        usual[circles.plane == plane] = np.median(off[keep & (circles.plane == plane)])
+        usual[circles.plane == plane] = np.median(off_px[keep & (circles.plane == plane)])
     limit = np.where(alone & enough, limit, np.maximum(limit, BEYOND * usual))
-    outlying = keep & (off > limit)
+    outlying = keep & (off_px > limit)
     moved_mm = np.linalg.solve(by_place, shift[..., None])[..., 0]
-    found: dict[int, str] = {}
+    reasons: dict[int, str] = {}
     for k in np.flatnonzero(outlying):
         same = keep & (circles.image != circles.image[k]) & [label == circles.rows[k][1] for _, label in circles.rows]
-        apart = np.linalg.norm((moved_mm[same] - moved_mm[k]) @ by_place[k].T, axis=1)
-        outlying[k] = not (apart < ALIKE * off[k]).any()
+        apart_px = np.linalg.norm((moved_mm[same] - moved_mm[k]) @ by_place[k].T, axis=1)
+        outlying[k] = not (apart_px < ALIKE * off_px[k]).any()
     for image, plane in {(circles.image[k], circles.plane[k]) for k in np.flatnonzero(outlying)}:
-        own = np.flatnonzero(keep & (circles.image == image) & (circles.plane == plane))
-        worst = own[np.argmax(np.where(outlying[own], off[own] / limit[own], 0))]
-        away = f"{off[worst]:.3g} px from its place, {limit[worst]:.3g} allowed"
+        circles_of_face = np.flatnonzero(keep & (circles.image == image) & (circles.plane == plane))
+        worst = circles_of_face[
+            np.argmax(np.where(outlying[circles_of_face], off_px[circles_of_face] / limit[circles_of_face], 0))
+        ]
+        error = f"{off_px[worst]:.3g} px from its place, {limit[worst]:.3g} allowed"
         if alone[worst] and enough[worst]:
-            why = f"{circles.rows[worst][1]} is {away}, and no other image of the group tells which circles are right"
-            found |= dict.fromkeys(own.tolist(), why)
+            why = f"{circles.rows[worst][1]} is {error}, and no other image of the group tells which circles are right"
+            reasons |= dict.fromkeys(circles_of_face.tolist(), why)
         else:
-            found[int(worst)] = away
-    return found
+            reasons[int(worst)] = error
+    return reasons

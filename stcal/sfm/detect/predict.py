@@ -1,4 +1,4 @@
-"""Circles searched where a known arrangement, or the image before, predicts them."""
+"""Search for circles at places predicted by an arrangement, or by the previous image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,12 +26,12 @@ from stcal.sfm.detect.circles.fits import MIN_SIGMA
 from stcal.sfm.detect.group_geometry import Arrangement
 
 MAX_STRETCH = 1.15
-"""Largest ratio of measured to predicted ellipse along any direction, beyond half a pixel at each end: a circle
-whose edge is cut by a seventh of its diameter has its centre off by as much as the rim test lets pass."""
+"""Largest ratio of measured to predicted ellipse along any direction, in addition to half a pixel at each end. If an
+edge is cut by a seventh of the diameter, the error of the centre is as large as the rim test admits."""
 MAX_SIGMA_PX = 0.5
-"""Largest σ of a centre: fifty times that of a clear one, so its weight is negligible."""
+"""Largest σ of a centre. It is fifty times that of a clear one, so that the weight of a worse one is negligible."""
 MIN_SIGNIFICANCE = 8.0
-"""Smallest contrast, in σ of a pixel's noise around the rim: one pixel of clutter or noise is no edge."""
+"""Smallest contrast, in σ of a pixel's noise around the rim. A single pixel of clutter or noise has less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +61,10 @@ class PredictedCircles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SecondLook:
-    """``labels`` of the circles that were measured, with their ``centres``; ``missed`` : label → why not."""
+    """Result of a second look.
+
+    ``labels``, ``centres`` : measured circles; ``missed`` : reason by label of the others.
+    """
 
     labels: tuple[Label, ...]
     centres: Centres
@@ -77,8 +80,10 @@ def predict_circles(
     camera: Camera,
     max_tilt_rad: float = MAX_TILT_RAD,
 ) -> PredictedCircles | None:
-    """Circles that the arrangement puts into view in an image, at most so oblique, wanted those that have not been
-    ``seen``; None where it does not know the image."""
+    """Predicts the circles in view of an image from the arrangement; None if the arrangement lacks the image.
+
+    Circles with a larger tilt are left out. Circles not in ``seen`` are wanted.
+    """
     pose = arrangement.camera_from_group.get(image)
     if pose is None:
         return None
@@ -103,35 +108,38 @@ def predict_circles(
 
 
 def contradictions(predicted: PredictedCircles, seen: ImageObservations, camera: Camera) -> dict[Label, str]:
-    """Circles of the first look that are not of the size that the others of their plane ask for: partly hidden, or
-    something else; with the reason. By how much a plane's circles are all larger or smaller is the design's, and let
-    pass."""
+    """Returns circles of the first look whose size contradicts the other circles of their plane, with the reasons.
+
+    Such a circle is partly hidden, or something else. A common size ratio of a plane's circles is attributed to the
+    design and accepted.
+    """
     place = {label: i for i, label in enumerate(predicted.labels)}
     rows = np.array([k for k, label in enumerate(seen.labels) if label in place], int)
-    own = np.array([place[seen.labels[k]] for k in rows], int)
-    widest, narrowest = _stretch(predicted.shape_px[own], seen.shape[rows], seen.centre[rows], camera)
+    predicted_rows = np.array([place[seen.labels[k]] for k in rows], int)
+    widest, narrowest = _stretch(predicted.shape_px[predicted_rows], seen.shape[rows], seen.centre[rows], camera)
     planes = np.array([seen.labels[k].plane for k in rows], str)
-    found: dict[Label, str] = {}
+    reasons: dict[Label, str] = {}
     for plane in dict.fromkeys(planes.tolist()):
         members = np.flatnonzero(planes == plane)
         size = float(np.median(np.sqrt(widest[members] * narrowest[members])))
         for k in members.tolist():
-            reason = _disagreement(predicted.shape_px[own[k]], 0.0, (widest[k] / size, narrowest[k] / size))
+            reason = _disagreement(predicted.shape_px[predicted_rows[k]], 0.0, (widest[k] / size, narrowest[k] / size))
             if reason:
-                found[seen.labels[rows[k]]] = reason
-    return found
+                reasons[seen.labels[rows[k]]] = reason
+    return reasons
 
 
 def _stretch(shape_px: np.ndarray, shape: np.ndarray, centre: np.ndarray, camera: Camera) -> tuple[np.ndarray, ...]:
-    """Largest and smallest ratio, over all directions, of measured ellipses (normalised) to those expected (px)."""
+    """Returns the largest and smallest ratio, in any direction, of measured ellipses (normalised) to expected ones."""
     local = camera.focal[:, None] * camera.distort_jacobian(centre)[1]
     return singular_values(np.linalg.solve(shape_px, local @ shape))
 
 
 def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, float]) -> str:
-    """Why a measured ellipse is not the one expected, of ``shape_px``; empty where it is.
+    """Returns the reason why a measured ellipse is not the expected one of ``shape_px``; empty if it is.
 
-    ``off_px`` : its distance from there; ``stretch`` : its largest and smallest size over the one expected.
+    ``off_px`` : distance from the expected place; ``stretch`` : largest and smallest ratio of its size to the expected
+    one.
     """
     largest, smallest = singular_values(shape_px)
     allowed = max(MAX_POSITION_ERROR * float(np.sqrt(largest * smallest)), MAX_POSITION_ERROR_PX)
@@ -144,8 +152,8 @@ def _disagreement(shape_px: np.ndarray, off_px: float, stretch: tuple[float, flo
 def measure_predicted(
     image: np.ndarray, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
 ) -> SecondLook:
-    """Measure the wanted circles in a grey image of any depth, of the sizes that the options ask for."""
-    scaled = grey_fine(image)
+    """Measures the wanted circles in a grey image of any depth, if the options admit their size."""
+    grey = grey_fine(image)
     everything = Ellipses(predicted.centre_px, predicted.shape_px, np.ones(len(predicted.labels)))
     wanted = np.flatnonzero(predicted.wanted)
     low, high = options.min_diameter_px or MIN_DIAMETER_PX, options.max_diameter_px
@@ -157,12 +165,12 @@ def measure_predicted(
     }
     wanted = np.array([i for i in wanted if predicted.labels[i] not in missed], int)
     expected = everything.select(wanted)
-    found = measure_centres(scaled, camera, expected, everything)
-    reasons = _reasons(found, expected, [predicted.polarity[i] for i in wanted], camera)
-    seen = [k for k, reason in enumerate(reasons) if not reason]
+    centres = measure_centres(grey, camera, expected, everything)
+    reasons = _reasons(centres, expected, [predicted.polarity[i] for i in wanted], camera)
+    accepted = [k for k, reason in enumerate(reasons) if not reason]
     return SecondLook(
-        tuple(predicted.labels[wanted[k]] for k in seen),
-        found.select(np.array(seen, int)),
+        tuple(predicted.labels[wanted[k]] for k in accepted),
+        centres.select(np.array(accepted, int)),
         missed | {predicted.labels[i]: reason for i, reason in zip(wanted, reasons, strict=True) if reason},
     )
 
@@ -200,16 +208,18 @@ def _reasons(found: Centres, expected: Ellipses, polarity: Sequence[Polarity], c
 
 
 def missed_notes(missed: dict[Label, str]) -> list[str]:
-    """One line for each face, and one for the board, of what was expected in view and not measured."""
+    """Returns one note for each face, and one for the board, on circles that were expected in view and not measured."""
     planes: dict[str, list[tuple[Label, str]]] = {}
     for label, reason in missed.items():
         planes.setdefault(label.plane, []).append((label, reason))
     notes = []
     for plane, rows in planes.items():
-        what = "board" if plane == BOARD else f"face {plane}"
+        place = "board" if plane == BOARD else f"face {plane}"
         first, reason = rows[0]
-        more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
-        notes.append(f"{what}: {first}{more} should be in view and not measured; {first}: {reason}; hidden or unclear")
+        others = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
+        notes.append(
+            f"{place}: {first}{others} should be in view and not measured; {first}: {reason}; hidden or unclear"
+        )
     return notes
 
 

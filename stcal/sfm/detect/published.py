@@ -1,11 +1,12 @@
 """Detection by the rules of Zhang & Wei (2017), §1.2: threshold, two tests of ellipses, names by directions.
 
 It is for comparison. The rules need a whole pattern of ten circles in view, and name a face by scalar and vector
-products in the image, which perspective bends. A pattern that they miss is noted with what was measured; one that they
-misname keeps the name that its own plane gives it, which is noted too.
-What the document leaves open is decided here: the threshold is Otsu's, one for the image; "= 0" is within half of the
-45° to the next name; distances are measured in radii of the circle that they start from, and the board, of which §1.2
-says nothing, is found as everywhere in this package.
+products in the image, which perspective distorts. A note states each pattern that they miss, with the measured values.
+A pattern that they misname keeps the name that its own plane gives it, also with a note.
+
+Details that the document leaves open are decided here. The threshold is Otsu's, one for the image. "= 0" means within
+half of the 45° to the next name. Distances are measured in radii of the circle that they start from. The board, which
+§1.2 does not mention, is found as everywhere in this package.
 """
 
 from dataclasses import dataclass
@@ -37,26 +38,26 @@ from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetecti
 SMOOTHING_PX = 5
 """Side of the Gaussian filter, px."""
 EQUAL_SIGMA_PX = 0.05
-"""σ of every centre. Only its being equal for all centres matters."""
+"""σ of every centre. Its value does not matter, as it is equal for all."""
 MIN_OUTLINE_PX = 6
 AREA_RATIO = 2.0
 """Largest ratio of areas of equal circles in one pattern, due to perspective."""
 STEP_RATIO = 1.4
 """Largest ratio of distances between neighbouring circles, due to perspective."""
 ZERO_COSINE = float(np.sin(np.radians(22.5)))
-"""What passes for the scalar product of perpendicular directions: half way to those 45° off."""
+"""Largest cosine of directions that count as perpendicular: half way to those 45° off."""
 MAX_MISFIT = 0.25
 """Largest distance of a circle from its place in the face's plane, in radii."""
 
 
 @dataclass(frozen=True, slots=True)
 class PublishedPattern:
-    """The pattern that the rules know, by circle ids.
+    """Pattern of the published rules, by circle ids.
 
-    ``lines`` : along X, Y and the diagonal, from the ``origin`` on, the circles as (id, distance in steps); ``a``,
-    ``b`` : the small circles beside the origin; ``c`` : the small circle that names the face, beside ``last``, at
-    ``c_radii`` radii of it; ``names`` : (sign of the scalar, of the vector product) with the diagonal → face id;
-    ``step_radii`` : from the origin to ``a`` in its radii; ``small`` : area of the small circles in that of the large.
+    ``lines`` : circles along X, Y and the diagonal from the ``origin`` on, as (id, distance in steps); ``a``, ``b`` :
+    small circles beside the origin; ``c`` : small circle that names the face, beside ``last``, at ``c_radii`` radii of
+    it; ``names`` : face id by (sign of the scalar, of the vector product) with the diagonal; ``step_radii`` : distance
+    from the origin to ``a`` in radii of the origin; ``small`` : ratio of the areas of small and large circles.
     """
 
     origin: str
@@ -77,7 +78,7 @@ class PublishedPattern:
         Raises
         ------
         InputError
-            The design is not of that form.
+            If the design does not have that form.
         """
         try:
             return cls._of(target)
@@ -92,7 +93,7 @@ class PublishedPattern:
     @classmethod
     def _of(cls, target: TargetDesign) -> "PublishedPattern":
         first = target.faces[0]
-        common, own = _common(target)
+        common, circle_of_face = _common(target)
         place = {circle: first.xy_mm[i] for i, circle in enumerate(first.ids) if circle in common}
         radius = {circle: float(first.radius_mm[first.ids.index(circle)]) for circle in common}
         largest = max(radius.values())
@@ -101,30 +102,30 @@ class PublishedPattern:
         lines = []
         for direction in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
             lines.append(_along(np.array(direction), {circle: place[circle] for circle in large}))
-        (a, step), (b, other) = (
+        (a, step_x), (b, step_y) = (
             _along(np.array(d), {circle: place[circle] for circle in small})[0] for d in ((1.0, 0.0), (0.0, 1.0))
         )
-        if not np.isclose(step, other) or len(large) != sum(len(line) for line in lines) or len(small) != 2:
+        if not np.isclose(step_x, step_y) or len(large) != sum(len(line) for line in lines) or len(small) != 2:
             raise ValueError("its circles lie elsewhere")
         last = lines[2][-1][0]
         names: dict[tuple[int, int], str] = {}
-        away = []
-        for face, circle in own.items():
+        distances = []
+        for face, circle in circle_of_face.items():
             direction = _place(face, circle) - place[last]
-            away.append(float(np.linalg.norm(direction)))
+            distances.append(float(np.linalg.norm(direction)))
             names[_signs(direction, np.ones(2))] = face.id
-        if len(names) < len(target.faces) or not np.allclose(away, away[0], rtol=0.05):
+        if len(names) < len(target.faces) or not np.allclose(distances, distances[0], rtol=0.05):
             raise ValueError("the circles beside the last do not tell its faces apart")
         return cls(
             origin=first.origin,
             a=a,
             b=b,
-            c=next(iter(own.values())),
+            c=next(iter(circle_of_face.values())),
             last=last,
-            lines=tuple(tuple((circle, far / step) for circle, far in line) for line in lines),
+            lines=tuple(tuple((circle, far / step_x) for circle, far in line) for line in lines),
             names=names,
-            step_radii=step / radius[first.origin],
-            c_radii=away[0] / radius[last],
+            step_radii=step_x / radius[first.origin],
+            c_radii=distances[0] / radius[last],
             small=(radius[a] / radius[first.origin]) ** 2,
         )
 
@@ -149,14 +150,14 @@ def _common(target: TargetDesign) -> tuple[list[str], dict[FaceDesign, str]]:
 
 def _along(direction: np.ndarray, place: dict[str, np.ndarray]) -> list[tuple[str, float]]:
     """Returns the circles in a direction from the origin, nearest first, with distances in units of ``direction``."""
-    found = []
+    aligned = []
     for circle, xy in place.items():
         far = float(xy @ direction / (direction @ direction))
         if far > 0 and np.allclose(xy, far * direction, atol=0.01 * far):
-            found.append((circle, far))
-    if not found:
+            aligned.append((circle, far))
+    if not aligned:
         raise ValueError(f"no circle along ({direction[0]:g}, {direction[1]:g})")
-    return sorted(found, key=lambda each: each[1])
+    return sorted(aligned, key=lambda each: each[1])
 
 
 def _signs(direction: np.ndarray, diagonal: np.ndarray) -> tuple[int, int]:
@@ -179,44 +180,44 @@ def detect_published(
     Parameters
     ----------
     image
-        (h, w), grey, 8 or 16 bits.
+        Image (h, w), grey, 8 or 16 bits.
     camera
-        Its intrinsics, px.
+        Camera with its intrinsics, px.
     target, board
-        Designs; no board is sought where None.
+        Designs; no board is sought if None.
     options
         ``min_diameter_px``, ``max_diameter_px`` and ``min_axis_ratio`` are the rules' two tests.
 
     Returns
     -------
     ImageDetection
-        Centres of ellipses fitted to contours, px, all of the same σ.
+        Centres of ellipses fitted to contours, px, all with the same σ.
 
     Raises
     ------
     InputError
-        The design is not of the published form.
+        If the design does not have the published form.
     """
     pattern = PublishedPattern.of(target)
     grey = cv2.GaussianBlur(grey_8bit(image), (SMOOTHING_PX, SMOOTHING_PX), 0)
     polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
-    found = {polarity: contour_ellipses(grey, polarity, options) for polarity in sorted(polarities)}
-    start = dict(zip(found, np.cumsum([0, *(len(each) for each in found.values())]).tolist(), strict=False))
-    candidates = {polarity: Candidates.of(each, camera) for polarity, each in found.items()}
-    boards, free = [], np.ones(len(found[target.polarity]), bool)
+    ellipses = {polarity: contour_ellipses(grey, polarity, options) for polarity in sorted(polarities)}
+    start = dict(zip(ellipses, np.cumsum([0, *(len(each) for each in ellipses.values())]).tolist(), strict=False))
+    candidates = {polarity: Candidates.of(each, camera) for polarity, each in ellipses.items()}
+    boards, free = [], np.ones(len(ellipses[target.polarity]), bool)
     if board is not None:
         for each in find_boards(candidates[board.polarity], board, image_corners(camera)):
             boards.append(BoardSighting(start[board.polarity] + each.candidates, each.numberings, each.unlikely))
             if board.polarity == target.polarity:
                 free[each.candidates] = False
-    faces, notes = _Rules(pattern, target, candidates[target.polarity], found[target.polarity]).find(free)
+    faces, notes = _Rules(pattern, target, candidates[target.polarity], ellipses[target.polarity]).find(free)
     first = start[target.polarity]
     return ImageDetection(
-        centres=Centres.concatenate([_centres(each, candidates[p]) for p, each in found.items()]),
+        centres=Centres.concatenate([_centres(each, candidates[p]) for p, each in ellipses.items()]),
         faces=tuple(FaceSighting(face, first + rows, circles) for face, rows, circles in faces),
         boards=tuple(boards),
         notes=tuple(notes),
-        candidates=sum(len(each) for each in found.values()),
+        candidates=sum(len(each) for each in ellipses.values()),
     )
 
 
@@ -303,8 +304,10 @@ class _Rules:
         return {self.pattern.a: first, self.pattern.b: second}
 
     def _walk(self, circles: dict[str, int], free: np.ndarray) -> str:
-        """Label the large circles along the three directions, the diagonal's being the median of the other two; why
-        not, where one is missing."""
+        """Labels the large circles along the three directions, and returns the reason if one is missing, else "".
+
+        The step along the diagonal is the sum of the other two.
+        """
         origin = circles[self.pattern.origin]
         at = self.found.xy[origin]
         step_x, step_y = (self.found.xy[circles[circle]] - at for circle in (self.pattern.a, self.pattern.b))
@@ -312,52 +315,59 @@ class _Rules:
         large = free & (size > 1 / AREA_RATIO) & (size < AREA_RATIO)
         large[origin] = False
         for line, step in zip(self.pattern.lines, (step_x, step_y, step_x + step_y), strict=True):
-            way = step / np.linalg.norm(step)
-            for circle, far in line:
+            direction = step / np.linalg.norm(step)
+            for circle, steps in line:
                 off = self.found.xy - at
-                along = off @ way
-                across = np.abs(off @ [-way[1], way[0]])
-                far_seen = along / (far * np.linalg.norm(step))
-                there = large & (across < self.found.radius) & (far_seen > 1 / STEP_RATIO) & (far_seen < STEP_RATIO)
-                if not there.any():
+                along = off @ direction
+                across = np.abs(off @ [-direction[1], direction[0]])
+                relative_steps = along / (steps * np.linalg.norm(step))
+                candidates = (
+                    large
+                    & (across < self.found.radius)
+                    & (relative_steps > 1 / STEP_RATIO)
+                    & (relative_steps < STEP_RATIO)
+                )
+                if not candidates.any():
                     return f"circle {circle} not found in its direction"
-                rows = np.flatnonzero(there)
-                circles[circle] = int(rows[np.argmin(np.abs(far_seen[rows] - 1))])
-                own = self.found.xy[[origin, *(circles[c] for c, _ in line if c in circles)]]
-                way = _fitted_direction(own, way)
+                rows = np.flatnonzero(candidates)
+                circles[circle] = int(rows[np.argmin(np.abs(relative_steps[rows] - 1))])
+                on_line = self.found.xy[[origin, *(circles[c] for c, _ in line if c in circles)]]
+                direction = _fitted_direction(on_line, direction)
         return ""
 
     def _name(self, circles: dict[str, int], free: np.ndarray) -> str | tuple[FaceDesign, np.ndarray, str]:
-        """The face by its circle c, the rows of its circles in the design's order, and what is to be noted of the name;
-        why not, where there is none."""
+        """Returns the face named by circle c, the rows of its circles in the design's order, and a note on the name.
+
+        If there is no such face, the reason is returned.
+        """
         pattern = self.pattern
         last = circles[pattern.last]
-        known = set(circles.values())
-        beside = [i for i in self._beside(last, pattern.c_radii, free) if i not in known]
+        labelled = set(circles.values())
+        beside = [i for i in self._beside(last, pattern.c_radii, free) if i not in labelled]
         if len(beside) != 1:
             return f"{len(beside)} small circles beside circle {pattern.last}, 1 needed"
         on_diagonal = self.found.xy[[circles[c] for c in (pattern.origin, *(c for c, _ in pattern.lines[2]))]]
         diagonal = _fitted_direction(on_diagonal, on_diagonal[-1] - on_diagonal[0])
         direction = self.found.xy[beside[0]] - self.found.xy[last]
         flip = np.array([1.0, -1.0])  # the image's y points down
-        told = pattern.names.get(_signs(flip * direction, flip * diagonal))
+        published = pattern.names.get(_signs(flip * direction, flip * diagonal))
         placed = self._placed(circles, beside[0])
         if isinstance(placed, str):
             return placed
         face = min(self.target.faces, key=lambda f: float(np.linalg.norm(_place(f, pattern.c) - placed)))
         rows = np.array([{**circles, pattern.c: beside[0]}[circle] for circle in face.ids])
-        if told == face.id:
+        if published == face.id:
             return face, rows, ""
         cosine = direction @ diagonal / np.linalg.norm(direction)
         return (
             face,
             rows,
             f"perspective breaks the published name: the products in the image (cosine {cosine:+.2f}) say "
-            f"{f'face {told}' if told else 'no face'}, its own plane says face {face.id}, which was taken",
+            f"{f'face {published}' if published else 'no face'}, its own plane says face {face.id}, which was taken",
         )
 
     def _placed(self, circles: dict[str, int], c: int) -> np.ndarray | str:
-        """Circle c in the plane of the face, mm; or why the others are no face."""
+        """Returns circle c in the plane of the face, mm, or the reason why the others are no face."""
         face = self.target.faces[0]
         common = [i for i, circle in enumerate(face.ids) if circle in circles]
         xy = self.found.xy[[circles[face.ids[i]] for i in common]]

@@ -80,14 +80,14 @@ class ImageDetection:
 
     @property
     def repeated(self) -> tuple[str, ...]:
-        """The faces and the board that are in view more than once."""
+        """Names of the faces, and of the board, that are in view more than once."""
         ids = [sighting.face for sighting in self.faces]
         boards = self.boards[1:2] and len(self.boards[1].rows) >= SECOND_BOARD_SHARE * len(self.boards[0].rows)
         return (BOARD,) * bool(boards) + tuple(f"face {i}" for i in sorted(set(ids)) if ids.count(i) > 1)
 
     @property
     def board(self) -> BoardSighting | None:
-        """The only board; None if there is none, or a second one of similar size."""
+        """The only board of the image; None if there is none, or a second one of similar size."""
         return None if not self.boards or BOARD in self.repeated else self.boards[0]
 
     def single_faces(self) -> tuple[FaceSighting, ...]:
@@ -211,14 +211,14 @@ def confusable(target: TargetDesign) -> dict[str, tuple[frozenset[int], ...]]:
 @lru_cache(maxsize=8)
 def _confusable(key) -> dict[str, tuple[frozenset[int], ...]]:
     faces = [(face_id, np.frombuffer(xy).reshape(-1, 2), np.frombuffer(radius)) for face_id, xy, radius in key]
-    found = {}
+    sets_of_face = {}
     for face_id, xy, radius in faces:
         sets: set[frozenset[int]] = set()
         for other_id, other_xy, other_radius in faces:
             for common in common_circles(xy, radius, other_xy, other_radius, same=face_id == other_id):
                 sets.add(common)
-        found[face_id] = tuple(s for s in sets if not any(s < t for t in sets))
-    return found
+        sets_of_face[face_id] = tuple(s for s in sets if not any(s < t for t in sets))
+    return sets_of_face
 
 
 def in_common(face: FaceDesign, other: FaceDesign, mirrored: bool = False) -> int:
@@ -261,17 +261,17 @@ def likeness_notes(target: TargetDesign) -> list[str]:
 def _telling(face: FaceDesign, other: FaceDesign) -> list[tuple[float, str, str, str]]:
     """Returns single circles that distinguish a face from another one: distance in mm, both faces, and the circle."""
     rival = other.xy_mm, other.radius_mm
-    found = []
+    telling = []
     for common in common_circles(face.xy_mm, face.radius_mm, *rival, same=face is other):
         if len(common) != len(face.ids) - 1:
             continue
-        own = np.array(sorted(common))
-        like = whole_likeness(face.xy_mm[own], face.radius_mm[own], *rival, own if face is other else None)
+        shared = np.array(sorted(common))
+        like = whole_likeness(face.xy_mm[shared], face.radius_mm[shared], *rival, shared if face is other else None)
         if like is not None:
             (alone,) = set(range(len(face.ids))) - common
             gap = np.linalg.norm(like.moved(face.xy_mm[alone]) - other.xy_mm, axis=1).min()
-            found.append((float(gap), face.id, other.id, face.ids[alone]))
-    return found
+            telling.append((float(gap), face.id, other.id, face.ids[alone]))
+    return telling
 
 
 def mirror_images(target: TargetDesign) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""The native COLMAP against ours: same database, same initial pairs, same thresholds; result file and text."""
+"""Cross-check against the native COLMAP: same database, same initial pairs, same thresholds; result file and text."""
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -56,20 +56,22 @@ from stcal.sfm.runs.transaction import added_results
 MICRO = 1e3
 TOLERANCES = Tolerances()
 FACE_FLOOR = np.array([1e-7] * 3 + [1e-4] * 3)
-"""rad, mm: what never matters, 6 µdeg and 0.1 µm; circles that carry the frame have no σ of their own."""
+"""Negligible differences in rad and mm: 6 µdeg and 0.1 µm. Circles that carry the frame have no σ."""
 RENAMED = {
     "ba_global_images_freq": "ba_global_frames_freq",
     "ba_global_images_ratio": "ba_global_frames_ratio",
     "local_ba_min_tri_angle": "ba_local_min_tri_angle",
 }
-"""Thresholds that older versions know by other names than pycolmap."""
+"""Names of thresholds in older versions, and in pycolmap."""
 
 
 def crosscheck_run(
     saved: SavedRun, colmap: Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress | None = None
 ) -> Crosscheck:
-    """Cross-check a finished run with the native COLMAP; the comparison is added to its report. Nothing else is
-    written to its folder meanwhile."""
+    """Cross-checks a finished run with the native COLMAP and adds the comparison to its report.
+
+    Nothing else is written to the run's folder meanwhile.
+    """
     require_report(saved)  # before minutes of mapping
     with added_results(saved.folder) as stage:
         if read_json(saved.folder / "report.json", "", AGAIN) != saved.report:
@@ -88,70 +90,73 @@ def crosscheck(
     timeout_s: float = 600.0,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Crosscheck:
-    """Map the run's database with the native program and compare: the content of ``report.json``'s ``crosscheck``.
+    """Maps the run's database with the native program and returns the comparison, ``crosscheck`` of ``report.json``.
 
     Raises
     ------
     InputError
-        No native program, or one of a version that no schema is known for; a name that it cannot list; a database that
-        is not the run's.
+        If there is no native program or no schema of its version is known, it cannot list a name, or the database is
+        not the run's.
     MappingError
-        The native program fails, hangs, or makes no model of a group, or none of this database.
+        If the native program fails, hangs, makes no model of a group, or makes a model of another database.
     """
     progress = progress or (lambda *_: None)
     native = find_colmap(colmap)
     schema = schema_of_version(native.version)
     require_listable([image.name for image in run.observations])
     ids = image_ids(run.observations)
-    theirs, ours, adjusted = [], [], []
+    native_models, pycolmap_models, adjusted = [], [], []
     groups = run.groups()
     with tempfile.TemporaryDirectory(prefix="stcal-crosscheck-") as scratch:
         folder = Path(scratch)
         export_database(run.database, folder / "native.db", schema, run)
         export_database(run.database, folder / "ours.db", "4.2", run)
-        for done, (name, group) in enumerate(groups.items()):
-            progress("crosscheck", done, len(groups))
+        for index, (name, group) in enumerate(groups.items()):
+            progress("crosscheck", index, len(groups))
             names = [image.name for image in group]
             pair = _initial_pair(run, name, ids)
-            place = folder / f"group{done}"
+            work = folder / f"group{index}"
             options = mapper_options(native, names, pair)
-            map_natively(native, folder / "native.db", place, names, options, timeout_s)
-            path, read = _native_model(place / "models", name, native, run, ids)
-            theirs.append(read)
+            map_natively(native, folder / "native.db", work, names, options, timeout_s)
+            path, model = _native_model(work / "models", name, native, run, ids)
+            native_models.append(model)
             adjusted.append(_adjusted(path, group, ids, run))
-            ours.append(_own(folder, place, names, pair, name, run, ids))
+            pycolmap_models.append(_own(folder, work, names, pair, name, run, ids))
         progress("crosscheck", len(groups), len(groups))
-        external, own = faces_from_models(theirs, run), faces_from_models(ours, run)
-    again = calibrate(adjusted, run.camera, run.target, run.board, run.options.adjustment(run.target))
-    return _comparison(run, native, schema, external, own, again, tolerances)
+        of_native, of_pycolmap = faces_from_models(native_models, run), faces_from_models(pycolmap_models, run)
+    readjusted = calibrate(adjusted, run.camera, run.target, run.board, run.options.adjustment(run.target))
+    return _comparison(run, native, schema, of_native, of_pycolmap, readjusted, tolerances)
 
 
 def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]) -> dict[str, str]:
-    """Our thresholds as options of the native mapper: every ``Mapper.*`` that it has and pycolmap's options know, but
-    for negative values, by which newer versions mean a choice of their own."""
-    own = pipeline_options(names, pair)
+    """Returns our thresholds as options of the native mapper.
+
+    These are all of its ``Mapper.*`` options that pycolmap has, except negative values, with which newer versions ask
+    for an automatic choice.
+    """
+    options = pipeline_options(names, pair)
     chosen = {}
-    for option in sorted(native.mapper_options):
-        prefix, _, key = option.partition(".")
+    for name in sorted(native.mapper_options):
+        prefix, _, field = name.partition(".")
         if prefix == "Mapper":
-            key = RENAMED.get(key, key)
-            places = ((own, key), (own.mapper, key), (own.triangulation, key.removeprefix("tri_")))
-            value = next((getattr(place, k) for place, k in places if hasattr(place, k)), None)
-            if isinstance(value, bool | int | float) and value >= 0:
-                chosen[option] = str(int(value)) if isinstance(value, bool) else repr(value)
+            field = RENAMED.get(field, field)
+            places = ((options, field), (options.mapper, field), (options.triangulation, field.removeprefix("tri_")))
+            setting = next((getattr(place, k) for place, k in places if hasattr(place, k)), None)
+            if isinstance(setting, bool | int | float) and setting >= 0:
+                chosen[name] = str(int(setting)) if isinstance(setting, bool) else repr(setting)
     seed = next((o for o in ("random_seed", "default_random_seed") if o in native.mapper_options), None)
-    return chosen | ({seed: str(own.random_seed)} if seed else {})
+    return chosen | ({seed: str(options.random_seed)} if seed else {})
 
 
 def _initial_pair(run: SavedRun, group: str, ids: dict[str, int]) -> tuple[int, int]:
-    chosen = next(each for each in run.report["groups"] if each["name"] == group)["pairs"][0]
-    return ids[chosen["first"]], ids[chosen["second"]]
+    pair = next(row for row in run.report["groups"] if row["name"] == group)["pairs"][0]
+    return ids[pair["first"]], ids[pair["second"]]
 
 
 def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun, ids) -> tuple[Path, ReadModel]:
-    """The largest of the native models, and the same read with labels."""
+    """Returns the path of the largest native model, and this model with labels."""
     try:
-        found = find_models(folder)
+        models = find_models(folder)
     except InputError as error:
         raise MappingError(
             "E-COLMAP-NO-MODEL",
@@ -159,7 +164,7 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
             "see `stcal-sfm pairs` for the gate that stops it",
         ) from error
     try:
-        path = max(found, key=lambda each: open_model(each).num_reg_images())
+        path = max(models, key=lambda model: open_model(model).num_reg_images())
         return path, read_model(path, run.observations, ids, run.corrected_px)
     except InputError as error:
         raise MappingError(
@@ -174,7 +179,7 @@ def _adjusted(path: Path, group, ids, run: SavedRun):
 
 
 def _own(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids):
-    """The same mapping by pycolmap."""
+    """Returns the model of the same mapping by pycolmap."""
     reconstruction = seeded_mapping(folder / "ours.db", place / "own", names, pair)
     if reconstruction is None:
         raise MappingError(
@@ -197,13 +202,13 @@ def _comparison(
     again: Calibration,
     tolerances: Tolerances,
 ) -> Crosscheck:
-    theirs, ours = _images(external), _images(own)
+    native_images, pycolmap_images = _images(external), _images(own)
     images = ImagesRegistered(
-        native=len(theirs),
-        pycolmap=len(ours),
+        native=len(native_images),
+        pycolmap=len(pycolmap_images),
         run=len(run.observations),
-        only_native=sorted(theirs - ours),
-        only_pycolmap=sorted(ours - theirs),
+        only_native=sorted(native_images - pycolmap_images),
+        only_pycolmap=sorted(pycolmap_images - native_images),
     )
     faces = run.faces.target_from_face_covariance
     mapping = MappingCompared(
@@ -235,43 +240,43 @@ def _comparison(
 
 
 def face_differences(target: CalibratedTarget, run: SavedRun) -> dict[str, FaceDifference | None]:
-    """Differences of a target's faces from those of ``RUN/faces.json`` by face; None for what only one has."""
+    """Returns the differences of a target's faces from ``RUN/faces.json``, by face; None if only one has the face."""
     return _faces(target.target_from_face, run.faces.poses(), run.faces.target_from_face_covariance)
 
 
 def _faces(
     a: dict[str, Rigid], b: dict[str, Rigid], covariance: Mapping[str, np.ndarray]
 ) -> dict[str, FaceDifference | None]:
-    """Differences by face, for those that both have; None for the others."""
+    """Returns the differences by face; None for a face that only one of the two has."""
     rows: dict[str, FaceDifference | None] = {}
     for face in sorted(a.keys() | b.keys()):
         rows[face] = None
         if face in a and face in b:
-            off = _off(a[face], b[face])
+            difference = _off(a[face], b[face])
             rows[face] = FaceDifference(
-                translation_um=MICRO * float(np.linalg.norm(off[3:])),
-                rotation_mdeg=MICRO * float(np.degrees(np.linalg.norm(off[:3]))),
-                sigmas=_sigmas(off, np.asarray(covariance[face]), FACE_FLOOR) if face in covariance else None,
+                translation_um=MICRO * float(np.linalg.norm(difference[3:])),
+                rotation_mdeg=MICRO * float(np.degrees(np.linalg.norm(difference[:3]))),
+                sigmas=_sigmas(difference, np.asarray(covariance[face]), FACE_FLOOR) if face in covariance else None,
             )
     return rows
 
 
 def _off(pose: Rigid, other: Rigid) -> np.ndarray:
-    """Rotation vector (rad) and translation (mm) from ``other`` to ``pose``, in the frame that both lead to, (6,)."""
+    """Returns the rotation vector (rad) and translation (mm) from ``other`` to ``pose`` in their common frame, (6,)."""
     return Poses.of([pose]).difference(Poses.of([other]))[0]
 
 
 def _sigmas(off: np.ndarray, covariance: np.ndarray, floor: np.ndarray) -> float:
-    """√(dᵀC⁻¹d/k); ``floor`` : (k,) σ below which no difference matters."""
+    """Returns √(dᵀC⁻¹d/k) of k differences. ``floor`` : (k,) σ of negligible differences, added to the covariance."""
     return float(np.sqrt(off @ np.linalg.solve(covariance + np.diag(floor**2), off) / len(off)))
 
 
 def _circle_sigmas(a: dict, b: dict, run: SavedRun) -> dict[str, float]:
-    known = run.faces.circle_covariance_mm2
+    covariances = run.faces.circle_covariance_mm2
     return {
-        label: _sigmas(np.subtract(a[label], b[label]), np.asarray(known[label]), FACE_FLOOR[3:])
+        label: _sigmas(np.subtract(a[label], b[label]), np.asarray(covariances[label]), FACE_FLOOR[3:])
         for label in a
-        if label in b and label in known
+        if label in b and label in covariances
     }
 
 
@@ -280,17 +285,20 @@ def _circles(a: dict, b: dict) -> dict[str, float]:
 
 
 def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDifference]:
-    """Differences of camera positions and attitudes against the target."""
+    """Returns the differences of camera positions and attitudes relative to the target."""
     sigmas = _camera_sigmas(a, b, run)
-    poses = [{n: p for m in each.models for n, p in zip(m.images, m.camera_from_model, strict=True)} for each in (a, b)]
+    poses = [
+        {n: p for m in calibration.models for n, p in zip(m.images, m.camera_from_model, strict=True)}
+        for calibration in (a, b)
+    ]
     rows = []
     for name in sorted(poses[0].keys() & poses[1].keys()):
-        one, other = poses[0][name].inverse(), poses[1][name].inverse()
-        turn = Rigid(one.rotation @ other.rotation.T)
+        target_from_a, target_from_b = poses[0][name].inverse(), poses[1][name].inverse()
+        turn = Rigid(target_from_a.rotation @ target_from_b.rotation.T)
         rows.append(
             CameraDifference(
                 image=name,
-                position_um=MICRO * float(np.linalg.norm(one.translation - other.translation)),
+                position_um=MICRO * float(np.linalg.norm(target_from_a.translation - target_from_b.translation)),
                 rotation_mdeg=MICRO * float(np.degrees(turn.angle_rad())),
                 sigmas=sigmas[name],
             )
@@ -299,33 +307,34 @@ def _cameras(a: Calibration, b: Calibration, run: SavedRun) -> list[CameraDiffer
 
 
 def _camera_sigmas(a: Calibration, b: Calibration, run: SavedRun) -> dict[str, float]:
-    """Differences of the cameras against the circles of their group, in their own σ: the groups' models laid on one
-    another by all circles, which is the datum of the covariances."""
+    """Returns the differences of the cameras relative to the circles of their group, in σ of the cameras.
+
+    The two models of a group are aligned by all of their circles, which is the datum of the covariances.
+    """
     factors = run.sigma_factors()
-    ours = {model.group: model for model in b.models}
-    found = {}
+    model_of_group = {model.group: model for model in b.models}
+    sigmas = {}
     for theirs in a.models:
-        model = ours.get(theirs.group)
+        model = model_of_group.get(theirs.group)
         if model is None:
             continue
-        place = {label: i for i, label in enumerate(theirs.labels)}
-        both = [(place[label], i) for i, label in enumerate(model.labels) if label in place]
-        rows = np.array(both, int).reshape(-1, 2).T
-        laid = align_similarity(model.xyz_model[rows[1]], theirs.xyz_model[rows[0]])
-        covariance = dict(
-            zip(model.images, free_network(with_sigma(model, factors), run.camera).pose_covariance(), strict=True)
-        )
+        index_of_label = {label: i for i, label in enumerate(theirs.labels)}
+        pairs = [(index_of_label[label], i) for i, label in enumerate(model.labels) if label in index_of_label]
+        rows = np.array(pairs, int).reshape(-1, 2).T
+        alignment = align_similarity(model.xyz_model[rows[1]], theirs.xyz_model[rows[0]])
+        network = free_network(with_sigma(model, factors), run.camera)
+        covariance = dict(zip(model.images, network.pose_covariance(), strict=True))
         poses = dict(zip(model.images, model.camera_from_model, strict=True))
         for name, pose in zip(theirs.images, theirs.camera_from_model, strict=True):
             if name in poses:
-                turned = pose.rotation @ laid.rigid.rotation.T
-                moved = Rigid(turned, laid.scale * pose.translation - turned @ laid.rigid.translation)
-                found[name] = _sigmas(_off(moved, poses[name]), covariance[name], np.zeros(6))
-    return found
+                turned = pose.rotation @ alignment.rigid.rotation.T
+                moved = Rigid(turned, alignment.scale * pose.translation - turned @ alignment.rigid.translation)
+                sigmas[name] = _sigmas(_off(moved, poses[name]), covariance[name], np.zeros(6))
+    return sigmas
 
 
 def _camera_notes(mapping: MappingCompared, result: ResultCompared) -> list[str]:
-    """The camera that differs most, where that is more than its σ."""
+    """Returns a note on the camera that differs most, if the difference is more than its σ."""
     worst = max(mapping.cameras, key=lambda camera: camera.sigmas, default=None)
     if worst is None or worst.sigmas <= 1:
         return []
@@ -352,7 +361,7 @@ def _run_rms(run: SavedRun) -> float:
 
 
 def comparison_text(check: Crosscheck) -> str:
-    """The comparison as a text table."""
+    """Returns the comparison as a text table."""
     residual, images, cameras = check.residual_rms_px, check.images, check.mapping.cameras
     rows = [["face", *("µm", "mdeg", "σ") * 3]]
     for face in check.mapping.faces:
@@ -384,46 +393,46 @@ def comparison_text(check: Crosscheck) -> str:
 def _differences(
     images: ImagesRegistered, mapping: MappingCompared, result: ResultCompared, tolerances: Tolerances
 ) -> list[str]:
-    """Where the two differ by more than is allowed, one clause each."""
-    found = []
-    for names, who in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):
+    """Returns the differences beyond their tolerances, one clause each."""
+    clauses = []
+    for names, program in ((images.only_native, "native COLMAP"), (images.only_pycolmap, "pycolmap")):
         if names:
-            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            found.append(f"image {names[0]}{more}: registered by {who} only")
-    for compared, what, sigma in (
+            others = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            clauses.append(f"image {names[0]}{others}: registered by {program} only")
+    for compared, source, sigma in (
         (mapping, "mapped by both", tolerances.mapped_sigma),
         (result, "from the native model against faces.json", tolerances.sigma),
     ):
         for face, row in compared.faces.items():
             if row is None:
-                found.append(f"face {face} ({what}): only one of the two has it")
+                clauses.append(f"face {face} ({source}): only one of the two has it")
                 continue
             limits = _exceeded(row, tolerances, sigma)
             if limits:
-                beside = "" if row.sigmas is None else f", {row.sigmas:.2f} σ"
-                found.append(
-                    f"face {face} ({what}) {row.translation_um:.1f} µm, {row.rotation_mdeg:.2f} mdeg{beside}; "
+                sigma_text = "" if row.sigmas is None else f", {row.sigmas:.2f} σ"
+                clauses.append(
+                    f"face {face} ({source}) {row.translation_um:.1f} µm, {row.rotation_mdeg:.2f} mdeg{sigma_text}; "
                     f"{', '.join(limits)} allowed"
                 )
         for unit, values, limit in (
             ("µm", compared.circles_um, tolerances.circle_um),
             ("σ", compared.circles_sigmas, sigma),
         ):
-            label, worst = max(values.items(), key=lambda each: each[1], default=("", 0.0))
+            label, worst = max(values.items(), key=lambda item: item[1], default=("", 0.0))
             if limit is not None and worst > limit:
-                found.append(f"circle {label} ({what}) {worst:.1f} {unit}; {limit:g} {unit} allowed")
-    for what, key, limit, unit in (
+                clauses.append(f"circle {label} ({source}) {worst:.1f} {unit}; {limit:g} {unit} allowed")
+    for source, key, limit, unit in (
         ("position", "position_um", tolerances.camera_um, "µm"),
         ("attitude", "rotation_mdeg", tolerances.camera_mdeg, "mdeg"),
     ):
         image, worst = max(((c.image, getattr(c, key)) for c in mapping.cameras), key=lambda c: c[1], default=("", 0.0))
         if limit is not None and worst > limit:
-            found.append(f"camera {image}: {what} {worst:.1f} {unit}; {limit:g} {unit} allowed")
-    return found
+            clauses.append(f"camera {image}: {source} {worst:.1f} {unit}; {limit:g} {unit} allowed")
+    return clauses
 
 
 def _exceeded(row: FaceDifference, tolerances: Tolerances, sigma: float) -> list[str]:
-    """The limits that a face is beyond."""
+    """Returns the limits that the difference of a face exceeds, as texts."""
     limits = (
         (row.translation_um, tolerances.face_um, "µm"),
         (row.rotation_mdeg, tolerances.face_mdeg, "mdeg"),
@@ -468,15 +477,15 @@ class GroupOfPairs(Part):
 
 
 class PairsFile(ResultFile):
-    """Of ``pairs``."""
+    """The JSON file of ``pairs``."""
 
     format: Literal["stcal pairs 1"] = Field(description="the file's form and its version")
     groups: list[GroupOfPairs] = Field(description="`name` of the group, and its pairs")
 
     @classmethod
     def of(cls, groups: Mapping[str, Sequence[PairGates]]) -> "PairsFile":
-        """The file of the ranked pairs by group."""
-        rows = [GroupOfPairs(name=name, pairs=[_pair(each) for each in own]) for name, own in groups.items()]
+        """Returns the file of the ranked pairs, by group."""
+        rows = [GroupOfPairs(name=name, pairs=[_pair(pair) for pair in ranked]) for name, ranked in groups.items()]
         return cls(format="stcal pairs 1", groups=rows)
 
 
@@ -508,12 +517,12 @@ def _gate(gate: Gate) -> GateRow:
 
 
 def _degrees(angle_rad: float) -> float:
-    """Without the last digits of the conversion, so that a limit reads as it was given."""
+    """Returns the angle in degrees, rounded to 9 digits, so that a limit reads as it was given."""
     return round(float(np.degrees(angle_rad)), 9)
 
 
 def database_text(written: Exported) -> str:
-    """What is in the copy, and how to open it."""
+    """Returns a text on the contents of the copied database, and how to open it."""
     return (
         f"schema {written.schema}, checked: {written.images} images, {written.pairs} pairs, "
         f"camera model {', '.join(written.camera_models)}\n"
@@ -522,11 +531,11 @@ def database_text(written: Exported) -> str:
 
 
 def model_text(written: ExportedModel, kind: str) -> str:
-    """What is in the model, and the ideal camera of a format that knows no other."""
-    holds = f"{written.images} images and {written.points} points"
+    """Returns a text on the contents of the model, and on the ideal camera if the format needs one."""
+    contents = f"{written.images} images and {written.points} points"
     if kind == "ply":
-        holds = f"{written.points} points, not the cameras of the {written.images} images, which other formats hold"
-    lines = [f"{holds}; mm, target frame: {written.path}", f"labels: {written.labels}"]
+        contents = f"{written.points} points, not the cameras of the {written.images} images, which other formats hold"
+    lines = [f"{contents}; mm, target frame: {written.path}", f"labels: {written.labels}"]
     if written.focal_px is not None and written.centre_px is not None:
         x, y = written.centre_px
         lines.append(
@@ -538,7 +547,7 @@ def model_text(written: ExportedModel, kind: str) -> str:
 
 
 def export_text(written: ExportedRun) -> str:
-    """What is in the file, and what of the run is not."""
+    """Returns a text on the contents of the file, and on the results that it lacks."""
     content = written.content
     lines = [
         f"{len(content.faces)} faces and {len(content.circles)} circles, frame {content.root}, as {written.form}: "
@@ -552,18 +561,18 @@ def export_text(written: ExportedRun) -> str:
 
 
 def faces_text(calibration: Calibration, run: SavedRun) -> str:
-    """Scale of each model, and the faces beside those of the run."""
+    """Returns a text with the scale of each model, and the faces with their differences from the run's."""
     lines = [*calibration.notes]
-    for each in calibration.models:
-        scale = calibration.scales[each.group]
+    for model in calibration.models:
+        scale = calibration.scales[model.group]
         lines.append(
-            f"group {each.group}: {len(each.images)} images, {len(each.labels)} circles, {scale.mm_per_unit:.6g} mm "
+            f"group {model.group}: {len(model.images)} images, {len(model.labels)} circles, {scale.mm_per_unit:.6g} mm "
             f"per unit, board within {1e3 * scale.rms_mm():.1f} µm RMS"
         )
     difference = face_differences(calibration.target, run)
     rows = [["face", "x", "y", "z", "mm   against the run: µm", "mdeg"]]
     for face_id, pose in calibration.target.target_from_face.items():
         row = difference.get(face_id)
-        beside = [number(row.translation_um, 2), number(row.rotation_mdeg, 3)] if row else ["not in the run", ""]
-        rows.append([face_id, *(number(x, 4) for x in pose.translation), *beside])
+        cells = [number(row.translation_um, 2), number(row.rotation_mdeg, 3)] if row else ["not in the run", ""]
+        rows.append([face_id, *(number(x, 4) for x in pose.translation), *cells])
     return "\n".join([*lines, *text_table(rows, least=(6, 11, 11, 11, 24, 8), gap=1)])

@@ -1,4 +1,4 @@
-"""The database for other versions of COLMAP: checked to be whole, and copied into that version's schema."""
+"""Export of the database for other versions of COLMAP: it is checked, and copied into that version's schema."""
 
 import os
 import re
@@ -21,38 +21,38 @@ from stcal.sfm.mapping.pairs import image_graph, kind_of_graph
 from stcal.sfm.runs.saved import SavedRun
 
 PAIR_BASE = 2**31 - 1
-"""A pair's id is this times the smaller image id, plus the larger one (COLMAP's ``kMaxNumImages``)."""
+"""Factor of the smaller image id in a pair's id, to which the larger one is added (COLMAP's ``kMaxNumImages``)."""
 KEYPOINT_COLUMNS = (2, 4, 6)
-"""x, y; and scale and angle, or an affine shape."""
+"""Possible numbers of columns: x, y, and then nothing, scale and angle, or an affine shape."""
 REAL = 8
 MATRICES = {
     "two_view_geometries": {"F": 9, "E": 9, "H": 9, "qvec": 4, "tvec": 3},
     "pose_priors": {"position": 3, "position_covariance": 9, "gravity": 3},
     "rig_sensors": {"sensor_from_rig": 7},
 }
-"""Numbers in blobs that may also be empty."""
+"""Count of numbers in blobs that may also be empty, by table and column."""
 PAIRED = ("matches", "two_view_geometries")
 
 
 def damaged(path: Path, sign: str) -> InputError:
-    """A database that is not as it should be."""
+    """Returns the error of a damaged database."""
     return InputError("E-RUN-DAMAGED", f"{path}: damaged ({sign}); make the run again")
 
 
 def require_whole(database: Path, copy: sqlite3.Connection) -> None:
-    """Every name, blob and reference of a database, by the schema alone.
+    """Checks every name, blob and reference of a database against the schema.
 
     Parameters
     ----------
     database : Path
-        For messages.
+        Path of the database, for messages.
     copy : sqlite3.Connection
-        Of what it holds, in the schema of our own database.
+        Copy of its content, in the schema of our own database.
 
     Raises
     ------
     InputError
-        Names the first row that is not whole.
+        If a row is damaged; the message names the first one.
     """
     for fault in _faults(copy):
         raise damaged(database, fault)
@@ -90,7 +90,7 @@ def _faulty_references(copy: sqlite3.Connection) -> Iterator[str]:
 
 
 def _faulty_matrices(copy: sqlite3.Connection, table: str, width: int, allowed: Sequence[int] | None) -> Iterator[str]:
-    """Rows whose ``data`` is not rows × cols numbers of ``width`` bytes."""
+    """Yields the faults of rows whose ``data`` is not rows × cols numbers of ``width`` bytes."""
     key = copy.execute(f"SELECT name FROM pragma_table_info('{table}')").fetchone()[0]
     for row, rows, cols, data in copy.execute(f"SELECT {key}, rows, cols, data FROM {table}"):
         if not (isinstance(rows, int) and isinstance(cols, int) and rows >= 0 and cols >= 0):
@@ -102,7 +102,7 @@ def _faulty_matrices(copy: sqlite3.Connection, table: str, width: int, allowed: 
 
 
 def _faulty_pairs(copy: sqlite3.Connection) -> Iterator[str]:
-    """Pairs of images that are not there, or of keypoints that they do not have."""
+    """Yields the faults of pairs of images or keypoints that do not exist."""
     count = dict(copy.execute("SELECT image_id, rows FROM keypoints"))
     images = {image for (image,) in copy.execute("SELECT image_id FROM images")}
     for table in PAIRED:
@@ -115,13 +115,13 @@ def _faulty_pairs(copy: sqlite3.Connection) -> Iterator[str]:
 
 
 def _matches(copy: sqlite3.Connection, table: str) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Ids of two images, and the keypoints (n, 2) matched."""
+    """Yields the ids of two images, and their matched keypoints (n, 2)."""
     for pair, data in copy.execute(f"SELECT pair_id, data FROM {table}"):
         yield pair // PAIR_BASE, pair % PAIR_BASE, np.frombuffer(data or b"", np.uint32).reshape(-1, 2).astype(int)
 
 
 def _size(blob: object) -> int:
-    """Bytes of a blob; −1 where it is another kind of value."""
+    """Returns the number of bytes of a blob; −1 for a value of another kind."""
     return len(blob) if isinstance(blob, bytes) else 0 if blob is None else -1
 
 
@@ -130,19 +130,19 @@ def _told(blob: object) -> str:
 
 
 def require_of_run(database: Path, copy: sqlite3.Connection, run: SavedRun) -> None:
-    """The database must hold the run's camera, its images, their centres, and what their labels match.
+    """Checks that the database holds the run's camera, images, centres, and the matches of their labels.
 
     Parameters
     ----------
     database, copy :
-        As of :func:`require_whole`, which must have passed it.
+        As in :func:`require_whole`, which must have accepted the database.
     run : SavedRun
-        Camera, labelled and corrected centres.
+        Run with the camera and the labelled, corrected centres.
 
     Raises
     ------
     InputError
-        Names the first difference from the run's files.
+        If it differs from the run's files; the message names the first difference.
     """
     _require_camera(database, copy, run)
     ids = image_ids(run.observations)
@@ -151,8 +151,8 @@ def require_of_run(database: Path, copy: sqlite3.Connection, run: SavedRun) -> N
 
 
 def _require_camera(database: Path, copy: sqlite3.Connection, run: SavedRun) -> None:
-    own = colmap_camera(run.camera)
-    wanted = (own.model.value, own.width, own.height, np.asarray(own.params, float).tobytes())
+    camera = colmap_camera(run.camera)
+    wanted = (camera.model.value, camera.width, camera.height, np.asarray(camera.params, float).tobytes())
     if copy.execute("SELECT model, width, height, params FROM cameras").fetchall() != [wanted]:
         raise InputError(
             "E-RUN-DATABASE", f"{database}: its camera is not that of {run.folder / 'cameras.txt'}; run again"
@@ -160,45 +160,47 @@ def _require_camera(database: Path, copy: sqlite3.Connection, run: SavedRun) -> 
 
 
 def _require_keypoints(database: Path, copy: sqlite3.Connection, run: SavedRun, ids: dict[str, int]) -> None:
-    """The keypoints that the labels are of, under the images' names."""
+    """Checks that the keypoints of each image are the labelled centres of the image of that name."""
     names = dict(copy.execute("SELECT name, image_id FROM images"))
-    keypoints = {image: own for image, *own in copy.execute("SELECT image_id, cols, data FROM keypoints")}
+    keypoints = {image: content for image, *content in copy.execute("SELECT image_id, cols, data FROM keypoints")}
     labels = f"not those of {run.folder / 'labels.csv'}"
     for image, expected in zip(run.observations, run.corrected_px, strict=True):
         cols, data = keypoints.get(ids[image.name], (2, b""))
         xy = from_colmap_px(np.frombuffer(data or b"", np.float32).reshape(-1, cols or 2)[:, :2])
         if names.get(image.name) != ids[image.name] or len(xy) != len(expected):
             raise InputError("E-RUN-DATABASE", f"{database}: its keypoints of {image.name} are {labels}; run again")
-        off = np.abs(xy - expected).max(initial=0)
-        if not off <= KEYPOINT_TOLERANCE_PX:
+        off_px = np.abs(xy - expected).max(initial=0)
+        if not off_px <= KEYPOINT_TOLERANCE_PX:
             raise InputError(
                 "E-RUN-DATABASE",
-                f"{database}: its keypoints of {image.name} are {labels} (up to {off:.3g} px off, "
+                f"{database}: its keypoints of {image.name} are {labels} (up to {off_px:.3g} px off, "
                 f"{KEYPOINT_TOLERANCE_PX:g} allowed); run again",
             )
     if len(names) > len(ids):
-        other = next(name for name in names if name not in ids)
-        raise InputError("E-RUN-DATABASE", f"{database}: its images, with {other}, are {labels}; run again")
+        unknown = next(name for name in names if name not in ids)
+        raise InputError("E-RUN-DATABASE", f"{database}: its images, with {unknown}, are {labels}; run again")
 
 
 def _require_matches(database: Path, copy: sqlite3.Connection, run: SavedRun, ids: dict[str, int]) -> None:
-    """Each pair matches what has the same label; of small sets every pair is there."""
+    """Checks that each pair matches circles of the same label, and that a small set has every pair."""
     images = {ids[image.name]: image for image in run.observations}
-    whole = kind_of_graph(len(run.observations), run.options.graph) == "all"
+    all_pairs = kind_of_graph(len(run.observations), run.options.graph) == "all"
     wanted = (
-        {(i + 1, j + 1) for i, j in image_graph(run.observations, run.board, "all").pairs.tolist()} if whole else set()
+        {(i + 1, j + 1) for i, j in image_graph(run.observations, run.board, "all").pairs.tolist()}
+        if all_pairs
+        else set()
     )
     for table in PAIRED:
-        found = set()
+        pairs = set()
         for first, second, matches in _matches(copy, table):
-            found.add((first, second))
+            pairs.add((first, second))
             a, b = images[first], images[second]
             if not np.array_equal(matches, match_labels(a, b)):
                 wrong = [f"{a.labels[i]} with {b.labels[j]}" for i, j in matches.tolist() if a.labels[i] != b.labels[j]]
-                what = f"match {wrong[0]}" if wrong else "do not match all that have the same label"
-                raise InputError("E-RUN-DATABASE", f"{database}: {table}: {a.name} and {b.name} {what}; run again")
-        if whole and found != wanted:
-            count = f"{len(found)} pairs of images, the {len(wanted)} of {run.folder / 'labels.csv'} needed"
+                fault = f"match {wrong[0]}" if wrong else "do not match all that have the same label"
+                raise InputError("E-RUN-DATABASE", f"{database}: {table}: {a.name} and {b.name} {fault}; run again")
+        if all_pairs and pairs != wanted:
+            count = f"{len(pairs)} pairs of images, the {len(wanted)} of {run.folder / 'labels.csv'} needed"
             raise InputError("E-RUN-DATABASE", f"{database}: {table}: {count}; run again")
 
 
@@ -212,7 +214,7 @@ CAMERA_SENSOR = 0
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What the exported database holds.
+    """Summary of an exported database.
 
     ``pairs`` : pairs of images with a two-view geometry; ``camera_models`` : COLMAP's names.
     """
@@ -225,25 +227,25 @@ class Exported:
 
 
 def export_database(database: Path, out: Path, schema: str, run: SavedRun | None = None) -> Exported:
-    """Write ``out``, the content of ``database`` in the schema of another COLMAP version.
+    """Writes the content of ``database`` to ``out`` in the schema of another COLMAP version.
 
-    Ids, the order of keypoints, matches and pairs, and every blob stay. ``database`` is only read; every blob, name
-    and reference in it must be whole, and with ``run`` all of it what the run has labelled. ``out`` is compared with it
-    and with the published schema before it appears; it appears complete or not at all.
+    Ids, the order of keypoints, matches and pairs, and every blob stay the same. ``database`` is only read. Every blob,
+    name and reference in it must be valid; if ``run`` is given, the content must be what the run has labelled. ``out``
+    is compared with the database and with the published schema before it appears. It appears complete or not at all.
 
     Parameters
     ----------
-    database : as pycolmap 4.2 writes it, with no other program at it
+    database : database of pycolmap 4.2 that no other program has open
     schema : name of a schema of :mod:`stcal.sfm.interop.schema`
-    run : whose database it is
+    run : run to which the database belongs
 
     Raises
     ------
     InputError
-        Unknown schema; ``out`` exists or cannot be written; ``database`` is in use, damaged or of another version; or
-        it holds something that has no place in the schema.
+        If the schema is unknown; ``out`` exists or cannot be written; ``database`` is in use, damaged or of another
+        version; or it holds something that has no place in the schema.
     StcalError
-        The written copy is not what it should be.
+        If the written copy differs from the database or the schema.
     """
     database, out = Path(database), Path(out)
     wanted = find_schema(schema)
@@ -273,7 +275,7 @@ def export_database(database: Path, out: Path, schema: str, run: SavedRun | None
 
 
 def read_tables(connection: sqlite3.Connection) -> dict[str, SchemaTable]:
-    """The tables of a database as SQLite describes them."""
+    """Returns the tables of a database as SQLite describes them, by name."""
     listing = "SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
     return {name: _read_table(connection, name, sql) for name, sql in connection.execute(listing).fetchall()}
 
@@ -302,7 +304,9 @@ def _read_table(connection: sqlite3.Connection, name: str, sql: str) -> SchemaTa
 
 
 def _open_unchanged(path: Path) -> sqlite3.Connection:
-    """Open for reading without a trace; InputError where another program is at it, or where it is no database.
+    """Opens a database for reading, without any trace.
+
+    Raises InputError if another program has it open, or if it is no database.
 
     SQLite makes side files beside a database in WAL mode even for a reader. ``immutable`` prevents it; it also skips
     the locks, which in WAL mode nobody holds while there are no side files.
@@ -322,10 +326,12 @@ def _open_unchanged(path: Path) -> sqlite3.Connection:
 
 
 def _copy(database: Path, source: sqlite3.Connection, copy: sqlite3.Connection) -> None:
-    """All pages of ``source`` in one step, and sound."""
+    """Copies all pages of ``source`` in one step, and checks them."""
     try:
         source.execute("BEGIN")
-        source.execute("SELECT 1 FROM sqlite_master").fetchone()  # takes the read lock; a backup waits for it for ever
+        source.execute(
+            "SELECT 1 FROM sqlite_master"
+        ).fetchone()  # takes the read lock, for which a backup would wait for ever
         source.backup(copy)
         faults = [fault for (fault,) in copy.execute("PRAGMA integrity_check(1)") if fault != "ok"]
         differences = table_differences(read_tables(copy), SOURCE)
@@ -344,7 +350,7 @@ def _in_use(path: Path, sign: str) -> InputError:
 
 
 def table_differences(found: dict[str, SchemaTable], wanted: Schema) -> list[str]:
-    """What in the tables ``found`` is not as the schema has it, table by table and column by column."""
+    """Returns the differences of the tables ``found`` from the schema, table by table and column by column."""
     names = [*wanted.tables, *(name for name in found if name not in wanted.tables)]
     return [line for name in names for line in _differences(name, found.get(name), wanted.tables.get(name))]
 
@@ -363,7 +369,7 @@ def _differences(name: str, found: SchemaTable | None, wanted: SchemaTable | Non
 
 
 def _require_expressible(database: Path, copy: sqlite3.Connection, wanted: Schema) -> None:
-    """InputError for the first thing in the database that has no place in the schema."""
+    """Raises InputError for the first content of the database that has no place in the schema."""
     _require_known(database, copy, wanted, "camera", "cameras", "model", "camera_models")
     _require_known(database, copy, wanted, "pair", "two_view_geometries", "config", "pair_configurations")
     _require_known(database, copy, wanted, "image", "descriptors", "type", "descriptor_types")
@@ -380,37 +386,40 @@ def _require_expressible(database: Path, copy: sqlite3.Connection, wanted: Schem
 
 
 def _require_known(database, copy, wanted: Schema, what: str, table: str, column: str, enumeration: str) -> None:
-    """The number in ``column`` must have a meaning in the schema."""
+    """Checks that every number in ``column`` has a meaning in the schema."""
     key = SOURCE.tables[table].columns[0].name
-    known = getattr(wanted, enumeration)
+    meanings = getattr(wanted, enumeration)
     for first, number in copy.execute(f"SELECT min({key}), {column} FROM {table} GROUP BY {column}"):
-        if number not in known:
-            having = [name for name, other in SCHEMAS.items() if number in getattr(other, enumeration)]
+        if number not in meanings:
+            having = [name for name, schema_with in SCHEMAS.items() if number in getattr(schema_with, enumeration)]
             name = getattr(SOURCE, enumeration).get(number, "unknown")
             raise _no_place(database, wanted, f"{what} {first} with {column} {number} ({name})", *having[:1])
 
 
 def _require_no_rigs(database: Path, copy: sqlite3.Connection, wanted: Schema) -> None:
-    """Before 3.12 each camera is alone and each image by itself, which is what COLMAP makes of it again later."""
-    shared = _count(copy, "SELECT 1 FROM rig_sensors")
-    if shared:
-        raise _no_place(database, wanted, f"a rig of more than one sensor ({shared} beside the first)", "3.12")
-    other = _count(
+    """Checks that every rig is one camera and every frame one image, with the same ids.
+
+    Versions before 3.12 have no rigs and frames. Later versions make exactly these from their databases.
+    """
+    extra_sensors = _count(copy, "SELECT 1 FROM rig_sensors")
+    if extra_sensors:
+        raise _no_place(database, wanted, f"a rig of more than one sensor ({extra_sensors} beside the first)", "3.12")
+    foreign_rigs = _count(
         copy,
         "SELECT 1 FROM rigs WHERE ref_sensor_type <> :camera OR rig_id <> ref_sensor_id"
         " OR ref_sensor_id NOT IN (SELECT camera_id FROM cameras)",
     )
-    if other:
-        raise _no_place(database, wanted, f"{other} rigs that are not each one camera of the same id", "3.12")
-    odd = _count(
+    if foreign_rigs:
+        raise _no_place(database, wanted, f"{foreign_rigs} rigs that are not each one camera of the same id", "3.12")
+    foreign_frames = _count(
         copy,
         "SELECT frame_id FROM frames LEFT JOIN frame_data USING (frame_id) LEFT JOIN images ON image_id = data_id"
         " GROUP BY frame_id HAVING count(*) <> 1 OR sensor_type IS NOT :camera OR frame_id IS NOT image_id"
         " OR sensor_id IS NOT camera_id OR rig_id IS NOT camera_id"
         " UNION ALL SELECT image_id FROM images WHERE image_id NOT IN (SELECT frame_id FROM frames)",
     )
-    if odd:
-        raise _no_place(database, wanted, f"{odd} frames that are not each one image of the same id", "3.12")
+    if foreign_frames:
+        raise _no_place(database, wanted, f"{foreign_frames} frames that are not each one image of the same id", "3.12")
 
 
 def _count(connection: sqlite3.Connection, select: str) -> int:
@@ -424,7 +433,7 @@ def _no_place(database: Path, wanted: Schema, what: str, since: str | None = Non
 
 
 def _shared_columns(table: SchemaTable) -> str:
-    """The columns that the table has here and in our database, as SQL."""
+    """Returns the columns that the table shares with our own database, as SQL."""
     return ", ".join(name for name in table.column_names() if name in SOURCE.tables[table.name].column_names())
 
 
@@ -433,7 +442,7 @@ def _rows(connection: sqlite3.Connection, table: SchemaTable) -> sqlite3.Cursor:
 
 
 def _write(copy: sqlite3.Connection, path: Path, wanted: Schema) -> None:
-    """A new file in rollback-journal mode: one file, which any program opens."""
+    """Writes a new file in rollback-journal mode, which is a single file that any program opens."""
     with closing(sqlite3.connect(path)) as out, out:
         for table in wanted.tables.values():
             for statement in table.statements():
@@ -457,7 +466,7 @@ def _require_schema(written: sqlite3.Connection, wanted: Schema) -> None:
 
 
 def _require_same_content(source: sqlite3.Connection, written: sqlite3.Connection, wanted: Schema) -> None:
-    """Row by row and value by value against our own database; columns that it has not are empty."""
+    """Compares every value with our own database, and checks that columns it does not have are empty."""
     for table in wanted.tables.values():
         for row, (ours, theirs) in enumerate(zip_longest(_rows(source, table), _rows(written, table)), start=1):
             if ours != theirs:
@@ -477,7 +486,10 @@ def _require_same_content(source: sqlite3.Connection, written: sqlite3.Connectio
 
 
 def _publish(partial: Path, out: Path) -> None:
-    """Give the finished file its name; unlike a rename, a link overwrites nothing that appeared meanwhile."""
+    """Gives the finished file its name by a link.
+
+    Unlike a rename, a link never overwrites a file that appeared meanwhile.
+    """
     try:
         os.link(partial, out)
     except FileExistsError as error:

@@ -1,4 +1,4 @@
-"""The final model for other programs: COLMAP's two forms, PLY, NVM and Bundler, checked to be the run's."""
+"""Export of the final model for other programs: COLMAP's two forms, PLY, NVM and Bundler, checked against the run."""
 
 import csv
 import io
@@ -31,22 +31,22 @@ from stcal.sfm.runs.report import CameraInSpace, ImageResiduals, ReportCamera
 from stcal.sfm.runs.saved import SavedRun, load_run
 
 ROUNDING = 1e-6
-"""Of a residual, relative, …"""
+"""Relative rounding error of a residual that is computed again from the model's files."""
 ROUNDING_PX = 1e-4
-"""… and in px: computed again from the model's files."""
+"""Absolute part of this rounding error, px."""
 SAME_PLACE_MM = 1e-6
 SAME_AXES = 1e-9
-"""Of cameras in the model and in ``report.json``, which have the same doubles."""
+"""Largest deviation of a camera's axes. Model and ``report.json`` have the same doubles."""
 
 
 class Cameras(Part):
-    """What of the report's picture in space is needed."""
+    """The cameras of the report's spatial picture."""
 
     cameras: list[CameraInSpace]
 
 
 class ReportOfModel(Part):
-    """What ``report.json`` says of the run's final model."""
+    """The parts of ``report.json`` on the run's final model."""
 
     camera: ReportCamera
     residuals_by_image: list[ImageResiduals]
@@ -55,8 +55,11 @@ class ReportOfModel(Part):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What an image shows of the model: ``labels`` of n points, ``xyz`` (n, 3) mm, target frame, and ``xy_px`` (n, 2)
-    of their keypoints, OpenCV pixel origin."""
+    """The points that an image shows.
+
+    ``labels`` : of n points; ``xyz`` : (n, 3) mm, target frame; ``xy_px`` : (n, 2) their keypoints, OpenCV pixel
+    origin.
+    """
 
     camera_from_target: Rigid
     labels: Sequence[Label]
@@ -64,49 +67,49 @@ class View:
     xy_px: np.ndarray
 
     def off_px(self, camera: Camera) -> np.ndarray:
-        """(n,) how far keypoints are from the images of their points; infinite where a point is behind the camera."""
-        inside = self.camera_from_target @ self.xyz
+        """Returns the distances (n,) of keypoints from their projected points, px; infinite behind the camera."""
+        xyz_camera = self.camera_from_target @ self.xyz
         with np.errstate(all="ignore"):
-            off = np.linalg.norm(camera.project(inside) - self.xy_px, axis=1)
-        return np.where((inside[:, 2] > 0) & np.isfinite(off), off, np.inf)
+            distance_px = np.linalg.norm(camera.project(xyz_camera) - self.xy_px, axis=1)
+        return np.where((xyz_camera[:, 2] > 0) & np.isfinite(distance_px), distance_px, np.inf)
 
 
 def require_fit(path: Path, views: Mapping[str, View], camera: Camera, report: ReportOfModel) -> None:
-    """Every keypoint must be as near to its point's image as the report says, and every camera where it says.
+    """Checks the residual of every keypoint and the pose of every camera against the report.
 
     Parameters
     ----------
     path : Path
-        Of the model, for messages.
+        Path of the model, for messages.
     views : mapping of str to View
-        By image.
+        Views by name of the image.
     camera : Camera
-        The model's.
+        Camera of the model.
     report : ReportOfModel
-        Of its run.
+        Report of the model's run.
 
     Raises
     ------
     InputError
-        Names the image, the point that is farthest off by its limit, and by how much.
+        If one deviates. The message names the point and image that exceed their limit most, and the deviation.
     """
     limits = {row.image: row for row in report.residuals_by_image}
     worst = (1.0, "")
     for image, view in views.items():
         row = limits.get(image)
         if row is None or row.observations != len(view.labels) or not len(view.labels):
-            known = 0 if row is None else row.observations
+            expected = 0 if row is None else row.observations
             raise InputError(
                 "E-MODEL-NOT-OF-RUN",
-                f"model {path}: image {image} shows {len(view.labels)} points, {known} by report.json; run it again",
+                f"model {path}: image {image} shows {len(view.labels)} points, {expected} by report.json; run it again",
             )
         limit = (1 + ROUNDING) * max(row.max_px, 0.0) + ROUNDING_PX
-        off = view.off_px(camera)
-        k = int(np.argmax(off))
-        if off[k] / limit > worst[0]:
-            far = f"{off[k]:.3g} px from its keypoint, {row.max_px:.3g} px allowed by report.json"
-            where = far if np.isfinite(off[k]) else "behind the camera"
-            worst = off[k] / limit, f"{view.labels[k]} in {image} is {where}"
+        off_px = view.off_px(camera)
+        farthest = int(np.argmax(off_px))
+        if off_px[farthest] / limit > worst[0]:
+            distance = f"{off_px[farthest]:.3g} px from its keypoint, {row.max_px:.3g} px allowed by report.json"
+            where = distance if np.isfinite(off_px[farthest]) else "behind the camera"
+            worst = off_px[farthest] / limit, f"{view.labels[farthest]} in {image} is {where}"
     if worst[1]:
         raise InputError(
             "E-MODEL-NOT-OF-RUN",
@@ -116,35 +119,41 @@ def require_fit(path: Path, views: Mapping[str, View], camera: Camera, report: R
 
 
 def _require_places(path: Path, views: Mapping[str, View], report: ReportOfModel) -> None:
-    """Residuals do not tell a model that was moved, turned or scaled as a whole."""
-    known = {camera.image: camera for camera in report.scene.cameras}
-    missing = sorted(known.keys() ^ views.keys())
+    """Checks the poses of the cameras against the report.
+
+    Residuals cannot show that a model was moved, turned or scaled as a whole.
+    """
+    camera_of_image = {camera.image: camera for camera in report.scene.cameras}
+    missing = sorted(camera_of_image.keys() ^ views.keys())
     if missing:
         raise InputError(
             "E-MODEL-NOT-OF-RUN", f"model {path}: image {missing[0]} is not in both model and report.json; run it again"
         )
     for image, view in views.items():
-        apart = np.linalg.norm(view.camera_from_target.inverse().translation - known[image].position_mm)
-        turned = np.abs(view.camera_from_target.rotation - known[image].axes).max()
-        if not (apart <= SAME_PLACE_MM and turned <= SAME_AXES):
+        off = np.linalg.norm(view.camera_from_target.inverse().translation - camera_of_image[image].position_mm)
+        axes_off = np.abs(view.camera_from_target.rotation - camera_of_image[image].axes).max()
+        if not (off <= SAME_PLACE_MM and axes_off <= SAME_AXES):
             raise InputError(
                 "E-MODEL-NOT-OF-RUN",
-                f"model {path}: image {image}: its camera is {apart:.3g} mm from where report.json has it (axes differ "
-                f"by {turned:.2g}), {SAME_PLACE_MM:g} mm allowed; run it again",
+                f"model {path}: image {image}: its camera is {off:.3g} mm from where report.json has it (axes differ "
+                f"by {axes_off:.2g}), {SAME_PLACE_MM:g} mm allowed; run it again",
             )
 
 
 ModelFormat = Literal["colmap-bin", "colmap-txt", "ply", "nvm", "bundler"]
 FOLDERS = ("colmap-bin", "colmap-txt", "bundler")
-"""Formats of several files: OUT is a folder; that of the others is a file, with ``OUT.labels.csv`` beside it."""
+"""Formats of several files, for which OUT is a folder. The others are a file, with ``OUT.labels.csv`` beside it."""
 TARGET_MODEL = "target_model"
 LABEL_COLUMNS = ["point", "group", "label", "x_mm", "y_mm", "z_mm", "sigma_x_um", "sigma_y_um", "sigma_z_um"]
 
 
 @dataclass(frozen=True, slots=True)
 class ExportedModel:
-    """What was written: ``path`` and ``labels``, counts, and where the format knows nothing better the ``focal_px``
-    and ``centre_px`` (OpenCV pixel origin) of the ideal camera in place of the run's."""
+    """Summary of an exported model.
+
+    ``path``, ``labels`` : written files; ``images``, ``points`` : counts; ``focal_px``, ``centre_px`` : ideal camera in
+    place of the run's, OpenCV pixel origin, None if the format holds the run's camera.
+    """
 
     path: Path
     labels: Path
@@ -156,8 +165,11 @@ class ExportedModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Point:
-    """A point of the model: its ``id``; ``group``, empty where several have it in common; ``xyz`` (3,), target frame,
-    mm; ``rgb``; ``views`` : (image id, keypoint)."""
+    """A point of the model.
+
+    ``group`` : name of its group, empty if several groups share it; ``xyz`` : (3,), target frame, mm; ``views`` :
+    (image id, keypoint).
+    """
 
     id: int
     group: str
@@ -168,24 +180,23 @@ class _Point:
 
 
 def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
-    """Write a run's final model, mm, target frame, in another program's format; it appears complete or not at all.
+    """Writes a run's final model, mm, target frame, in another program's format. It appears complete or not at all.
 
-    The model must be the one that the report is of: every keypoint as near to the image of its point as it says, every
-    camera where it says.
+    The model must agree with the report in the residual of every keypoint and the pose of every camera.
 
-    NVM and Bundler know one focal length, little distortion and a centred principal point. They get an ideal camera,
-    without distortion, and the keypoints where that camera sees them; it is exact, but photographs have to be
+    NVM and Bundler support one focal length, little distortion and a centred principal point. They get an ideal camera
+    without distortion, and the keypoints as this camera sees them. This is exact, but photographs have to be
     undistorted to match.
 
     Parameters
     ----------
-    out : new, or an empty folder for a format that is a folder; folders above it are made
+    out : new file or folder, or an empty folder for a format of :data:`FOLDERS`; missing parent folders are made
     kind : a :data:`ModelFormat`
 
     Raises
     ------
     InputError
-        Not a finished run, a damaged or changed model in it, an unknown format, or an ``out`` that exists.
+        If it is no finished run, its model is damaged or changed, the format is unknown, or ``out`` exists.
     """
     out = Path(out)
     if kind not in get_args(ModelFormat):
@@ -204,10 +215,10 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.partial-", dir=out.parent) as scratch:
             partial = Path(scratch) / out.name
-            beside = partial / labels.name if kind in FOLDERS else Path(scratch) / labels.name
+            partial_labels = partial / labels.name if kind in FOLDERS else Path(scratch) / labels.name
             if kind in FOLDERS:
                 partial.mkdir()
-            beside.write_text(_labels_csv(points, saved.faces, kind), encoding="utf-8")
+            partial_labels.write_text(_labels_csv(points, saved.faces, kind), encoding="utf-8")
             match kind:
                 case "colmap-bin" | "colmap-txt":
                     write_reconstruction(reconstruction, partial, text=kind == "colmap-txt")
@@ -220,7 +231,7 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
                     (partial / "bundle.out").write_text(bundle, encoding="utf-8")
                     (partial / "list.txt").write_text(names, encoding="utf-8")
             if kind not in FOLDERS:
-                os.replace(beside, labels)
+                os.replace(partial_labels, labels)
             elif out.exists():
                 out.rmdir()  # empty; not every system lets a folder take its place
             os.replace(partial, out)
@@ -232,9 +243,9 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
 
 
 def _require_free(out: Path, labels: Path, kind: str) -> None:
-    above = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
-    if not above.is_dir():
-        raise InputError("E-OUTPUT-FOLDER", f"{out}: {above} is a file; give another place")
+    existing = next(folder for folder in out.absolute().parents if os.path.lexists(folder))
+    if not existing.is_dir():
+        raise InputError("E-OUTPUT-FOLDER", f"{out}: {existing} is a file; give another place")
     empty = kind in FOLDERS and out.is_dir() and not any(out.iterdir())
     for path in (out, labels):
         if os.path.lexists(path) and not (path == out and empty):
@@ -243,7 +254,7 @@ def _require_free(out: Path, labels: Path, kind: str) -> None:
 
 
 def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Point]]:
-    """The run's model, its points coloured, and the points by ascending id."""
+    """Returns the run's model with coloured points, and the points by ascending id."""
     path = run.folder / TARGET_MODEL
     if not path.is_dir():
         raise InputError("E-RUN-VERSION", f"run {run.folder}: of another version, no {TARGET_MODEL}; run it again")
@@ -284,24 +295,24 @@ def _labelled_points(run: SavedRun) -> tuple[pycolmap.Reconstruction, list[_Poin
 
 
 def _views(run: SavedRun, reconstruction: pycolmap.Reconstruction, points: Sequence[_Point]) -> dict[str, View]:
-    """What each image shows, by its name."""
+    """Returns the view of each image, by name."""
     images = _images(reconstruction)
-    shown: dict[int, list[tuple[_Point, int]]] = {image.image_id: [] for image in images}
+    points_of_image: dict[int, list[tuple[_Point, int]]] = {image.image_id: [] for image in images}
     for point in points:
         for image_id, k in point.views:
-            shown[image_id].append((point, k))
-    views = {}
+            points_of_image[image_id].append((point, k))
+    view_of_image = {}
     for image in images:
-        own = shown[image.image_id]
-        xy = np.array([image.points2D[k].xy for _, k in own]).reshape(-1, 2)
-        xyz = np.array([point.xyz for point, _ in own]).reshape(-1, 3)
+        seen_points = points_of_image[image.image_id]
+        xy = np.array([image.points2D[k].xy for _, k in seen_points]).reshape(-1, 2)
+        xyz = np.array([point.xyz for point, _ in seen_points]).reshape(-1, 3)
         pose = pose_of_image(run.folder / TARGET_MODEL, image)
-        views[image.name] = View(pose, [point.label for point, _ in own], xyz, from_colmap_px(xy))
-    return views
+        view_of_image[image.name] = View(pose, [point.label for point, _ in seen_points], xyz, from_colmap_px(xy))
+    return view_of_image
 
 
 def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:
-    """``labels.csv``: COLMAP's files name points by id, the others by their place, from 0."""
+    """Returns ``labels.csv``. Its first column is the point's id in COLMAP's files, in others its index from 0."""
     covariance = faces.circle_covariance_mm2
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
@@ -316,7 +327,10 @@ def _labels_csv(points: Sequence[_Point], faces: FacesFile, kind: str) -> str:
 
 
 def _ply(points: Sequence[_Point]) -> str:
-    """Text PLY in double precision: pycolmap's own has single, and its points in an order that is not documented."""
+    """Returns text PLY in double precision.
+
+    pycolmap's own PLY has single precision, and an order of points that is not documented.
+    """
     header = [
         "ply",
         "format ascii 1.0",
@@ -329,9 +343,10 @@ def _ply(points: Sequence[_Point]) -> str:
 
 
 def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float) -> str:
-    """VisualSFM's format (ccwu.me/vsfm/doc.html#nvm): y down, z forward, measurements relative to the principal point.
+    """Returns the model in VisualSFM's format (ccwu.me/vsfm/doc.html#nvm).
 
-    MeshLab wants the spaces at the ends of the first lines; a space in a name is written as a quotation mark.
+    y points down, z forward, and measurements are relative to the principal point. MeshLab needs the spaces at the ends
+    of the first lines. A space in a name is written as a quotation mark.
     """
     images = _images(reconstruction)
     place = {image.image_id: i for i, image in enumerate(images)}
@@ -351,8 +366,10 @@ def _nvm(reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run:
 def _bundler(
     reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float
 ) -> tuple[str, str]:
-    """``bundle.out`` and ``list.txt`` (Bundler's manual, section VI): y up, the camera looks along −z, views relative
-    to the image's centre."""
+    """Returns ``bundle.out`` and ``list.txt`` (Bundler's manual, section VI).
+
+    y points up, the camera looks along −z, and views are relative to the image's centre.
+    """
     images = _images(reconstruction)
     place = {image.image_id: i for i, image in enumerate(images)}
     lines = ["# Bundle file v0.3", f"{len(images)} {len(points)}"]
@@ -375,13 +392,13 @@ def _images(reconstruction: pycolmap.Reconstruction) -> list[pycolmap.Image]:
 def _ideal_px(
     reconstruction: pycolmap.Reconstruction, points: Sequence[_Point], run: SavedRun, focal_px: float
 ) -> list[np.ndarray]:
-    """Where the ideal camera sees the views of every point, (n, 2), relative to its principal point, y down."""
+    """Returns the views of every point in the ideal camera, (n, 2) px, relative to its principal point, y down."""
     xy_px = [[reconstruction.image(i).points2D[k].xy for i, k in point.views] for point in points]
-    counts = np.cumsum([len(each) for each in xy_px])
+    counts = np.cumsum([len(views) for views in xy_px])
     ideal = focal_px * run.camera.normalised_from_pixel(from_colmap_px(np.concatenate(xy_px)))
     return np.split(ideal, counts[:-1])
 
 
 def _numbers(*values: float) -> str:
-    """Shortest text that reads back as the same numbers."""
+    """Returns the shortest text that reads back as the same numbers."""
     return " ".join(map(repr, values))

@@ -1,4 +1,4 @@
-"""Scale and faces from COLMAP models that someone made or edited elsewhere: the native mapper, the GUI."""
+"""Scale and faces from COLMAP models that were made or edited elsewhere, by the native mapper or in the GUI."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,17 +30,18 @@ def _options(run: SavedRun, solve: Chained) -> AdjustOptions:
 
 
 def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained = "chain") -> Calibration:
-    """Our scale and face stages, group by group and chained, on models of the run's groups as they are; or as
-    Zhang & Wei (2017) have these stages, with ``solve`` ``paper``.
+    """Returns scale and faces of unchanged models of the run's groups, group by group and chained.
+
+    ``solve`` : ``chain`` for our stages, ``paper`` for those of Zhang & Wei (2017).
 
     Raises
     ------
     InputError
-        The models state different cameras.
+        If the models state different cameras.
     ScaleError
-        A group's board is not in its model.
+        If the board of a group is not in its model.
     MappingError
-        The reference face is in none of the models, or a face is not linked to it.
+        If the reference face is in none of the models, or a face is not linked to it.
     """
     models: dict[str, WorldModel] = {}
     notes = []
@@ -75,9 +76,9 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained =
                 models[model.group] = model
     notes += [f"group {name}: in none of the models" for name in run.groups() if name not in models]
     options = _options(run, solve)
-    ordered = [models[name] for name in run.groups() if name in models]
+    models_in_order = [models[name] for name in run.groups() if name in models]
     try:
-        calibration = calibrate(ordered, read[0].camera, run.target, run.board, options)
+        calibration = calibrate(models_in_order, read[0].camera, run.target, run.board, options)
     except MappingError as error:
         raise MappingError(error.code, "; ".join([str(error), *notes])) from error
     return replace(calibration, notes=(*notes, *calibration.notes))
@@ -85,20 +86,20 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained =
 
 @one_thread()
 def calibrate_models(model: Path, run: SavedRun, solve: Chained = "chain") -> Calibration:
-    """Scale and faces from a COLMAP model, or the models in a folder, that rest on the run's database."""
+    """Returns scale and faces from a COLMAP model, or from the models in a folder, of the run's database."""
     ids = image_ids(run.observations)
     read = [read_model(path, run.observations, ids, run.corrected_px) for path in find_models(model)]
     return faces_from_models(read, run, solve)
 
 
 def write_faces(path: Path, calibration: Calibration, run: SavedRun, solve: Chained = "chain") -> None:
-    """``faces.json`` of models that were chained."""
+    """Writes ``faces.json`` of chained models."""
     options = _options(run, solve)
     faces = FacesFile.of(calibration.target, run.target, options, calibration.sigma_factors.circles)
     save(path, json_text(faces.content()))
 
 
 def _camera_change_px(camera: Camera, run: SavedRun) -> float:
-    """How far another camera moves the images of what the run's keypoints show, at most."""
+    """Returns the largest change of the run's keypoints, per coordinate, by projection with another camera, px."""
     ideal = np.concatenate([image.centre for image in run.observations])
     return float(np.abs(camera.pixel_from_normalised(ideal) - run.camera.pixel_from_normalised(ideal)).max())

@@ -1,8 +1,8 @@
-"""How the ranked pairs fare at the gates for the initial pair: ours, and COLMAP's as we set them and at its defaults.
+"""Gates of the ranked pairs for the initial pair: our own, and COLMAP's with our options and with its defaults.
 
 COLMAP's gates are taken from its source (4.2: ``EstimateInitialTwoViewGeometry`` in sfm/incremental_mapper_impl.cc,
-``InitializeReconstruction`` and ``Run`` in controllers/incremental_pipeline.cc). What they measure COLMAP measures
-itself here, pair by pair, from the centres that the mapping had.
+``InitializeReconstruction`` and ``Run`` in controllers/incremental_pipeline.cc). COLMAP itself measures their values
+here, pair by pair, from the centres of the mapping.
 """
 
 import tempfile
@@ -23,17 +23,20 @@ from stcal.sfm.mapping.pairs import MIN_ANGLE_RAD, MIN_IN_FRONT, MIN_LABELS, Pai
 from stcal.sfm.runs.saved import SavedRun
 
 MIN_TRIALS = 30
-"""Of RANSAC, for the initial pair: a constant of COLMAP, not an option."""
+"""Least number of RANSAC trials for the initial pair, a constant of COLMAP and not an option."""
 MIN_INLIERS = pycolmap.TwoViewGeometryOptions().min_num_inliers
-"""Whatever ``init_min_num_inliers`` is: COLMAP estimates the initial pair with this option at its default."""
+"""Least number of inliers for any ``init_min_num_inliers``, as COLMAP estimates the initial pair with this default."""
 RELAXATIONS = 2
-"""How often COLMAP's pipeline halves the inliers, and then the angle, where not every image was registered."""
+"""Number of times that COLMAP's pipeline halves each limit, inliers and angle, while images are not registered."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """``name``; measured ``value`` and ``limit`` (angles in rad; ``pose`` : COLMAP's name of the configuration, and no
-    limit); ``passed``."""
+    """A gate for the initial pair.
+
+    ``value``, ``limit`` : measured value and its limit, angles in rad; the gate ``pose`` has COLMAP's name of the
+    configuration as value, and no limit.
+    """
 
     name: str
     value: float | str
@@ -43,8 +46,11 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class GateVerdict:
-    """COLMAP's ``gates`` in its order, at the limits as given; ``relaxations`` : how many times it halves a limit
-    until the pair passes, 0 where it passes at once, None where it never does."""
+    """Verdict of COLMAP on a pair.
+
+    ``gates`` : in COLMAP's order, at the limits as given; ``relaxations`` : number of times that COLMAP halves a limit
+    until the pair passes, 0 if it passes at once, None if it never passes.
+    """
 
     gates: tuple[Gate, ...]
     relaxations: int | None
@@ -52,7 +58,7 @@ class GateVerdict:
 
 @dataclass(frozen=True, slots=True)
 class PairGates:
-    """A ranked pair: ``own`` gates, and COLMAP's verdict with our options and with its defaults."""
+    """A ranked pair with our ``own`` gates, and COLMAP's verdict with our options and with its defaults."""
 
     score: PairScore
     own: tuple[Gate, ...]
@@ -62,8 +68,11 @@ class PairGates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _TwoViews:
-    """COLMAP's estimate of one pair: ``matches``, ``inliers`` counts; ``configuration``; ``pose``, None without;
-    ``forward`` |t_z| and ``angle_rad``, the median ray angle."""
+    """COLMAP's estimate of one pair.
+
+    ``matches``, ``inliers`` : counts; ``pose`` : None if there is no pose; ``forward`` : |t_z|; ``angle_rad`` : median
+    angle between the rays.
+    """
 
     matches: int
     inliers: int
@@ -74,17 +83,17 @@ class _TwoViews:
 
 
 def run_gates(run: SavedRun, group: str | None = None) -> dict[str, list[PairGates]]:
-    """The gates of every ranked pair of a run by group, or of one group; the pairs in the run's order.
+    """Returns the gates of every ranked pair of a run or of one of its groups, by group, in the run's order.
 
     Raises
     ------
     InputError
-        There is no such group, or the report lacks its pairs.
+        If there is no such group, or the report lacks its pairs.
     """
     ranked = ranked_pairs(run)
     if group is not None and group not in ranked:
         raise InputError("E-RUN-NO-GROUP", f"group {group}: not in run {run.folder}; give one of {', '.join(ranked)}")
-    found = {}
+    gates_of_group = {}
     for name in ranked if group is None else [group]:
         names = {image for score in ranked[name] for image in (score.first, score.second)}
         images = [image for image in run.observations if image.name in names]
@@ -93,17 +102,17 @@ def run_gates(run: SavedRun, group: str | None = None) -> dict[str, list[PairGat
             raise InputError(
                 "E-RUN-DAMAGED", f"{run.folder / 'report.json'}: no image {min(missing)} in labels.csv; run it again"
             )
-        found[name] = group_gates(images, ranked[name], run.camera, run.options.pairs)
-    return found
+        gates_of_group[name] = group_gates(images, ranked[name], run.camera, run.options.pairs)
+    return gates_of_group
 
 
 def ranked_pairs(run: SavedRun) -> dict[str, list[PairScore]]:
-    """The pairs of a run by group, as it ranked them, the chosen one first; without their poses.
+    """Returns the pairs of a run by group, as the run ranked them, the chosen one first; without their poses.
 
     Raises
     ------
     InputError
-        A report without them.
+        If the report has no ranked pairs.
     """
     try:
         return {
@@ -134,11 +143,11 @@ def group_gates(
     camera: CalibratedCamera,
     options: PairOptions,
 ) -> list[PairGates]:
-    """The gates of some pairs of a group's images.
+    """Returns the gates of ranked pairs of a group's images.
 
     Parameters
     ----------
-    group : the images that are mapped together; more than two matter for tracks of two views, which the defaults skip
+    group : all images that are mapped together, as the defaults ignore tracks of two views
     """
     pycolmap.logging.minloglevel = LOG_ERRORS_ONLY
     native = colmap_camera(camera)
@@ -158,7 +167,7 @@ def group_gates(
 
 
 def own_gates(score: PairScore, options: PairOptions) -> tuple[Gate, ...]:
-    """Our gates; of a pair with too few labels nothing else was measured."""
+    """Returns our gates, or the first one alone if the pair has too few labels, as nothing else was measured then."""
     labels = Gate("labels", score.shared, MIN_LABELS, score.shared >= MIN_LABELS)
     if not labels.passed:
         return (labels,)
@@ -172,7 +181,7 @@ def own_gates(score: PairScore, options: PairOptions) -> tuple[Gate, ...]:
 
 
 def _defaults(names: list[str], pair: tuple[int, int]) -> pycolmap.IncrementalPipelineOptions:
-    """COLMAP's defaults, but for the seed, which would be another one each time."""
+    """Returns COLMAP's defaults with a fixed seed."""
     options = pycolmap.IncrementalPipelineOptions()
     options.image_names = names
     options.init_image_id1, options.init_image_id2 = pair
@@ -181,20 +190,20 @@ def _defaults(names: list[str], pair: tuple[int, int]) -> pycolmap.IncrementalPi
 
 
 def attempts(options: pycolmap.IncrementalPipelineOptions) -> list[pycolmap.IncrementalMapperOptions]:
-    """The mapper's options as set, and as COLMAP's pipeline relaxes them one after the other."""
-    found = [options.get_mapper()]
+    """Returns the mapper's options as set, followed by the relaxed ones in the order of COLMAP's pipeline."""
+    mappers = [options.get_mapper()]
     for count in range(1, 2 * RELAXATIONS + 1):
         mapper = options.get_mapper()
         mapper.init_min_num_inliers //= 2 ** ((count + 1) // 2)
         mapper.init_min_tri_angle /= 2 ** (count // 2)
-        found.append(mapper)
-    return found
+        mappers.append(mapper)
+    return mappers
 
 
 def _limits(
     options: pycolmap.IncrementalPipelineOptions, mapper: pycolmap.IncrementalMapperOptions
 ) -> dict[str, float]:
-    """Limit of every gate that has one; the angle in rad."""
+    """Returns the limit of every gate that has one; the angle in rad."""
     return {
         "matches": options.min_num_matches,
         "inliers": max(mapper.init_min_num_inliers, MIN_INLIERS),
@@ -214,7 +223,7 @@ class _Mapping:
             self.cache = pycolmap.DatabaseCache.create(opened, wanted)
 
     def two_views(self, a: ImageObservations, b: ImageObservations, native: pycolmap.Camera) -> _TwoViews:
-        """COLMAP's estimate, also where it has fewer inliers than COLMAP accepts."""
+        """Returns COLMAP's estimate, even if it has fewer inliers than COLMAP accepts."""
         mapper = self.options.get_mapper()
         options = pycolmap.TwoViewGeometryOptions()
         options.min_num_inliers = 1
@@ -224,16 +233,16 @@ class _Mapping:
         matches = match_labels(a, b)
         views = native, to_colmap_px(a.centre_px), native, to_colmap_px(b.centre_px)
         geometry = pycolmap.estimate_calibrated_two_view_geometry(*views, matches, options)
-        found = pycolmap.estimate_two_view_geometry_pose(*views, geometry)
+        has_pose = pycolmap.estimate_two_view_geometry_pose(*views, geometry)
         name = pycolmap.TwoViewGeometryConfiguration(geometry.config).name
         inliers = len(geometry.inlier_matches)
-        pose = geometry.cam2_from_cam1 if found else None
+        pose = geometry.cam2_from_cam1 if has_pose else None
         if pose is None:
             return _TwoViews(len(matches), inliers, name, None, 0.0, 0.0)
         return _TwoViews(len(matches), inliers, name, pose, float(abs(pose.translation[2])), float(geometry.tri_angle))
 
     def verdict(self, pair: tuple[int, int], views: _TwoViews) -> GateVerdict:
-        """At the limits as set, and if they refuse the pair, at the first relaxed ones that let it pass."""
+        """Returns the gates at the limits as set, and the number of relaxations with which the pair passes."""
         first, *relaxed = attempts(self.options)
         gates = self.gates(pair, views, first)
         if all(gate.passed for gate in gates):
@@ -246,7 +255,7 @@ class _Mapping:
     def gates(
         self, pair: tuple[int, int], views: _TwoViews, mapper: pycolmap.IncrementalMapperOptions
     ) -> tuple[Gate, ...]:
-        """The gates in COLMAP's order; without a pose there is nothing to measure for the last three."""
+        """Returns the gates in COLMAP's order, without the last three if there is no pose."""
         limit = _limits(self.options, mapper)
         loaded = views.matches >= limit["matches"]
         gates = (
@@ -267,7 +276,7 @@ class _Mapping:
     def points_left(
         self, pair: tuple[int, int], second_from_first: pycolmap.Rigid3d, mapper: pycolmap.IncrementalMapperOptions
     ) -> int:
-        """Points that COLMAP triangulates in the pair and keeps after adjusting and filtering it."""
+        """Returns the number of points that COLMAP triangulates in the pair, adjusts, and keeps after filtering."""
         reconstruction = pycolmap.Reconstruction()
         mapping = pycolmap.IncrementalMapper(self.cache)
         mapping.begin_reconstruction(reconstruction)
@@ -291,7 +300,7 @@ BROKEN = {"≥": "<", "<": "≥", ">": "≤"}
 
 
 def pairs_table(group: str, images: int, rows: Sequence[PairGates], shown: int) -> str:
-    """The first ``shown`` pairs of a group's ``images`` as text, the chosen one marked."""
+    """Returns the first ``shown`` pairs of a group as text, with the chosen one marked. ``images`` : their number."""
     heading = f"group {group}: {len(rows)} pairs of {images} images"
     if shown < len(rows):
         heading += f", the first {shown} (--all for the other {len(rows) - shown})"
@@ -324,15 +333,17 @@ def pairs_table(group: str, images: int, rows: Sequence[PairGates], shown: int) 
 
 
 def limits_text(options: PairOptions) -> str:
-    """What the table's verdicts rest on."""
+    """Returns the limits on which the table's verdicts rest, as text."""
     lines = []
     for title, options_of in (("as set", pipeline_options), ("COLMAP's defaults", _defaults)):
         pipeline = options_of([], (1, 2))
-        tries = attempts(pipeline)
-        limits, relaxed = (_limits(pipeline, mapper) for mapper in (tries[0], tries[-1]))
-        words = ", ".join(f"{name} {KEPT[name]} {_number(name, value)}" for name, value in limits.items())
-        end = ", ".join(f"{name} {KEPT[name]} {_number(name, relaxed[name])}" for name in ("inliers", "angle"))
-        lines.append(f"{title}: {words}; relaxed {len(tries) - 1}×: {end}")
+        mappers = attempts(pipeline)
+        limits, relaxed = (_limits(pipeline, mapper) for mapper in (mappers[0], mappers[-1]))
+        limits_as_text = ", ".join(f"{name} {KEPT[name]} {_number(name, value)}" for name, value in limits.items())
+        relaxed_as_text = ", ".join(
+            f"{name} {KEPT[name]} {_number(name, relaxed[name])}" for name in ("inliers", "angle")
+        )
+        lines.append(f"{title}: {limits_as_text}; relaxed {len(mappers) - 1}×: {relaxed_as_text}")
     mapper = pipeline_options([], (1, 2)).get_mapper()
     return "\n".join(
         [

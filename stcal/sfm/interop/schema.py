@@ -47,7 +47,7 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class Index:
-    """A unique index; those that SQLite makes by itself for UNIQUE columns have no name here."""
+    """A unique index. ``name`` : None for an index that SQLite makes by itself for UNIQUE columns."""
 
     name: str | None
     columns: tuple[str, ...]
@@ -55,7 +55,7 @@ class Index:
 
 @dataclass(frozen=True, slots=True)
 class SchemaTable:
-    """A table: ``check`` is the condition of its CHECK constraint."""
+    """A table. ``check`` : condition of its CHECK constraint."""
 
     name: str
     columns: tuple[Column, ...]
@@ -65,11 +65,11 @@ class SchemaTable:
     check: str | None = None
 
     def column_names(self) -> tuple[str, ...]:
-        """Names of the columns in their order."""
+        """Returns the names of the columns in their order."""
         return tuple(column.name for column in self.columns)
 
     def statements(self) -> list[str]:
-        """SQL that makes the table and its named indices."""
+        """Returns the SQL statements that make the table and its named indices."""
         parts = [f"{c} AUTOINCREMENT" if c.key and self.autoincrement else str(c) for c in self.columns]
         parts += [f"UNIQUE ({', '.join(index.columns)})" for index in self.indices if index.name is None]
         if self.check:
@@ -86,7 +86,7 @@ class SchemaTable:
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """What a version's database holds.
+    """The database schema of a COLMAP version.
 
     ``user_version`` : the stamp of the version's first release;
     ``camera_models``, ``pair_configurations``, ``descriptor_types`` : name by number, as stored in ``cameras.model``,
@@ -101,7 +101,7 @@ class Schema:
     descriptor_types: dict[int, str]
 
     def following(self, name: str, *changed: SchemaTable, **others) -> "Schema":
-        """The schema of a later version: tables added or replaced, and other fields."""
+        """Returns the schema of a later version, with changed tables added or replaced, and changed fields."""
         return replace(self, name=name, tables=self.tables | {table.name: table for table in changed}, **others)
 
 
@@ -232,22 +232,22 @@ _4_2 = _4_0.following(
 )
 
 SCHEMAS = {schema.name: schema for schema in (_3_8, _3_9, _3_10, _3_11, _3_12, _3_13, _4_0, _4_2)}
-"""Published schemas by name, oldest first."""
+"""All published schemas by name, the oldest first."""
 
 SOURCE = _4_2
 """The schema of our own database, which pycolmap 4.2 writes."""
 
 _SAME_TABLES = {"4.1": "4.0"}
-"""Versions without a schema of their own."""
+"""Versions that have the tables of another version."""
 
 
 def find_schema(name: str) -> Schema:
-    """The schema of that name.
+    """Returns the schema of that name.
 
     Raises
     ------
     InputError
-        Not the name of a schema.
+        If it is not the name of a schema.
     """
     if name not in SCHEMAS:
         raise InputError("E-OPTION-VALUE", f"schema {name}: unknown; give one of {', '.join(SCHEMAS)}")
@@ -255,19 +255,20 @@ def find_schema(name: str) -> Schema:
 
 
 def schema_of_version(version: str) -> str:
-    """Name of the schema that a COLMAP program of ``version`` (``3.8``, ``3.11.1``, ``4.0.3``) reads and writes.
+    """Returns the name of the schema that a COLMAP program of ``version`` (``3.8``, ``3.11.1``, ``4.0.3``) reads and
+    writes.
 
     Raises
     ------
     InputError
-        Not a release, older than 3.8, or newer than what is known here.
+        If the version is no release, older than 3.8, or newer than the newest schema here.
     """
     release = re.fullmatch(r"(\d+\.\d+)(\.\d+)?", version)
     minor = release[1] if release else version
     name = _SAME_TABLES.get(minor, minor)
     if name not in SCHEMAS:
-        known = ", ".join([*SCHEMAS, *_SAME_TABLES])
+        versions = ", ".join([*SCHEMAS, *_SAME_TABLES])
         raise InputError(
-            "E-COLMAP-VERSION", f"COLMAP {version}: its database schema is not known; use a release of {known}"
+            "E-COLMAP-VERSION", f"COLMAP {version}: its database schema is not known; use a release of {versions}"
         )
     return name

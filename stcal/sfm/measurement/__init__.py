@@ -1,1 +1,1 @@
-"""The calibrated target at work: its pose in each image."""
+"""Measurement of the pose of a calibrated target in images."""

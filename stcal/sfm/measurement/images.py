@@ -1,4 +1,4 @@
-"""From a folder of images to camera_from_target of each: the calibrated target at work."""
+"""Measurement of camera_from_target in each image of a folder, with a calibrated target."""
 
 import hashlib
 import tempfile
@@ -28,22 +28,22 @@ from stcal.sfm.measurement.tracker import Tracker
 
 @dataclass(frozen=True, slots=True)
 class MeasureOptions:
-    """What :func:`measure` does with each image.
+    """Options of :func:`measure`.
 
     Parameters
     ----------
     pose : PoseOptions
-        Of the single images.
+        Options of the pose of a single image.
     previous : bool
-        An image's own undecided pose is decided by that of the image before it, by name and in the same folder.
+        Whether an ambiguous pose is decided by that of the image before, by name and in the same folder.
     sequence : bool
-        The images of each folder follow each other, by name: the target is looked for where the pose before puts it,
-        and in the whole image only where it is not there; see :class:`stcal.sfm.measurement.tracker.Tracker`. An
-        undecided pose is decided by the one before.
+        Whether the images of each folder follow each other, by name. The target is then looked for at its predicted
+        place, and in the whole image only if it is not there; see :class:`stcal.sfm.measurement.tracker.Tracker`. An
+        ambiguous pose is decided by the one before.
     ellipses : EllipseOptions
-        Of detection.
+        Options of detection.
     workers : int, optional
-        Processes; one per core where None.
+        Number of processes; one per core if None.
     """
 
     pose: PoseOptions = field(default_factory=PoseOptions)
@@ -55,7 +55,7 @@ class MeasureOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredImage:
-    """``name`` of the image, its ``pose``, and ``notes`` on what was seen and left out in it."""
+    """An image with its pose. ``notes`` : circles that were seen in it and left out, with reasons."""
 
     name: str
     pose: TargetPose
@@ -64,11 +64,13 @@ class MeasuredImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasureResult:
-    """``images`` that have a pose, in order of name; ``left_out`` : the others, with reasons; ``notes`` : what the
-    covariances lack; ``sigma_factor`` : on the centres' own σ; ``intrinsics_held`` : whether they were taken as exact;
-    ``common`` : (m, 6, r) what the poses' errors have in common, see
-    :func:`stcal.sfm.measurement.pose.common_errors`; ``searched`` : images of a sequence that were searched as
-    a whole, None where each stands for itself.
+    """Result of :func:`measure`.
+
+    ``images`` : those with a pose, in order of name; ``left_out`` : the others, with reasons; ``notes`` : what the
+    covariances lack; ``sigma_factor`` : factor on the centres' own σ; ``intrinsics_held`` : whether the intrinsics were
+    taken as exact; ``common`` : (m, 6, r) common errors of the poses, see
+    :func:`stcal.sfm.measurement.pose.common_errors`; ``searched`` : number of images of a sequence that were searched
+    as a whole, None if the images are no sequence.
     """
 
     images: tuple[MeasuredImage, ...]
@@ -93,25 +95,26 @@ def measure(
     options: MeasureOptions | None = None,
     progress: Progress | None = None,
 ) -> MeasureResult:
-    """Pose of a calibrated target in each image of a folder and of its subfolders.
+    """Measures the pose of a calibrated target in each image of a folder and of its subfolders.
 
-    Two minima of a face seen alone are told apart where its circles can (Schweighofer & Pinz 2006), and stated both
-    where they cannot.
+    A face seen alone can have two minima (Schweighofer & Pinz 2006). If its circles cannot decide between them, both
+    are stated.
 
     Parameters
     ----------
     images : path
-        Folder of photographs; every folder in it too.
+        Folder of photographs, with its subfolders.
     camera : CameraModel
-        As :func:`stcal.io.cameras.read.read_camera` returns it; its covariance, if it has one, goes into the poses'.
+        Camera from :func:`stcal.io.cameras.read.read_camera`. Its covariance, if any, is part of the poses'
+        covariances.
     target : TargetCircles
-        Its circles, target frame, mm; see :func:`read_target`.
+        Circles of the target, target frame, mm; see :func:`read_target`.
     design : TargetDesign
-        Radii and polarity, for detection and labels.
+        Design with radii and polarity, for detection and labels.
     board : BoardDesign, optional
         A dot board that may be in view, so that its dots are not taken for circles of the target.
     options : MeasureOptions, optional
-        The defaults where None.
+        The defaults if None.
     progress : callable, optional
         Called with (stage, done, total).
 
@@ -119,17 +122,17 @@ def measure(
     -------
     MeasureResult
         camera_from_target of every image that has a pose, mm, with (6, 6) covariances in rad and mm, left perturbation
-        in the camera frame; and what was left out, with reasons.
+        in the camera frame; and the images left out, with reasons.
 
     Raises
     ------
     InputError
-        No image is usable, or the camera file does not belong to them.
+        If no image is usable, or the camera file does not belong to the images.
     DetectionError
-        No image shows a face.
+        If no image shows a face.
     """
     options, progress = options or MeasureOptions(), progress or (lambda *_: None)
-    files, other = find_images(images)
+    files, unreadable = find_images(images)
     step = counted(progress, "detect", len(files))
     if options.sequence:
         result = follow_files(files, camera, replace(target, design=design), board, options, step)
@@ -142,9 +145,9 @@ def measure(
         observations, notes = _labelled(detection.images, detection.camera, design)
         prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
         result = measure_labelled(observations, detection.camera, target, options, prior)
-        measured = tuple(replace(each, notes=notes[each.name]) for each in result.images)
+        measured = tuple(replace(image, notes=notes[image.name]) for image in result.images)
         result = replace(result, images=measured, left_out=(*detection.skipped, *result.left_out))
-    result = replace(result, left_out=(*other, *result.left_out))
+    result = replace(result, left_out=(*unreadable, *result.left_out))
     if not result.images:
         last = result.left_out[-1]
         raise DetectionError(
@@ -156,10 +159,10 @@ def measure(
 
 
 def _labelled(images: Sequence[DetectedImage], camera: Camera, design: TargetDesign):
-    """Observations of all images, and the notes on each."""
+    """Returns the observations of all images, and the notes by name of the image."""
     labelled = [label_single(i.file.name, i.file.group, i.detection, design) for i in images]
     labelled = without_defocus(labelled, camera, patterns_of(design, None))
-    return [each.observations for each in labelled], {each.observations.name: each.notes for each in labelled}
+    return [image.observations for image in labelled], {image.observations.name: image.notes for image in labelled}
 
 
 def measure_labelled(
@@ -169,21 +172,21 @@ def measure_labelled(
     options: MeasureOptions | None = None,
     prior: CameraPrior | None = None,
 ) -> MeasureResult:
-    """The poses from labelled centres, without pixels; ``prior`` : of the intrinsics, exact where None.
+    """Returns the poses from labelled centres, without pixels.
 
-    An image that gives no pose is among those left out.
+    ``prior`` : covariance of the intrinsics, which are exact if None. Images without a pose are in ``left_out``.
     """
     options = options or MeasureOptions()
-    found: list[MeasuredImage | Skipped] = []
+    outcomes: list[MeasuredImage | Skipped] = []
     for group in by_group(observations).values():
         before: TargetPose | None = None
-        for image in sorted(group, key=lambda each: each.name):
+        for image in sorted(group, key=lambda observation: observation.name):
             pose = measured_pose(image, camera, target, options.pose, prior)
             if options.previous and before is not None and isinstance(pose, TargetPose):
                 pose = resolved(pose, before.camera_from_target)
-            found.append(outcome(image.name, pose, ()))
+            outcomes.append(outcome(image.name, pose, ()))
             before = pose if isinstance(pose, TargetPose) and pose.status != "ambiguous" else None
-    return result_of(found, target, options, prior)
+    return result_of(outcomes, target, options, prior)
 
 
 def follow_files(
@@ -194,53 +197,55 @@ def follow_files(
     options: MeasureOptions,
     step: Callable[[object], None],
 ) -> MeasureResult:
-    """The poses in files of which each folder is a sequence in order of name; folders side by side.
+    """Returns the poses of files, each folder of which is a sequence in order of name. Folders run in parallel.
 
     ``step`` : called once for each file.
     """
     camera, size_from = sized_by(camera_model, list(files))
     folders: dict[str, list[ImageFile]] = {}
-    for file in sorted(files, key=lambda each: each.name):
+    for file in sorted(files, key=lambda result_of_image: result_of_image.name):
         folders.setdefault(file.group, []).append(file)
     model = replace(camera_model, width=camera.width, height=camera.height)
-    jobs = [(own, model, camera, size_from, target, board, options) for own in folders.values()]
+    jobs = [(files_of_folder, model, camera, size_from, target, board, options) for files_of_folder in folders.values()]
     followed: list[tuple[list[MeasuredImage | Skipped], int]] = [([], 0)] * len(jobs)
     for i, outcome in run_on_images(_follow_folder, jobs, options.workers):
         followed[i] = outcome
         for file in jobs[i][0]:
             step(file.name)
     prior = None if camera_model.covariance is None else CameraPrior(camera_model.colmap_model, camera_model.covariance)
-    result = result_of([each for found, _ in followed for each in found], target, options, prior)
+    result = result_of(
+        [result_of_image for outcomes, _ in followed for result_of_image in outcomes], target, options, prior
+    )
     return replace(result, searched=sum(searched for _, searched in followed))
 
 
 def _follow_folder(
     files: Sequence[ImageFile], model: CameraModel, camera: Camera, size_from: str, target, board, options
 ) -> tuple[list[MeasuredImage | Skipped], int]:
-    """What each image of a folder gives, and how many were searched as a whole."""
+    """Returns the outcome of each image of a folder, and the number of images that were searched as a whole."""
     tracker = Tracker(target, model, board, options.pose, options.ellipses)
-    found: list[MeasuredImage | Skipped] = []
-    first: dict[str, str] = {}
+    outcomes: list[MeasuredImage | Skipped] = []
+    name_of_digest: dict[str, str] = {}
     searched = 0
     for file in files:
         loaded = load_image(file, camera, size_from)
         if isinstance(loaded, Skipped):
-            found.append(loaded)
+            outcomes.append(loaded)
             continue
         data, image = loaded
         digest = hashlib.sha256(data).hexdigest()
-        if digest in first:
-            found.append(copy_of(file, first[digest]))
+        if digest in name_of_digest:
+            outcomes.append(copy_of(file, name_of_digest[digest]))
             continue
-        first[digest] = file.name
+        name_of_digest[digest] = file.name
         try:
-            seen, pose = tracker.observe(image, file.name)
+            labelled, pose = tracker.observe(image, file.name)
         except ConvergenceError as error:
-            found.append(Skipped(file.name, str(error), "distortion"))
+            outcomes.append(Skipped(file.name, str(error), "distortion"))
             continue
         searched += tracker.searched
-        found.append(outcome(file.name, pose, seen.notes))
-    return found, searched
+        outcomes.append(outcome(file.name, pose, labelled.notes))
+    return outcomes, searched
 
 
 def outcome(name: str, pose: TargetPose | StcalError, notes: tuple[str, ...]) -> MeasuredImage | Skipped:
@@ -250,8 +255,8 @@ def outcome(name: str, pose: TargetPose | StcalError, notes: tuple[str, ...]) ->
 
 
 def result_of(found: Sequence[MeasuredImage | Skipped], target: TargetCircles, options, prior) -> MeasureResult:
-    measured = tuple(each for each in found if isinstance(each, MeasuredImage))
-    left_out = tuple(each for each in found if isinstance(each, Skipped))
+    measured = tuple(image for image in found if isinstance(image, MeasuredImage))
+    left_out = tuple(image for image in found if isinstance(image, Skipped))
     factor = target.sigma_factor if options.pose.sigma_factor is None else options.pose.sigma_factor
-    common = common_errors([each.pose for each in measured], target, prior)
+    common = common_errors([image.pose for image in measured], target, prior)
     return MeasureResult(measured, left_out, target.notes, factor, prior is None, common)

@@ -24,7 +24,7 @@ HOPELESS = 500.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseProblem:
-    """n circles with their measured centres, and what is known of everything else. The lens is taken out.
+    """Data of a pose: n circles, their measured centres and all covariances. Centres are free of distortion.
 
     ``xyz``, ``normal`` : (n, 3) target frame; ``radius`` : (n,); ``centre`` : (n, 2) centres of the ellipses,
     normalised coordinates; ``px_by_centre`` : (n, 2, 2) Jacobian of the lens; ``noise`` : (n, 2, 2) covariance of
@@ -113,10 +113,10 @@ def start_pose(
         faces.setdefault(name.face, []).append(i)
     by_size = sorted((f for f in faces if f in target.target_from_plane), key=lambda f: -len(faces[f]))
     if not by_size or len(faces[by_size[0]]) < MIN_CIRCLES:
-        seen = f"{len(faces[by_size[0]])} of face {by_size[0]}" if by_size else "0"
+        count = f"{len(faces[by_size[0]])} of face {by_size[0]}" if by_size else "0"
         raise DegenerateError(
             "E-MEASURE-FEW-CIRCLES",
-            f"{where}: {seen} circles seen, {MIN_CIRCLES} of one face needed; show one face as a whole",
+            f"{where}: {count} circles seen, {MIN_CIRCLES} of one face needed; show one face as a whole",
         )
     for face_id in by_size:
         rows, plane = faces[face_id], target.target_from_plane[face_id]

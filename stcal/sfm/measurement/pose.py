@@ -38,15 +38,15 @@ from stcal.sfm.measurement.minima import (
 from stcal.sfm.measurement.target import TargetCircles
 
 CURVED = 0.2
-"""χ² two σ away that differs from its parabola by more than this share: the covariance is then taken from samples."""
+"""Relative deviation of χ² from its parabola, two σ away, beyond which the covariance is taken from samples."""
 SAMPLES = 1000
 SAMPLED_WIDER = 1.5
-"""Samples are drawn with σ so much larger, or their tails would rest on a few of them."""
+"""Factor on the σ with which samples are drawn. Else the tails would rest on a few samples."""
 SAMPLE_ROUNDS = 2
 MIN_EFFECTIVE = 20
-"""Effective number of samples (Kong 1992) below which they say less than what they were drawn from."""
+"""Least effective number of samples (Kong 1992). With fewer, the distribution they are drawn from is the better one."""
 OTHER_SIDE = 3.0
-"""A pose mirrored at the line of sight is another one from this distance on, in σ; nearer, the covariance covers it."""
+"""Distance in σ from which the pose mirrored at the line of sight is another solution. A nearer one is covered by σ."""
 
 
 def covariance_of_likelihood(
@@ -59,11 +59,12 @@ def covariance_of_likelihood(
     plane: Rigid | None,
     plausible: float,
 ) -> tuple[np.ndarray, float]:
-    """Covariance of a pose (6, 6), and by how much χ² its mirror image is worse, infinite where that is no matter.
+    """Returns the covariance of a pose (6, 6), and the excess in χ² of its mirror image.
 
-    The covariance is the given one where the likelihood is Gaussian. Else it is the second moment about the pose of all
-    poses by their likelihood: importance sampling with fixed numbers (Bishop 2006, Pattern Recognition and Machine
-    Learning, sec. 11.1.4); poses nearer to the ``second`` solution are that one's.
+    The excess is infinite if the mirror image does not matter. The covariance is the given one if the likelihood is
+    Gaussian. Else it is the second moment of the likelihood about the pose, by importance sampling with fixed numbers
+    (Bishop 2006, Pattern Recognition and Machine Learning, sec. 11.1.4). Poses nearer to the ``second`` solution are
+    left out.
 
     Parameters
     ----------
@@ -71,16 +72,16 @@ def covariance_of_likelihood(
     least : χ² of the pose
     covariance : (6, 6) of the linearised problem
     second : the second solution, or None
-    plane : target_from_plane of a face seen alone and without a second minimum, else None. The two may have grown
-        together: a valley of which the linearised problem sees one side. The mirror image matters where it is
-        ``plausible``, some σ off, and far more probable than these say.
-    plausible : what χ² of the mirror image may be worse by
+    plane : target_from_plane of a face seen alone and without a second minimum, else None. The two minima may have
+        merged into a valley, of which the linearised problem sees one side. The mirror image matters if its excess in
+        χ² is below ``plausible``, it is some σ away, and it is far more probable than these σ say.
+    plausible : largest excess in χ² with which the mirror image is plausible
     """
     whiten = np.linalg.inv(np.linalg.cholesky(full))
 
     def excess(step: np.ndarray) -> np.ndarray:
-        near = PoseStack(np.repeat(pose.rotation, len(step), 0), np.repeat(pose.translation, len(step), 0)).moved(step)
-        residual, image = problem.seen(near)
+        poses = PoseStack(np.repeat(pose.rotation, len(step), 0), np.repeat(pose.translation, len(step), 0)).moved(step)
+        residual, image = problem.seen(poses)
         square = ((residual.reshape(len(step), -1) @ whiten.T) ** 2).sum(1)
         return np.where((image.depth > 0).all(1), square, np.inf)
 
@@ -89,35 +90,42 @@ def covariance_of_likelihood(
     other_side, first = np.inf, covariance
     if plane is not None:
         image_pose = mirrored(pose, plane)
-        away = step_between(pose, image_pose)
-        square = float(away @ np.linalg.solve(covariance, away))
-        worse = _best_of_tilt(problem, image_pose, plane, whiten) - least
-        if worse < min(plausible, square / 2) and square > OTHER_SIDE**2:
-            other_side, first, curved = float(worse), covariance + np.outer(away, away) / 4, True
+        step_to_mirrored = step_between(pose, image_pose)
+        square = float(step_to_mirrored @ np.linalg.solve(covariance, step_to_mirrored))
+        delta = _best_of_tilt(problem, image_pose, plane, whiten) - least
+        if delta < min(plausible, square / 2) and square > OTHER_SIDE**2:
+            other_side, first, curved = (
+                float(delta),
+                covariance + np.outer(step_to_mirrored, step_to_mirrored) / 4,
+                True,
+            )
     return (_sampled(excess, least, pose, first, second) if curved else covariance), other_side
 
 
 def _best_of_tilt(problem: PoseProblem, pose: PoseStack, plane: Rigid, whiten: np.ndarray) -> float:
-    """χ² of a pose when everything but the tilt of the plane may follow, to first order."""
+    """Returns χ² of a pose after all parameters but the tilt of the plane are adjusted, to first order."""
     residual, image = problem.seen(pose)
     free = np.zeros((6, 4))
     free[:3, 0] = pose.rotation[0] @ plane.rotation[:, 2]
     free[3:, 1:] = np.eye(3)
     a, r = whiten @ image.by_pose.reshape(-1, 6) @ free, whiten @ residual.ravel()
-    rest = r - a @ np.linalg.lstsq(a, r)[0]
-    return float(rest @ rest)
+    residual_after = r - a @ np.linalg.lstsq(a, r)[0]
+    return float(residual_after @ residual_after)
 
 
 def _sampled(excess, least: float, pose: PoseStack, covariance: np.ndarray, second: PoseStack | None) -> np.ndarray:
-    """Second moment (6, 6) of exp(−(excess − least)/2) about the pose; ``covariance`` : about what it will be."""
+    """Returns the second moment (6, 6) of exp(−(excess − least)/2) about the pose.
+
+    ``covariance`` : a first guess of it.
+    """
     normal = np.random.default_rng(0).standard_normal((SAMPLES, 6))
     precision = np.linalg.inv(covariance)
     for _ in range(SAMPLE_ROUNDS):
         step = SAMPLED_WIDER * normal @ _principal(covariance)
         log = (normal**2).sum(1) / 2 - (excess(step) - least) / 2
         if second is not None:
-            away = step_between(pose, second)
-            log[(step - away / 2) @ precision @ away > 0] = -np.inf
+            step_to_second = step_between(pose, second)
+            log[(step - step_to_second / 2) @ precision @ step_to_second > 0] = -np.inf
         weight = np.exp(log - log.max())
         weight /= weight.sum()
         if 1 / (weight**2).sum() < MIN_EFFECTIVE:
@@ -127,27 +135,27 @@ def _sampled(excess, least: float, pose: PoseStack, covariance: np.ndarray, seco
 
 
 def _principal(covariance: np.ndarray) -> np.ndarray:
-    """Rows whose summed outer products are the covariance: principal axes in units of σ."""
+    """Returns the principal axes in units of σ, as rows. The sum of their outer products is the covariance."""
     sigma = np.sqrt(np.diag(covariance))
     value, vector = np.linalg.eigh(covariance / sigma / sigma[:, None])
     return (vector * np.sqrt(np.maximum(value, 0))).T * sigma
 
 
 NEAR_PREVIOUS = 1 / 3
-"""The pose nearer to the previous image's is taken where its turn from there is at most this share of the other's."""
+"""Largest ratio of two rotations from the previous image's pose, of the nearer pose over the other, that decides."""
 NO_FACE = "no face of the target recognised; if a dot board is in view, give --board"
 SUSPICIOUS, FAILED = 1e-3, 1e-5
-"""Probabilities of a fit's χ², as the checks of a run have them."""
+"""Limits of the p-value of a fit's χ², the same as in the checks of a run."""
 Status = Literal["certain", "resolved", "ambiguous"]
 
 
 @dataclass(frozen=True, slots=True)
 class PoseOptions:
-    """How to measure.
+    """Options of the measurement of a pose.
 
-    ``flip_odds`` : at most these odds of the second solution for a pose to be certain, for Gaussian errors;
-    ``sigma_margin`` : by which σ may be too small without that becoming untrue; ``sigma_factor`` : factor on the
-    centres' own σ, that of the target's run where None.
+    ``flip_odds`` : largest odds of the second solution for a pose to be certain, for Gaussian errors;
+    ``sigma_margin`` : factor by which the stated σ may be too small while this holds; ``sigma_factor`` : factor on the
+    centres' own σ, the one of the target's run if None.
     """
 
     flip_odds: float = 1e-6
@@ -164,7 +172,7 @@ class PoseOptions:
             )
 
     def needed(self, chi2_per_dof: float) -> float:
-        """Δχ² that makes a pose certain."""
+        """Returns the Δχ² that makes a pose certain."""
         return deciding_delta(self.flip_odds, self.sigma_margin, chi2_per_dof)
 
 
@@ -173,16 +181,16 @@ class TargetPose(ImageFit):
     """The pose of the target in one image.
 
     ``camera_from_target`` ; ``covariance`` : (6, 6), rad and mm, left perturbation in the camera frame, R' = exp(w) R,
-    t' = t + dt; ``parts`` : what it is the sum of, (6, 6) each: ``image``, ``target`` and ``intrinsics``, of which the
-    last two are common to all images of the same target and camera, and ``curvature``, by which the spread of all poses
-    by their likelihood differs from these, zero where that is Gaussian; ``by_circles`` : (6, 3n), and ``by_intrinsics``
-    : (6, q) derivatives, but for the sign, by errors of the circles (target frame, mm) and intrinsics; ``status`` : see
-    ``delta_chi2``; ``faces`` and ``labels`` used; ``residuals_px`` : (n, 2) measured minus projected ellipse centres;
-    ``weights`` : (n,) Huber's;
-    ``outliers`` left out; ``chi2``, ``redundancy`` : of all residuals against their covariance; ``delta_chi2`` : by
-    which the second solution is worse, or, where both are one wide valley, the other side of it (infinite where there
-    is neither); ``needed_chi2`` : the least of it for the pose to be certain; ``second`` : the second solution, where
-    that is not reached.
+    t' = t + dt; ``parts`` : (6, 6) each, summands of the covariance: ``image``, ``target`` and ``intrinsics``, of which
+    the last two are common to all images of the same target and camera, and ``curvature``, the difference between the
+    second moment of the likelihood and the sum of the others, zero if the likelihood is Gaussian; ``by_circles`` : (6,
+    3n), and ``by_intrinsics`` : (6, q) derivatives, but for the sign, by errors of the circles (target frame, mm) and
+    intrinsics; ``status`` : certain, resolved or ambiguous; ``faces``, ``labels`` : faces and circles used;
+    ``residuals_px`` : (n, 2) measured minus projected ellipse centres; ``weights`` : (n,) Huber's; ``outliers`` :
+    circles left out; ``chi2``, ``redundancy`` : of all residuals with their covariance; ``delta_chi2`` : excess in χ²
+    of the second solution, or of the other side of the valley if both solutions are one, infinite if there is neither;
+    ``needed_chi2`` : least ``delta_chi2`` with which the pose is certain; ``second`` : the second solution, unless the
+    pose is certain.
     """
 
     camera_from_target: Rigid
@@ -211,7 +219,7 @@ class TargetPose(ImageFit):
         object.__setattr__(self, "weights", frozen(self.weights, (n,), "weights"))
 
     def swapped(self) -> "TargetPose":
-        """The second solution in its place, as ``resolved``; this one where there is none."""
+        """Returns the second solution as ``resolved``, with this one as its second; this one if there is no second."""
         if self.second is None:
             return self
         return replace(self.second, status="resolved", second=replace(self, second=None))
@@ -227,44 +235,44 @@ def pose_from_circles(
     prior: CameraPrior | None = None,
     where: str = "image",
 ) -> TargetPose:
-    """Pose of a calibrated target from the ellipse centres of its circles in one image.
+    """Returns the pose of a calibrated target from the ellipse centres of its circles in one image.
 
     The first step minimises the residuals of the single centres with Huber's loss, from the homography of the face with
     the most circles and from its mirror image at the line of sight. The second weighs them by their whole covariance
-    (generalised least squares), to which the image's noise, the target's and the intrinsics' uncertainty add up, so
-    that the covariance of the pose contains all three. Dots of the board are passed over.
+    (generalised least squares), which is the sum of image noise and the uncertainties of target and intrinsics. So the
+    covariance of the pose contains all three.
 
     Parameters
     ----------
-    labels : n labels ``face:circle``, or texts of that form; dots of the board are passed over
-    centre_px : (n, 2) ellipse centres in the image as it is, px
-    covariance_px2 : (n, 2, 2) their own, without the σ factor
-    prior : covariance of the intrinsics, which are exact where None
+    labels : n labels ``face:circle``, or texts of that form; dots of the board are ignored
+    centre_px : (n, 2) ellipse centres in the distorted image, px
+    covariance_px2 : (n, 2, 2) covariances of the single centres, without the σ factor
+    prior : covariance of the intrinsics, which are exact if None
     where : name of the image, for messages
 
     Raises
     ------
     InputError
-        A circle that the target does not have, a label twice, or arrays of a wrong shape.
+        If the target does not have a circle, a label occurs twice, or an array has a wrong shape.
     DegenerateError
-        No face has four circles in general position, or too many circles contradict each other.
+        If no face has four circles in general position, or too many circles contradict each other.
     ConvergenceError
-        No minimum is reached.
+        If no minimum is reached.
     """
     options = options or PoseOptions()
     labels = parse_labels(labels)
     used, problem = _problem(labels, centre_px, covariance_px2, target, camera, options, prior, where)
     names = list(circle_labels(labels[i] for i in used))
     start, plane = start_pose(names, problem, target, where)
-    found, keep, outliers = minima_without_outliers(problem, start, plane, names, where)
+    minima, keep, outliers = minima_without_outliers(problem, start, plane, names, where)
     problem, names = problem.select(keep), [names[i] for i in keep]
     if len(names) < MIN_CIRCLES:
         raise DegenerateError(
             "E-MEASURE-FEW-CIRCLES", f"{where}: {len(names)} circles left, {MIN_CIRCLES} needed; show more of a face"
         )
-    pose = _answer(problem, found, names, outliers, plane, options)
+    pose = _answer(problem, minima, names, outliers, plane, options)
     if np.sqrt(np.diag(pose.covariance)[:3].max()) > MAX_SIGMA_RAD:
-        if pose.chi2_per_redundancy() > OUTLIER**2:  # what leaves the rotation open are the residuals
+        if pose.chi2_per_redundancy() > OUTLIER**2:  # the rotation is open because the residuals are large
             raise DegenerateError(
                 "E-MEASURE-CONTRADICTS",
                 f"{where}: its circles contradict each other, χ²/dof {pose.chi2_per_redundancy():.2g}; check their "
@@ -277,7 +285,7 @@ def pose_from_circles(
 
 
 def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, options, prior, where):
-    """Indices of the target's circles among the labels, and the problem that they make."""
+    """Returns the indices of the target's circles among the labels, and the data of the pose."""
     n = len(labels)
     centre, noise = frozen(centre_px, (n, 2), "centres"), frozen(covariance_px2, (n, 2, 2), "centres' covariance")
     used = [i for i, label in enumerate(labels) if isinstance(label, CircleLabel)]
@@ -301,18 +309,20 @@ def _problem(labels, centre_px, covariance_px2, target: TargetCircles, camera, o
     factor = target.sigma_factor if options.sigma_factor is None else options.sigma_factor
     ideal = camera.normalised_from_pixel(centre[used])
     px_by_centre = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
-    back = np.linalg.inv(px_by_centre)
-    by_camera, known = np.zeros((len(used), 2, 0)), np.zeros((0, 0))
+    centre_by_px = np.linalg.inv(px_by_centre)
+    by_camera, prior_covariance = np.zeros((len(used), 2, 0)), np.zeros((0, 0))
     if prior is not None:
-        by_camera = back @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
-        known = prior.covariance
-    own = target.xyz[place], target.normal[place], target.radius[place], ideal, px_by_centre
-    noise_of_centres = factor**2 * back @ noise[used] @ np.swapaxes(back, 1, 2)
-    return used, PoseProblem(*own, noise_of_centres, by_camera, known, target.covariance[np.ix_(rows, rows)])
+        by_camera = centre_by_px @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
+        prior_covariance = prior.covariance
+    circles = target.xyz[place], target.normal[place], target.radius[place], ideal, px_by_centre
+    noise_of_centres = factor**2 * centre_by_px @ noise[used] @ np.swapaxes(centre_by_px, 1, 2)
+    return used, PoseProblem(
+        *circles, noise_of_centres, by_camera, prior_covariance, target.covariance[np.ix_(rows, rows)]
+    )
 
 
 def _gain(image: CircleImages, full: np.ndarray) -> np.ndarray:
-    """(6, 2n) derivative of the weighted pose by the centres."""
+    """Returns the derivative (6, 2n) of the weighted pose by the centres."""
     a = image.by_pose.reshape(-1, 6)
     gain = np.linalg.solve(full, a)
     return np.linalg.solve(a.T @ gain, gain.T)
@@ -326,48 +336,53 @@ def _answer(
     plane: Rigid,
     options: PoseOptions,
 ) -> TargetPose:
-    """Decide between the minima, or what there is of a second one, and collect."""
+    """Decides between the two minima, or the two sides of a valley, and returns the pose."""
     redundancy = 2 * len(names) - 6
-    seen = {
+    common = {
         "faces": tuple(dict.fromkeys(name.face for name in names)),
         "labels": tuple(names),
         "outliers": outliers,
         "redundancy": redundancy,
     }
     delta, second = _second_solution(problem, found, redundancy)
-    alone = second is None and len(seen["faces"]) == 1
+    alone = second is None and len(common["faces"]) == 1
     first = _solution(problem, found.rows([0]), second, plane if alone else None, options)
-    seen["needed_chi2"] = options.needed(first.chi2 / redundancy)
-    if min(delta, first.other_side) > seen["needed_chi2"]:
-        return first.pose("certain", min(delta, first.other_side), seen)
+    common["needed_chi2"] = options.needed(first.chi2 / redundancy)
+    if min(delta, first.other_side) > common["needed_chi2"]:
+        return first.pose("certain", min(delta, first.other_side), common)
     if second is None:
-        return first.pose("ambiguous", first.other_side, seen)
-    rest = _solution(problem, found.rows([1]), found.poses[[0]], None, options)
-    return first.pose("ambiguous", min(delta, first.other_side), seen, rest.pose("ambiguous", -delta, seen))
+        return first.pose("ambiguous", first.other_side, common)
+    other_solution = _solution(problem, found.rows([1]), found.poses[[0]], None, options)
+    return first.pose(
+        "ambiguous", min(delta, first.other_side), common, other_solution.pose("ambiguous", -delta, common)
+    )
 
 
 def _second_solution(problem: PoseProblem, found: Minima, redundancy: int) -> tuple[float, PoseStack | None]:
-    """By how much χ² the second minimum is worse than the first, and its pose; infinite where there is none.
+    """Returns the excess in χ² of the second minimum over the first, and its pose; infinite and None if there is none.
 
-    Both weigh the circles alike, as the stricter of the two does, or an outlier of one of them could decide.
+    Both minima give a circle the same weight, the smaller of the two. Else an outlier of one minimum could decide.
     """
     if len(found.cost) == 1:
         return np.inf, None
-    behind = float(found.cost[1] - found.cost[0])
-    if behind > HOPELESS * max(1.0, found.cost[0] / redundancy):  # whatever the weights
-        return behind, found.poses[[1]]
+    delta = float(found.cost[1] - found.cost[0])
+    if delta > HOPELESS * max(1.0, found.cost[0] / redundancy):  # whatever the weights
+        return delta, found.poses[[1]]
     residual, image = problem.seen(found.poses)
     common = np.tile(problem.noise / weights_of(found.length).min(0)[:, None, None], (2, 1, 1, 1))
-    both = weigh(residual, image.by_pose, covariance_of_centres(problem, image, common), found.poses)
-    if not distinct(both.poses, both.normal[0]):
+    weighed = weigh(residual, image.by_pose, covariance_of_centres(problem, image, common), found.poses)
+    if not distinct(weighed.poses, weighed.normal[0]):
         return np.inf, None
-    return float(both.chi2[1] - both.chi2[0]), both.poses[[1]]
+    return float(weighed.chi2[1] - weighed.chi2[0]), weighed.poses[[1]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solution:
-    """One minimum by the whole covariance of its centres; fields as in :class:`TargetPose`. ``other_side`` : by how
-    much χ² the other side of a wide valley is worse, infinite where the minimum is none."""
+    """One minimum, weighed by the whole covariance of its centres.
+
+    Fields are as in :class:`TargetPose`. ``other_side`` : excess in χ² of the other side of a wide valley, infinite if
+    the minimum is no valley.
+    """
 
     camera_from_target: Rigid
     covariance: np.ndarray
@@ -380,19 +395,18 @@ class _Solution:
     other_side: float
 
     def pose(self, status: Status, delta_chi2: float, seen: dict, second: TargetPose | None = None) -> TargetPose:
-        """With the decision, and what does not depend on the minimum."""
-        own = {name: getattr(self, name) for name in _Solution.__slots__ if name != "other_side"}
-        return TargetPose(**own, **seen, status=status, delta_chi2=delta_chi2, second=second)
+        """Returns the pose with the decision. ``seen`` : the fields that do not depend on the minimum."""
+        fields = {name: getattr(self, name) for name in _Solution.__slots__ if name != "other_side"}
+        return TargetPose(**fields, **seen, status=status, delta_chi2=delta_chi2, second=second)
 
 
 def _solution(
     problem: PoseProblem, minimum: Minima, second: PoseStack | None, plane: Rigid | None, options: PoseOptions
 ) -> _Solution:
-    """One minimum weighed.
+    """Returns a minimum weighed by the whole covariance of its centres, with its own covariance.
 
-    ``second``, ``plane`` : see :func:`stcal.sfm.measurement.pose.covariance_of_likelihood`
-
-    Two steps: what the first leaves is of second order.
+    ``second``, ``plane`` : see :func:`stcal.sfm.measurement.pose.covariance_of_likelihood`. Two steps are enough, as
+    the error after the first is of second order.
     """
     weights = weights_of(minimum.length[0])
     noise = problem.noise / weights[:, None, None]
@@ -411,7 +425,7 @@ def _solution(
     }
     gaussian = parts["image"] + parts["target"] + parts["intrinsics"]
     chi2 = float(last.chi2[0])
-    # The samples span a valley from side to side: the margin for wrong σ is for what they do not show.
+    # The samples cover a valley from side to side, so that no margin for wrong σ is needed here.
     plausible = options.needed(chi2 / (2 * len(weights) - 6)) / options.sigma_margin**2
     covariance, other_side = covariance_of_likelihood(
         problem, last.poses, full[0], chi2, gaussian, second, plane, plausible
@@ -437,37 +451,41 @@ def measured_pose(
     options: PoseOptions | None = None,
     prior: CameraPrior | None = None,
 ) -> TargetPose | StcalError:
-    """:func:`pose_from_circles` of what one image shows of the calibrated target, or why there is no pose."""
-    known = [i for i, label in enumerate(image.labels) if label in target.place]
-    if not known:
-        seen = ", ".join(image.face_ids())
+    """Returns :func:`pose_from_circles` of the calibrated circles in one image, or the error if there is no pose."""
+    calibrated = [i for i, label in enumerate(image.labels) if label in target.place]
+    if not calibrated:
+        faces = ", ".join(image.face_ids())
         return DetectionError(
-            "E-MEASURE-NO-FACE", f"{image.name}: " + (f"face {seen} is not calibrated" if seen else NO_FACE)
+            "E-MEASURE-NO-FACE", f"{image.name}: " + (f"face {faces} is not calibrated" if faces else NO_FACE)
         )
-    own = image.select(known)
+    circles = image.select(calibrated)
     try:
         return pose_from_circles(
-            own.labels, own.centre_px, own.covariance_px2, target, camera, options, prior, image.name
+            circles.labels, circles.centre_px, circles.covariance_px2, target, camera, options, prior, image.name
         )
     except StcalError as error:
         return error
 
 
 def resolved(pose: TargetPose, previous: Rigid) -> TargetPose:
-    """The pose with its two-fold ambiguity decided by another one that is near, camera_from_target of the image before;
-    the same where it is certain, or where that one is near to neither."""
+    """Returns the pose with its two-fold ambiguity decided by the pose of the image before.
+
+    ``previous`` : camera_from_target of that image. The pose is unchanged if it is certain, or if neither of its two
+    solutions is clearly nearer to the previous pose.
+    """
     if pose.status == "certain" or pose.second is None:
         return pose
-    own, other = (
-        Rigid(each.camera_from_target.rotation @ previous.rotation.T).angle_rad() for each in (pose, pose.second)
+    turn, turn_of_second = (
+        Rigid(candidate.camera_from_target.rotation @ previous.rotation.T).angle_rad()
+        for candidate in (pose, pose.second)
     )
-    if own <= NEAR_PREVIOUS * other:
+    if turn <= NEAR_PREVIOUS * turn_of_second:
         return replace(pose, status="resolved")
-    return pose.swapped() if other <= NEAR_PREVIOUS * own else pose
+    return pose.swapped() if turn_of_second <= NEAR_PREVIOUS * turn else pose
 
 
 def fit_verdict(pose: TargetPose) -> str:
-    """``passed``, ``suspicious`` or ``failed`` of the χ² of the residuals."""
+    """Returns ``passed``, ``suspicious`` or ``failed``, by the p-value of the residuals' χ²."""
     p = pose.p_value()
     return "failed" if p < FAILED else "suspicious" if p < SUSPICIOUS else "passed"
 

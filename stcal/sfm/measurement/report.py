@@ -78,7 +78,7 @@ class ImagePose(Part):
 
 
 class PosesFile(ResultFile):
-    """Of ``measure``."""
+    """The JSON file of ``measure``."""
 
     format: Literal["stcal poses 1"] = Field(description="the file's form and its version")
     unit: Literal["mm"] = Field(description="of all lengths")
@@ -98,56 +98,57 @@ QUALITY = ("rms_px", "chi2_per_dof")
 
 
 def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, tuple[str, ...]]:
-    """Text of ``poses.csv``, and what could not be joined; ``joints`` : more columns by image, whose rows
-    alone are then written.
+    """Returns the text of ``poses.csv``, and notes on images that could not be joined.
+
+    ``joints`` : further columns by image. Only images of this table are then written.
 
     Raises
     ------
     InputError
-        The table has no column ``image``, an image twice, or a column that is here already.
+        If the table has no column ``image``, an image twice, or a column of the name of a measured one.
     """
     header = [IMAGE, FACES, CIRCLES, STATUS, *POSE, *COVARIANCE, *QUALITY]
     common = common_columns(result.common.shape[2])
-    where, more, rows = "", [], None
+    where, joint_columns, rows = "", [], None
     if joints is not None:
-        where, (more, rows) = joints.where, _joint_cells(joints, header + common)
+        where, (joint_columns, rows) = joints.where, _joint_cells(joints, header + common)
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header + more + common)
-    missing = []
-    for each, felt in zip(result.images, result.common, strict=True):
-        if rows is not None and each.name not in rows:
-            missing.append(f"{each.name}: measured, but not in {where}")
+    writer.writerow(header + joint_columns + common)
+    unmatched = []
+    for image, common_error in zip(result.images, result.common, strict=True):
+        if rows is not None and image.name not in rows:
+            unmatched.append(f"{image.name}: measured, but not in {where}")
             continue
-        pose = each.pose
+        pose = image.pose
         writer.writerow(
-            [each.name, "+".join(pose.faces), len(pose.labels), pose.status]
+            [image.name, "+".join(pose.faces), len(pose.labels), pose.status]
             + pose_cells(pose.camera_from_target, pose.covariance)
             + [f"{pose.rms_px():.5f}", f"{pose.chi2_per_redundancy():.4f}"]
-            + (rows[each.name] if rows is not None else [])
-            + [f"{v:.7g}" for v in felt.T.ravel()]
+            + (rows[image.name] if rows is not None else [])
+            + [f"{v:.7g}" for v in common_error.T.ravel()]
         )
     if rows is not None:
-        names = {each.name for each in result.images}
-        missing += [f"{name}: in {where}, but without a pose" for name in rows if name not in names]
+        names = {image.name for image in result.images}
+        unmatched += [f"{name}: in {where}, but without a pose" for name in rows if name not in names]
         if len(rows.keys() & names) == 0:
             raise InputError(
                 "E-IMAGES-UNMATCHED",
                 f"{where}: none of its images was measured; names are like {result.images[0].name}",
             )
-    return stream.getvalue(), tuple(missing)
+    return stream.getvalue(), tuple(unmatched)
 
 
 def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str, list[str]]]:
-    """Names of the further columns, and their cells by image, as they stand in the file."""
-    more = [name for name in joints.columns if name != IMAGE]
-    taken = [name for name in more if name in header]
-    if taken:
+    """Returns the names of the further columns, and their cells by image, as they stand in the file."""
+    further = [name for name in joints.columns if name != IMAGE]
+    conflicts = [name for name in further if name in header]
+    if conflicts:
         raise InputError(
-            "E-TABLE-COLUMNS-CONFLICT", f"{joints.where}: column {taken[0]} is measured here; leave it out"
+            "E-TABLE-COLUMNS-CONFLICT", f"{joints.where}: column {conflicts[0]} is measured here; leave it out"
         )
     names = joints.text(IMAGE)
-    cells = [joints.columns[name] for name in more]
+    cells = [joints.columns[name] for name in further]
     rows: dict[str, list[str]] = {}
     for i, name in enumerate(names):
         if name in rows:
@@ -156,11 +157,11 @@ def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str,
                 f"{joints.where}: line {joints.lines[i]}: image {name} a second time; every image once",
             )
         rows[name] = [c[i] if isinstance(c, list) else repr(float(c[i])) for c in cells]
-    return more, rows
+    return further, rows
 
 
 def poses_file(result: MeasureResult) -> PosesFile:
-    """The content of ``--json``."""
+    """Returns the content of ``--json``."""
     return PosesFile.model_validate(
         {
             "format": "stcal poses 1",
@@ -168,7 +169,7 @@ def poses_file(result: MeasureResult) -> PosesFile:
             "sigma_factor": result.sigma_factor,
             "intrinsics_held": result.intrinsics_held,
             "notes": list(result.notes),
-            "images": [_image_json(each) for each in result.images],
+            "images": [_image_json(image) for image in result.images],
             "left_out": result.left_out,
         }
     )
@@ -176,7 +177,7 @@ def poses_file(result: MeasureResult) -> PosesFile:
 
 def _image_json(each: MeasuredImage) -> dict:
     pose = each.pose
-    other = pose.second
+    second = pose.second
     return {
         "image": each.name,
         "faces": list(pose.faces),
@@ -184,7 +185,7 @@ def _image_json(each: MeasuredImage) -> dict:
         "camera_from_target": pose.camera_from_target,
         "covariance": pose.covariance,
         "covariance_parts": pose.parts,
-        "alternative": other,
+        "alternative": second,
         "delta_chi2": pose.delta_chi2,
         "delta_chi2_needed": pose.needed_chi2,
         "rms_px": pose.rms_px(),
@@ -202,42 +203,44 @@ def _image_json(each: MeasuredImage) -> dict:
 
 
 def measure_text(result: MeasureResult) -> str:
-    """The table for people, 80 columns wide for names of eight characters: σ are the largest of three axes, n counts
-    circles."""
-    wide = max([len(each.name) for each in result.images] + [5])
-    faces = max([len("+".join(each.pose.faces)) for each in result.images] + [5])
+    """Returns the table for the terminal, 80 columns wide for names of eight characters.
+
+    σ are the largest of three axes, n counts circles.
+    """
+    wide = max([len(image.name) for image in result.images] + [5])
+    faces = max([len("+".join(image.pose.faces)) for image in result.images] + [5])
     lines = [
         f"{'image':{wide}}  {'faces':{faces}}  n {'status':9} {'x':>9} {'y':>8} {'z':>8} mm {'σ µm':>5} {'σ mdeg':>6} "
         f"{'RMS px':>6}"
     ]
-    for each in result.images:
-        pose = each.pose
+    for image in result.images:
+        pose = image.pose
         sigma = np.sqrt(np.diag(pose.covariance))
         place = " ".join(f"{v:8.3f}" for v in pose.camera_from_target.translation)
         verdict = fit_verdict(pose)
         lines.append(
-            f"{each.name:{wide}}  {'+'.join(pose.faces):{faces}} {len(pose.labels):2} {pose.status:9}  {place}   "
+            f"{image.name:{wide}}  {'+'.join(pose.faces):{faces}} {len(pose.labels):2} {pose.status:9}  {place}   "
             f"{1e3 * sigma[3:].max():5.1f} {1e3 * np.degrees(sigma[:3].max()):6.2f} {pose.rms_px():6.4f}"
             + ("" if verdict == "passed" else f"  {verdict}")
         )
         lines += [
-            f"  outlier {each.name} {o.label}: residual {o.residual_px:.3f} px, limit {o.limit_px:.3f} px"
+            f"  outlier {image.name} {o.label}: residual {o.residual_px:.3f} px, limit {o.limit_px:.3f} px"
             for o in pose.outliers
         ]
-    left_out = [f"left out {each.name}: {each.reason}" for each in result.left_out]
+    left_out = [f"left out {image.name}: {image.reason}" for image in result.left_out]
     return "\n".join([*lines, *summary(result), *left_out])
 
 
 def summary(result: MeasureResult) -> list[str]:
-    """Counts, then what is to be known besides."""
-    poses = [each.pose for each in result.images]
+    """Returns the counts of poses by status, followed by warnings and notes."""
+    poses = [image.pose for image in result.images]
     count = {s: sum(pose.status == s for pose in poses) for s in ("certain", "resolved", "ambiguous")}
-    told = ", ".join(f"{n} {s}" for s, n in count.items() if n)
-    lines = [f"{len(poses)} poses: {told}; centres' σ × {result.sigma_factor:.3g}"]
+    counts = ", ".join(f"{n} {s}" for s, n in count.items() if n)
+    lines = [f"{len(poses)} poses: {counts}; centres' σ × {result.sigma_factor:.3g}"]
     held = "held: their errors are not in σ"
     lines[0] += f", intrinsics {held if result.intrinsics_held else 'with their σ'}"
     if result.searched is not None:
-        total = len(poses) + sum(each.gate == "pose" for each in result.left_out)
+        total = len(poses) + sum(image.gate == "pose" for image in result.left_out)
         lines.append(
             f"sequence: {total - result.searched} images followed from the one before, "
             f"{result.searched} searched as a whole"
@@ -247,7 +250,7 @@ def summary(result: MeasureResult) -> list[str]:
             "ambiguous: two poses fit, mirrored at the line of sight; the likelier one is given, --json has both; "
             "show a second face, come nearer, or use --previous for small motions"
         )
-    failed = [each.name for each in result.images if fit_verdict(each.pose) == "failed"]
+    failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
     if failed:
         lines.append(
             f"χ² failed in {len(failed)} images, first {failed[0]}: residuals beyond their σ by chance in one image of "
@@ -258,54 +261,54 @@ def summary(result: MeasureResult) -> list[str]:
 
 COLOUR_OF = {"certain": COLOURS[0], "resolved": COLOURS[2], "ambiguous": COLOURS[1]}
 MOST_ROWS = 500
-"""Rows of a table on a page; more are in the CSV file."""
+"""Largest number of rows of the table on a page. The CSV file has all."""
 ELLIPSE_SHARE = 0.06
-"""Of the plot's width: how long the largest σ is drawn."""
+"""Length with which the largest σ is drawn, as a share of the plot's width."""
 
 
 def measure_page(result: MeasureResult, where: str) -> str:
-    """The report of ``measure``."""
-    at = np.array([each.pose.camera_from_target.translation for each in result.images])
-    largest = np.sqrt(max(np.linalg.eigvalsh(each.pose.covariance[3:, 3:])[-1] for each in result.images))
+    """Returns the HTML report of ``measure``."""
+    at = np.array([image.pose.camera_from_target.translation for image in result.images])
+    largest = np.sqrt(max(np.linalg.eigvalsh(image.pose.covariance[3:, 3:])[-1] for image in result.images))
     times = round_below(ELLIPSE_SHARE * max(float(np.ptp(at, axis=0).max()), 1.0) / largest)
-    verdicts = any(fit_verdict(each.pose) != "passed" for each in result.images)
-    found = {each.pose.status for each in result.images}
+    verdicts = any(fit_verdict(image.pose) != "passed" for image in result.images)
+    statuses = {image.pose.status for image in result.images}
     return render(
         "sfm/measurement/page.html.jinja",
         where=where,
         lines=summary(result),
         times=times,
-        statuses={status: colour for status, colour in COLOUR_OF.items() if status in found},
+        statuses={status: colour for status, colour in COLOUR_OF.items() if status in statuses},
         views=[
             (_view(result, at, 0, 1, times), "as the camera sees it"),
             (_view(result, at, 0, 2, times), "from above, the camera below"),
         ],
         sigma=_sigma(result),
         verdicts=verdicts,
-        rows=[_row(each, verdicts) for each in result.images[:MOST_ROWS]],
+        rows=[_row(image, verdicts) for image in result.images[:MOST_ROWS]],
         count=len(result.images),
-        left_out=[(each.name, each.reason) for each in result.left_out],
+        left_out=[(image.name, image.reason) for image in result.left_out],
         outliers=[
-            [each.name, o.label, number(o.residual_px, 3), number(o.limit_px, 3)]
-            for each in result.images
-            for o in each.pose.outliers
+            [image.name, o.label, number(o.residual_px, 3), number(o.limit_px, 3)]
+            for image in result.images
+            for o in image.pose.outliers
         ],
     )
 
 
 def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, times: float) -> str:
-    """Plot of two coordinates of the path, with the ellipses of σ enlarged."""
+    """Returns a plot of two coordinates of the path, with enlarged ellipses of σ."""
     from matplotlib.patches import Ellipse
 
     figure = new_figure(5, 4.4)
     axes = figure.add_axes((0.15, 0.12, 0.83, 0.86))
     for rows in _folders(result.images):
         axes.plot(at[rows, i], at[rows, j], "-", lw=0.7, color="#9aa0a8", zorder=1)
-    for each, place in zip(result.images, at, strict=True):
-        values, directions = np.linalg.eigh(each.pose.covariance[np.ix_([3 + i, 3 + j], [3 + i, 3 + j])])
+    for image, place in zip(result.images, at, strict=True):
+        values, directions = np.linalg.eigh(image.pose.covariance[np.ix_([3 + i, 3 + j], [3 + i, 3 + j])])
         width, height = 2 * times * np.sqrt(values)
         angle = float(np.degrees(np.arctan2(directions[1, 0], directions[0, 0])))
-        colour = COLOUR_OF[each.pose.status]
+        colour = COLOUR_OF[image.pose.status]
         axes.add_patch(Ellipse(place[[i, j]], width, height, angle=angle, fc=colour, ec=colour, alpha=0.3, lw=0.6))
         axes.plot(place[i], place[j], "o", ms=3.2, color=colour, mew=0)
     plane(axes, f"{'xyz'[i]}, mm", f"{'xyz'[j]}, mm", 0.12)
@@ -315,7 +318,7 @@ def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, times: float) -
 
 
 def _folders(images: tuple[MeasuredImage, ...]) -> list[list[int]]:
-    """Rows of each folder, by name."""
+    """Returns the indices of the images of each folder, in order of name."""
     folders: dict[str, list[int]] = {}
     for row in sorted(range(len(images)), key=lambda i: images[i].name):
         folders.setdefault(images[row].name.rpartition("/")[0], []).append(row)
@@ -323,14 +326,14 @@ def _folders(images: tuple[MeasuredImage, ...]) -> list[list[int]]:
 
 
 def _sigma(result: MeasureResult) -> str:
-    """σ along and across the line of sight, and of the rotation, image by image."""
+    """Returns a plot of σ along and across the line of sight, and of the rotation, image by image."""
     figure = new_figure(9, 3)
     place = figure.add_axes((0.07, 0.17, 0.41, 0.74))
     turn = figure.add_axes((0.57, 0.17, 0.41, 0.74))
     along, across, rotation = (1e3 * np.array(values) for values in zip(*map(_split, result.images), strict=True))
     rows = np.arange(1, len(result.images) + 1)
     size = 4 if len(rows) <= 200 else 1.5
-    colours = [COLOUR_OF[each.pose.status] for each in result.images]
+    colours = [COLOUR_OF[image.pose.status] for image in result.images]
     place.scatter(rows, along, s=size**2, c=colours, lw=0)
     place.scatter(rows, across, s=size**2, c="none", edgecolors=colours, lw=0.8)
     turn.scatter(rows, np.degrees(rotation), s=size**2, c=colours, lw=0)
@@ -348,7 +351,7 @@ def _sigma(result: MeasureResult) -> str:
 
 
 def _split(each: MeasuredImage) -> tuple[float, float, float]:
-    """σ along the line of sight and across it (mm), and of the rotation (rad)."""
+    """Returns σ along the line of sight and across it (mm), and of the rotation (rad)."""
     covariance, place = each.pose.covariance, each.pose.camera_from_target.translation
     sight = place / np.linalg.norm(place)
     along = float(sight @ covariance[3:, 3:] @ sight)
@@ -357,7 +360,7 @@ def _split(each: MeasuredImage) -> tuple[float, float, float]:
 
 
 def _row(each: MeasuredImage, verdicts: bool) -> list[str]:
-    """Of the table of poses."""
+    """Returns the row of an image in the table of poses."""
     pose = each.pose
     sigma = np.sqrt(np.diag(pose.covariance))
     return (

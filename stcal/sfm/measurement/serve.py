@@ -1,4 +1,4 @@
-"""``measure --serve``: images over HTTP, one JSON each, measured by processes that hold the target."""
+"""HTTP service of ``measure --serve``: one JSON answer per image, measured by processes that hold the target."""
 
 import json
 import socket
@@ -30,17 +30,17 @@ from stcal.sfm.measurement.target import TargetCircles
 from stcal.sfm.measurement.tracker import Tracker
 
 SEQUENCES = 1024
-"""Followed at a time; of more, the one that has waited longest is searched for as a whole again."""
+"""Number of sequences followed at a time. With more, the least recent is forgotten, and searched as a whole again."""
 WAITING = 8
-"""Images for each process that may wait; more are refused."""
+"""Number of images that may wait for each process. More are refused."""
 LONGEST_NAME = 255
 DONE, NO_POSE, REFUSED, FAILED, BUSY = 200, 422, 400, 500, 503
-"""Codes of HTTP."""
+"""Status codes of HTTP."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """What every process holds; see :class:`stcal.sfm.measurement.tracker.Tracker`."""
+    """The data that every process holds; see :class:`stcal.sfm.measurement.tracker.Tracker`."""
 
     target: TargetCircles
     camera: CameraModel
@@ -51,61 +51,61 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """``code`` of HTTP, and the ``text``: JSON of one line."""
+    """An answer. ``code`` : status code of HTTP; ``text`` : JSON in one line."""
 
     code: int
     text: str
 
 
 def refusal(code: int, kind: str, reason: str) -> Answer:
-    """The answer that says why there is none; ``kind`` is the code of the error, like ``E-IMAGE-SIZE``."""
+    """Returns the answer of an error. ``kind`` : code of the error, like ``E-IMAGE-SIZE``."""
     return Answer(code, json.dumps({"error": reason, "code": kind}, ensure_ascii=False))
 
 
 class MeasureService:
     """Answers images with poses, by several processes.
 
-    Each image goes to the process that has least to do, with the poses before it, if it is one of a sequence. Images of
-    a sequence are measured in the order in which they came.
+    Each image goes to the process with the fewest waiting images, together with the previous poses of its sequence.
+    Images of a sequence are measured in the order in which they came.
 
     Parameters
     ----------
     setting : Setting
         Target and camera.
     workers : int
-        Processes.
+        Number of processes.
     """
 
     def __init__(self, setting: Setting, workers: int):
-        held = replace(setting, camera=replace(setting.camera, source=Path(setting.camera.source).name))
-        self._processes = [OwnProcess(_begin, held) for _ in range(workers)]
+        named = replace(setting, camera=replace(setting.camera, source=Path(setting.camera.source).name))
+        self._processes = [OwnProcess(_begin, named) for _ in range(workers)]
         self._waiting = [0] * workers
         self._sequences: OrderedDict[str, _Sequence] = OrderedDict()
         self._guard = threading.Lock()
 
     def start(self) -> None:
-        """Start the processes now, not with the first images."""
+        """Starts the processes now, not with the first images."""
         for process in self._processes:
             process.call(_ready)
 
     def answer(self, data: bytes, name: str = "image", sequence: str = "") -> Answer:
-        """Of one image.
+        """Returns the answer to one image.
 
         Parameters
         ----------
         data : bytes
             Content of an image file.
         name : str
-            Of the image, for the answer.
+            Name of the image, for the answer.
         sequence : str
-            Name of the sequence that it is the next image of; none where empty.
+            Name of the sequence whose next image it is; empty for a single image.
 
         Returns
         -------
         Answer
-            200 and the poses file of ``measure`` of this image; 422 and the same where it gives no pose, with the
-            reason among those left out; 400 for what is no image of this camera, 503 where too many wait, 500 where
-            the process ended: ``{"error": …, "code": …}``.
+            200 with the poses file of ``measure`` of this image. 422 with the same file if there is no pose; the reason
+            is in ``left_out``. 400 if the data are no image of this camera, 503 if too many images wait, 500 if the
+            process ended, with ``{"error": …, "code": …}``.
         """
         if fault := name_fault(name) or name_fault(sequence):
             return refusal(REFUSED, "E-SERVICE-NAME", f"name: {fault}; give that of the image alone")
@@ -115,23 +115,23 @@ class MeasureService:
             )
         if not sequence:
             return self._measured(data, name, ())[0]
-        own = self._sequence(sequence)
-        with own.turn:
-            answer, own.recent = self._measured(data, name, own.recent)
+        state = self._sequence(sequence)
+        with state.turn:
+            answer, state.recent = self._measured(data, name, state.recent)
         return answer
 
     def close(self) -> None:
-        """End the processes."""
+        """Ends the processes."""
         for process in self._processes:
             process.close()
 
     def _sequence(self, name: str) -> "_Sequence":
         with self._guard:
-            own = self._sequences.setdefault(name, _Sequence())
+            state = self._sequences.setdefault(name, _Sequence())
             self._sequences.move_to_end(name)
             while len(self._sequences) > SEQUENCES:
                 self._sequences.popitem(last=False)
-            return own
+            return state
 
     def _measured(self, data: bytes, name: str, recent: tuple[Rigid, ...]) -> tuple[Answer, tuple[Rigid, ...]]:
         with self._guard:
@@ -153,14 +153,18 @@ class MeasureService:
 
 @dataclass(slots=True, eq=False)
 class _Sequence:
-    """``turn`` : of its images, one at a time; ``recent`` : as of :class:`stcal.sfm.measurement.tracker.Tracker`."""
+    """State of a sequence of images.
+
+    ``turn`` : held while one of its images is measured; ``recent`` : as in
+    :class:`stcal.sfm.measurement.tracker.Tracker`.
+    """
 
     turn: threading.Lock = field(default_factory=threading.Lock)
     recent: tuple[Rigid, ...] = ()
 
 
 _tracker: Tracker | None = None
-"""In a process: what holds target and camera."""
+"""The tracker of this process, with target and camera."""
 
 
 def _begin(setting: Setting) -> None:
@@ -173,27 +177,27 @@ def _ready() -> bool:
 
 
 def _answer(data: bytes, name: str, recent: tuple[Rigid, ...]) -> tuple[Answer, tuple[Rigid, ...]]:
-    """The answer, and the poses from which the next image of the sequence is predicted."""
+    """Returns the answer, and the poses from which the next image of the sequence is predicted."""
     tracker = _tracker
     assert tracker is not None
     tracker.recent = recent
     try:
         width, height = stated_size(data, name)
-        own = tracker.model
-        if (own.width or width, own.height or height) != (width, height):
+        camera = tracker.model
+        if (camera.width or width, camera.height or height) != (width, height):
             raise InputError(
                 "E-IMAGE-SIZE",
-                f"{name}: {width}×{height} px, camera {own.width}×{own.height} px; send it as the camera took it",
+                f"{name}: {width}×{height} px, camera {camera.width}×{camera.height} px; send it as the camera took it",
             )
         image = decode(data, name)
         try:
-            seen, pose = tracker.observe(image, name)
-            found = outcome(name, pose, seen.notes)
+            labelled, pose = tracker.observe(image, name)
+            measured = outcome(name, pose, labelled.notes)
         except ConvergenceError as error:
-            found = Skipped(name, str(error), "distortion")
+            measured = Skipped(name, str(error), "distortion")
     except InputError as error:
         return refusal(REFUSED, error.code, str(error)), recent
-    result = result_of([found], tracker.target, MeasureOptions(tracker.pose_options), tracker.prior)
+    result = result_of([measured], tracker.target, MeasureOptions(tracker.pose_options), tracker.prior)
     content = poses_file(result).content()
     text = json.dumps(content, ensure_ascii=False, allow_nan=False)
     return Answer(DONE if result.images else NO_POSE, text), tracker.recent
@@ -202,26 +206,26 @@ def _answer(data: bytes, name: str, recent: tuple[Rigid, ...]) -> tuple[Answer, 
 LOCALHOST, PORT = "127.0.0.1", 8765
 MAX_MEGABYTES = 64.0
 PATIENCE_S = 30.0
-"""A client that sends nothing for so long is cut off."""
+"""Time without data after which a client is disconnected, s."""
 CONNECTIONS = 64
 LINGER_S = 1.0
-"""So long the rest of what was refused is read, so that the answer is not lost with it."""
+"""Time for which the rest of a refused request is read, s. Else the client could lose the answer."""
 MEASURE, STATUS = "/measure", "/"
 NO_LENGTH, TOO_LARGE, NOT_FOUND, NOT_ALLOWED = 411, 413, 404, 405
 
 
 @dataclass(frozen=True, slots=True)
 class ServeOptions:
-    """Where and how to serve.
+    """Options of the HTTP service.
 
     Parameters
     ----------
     host : str
-        Address to listen at; this machine alone by default.
+        Address to listen on; reachable from this machine only by default.
     port : int
-        A free one where 0.
+        Port to listen on; any free one if 0.
     max_megabytes : float
-        Of an image file.
+        Largest size of an image file.
     """
 
     host: str = LOCALHOST
@@ -230,17 +234,17 @@ class ServeOptions:
 
 
 class MeasureServer(ThreadingHTTPServer):
-    """Listens; a thread for each connection hands images to the service.
+    """HTTP server that passes images to the service, with a thread for each connection.
 
     Attributes
     ----------
     counts : Counter
-        Answers by code of HTTP.
+        Number of answers by status code.
 
     Raises
     ------
     InputError
-        The address cannot be listened at.
+        If it cannot listen on the address.
     """
 
     daemon_threads = True
@@ -265,23 +269,23 @@ class MeasureServer(ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """Where it listens."""
+        """URL of the server."""
         host, port = self.server_address[:2]
         host = host.decode() if isinstance(host, bytes | bytearray) else host
         return f"http://{f'[{host}]' if ':' in host else host}:{port}"
 
     @property
     def local(self) -> bool:
-        """Whether only this machine reaches it."""
+        """Whether only this machine can reach the server."""
         return ip_address(str(self.server_address[0]).partition("%")[0]).is_loopback
 
     def count(self, code: int) -> None:
-        """One more answer of this code."""
+        """Counts one more answer with this code."""
         with self._guard:
             self.counts[code] += 1
 
     def process_request(self, request: Any, client_address) -> None:
-        """In a thread of its own, if one is free."""
+        """Handles a request in a thread of its own, or answers 503 if none is free."""
         if self._free.acquire(blocking=False):
             super().process_request(request, client_address)
             return
@@ -291,18 +295,18 @@ class MeasureServer(ThreadingHTTPServer):
         self.shutdown_request(request)
 
     def process_request_thread(self, request, client_address) -> None:
-        """One connection, to its end."""
+        """Handles one connection to its end, and frees its thread."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._free.release()
 
     def handle_error(self, request, client_address) -> None:
-        """A client that went away is none of ours."""
+        """Ignores the error of a client that went away."""
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One connection; its images come one after the other."""
+    """One connection, whose images come one after the other."""
 
     protocol_version = default_request_version = "HTTP/1.1"
     server_version = f"stcal/{stcal.__version__}"
@@ -312,7 +316,7 @@ class _Handler(BaseHTTPRequestHandler):
     server: MeasureServer
 
     def do_POST(self) -> None:
-        """An image, or what else a client sends."""
+        """Answers an image, or refuses any other data."""
         parts = urlsplit(self.path)
         if parts.path != MEASURE:
             self._refuse(NOT_FOUND, f"POST an image to {MEASURE}")
@@ -326,36 +330,40 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(TOO_LARGE, f"{int(length) / 1e6:.1f} MB; {limit:g} MB at most, see --max-megabytes")
             return
         data = self.rfile.read(int(length))
-        if len(data) < int(length):  # it went away
+        if len(data) < int(length):  # the client went away
             self.close_connection = True
             return
         asked = parse_qs(parts.query)
         name, sequence = (asked.get(key, [default])[0] for key, default in (("name", "image"), ("sequence", "")))
         try:
             answer = self.server.service.answer(data, name, sequence)
-        except Exception as error:  # a mistake of ours must not end the connection without an answer
+        except Exception as error:  # a fault of the program must not end the connection without an answer
             answer = refusal(500, "E-SERVICE-FAILED", f"{type(error).__name__}: not answered")
         self._send(answer)
 
     def do_GET(self) -> None:
-        """What this is."""
+        """Answers with a description of the service and its counts."""
         if urlsplit(self.path).path != STATUS:
             self._refuse(NOT_FOUND, f"POST an image to {MEASURE}; GET {STATUS} tells what this is")
             return
         counts = {str(code): n for code, n in sorted(self.server.counts.items())}
-        own = {"format": "stcal service 1", "version": stcal.__version__, "measure": f"POST {MEASURE}?name=&sequence="}
-        own |= {"max_megabytes": self.server.options.max_megabytes, "answers": counts}
-        self._send(Answer(200, json.dumps(own)), counted=False)
+        description = {
+            "format": "stcal service 1",
+            "version": stcal.__version__,
+            "measure": f"POST {MEASURE}?name=&sequence=",
+        }
+        description |= {"max_megabytes": self.server.options.max_megabytes, "answers": counts}
+        self._send(Answer(200, json.dumps(description)), counted=False)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """In place of a page, JSON: what the standard library refuses by itself."""
+        """Sends JSON in place of a page for a request that the standard library refuses."""
         self._refuse(NOT_ALLOWED if code == 501 else code, message or self.responses.get(code, ("refused",))[0])
 
     def log_message(self, *_) -> None:
-        """Counts alone are kept."""
+        """Writes no log, as only counts are kept."""
 
     def _refuse(self, code: int, reason: str) -> None:
-        """And end the connection, whose rest is unknown."""
+        """Refuses the request and ends the connection, as the rest of its data is unknown."""
         self.close_connection = True
         self._send(refusal(code, "E-SERVICE-REQUEST", reason))
         with suppress(OSError):
@@ -380,9 +388,9 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def serve(service: MeasureService, options: ServeOptions, ready: Callable[[MeasureServer], None]) -> None:
-    """Answer until interrupted.
+    """Answers requests until interrupted.
 
-    ``ready`` : called with the server when images may come.
+    ``ready`` : called with the server as soon as it accepts images.
     """
     with MeasureServer(service, options) as server:
         try:
@@ -394,6 +402,6 @@ def serve(service: MeasureService, options: ServeOptions, ready: Callable[[Measu
 
 
 def counts_text(counts: Counter[int]) -> str:
-    """What was answered, in a line."""
-    every, poses, none = sum(counts.values()), counts[DONE], counts[NO_POSE]
-    return f"answered {every}: {poses} with a pose, {none} without, {every - poses - none} refused"
+    """Returns one line with the counts of answers."""
+    total, poses, without_pose = sum(counts.values()), counts[DONE], counts[NO_POSE]
+    return f"answered {total}: {poses} with a pose, {without_pose} without, {total - poses - without_pose} refused"

@@ -1,4 +1,4 @@
-"""A calibrated target as one image of it is measured by: its circles in the target frame with their covariance."""
+"""A calibrated target for measurement: its circles in the target frame with their covariance."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,7 +20,8 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
 
 SAME_DESIGN_MM = 0.5
-"""RMS by which a face's circles may differ from the design: made to a tenth of that, and drawn to far more."""
+"""Largest RMS deviation of a face's circles from the design. Faces are made to a tenth of that; another design is off
+by far more."""
 SAME_RADIUS_MM = 1e-6
 
 
@@ -28,18 +29,18 @@ SAME_RADIUS_MM = 1e-6
 class TargetCircles:
     """The c circles of a calibrated target, target frame, mm.
 
-    ``labels`` ; ``xyz`` : (c, 3) centres; ``radius`` : (c,); ``covariance`` : (3c, 3c) mm² of all centres together,
-    zero where nothing is known; ``sigma_factor`` : by which centres' own σ are too small, as the run found it;
-    ``notes`` : what the covariance lacks; ``design`` : by which they are found in images, None where they are not to
-    be. ``normal`` : (c, 3) of the plane of each circle's face, ``target_from_plane`` of each face, the plane's origin
-    amid its circles, and ``place`` of each label follow from the centres.
+    ``labels`` ; ``xyz`` : (c, 3) centres; ``radius`` : (c,); ``covariance`` : (3c, 3c) joint covariance of all centres,
+    mm², zero if unknown; ``sigma_factor`` : factor on the centres' own σ, as estimated by the run; ``notes`` : what the
+    covariance lacks; ``design`` : design for detection in images, None if images are not searched. Computed from these:
+    ``normal`` : (c, 3) normal of the plane of each circle's face; ``target_from_plane`` : by face, with the origin of
+    the plane at the mean of its circles; ``place`` : index by label.
 
     Raises
     ------
     DegenerateError
-        The circles of a face lie in line.
+        If the circles of a face lie in line.
     InputError
-        A wrong shape or number, a label twice, or a covariance that is none.
+        If an array has a wrong shape, a number is out of range, a label occurs twice, or a covariance is invalid.
     """
 
     labels: tuple[CircleLabel, ...]
@@ -74,7 +75,7 @@ class TargetCircles:
         for face_id in dict.fromkeys(label.face for label in self.labels):
             rows = [i for i, label in enumerate(self.labels) if label.face == face_id]
             if len(rows) < 3:
-                continue  # no plane of its own: such a face is not measured
+                continue  # such a face has no plane and is not measured
             try:
                 axis = fit_plane(self.xyz[rows]).normal
             except DegenerateError as error:
@@ -88,7 +89,7 @@ class TargetCircles:
 
     @classmethod
     def of(cls, target: CalibratedTarget, design: TargetDesign, sigma_factor: float = 1.0) -> "TargetCircles":
-        """Of the result of a run in memory; ``sigma_factor`` : that of its calibration."""
+        """Returns the circles of a run's result in memory. ``sigma_factor`` : the factor of its calibration."""
         labels, radius = tuple(target.circles), design.radius_of()
         covariance, notes = _covariance(labels, target.covariance_mm2, target.circle_covariance)
         xyz = np.array([target.circles[label] for label in labels])
@@ -96,24 +97,24 @@ class TargetCircles:
 
 
 def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
-    """Read a ``faces.json`` and check that it is of this design.
+    """Reads a ``faces.json`` and checks that it belongs to this design.
 
     Parameters
     ----------
     path : path
         ``faces.json`` of a finished run.
     design : TargetDesign
-        Of the same target.
+        Design of the same target.
 
     Returns
     -------
     TargetCircles
-        Centres of all circles with the covariance of all together, target frame, mm and mm².
+        Centres of all circles with their joint covariance, target frame, mm and mm².
 
     Raises
     ------
     InputError
-        Not a ``faces.json``, or one of another design.
+        If the file is no ``faces.json``, or belongs to another design.
     """
     path = Path(path)
     faces = read_result(path, FacesFile, "faces", "give RUN/faces.json, the faces.json of a run")
@@ -136,7 +137,7 @@ def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
 
 
 def _joint(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray | None:
-    """(3c, 3c) in the order of ``labels``; None where the file has none."""
+    """Returns the joint covariance (3c, 3c) in the order of ``labels``, or None if the file has none."""
     joint = faces.circles_joint_covariance_mm2
     if joint is None:
         return None
@@ -149,14 +150,14 @@ def _joint(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray | No
 def _covariance(
     labels, joint: np.ndarray | None, single: Mapping[Any, np.ndarray]
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The best covariance (3c, 3c) that there is, and what it lacks."""
+    """Returns the most complete covariance (3c, 3c) available, and notes on what it lacks."""
     notes: tuple[str, ...] = ()
     if joint is None:
         joint = np.zeros((3 * len(labels), 3 * len(labels)))
         for i, label in enumerate(labels if single else ()):
             joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = single[label]
-        what = "covariances between circles" if single else "covariances of its circles"
-        notes = (f"the target states no {what}: they are taken as zero in the poses' covariances",)
+        missing = "covariances between circles" if single else "covariances of its circles"
+        notes = (f"the target states no {missing}: they are taken as zero in the poses' covariances",)
     return joint, notes
 
 
@@ -179,10 +180,10 @@ def _require_design(target: TargetCircles, design: TargetDesign, path: Path) -> 
             continue
         flat = np.column_stack([face.xy_mm[own], np.zeros(len(own))])
         xyz = target.xyz[[target.place[face.labels()[i]] for i in own]]
-        off = float(np.sqrt(((align_rigid(xyz, flat) @ flat - xyz) ** 2).sum(1).mean()))
-        if off > SAME_DESIGN_MM:
+        rms_mm = float(np.sqrt(((align_rigid(xyz, flat) @ flat - xyz) ** 2).sum(1).mean()))
+        if rms_mm > SAME_DESIGN_MM:
             raise InputError(
                 "E-FACES-DESIGN",
-                f"faces {path}: face {face.id} is {off:.3g} mm RMS off that of target {design.name}, "
+                f"faces {path}: face {face.id} is {rms_mm:.3g} mm RMS off that of target {design.name}, "
                 f"{SAME_DESIGN_MM:g} mm allowed; give the target.toml of that run",
             )

@@ -1,4 +1,4 @@
-"""A calibrated target followed from image to image: its circles are measured where the poses before put them."""
+"""Tracker of a calibrated target from image to image, which measures circles at their predicted places."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,50 +35,52 @@ from stcal.sfm.measurement.pose import PoseOptions, TargetPose, fit_verdict, mea
 from stcal.sfm.measurement.target import TargetCircles
 
 MIN_SHARE = 0.5
-"""Of the circles that should be in view, found near their predicted places at least; with fewer the target is searched
-for in the whole image, as if it had not been seen before."""
+"""Least share of the expected circles that must be found near their predicted places. With fewer, the whole image is
+searched."""
 MIN_FOUND = 6
-"""As many as name a face."""
+"""Least number of circles found: as many as identify a face."""
 MAX_TRIED_TILT_RAD = np.radians(80.0)
-"""A face seen so obliquely may be found by its pattern; beyond 70° none is missed that is not."""
+"""Largest predicted tilt of the circles that are looked for. Up to it, a face may be found by its pattern; circles
+beyond 70° are not reported as missed."""
 
 
 class Tracker:
-    """Poses of a calibrated target in images that follow each other, as those of a live camera.
+    """Tracks a calibrated target through consecutive images, such as those of a live camera.
 
-    The pose is predicted from those of the two images before, at an even motion; the common shift of the circles from
-    there is found in a small picture, and every circle is measured where it then must be, with its whole rim, as in a
-    single image. Where too few are found, or the fit fails, the target is searched for in the whole image. Both ways
-    measure the same circles; what their centres differ by, since the band of pixels lies about another start, is a part
-    of their σ. A pose takes nothing else from the one before but the choice between two that fit alike.
+    The pose is predicted from the poses of the last two images, at constant motion. The common shift of the circles
+    from there is found in a reduced image. Every circle is then measured at its shifted place, with its whole rim, as
+    in a single image. If too few are found, or the fit fails, the target is searched for in the whole image. Both ways
+    measure the same circles. Their centres differ by a part of their σ, since the band of pixels lies about another
+    start. The previous pose affects a pose only by the choice between two solutions that fit equally well.
 
     Parameters
     ----------
     target : TargetCircles
-        The calibrated target, as :func:`stcal.sfm.read_target` gives it, with its design.
+        Calibrated target with its design, from :func:`stcal.sfm.read_target`.
     camera : CameraModel
-        As :func:`stcal.io.cameras.read.read_camera` returns it; its covariance, if it has one, goes into the poses'.
+        Camera from :func:`stcal.io.cameras.read.read_camera`. Its covariance, if any, is part of the poses'
+        covariances.
     board : BoardDesign, optional
         A dot board that may be in view, so that its dots are not taken for circles of the target.
     pose : PoseOptions, optional
-        The defaults where None.
+        The defaults if None.
     ellipses : EllipseOptions, optional
-        Of the search; the defaults where None.
+        Options of the search; the defaults if None.
 
     Attributes
     ----------
     notes : tuple of str
-        What was seen and left out in the last image, and why.
+        Circles of the last image that were left out, with reasons.
     searched : bool
         Whether the last image was searched as a whole.
     recent : tuple of Rigid
-        camera_from_target of the one or two images before, from which the next is predicted; none before the first and
-        after a cut. Where they are put back, another tracker of the same target goes on.
+        camera_from_target of the last one or two images, from which the next is predicted; empty before the first image
+        and after a cut. Another tracker of the same target continues the sequence if its ``recent`` is set to them.
 
     Raises
     ------
     InputError
-        The target has no design.
+        If the target has no design.
     """
 
     def __init__(
@@ -103,54 +105,54 @@ class Tracker:
         self._threads = ThreadpoolController()  # looked up once: it takes 2 ms
 
     def forget(self) -> None:
-        """Search the next image as a whole, as after a cut."""
+        """Makes the tracker search the next image as a whole, as after a cut."""
         self.recent = ()
 
     def locate(self, image: np.ndarray, name: str = "image") -> TargetPose:
-        """camera_from_target in the next image.
+        """Returns camera_from_target in the next image.
 
         Parameters
         ----------
         image : (height, width) array, uint8 or uint16
-            Grey values, as the camera took them.
+            Grey values of the unprocessed image.
         name : str
-            Of the image, for messages.
+            Name of the image, for messages.
 
         Returns
         -------
         TargetPose
-            mm, with its (6, 6) covariance in rad and mm, left perturbation in the camera frame.
+            Pose in mm, with its (6, 6) covariance in rad and mm, left perturbation in the camera frame.
 
         Raises
         ------
         InputError
-            Not a grey image, or not of the camera's size.
+            If the image is not grey, or not of the camera's size.
         DetectionError
-            No face of the target is seen.
+            If no face of the target is seen.
         StcalError
-            What was seen gives no pose; the next image is searched as a whole then.
+            If the circles give no pose. The next image is then searched as a whole.
         """
         with self._threads.limit(limits=1):
-            seen, pose = self.observe(image, name)
-        self.notes = seen.notes
+            labelled, pose = self.observe(image, name)
+        self.notes = labelled.notes
         if isinstance(pose, StcalError):
             raise pose
         return pose
 
     def observe(self, image: np.ndarray, name: str = "image") -> tuple[LabelledImage, TargetPose | StcalError]:
-        """The labelled circles of the next image, and its pose or why there is none; see :meth:`locate`."""
+        """Returns the labelled circles of the next image, and its pose or the error; see :meth:`locate`."""
         camera = self._camera_of(image, name)
-        found = self._follow(image, camera, name) if self.recent else None
-        self.searched = found is None
-        seen, pose = found or self._search(image, camera, name)
+        followed = self._follow(image, camera, name) if self.recent else None
+        self.searched = followed is None
+        labelled, pose = followed or self._search(image, camera, name)
         if isinstance(pose, StcalError):
             self.forget()
-            return seen, pose
+            return labelled, pose
         if self.recent:
             pose = resolved(pose, self.recent[-1])
         one_before = () if self.searched else self.recent[-1:]  # no motion is known across a search
         self.recent = (*one_before, pose.camera_from_target) if pose.status != "ambiguous" else ()
-        return seen, pose
+        return labelled, pose
 
     def _camera_of(self, image: np.ndarray, name: str) -> Camera:
         if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
@@ -172,11 +174,11 @@ class Tracker:
 
     def _search(self, image: np.ndarray, camera: Camera, name: str) -> tuple[LabelledImage, TargetPose | StcalError]:
         detection = detect_image(image, camera, self.design, self.board, self.ellipses)
-        seen = label_single(name, "", detection, self.design)
-        return seen, self._pose(seen.observations, camera)
+        labelled = label_single(name, "", detection, self.design)
+        return labelled, self._pose(labelled.observations, camera)
 
     def _follow(self, image: np.ndarray, camera: Camera, name: str) -> tuple[LabelledImage, TargetPose] | None:
-        """None where the target is not near its predicted place."""
+        """Returns circles and pose near the predicted place, or None if the target is not there."""
         last = self.recent[-1]
         expected = last @ self.recent[0].inverse() @ last if len(self.recent) == 2 else last
         predicted = self._predicted(expected, camera, (), MAX_TRIED_TILT_RAD)
@@ -186,30 +188,30 @@ class Tracker:
         labels, centres = measure_near(grey_fine(image), camera, predicted)
         if len(labels) < max(MIN_FOUND, MIN_SHARE * len(predicted.labels)):
             return None
-        seen = labelled_image(name, "", labels, centres, ())
-        pose = self._pose(seen.observations, camera)
+        labelled = labelled_image(name, "", labels, centres, ())
+        pose = self._pose(labelled.observations, camera)
         if isinstance(pose, StcalError):
             return None
-        again = self._completed(image, camera, seen, pose)
-        if again.observations is not seen.observations:
-            pose = self._pose(again.observations, camera)
-        seen = again
+        completed = self._completed(image, camera, labelled, pose)
+        if completed.observations is not labelled.observations:
+            pose = self._pose(completed.observations, camera)
+        labelled = completed
         if isinstance(pose, StcalError) or fit_verdict(pose) == "failed":
             return None
-        return seen, pose
+        return labelled, pose
 
     def _completed(self, image: np.ndarray, camera: Camera, seen: LabelledImage, pose: TargetPose) -> LabelledImage:
-        """With what the first pose puts into view too, and without what contradicts it."""
+        """Adds the circles that the first pose puts into view, and removes those that contradict it."""
         labels, pose_now = seen.observations.labels, pose.camera_from_target
         wrong = contradictions(self._predicted(pose_now, camera, labels, MAX_TRIED_TILT_RAD), seen.observations, camera)
         seen = seen.without(wrong, contradicted_notes(wrong))
         predicted = self._predicted(pose_now, camera, labels, MAX_TILT_RAD)
         if not predicted.wanted.any():
             return seen
-        look = measure_predicted(image, camera, predicted, self.ellipses)
-        if not look.labels:
-            return replace(seen, notes=(*seen.notes, *missed_notes(look.missed)))
-        return seen.plus(look.labels, look.centres, missed_notes(look.missed))
+        measured = measure_predicted(image, camera, predicted, self.ellipses)
+        if not measured.labels:
+            return replace(seen, notes=(*seen.notes, *missed_notes(measured.missed)))
+        return seen.plus(measured.labels, measured.centres, missed_notes(measured.missed))
 
     def _predicted(self, pose: Rigid, camera: Camera, seen: Sequence[Label], max_tilt_rad: float) -> PredictedCircles:
         arrangement = Arrangement(self._planes, {0: pose}, {})
@@ -223,11 +225,11 @@ class Tracker:
 
 
 def _target_from_face(target: TargetCircles, design: TargetDesign) -> dict[str, Rigid]:
-    """Place of each face's design amid its calibrated circles."""
-    found = {}
+    """Returns target_from_face of each design, by a fit to the calibrated circles."""
+    poses = {}
     for face in design.faces:
         if face.id in target.target_from_plane:
-            own = [i for i, label in enumerate(face.labels()) if label in target.place]
-            flat = np.column_stack([face.xy_mm[own], np.zeros(len(own))])
-            found[face.id] = align_rigid(target.xyz[[target.place[face.labels()[i]] for i in own]], flat)
-    return found
+            calibrated = [i for i, label in enumerate(face.labels()) if label in target.place]
+            flat = np.column_stack([face.xy_mm[calibrated], np.zeros(len(calibrated))])
+            poses[face.id] = align_rigid(target.xyz[[target.place[face.labels()[i]] for i in calibrated]], flat)
+    return poses

@@ -1,4 +1,4 @@
-"""After a run: which further photographs would make its worst face better, and when only a better board would."""
+"""Advice after a run: further photographs that would improve its worst face, or whether only a better board would."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,19 +29,20 @@ from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 from stcal.synthetic.scene import Group, Scene, group_name
 
 SHORTLIST = 8
-"""After the first choice only candidates that were among so many best for one of the faces are looked at again."""
+"""Number of candidates that stay in the search after the first choice: the best so many for each face."""
 NEW_GROUP_SPREAD_RAD = float(np.radians(40))
+"""Spread of the views of a new group about the view that shows both faces equally."""
 AT_ONCE = 50
-"""Candidates that one process computes at a time."""
+"""Number of candidates that one process computes at a time."""
 MIN_NEW_GROUP = 3
-"""Images that a new group needs to be mapped."""
+"""Least number of images with which a new group can be mapped."""
 BOARD_DOMINATES = 0.5
-"""Share of the worst face's variance from which more views are said not to help."""
+"""Share of the board in the variance of the worst face beyond which more views hardly help."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """A view to add, and the face that is worst after it (and those before it in the list), σ in mm."""
+    """A view to add. ``face``, ``sigma_mm`` : the worst face with this view and all choices before it, and its σ."""
 
     view: PlannedView
     face: str
@@ -50,7 +51,10 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class NewGroup:
-    """Faces to photograph together for the first time in ``images`` views, and the worst face after that, σ in mm."""
+    """A pair of faces to photograph together for the first time.
+
+    ``images`` : number of views; ``face``, ``sigma_mm`` : the worst face with these views, and its σ.
+    """
 
     faces: tuple[str, str]
     images: int
@@ -60,8 +64,12 @@ class NewGroup:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Advice:
-    """``now`` : the run's own geometry; ``shares`` of its variance by face and source; ``choices`` one after the other;
-    ``new_groups`` the best first; ``better_board`` : now with half the board's σ; ``tried`` candidates."""
+    """Further photographs, and what each of them would improve.
+
+    ``now`` : forecast of the run as it is; ``shares`` : of its variance, by face and source; ``choices`` : views, each
+    chosen in addition to those before it; ``new_groups`` : the best first; ``better_board`` : forecast of the run with
+    half the board's σ; ``tried`` : number of candidates.
+    """
 
     now: Forecast
     shares: dict[str, dict[str, float]]
@@ -73,13 +81,13 @@ class Advice:
 
     @property
     def board_dominates(self) -> bool:
-        """More views will not help much."""
+        """Whether most of the worst face's variance is the board's, so that more views help little."""
         return self.shares[self.now.worst()[0]]["board"] > BOARD_DOMINATES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Known:
-    """A run as the forecast sees it: models in mm in the target frame, σ as in the run's adjustment."""
+    """A finished run as input of a forecast: models in mm, target frame, with the σ of the run's adjustment."""
 
     models: tuple[MetricModel, ...]
     joint: JointResult
@@ -89,7 +97,9 @@ class Known:
 
 
 def known_of(run: SavedRun) -> Known:
-    """The geometry of a finished run, adjusted once more (which moves nothing), for what ``faces.json`` does not say.
+    """Returns the geometry of a finished run.
+
+    It is adjusted once more, which moves nothing, for the data that ``faces.json`` does not contain.
 
     Raises
     ------
@@ -114,33 +124,33 @@ def known_of(run: SavedRun) -> Known:
 
 
 def doubts(run: SavedRun) -> str:
-    """Why the σ that advice rests on are not those of the run's faces; empty where nothing speaks against them."""
+    """Returns the reason why the forecast σ may not hold for the run's faces; empty if there is none."""
     if not run.options.eccentricity:
         return f"{run.folder} is an uncorrected control, whose faces are biased by tens of µm: these σ are not theirs"
     failed = [check["title"] for check in run.report.get("checks", ()) if check["verdict"] == "failed"]
     if failed:
-        what = f"{len(failed)} checks of {run.folder} failed, first {failed[0]}"
-        return f"{what}: its faces may be off by far more than these σ"
+        failures = f"{len(failed)} checks of {run.folder} failed, first {failed[0]}"
+        return f"{failures}: its faces may be off by far more than these σ"
     return ""
 
 
 @one_thread()
 def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Advice:
-    """The views that, taken one after the other, lower the σ of the worst face most, and new groups of as many images.
+    """Returns the views that lower the σ of the worst face most, one after the other, and new groups of as many images.
 
     Parameters
     ----------
     known : Known
         The geometry of a finished run, see :func:`stcal.sfm.planning.advise.known_of`.
     count : int
-        Views to choose, each given those before it.
+        Number of views to choose, each in addition to those before it.
     progress : callable, optional
         Called with (stage, done, total).
 
     Returns
     -------
     Advice
-        The views, with the worst face and its σ after each, mm; the σ now, and their sources.
+        The views, with the worst face and its σ (mm) after each; the present σ and their sources.
     """
     setup = known.setup
     photographs = photographs_of(known.models, setup.board, setup.camera, setup.prior)
@@ -148,7 +158,7 @@ def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Ad
     shares = variance_shares(now, without_sources(known.models, setup, now.derivatives, photographs))
     with kept_processes():
         by_group = run_briefly(candidates, [(known.scene, model, setup, known.noise) for model in known.models])
-        views = [view for own in by_group for view in own]
+        views = [view for views_of_group in by_group for view in views_of_group]
         chosen = _greedy(known, views, now, photographs, count, progress or (lambda *_: None))
     return Advice(
         now,
@@ -164,7 +174,7 @@ def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Ad
 def _greedy(
     known: Known, views: list[PlannedView], now: Forecast, photographs: Photographs, count: int, progress: Progress
 ) -> list[Choice]:
-    """Always the view that leaves the worst face best, given those chosen before."""
+    """Chooses view after view, each time the one with which the worst face has the smallest σ."""
     chosen: list[Choice] = []
     setup, photographs = known.setup, dict(photographs)
     while views and len(chosen) < count:
@@ -187,31 +197,31 @@ def _positions(positions: PositionsWith, views: Sequence[PlannedView]) -> list[d
 
 
 def _promising(by_view: list[dict[str, float]]) -> set[int]:
-    """The best for any face: which one is worst may change."""
+    """Returns the indices of the best views for each of the faces, as another face may become the worst one."""
     return {i for face in by_view[0] for i in sorted(range(len(by_view)), key=lambda k: by_view[k][face])[:SHORTLIST]}
 
 
 def _new_groups(known: Known, now: Forecast, photographs: Photographs, images: int) -> list[NewGroup]:
-    """Pairs of faces that no group shows together, where the geometry allows to."""
+    """Returns the pairs of faces that no group shows together but one view can, the best first."""
     together = {
         pair
         for model in known.models
         for pair in combinations(sorted(key for key in model.points_by_face() if key != "board"), 2)
     }
-    found = []
+    new_groups = []
     for pair in combinations(sorted(face.id for face in known.scene.target.faces), 2):
         if pair not in together:
             try:
                 model = _new_model(known, pair, images)
             except DegenerateError:
                 continue  # the two cannot be seen together at this distance
-            with_it = forecast([*known.models, model], known.setup, now.derivatives, photographs)
-            found.append(NewGroup(pair, images, *with_it.worst()))
-    return sorted(found, key=lambda each: each.sigma_mm)
+            with_model = forecast([*known.models, model], known.setup, now.derivatives, photographs)
+            new_groups.append(NewGroup(pair, images, *with_model.worst()))
+    return sorted(new_groups, key=lambda group: group.sigma_mm)
 
 
 def _new_model(known: Known, pair: tuple[str, str], images: int) -> MetricModel:
-    """A group of two faces with the board beside them, photographed from the distance of the present ones."""
+    """Returns a group of two faces with the board beside them, at the distance of the present photographs."""
     scene = known.scene
     name = f"new {group_name(pair)}"
     normals = [scene.target_from_face[face].rotation[:, 2] for face in pair]

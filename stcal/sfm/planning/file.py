@@ -26,14 +26,14 @@ class FaceForecast(Part):
     @classmethod
     def of(cls, forecast: Forecast, face: str, shares: dict[str, float]) -> "FaceForecast":
         sigma = np.sqrt(np.diag(forecast.face_covariance[face]))
-        own = {label: sigma for label, sigma in forecast.circle_sigma_mm.items() if label.face == face}
-        worst = max(own, key=lambda label: own[label])
+        sigma_of_circle = {label: sigma for label, sigma in forecast.circle_sigma_mm.items() if label.face == face}
+        worst = max(sigma_of_circle, key=lambda label: sigma_of_circle[label])
         return cls(
             translation_sigma_um=MICRO * sigma[3:],
             rotation_sigma_mdeg=MICRO * np.degrees(sigma[:3]),
             position_sigma_um=MICRO * forecast.position_sigma_mm()[face],
             worst_circle=worst,
-            worst_circle_sigma_um=MICRO * own[worst],
+            worst_circle_sigma_um=MICRO * sigma_of_circle[worst],
             variance_shares=shares,
         )
 
@@ -114,8 +114,10 @@ class PlanFile(ForecastPart, PlannedPart, ResultFile):
             centre_sigma_rms_px=plan.centre_sigma_px,
             **dict(ForecastPart.of(plan.forecast, plan.shares)),
             remedies=[
-                RemedyRow(what=each.what, worst_sigma_um=each.sigma_mm and MICRO * each.sigma_mm, reason=each.reason)
-                for each in plan.remedies
+                RemedyRow(
+                    what=remedy.what, worst_sigma_um=remedy.sigma_mm and MICRO * remedy.sigma_mm, reason=remedy.reason
+                )
+                for remedy in plan.remedies
             ],
         )
 
@@ -195,9 +197,9 @@ class AdviceFile(ForecastPart, AdviceFormat, ResultFile):
             views=[ViewRow.of(choice) for choice in advice.choices],
             new_groups=[
                 GroupToAdd(
-                    faces=each.faces, images=each.images, worst_face=each.face, worst_sigma_um=MICRO * each.sigma_mm
+                    faces=group.faces, images=group.images, worst_face=group.face, worst_sigma_um=MICRO * group.sigma_mm
                 )
-                for each in advice.new_groups
+                for group in advice.new_groups
             ],
             board_dominates=advice.board_dominates,
             half_board_sigma_um=MICRO * advice.better_board.worst()[1],
@@ -225,7 +227,7 @@ def forecast_table(forecast: Forecast, shares: dict[str, dict[str, float]]) -> l
 
 def _shares_text(shares: dict[str, float]) -> str:
     """Returns the shares as a text, the largest first."""
-    ordered = sorted(shares.items(), key=lambda each: -each[1])
+    ordered = sorted(shares.items(), key=lambda item: -item[1])
     return ", ".join(f"{source.removeprefix('image ')} {100 * max(share, 0.0):.0f} %" for source, share in ordered)
 
 
@@ -246,7 +248,7 @@ def plan_text(plan: Plan, noise: str) -> str:
         f"{'what would help':<28} worst face µm",
     ]
     reachable = [(r.sigma_mm, r.what) for r in plan.remedies if r.sigma_mm is not None]
-    for worst_mm, change in sorted(reachable, key=lambda each: each[0]):
+    for worst_mm, change in sorted(reachable, key=lambda item: item[0]):
         lines.append(f"{change:<28} {MICRO * worst_mm:6.2f}   {100 * (worst_mm / sigma - 1):+.0f} %")
     lines += [f"{r.what:<28}      –   {r.reason}" for r in plan.remedies if r.sigma_mm is None]
     lines.append("where board and cameras happen to stand (--seed) makes about ±3 %")
@@ -326,5 +328,5 @@ def _verdict(advice: Advice) -> str:
         best = advice.new_groups[0]
         ways.append((best.sigma_mm, f"{best.images} images of faces {best.faces[0]} and {best.faces[1]}"))
     ways.sort()
-    told = "; ".join(f"{MICRO * sigma:.2f} µm with {what}" for sigma, what in ways)
-    return f"worst face afterwards, the best first: {told}"
+    options = "; ".join(f"{MICRO * sigma:.2f} µm with {what}" for sigma, what in ways)
+    return f"worst face afterwards, the best first: {options}"

@@ -32,7 +32,7 @@ PRACTICE = 1.3
 """Ratio of the σ of centres to the Cramér–Rao bound in runs on rendered photographs. It is due to estimated brightness
 gradients, quantisation and neighbouring edges."""
 ONE_PLATE = 0.99
-"""Share of the board's variance that all groups have in common where one plate is in all of them."""
+"""Share of the board's variance that all groups have in common if the same plate is in all of them."""
 ENOUGH = 10_000
 """Number of observations from which the parameters of their noise are estimated."""
 OFF = 1e-2
@@ -41,7 +41,7 @@ OFF = 1e-2
 
 @dataclass(frozen=True, slots=True)
 class CentreNoise:
-    """What a measured centre is worth: covariance = edge² (1 + (narrow/b)²) (∮ n nᵀ ds)⁻¹ + floor² 1.
+    """Noise of a measured centre: covariance = edge² (1 + (narrow/b)²) (∮ n nᵀ ds)⁻¹ + floor² 1.
 
     The integral runs over the rim (normals n, arc ds, px), b is the minor semi-axis. A straight edge fixes its place
     along its normal with an information of 1/edge² per pixel of its length. For noise s, contrast C and a blur β that
@@ -49,8 +49,8 @@ class CentreNoise:
     Processing, example 3.13), so that the centre of a circle of radius r has σ = edge/√(π r): noise by the root of its
     perimeter.
 
-    ``edge`` : px^1.5; ``narrow_px`` : rims so close together lose half of their information, 0 for none; ``floor_px`` :
-    what no size removes, per axis.
+    ``edge`` : px^1.5; ``narrow_px`` : minor semi-axis at which half of the information is lost, 0 for no loss;
+    ``floor_px`` : σ per axis that does not depend on the size.
     """
 
     edge: float
@@ -129,10 +129,10 @@ def _rim_integrals(minor: np.ndarray, major: np.ndarray) -> tuple[np.ndarray, np
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
-    """What a forecast rests on besides the views: hardware, and what the adjustment is told.
+    """Input of a forecast besides the views: the hardware and the options of the adjustment.
 
     ``start`` : the target as it is, for the reference face and the sides that faces look to; ``prior`` : of the
-    intrinsics, None where they are fixed; ``common`` : see :func:`stcal.sfm.adjust.joint.covariance_of`; ``sigma0`` :
+    intrinsics, None if they are fixed; ``common`` : see :func:`stcal.sfm.adjust.joint.covariance_of`; ``sigma0`` :
     factor on all σ.
     """
 
@@ -157,7 +157,7 @@ class Setup:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
-    """The σ to expect, target frame.
+    """The σ to expect of a geometry, target frame.
 
     ``face_covariance`` : (6, 6) by face except the reference face, rad and mm; ``circle_sigma_mm`` : root of the trace,
     by label; ``scale_sigma`` : relative σ of the target's size; ``derivatives`` : reusable for other views of the same
@@ -265,6 +265,6 @@ def without_sources(
 def variance_shares(whole: Forecast, without: dict[str, Forecast]) -> dict[str, dict[str, float]]:
     """Returns, by face and source, the share of the variance of the face's position that is due to the source."""
     return {
-        face: {source: 1 - (each.position_sigma_mm()[face] / sigma) ** 2 for source, each in without.items()}
+        face: {source: 1 - (quieter.position_sigma_mm()[face] / sigma) ** 2 for source, quieter in without.items()}
         for face, sigma in whole.position_sigma_mm().items()
     }

@@ -53,8 +53,8 @@ def _faces(ids: list[str]) -> str:
 
 
 def _is_reference(target: TargetDesign) -> bool:
-    own, reference = _places(target), _places(reference_target())
-    return own.keys() == reference.keys() and all(np.allclose(own[k], reference[k], atol=0.5) for k in own)
+    places, reference = _places(target), _places(reference_target())
+    return places.keys() == reference.keys() and all(np.allclose(places[k], reference[k], atol=0.5) for k in places)
 
 
 def _places(target: TargetDesign) -> dict[str, np.ndarray]:
@@ -73,15 +73,15 @@ def observe(scene: Scene, noise_px: float, rng: np.random.Generator, missing: fl
     images = []
     for name, group in scene.groups.items():
         for i in range(len(group.camera_from_target)):
-            seen = image_circles(scene, name, i)
-            keep = np.flatnonzero(seen.must_find & (rng.random(len(seen.labels)) >= missing))
-            ideal = circle_image_offset(seen.xyz_camera[keep], seen.normal_camera[keep], seen.radius_mm[keep])
+            circles = image_circles(scene, name, i)
+            keep = np.flatnonzero(circles.must_find & (rng.random(len(circles.labels)) >= missing))
+            ideal = circle_image_offset(circles.xyz_camera[keep], circles.normal_camera[keep], circles.radius_mm[keep])
             centre_px = scene.camera.project(ideal) + noise_px * rng.standard_normal((len(keep), 2))
             images.append(
                 ImageObservations(
                     name=f"{name}/{i:04d}",
                     group=name,
-                    labels=tuple(seen.labels[k] for k in keep),
+                    labels=tuple(circles.labels[k] for k in keep),
                     centre_px=centre_px,
                     centre=scene.camera.normalised_from_pixel(centre_px),
                     shape=np.zeros((len(keep), 2, 2)),
@@ -98,7 +98,7 @@ def true_models(scene: Scene, observations: Sequence[ImageObservations]) -> list
     for name, images in by_group(observations).items():
         group = scene.groups[name]
         place = scene.circles_target | dict(zip(scene.board.labels(), group.board_circles_target, strict=True))
-        seen = {label for image in images for label in image.labels}
+        labels = {label for image in images for label in image.labels}
         poses = [group.camera_from_target[int(image.name.rpartition("/")[2])] for image in images]
-        models.append(assemble(MetricModel, name, images, poses, {label: place[label] for label in seen}))
+        models.append(assemble(MetricModel, name, images, poses, {label: place[label] for label in labels}))
     return models

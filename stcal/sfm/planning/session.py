@@ -1,4 +1,4 @@
-"""Before any image exists: the σ to expect of a plan, and what would help most."""
+"""Forecast of a plan before any image exists: the σ to expect, and what would help most."""
 
 from dataclasses import dataclass, field, replace
 from itertools import permutations
@@ -26,46 +26,47 @@ from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.scene import Scene, SceneOptions, group_name, make_scene, seen_by
 
 SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)
-"""Tried from the largest down: the tilts that a view may have keep the views closer together than that."""
+"""Spreads that are tried, from the largest down. The largest tilts that a view may have often forbid wide ones."""
 NEARER = 0.8
+"""Distance of the remedy of nearer cameras, relative to the plan's."""
 MIN_IMAGES = 2
 MAX_DOTS = 10_000
-"""Of the board …"""
+"""Largest number of dots of a board."""
 FINE_DOTS, MAX_CENTRES = 500, 450_000
-"""… and of boards of more than so many the dots in all images, which take about a minute and 0.8 GB."""
+"""Largest number of dots in all images, for boards of more than ``FINE_DOTS`` dots: about a minute and 0.8 GB."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanOptions:
-    """What is planned.
+    """The plan of a session.
 
     Parameters
     ----------
     images : int
-        Of each group.
+        Number of images of each group.
     spread_deg : float
         ± about the view that shows both faces equally, degrees.
     distance_mm : float
-        From the cameras to the target, mm.
+        Distance of the cameras from the target, mm.
     width : int
-        px; 3:2 images of a 24 mm lens, where no ``camera`` is given.
+        Width of the images, px; 3:2 images of a 24 mm lens, if no ``camera`` is given.
     camera : CameraModel, optional
-        The camera; its file must state the image size.
+        Camera, whose file must state the image size.
     groups : tuple of pairs of str, optional
-        Pairs of face ids; those of the design where None.
+        Pairs of face ids; the pairs of the design if None.
     noise : CentreNoise
         σ of the centres.
     one_board : bool
-        The same plate in all groups, else made anew for each.
+        Whether the same plate is in all groups; else each group has its own.
     run : RunOptions
         Flatness, frame, refined intrinsics and reference face.
     seed : int
-        Of where board and cameras happen to stand.
+        Seed of the random places of board and cameras.
 
     Raises
     ------
     InputError
-        Fewer than two images in each group, or a camera file without image size.
+        If a group has fewer than two images, or the camera file states no image size.
     """
 
     images: int = 10
@@ -92,7 +93,10 @@ class PlanOptions:
 
 @dataclass(frozen=True, slots=True)
 class Remedy:
-    """What could be done: ``sigma_mm`` of the face that is then worst, or None and ``reason`` where it cannot."""
+    """A change of the plan.
+
+    ``sigma_mm`` : σ of the worst face with it, or None and the ``reason`` if it is impossible.
+    """
 
     what: str
     sigma_mm: float | None
@@ -101,7 +105,11 @@ class Remedy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """The answer. ``centre_sigma_px`` : RMS over all centres; ``shares`` of the variance by face and source."""
+    """A plan with its forecast and remedies.
+
+    ``observations`` : number of centres; ``centre_sigma_px`` : RMS of their σ; ``shares`` : of the variance, by face
+    and source.
+    """
 
     options: PlanOptions
     setup: Setup
@@ -114,37 +122,40 @@ class Plan:
 
 
 def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ...]:
-    """``12,14`` or ``top-left,top-right`` as pairs of face ids.
+    """Returns the pairs of face ids that a text like ``12,14`` or ``top-left,top-right`` names.
 
     Raises
     ------
     InputError
-        A name that is no pair of the target's faces.
+        If a name is not a pair of the target's faces.
     """
-    known = {group_name(pair): pair for pair in permutations([face.id for face in target.faces], 2)}
+    pair_of_name = {group_name(pair): pair for pair in permutations([face.id for face in target.faces], 2)}
     names = [name.strip() for name in text.split(",")]
     for name in names:
-        if name not in known:
+        if name not in pair_of_name:
             raise InputError(
-                "E-OPTION-VALUE", f"--groups: {name!r} is no pair of faces; use such as {', '.join(list(known)[:3])}"
+                "E-OPTION-VALUE",
+                f"--groups: {name!r} is no pair of faces; use such as {', '.join(list(pair_of_name)[:3])}",
             )
-    return tuple(known[name] for name in names)
+    return tuple(pair_of_name[name] for name in names)
 
 
 @one_thread()
 def plan(
     options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal: dict[str, Rigid] | None = None
 ) -> Plan:
-    """Forecast of a plan: nominal geometry, board and cameras where a simulated session would have them.
+    """Returns the forecast of a plan.
+
+    The geometry is nominal, and board and cameras stand where a simulated session would have them.
 
     Parameters
     ----------
     options : PlanOptions
         Images, camera, groups and noise.
     target : TargetDesign
-        Drawing frame of each face, mm.
+        Design of the target, drawing frame of each face, mm.
     board : BoardDesign
-        With its σ, mm.
+        Board with its σ, mm.
     nominal : dict of Rigid, optional
         Pose of every face in one common frame, mm, by face id.
 
@@ -156,9 +167,10 @@ def plan(
     Raises
     ------
     InputError
-        A face without nominal pose, an unknown face in a group, or more dots than ``MAX_DOTS`` and ``MAX_CENTRES``.
+        If a face has no nominal pose, a group names an unknown face, or there are more dots than ``MAX_DOTS`` or
+        ``MAX_CENTRES``.
     DegenerateError
-        A group cannot be photographed like that.
+        If a group cannot be photographed as planned.
     """
     if (dots := board.rows * board.columns) > MAX_DOTS:
         raise InputError(
@@ -174,8 +186,8 @@ def plan(
             f"{MAX_CENTRES} possible; plan fewer images, or fewer dots over the same area",
         )
     setup, models = _setup(scene, options, board), _models(scene, options)
-    whole = forecast(models, setup)
-    half_board = forecast(models, setup.better_board(0.5), whole.derivatives)
+    expected = forecast(models, setup)
+    half_board = forecast(models, setup.better_board(0.5), expected.derivatives)
     twice = replace(options, images=2 * options.images)
     nearer = replace(options, distance_mm=NEARER * options.distance_mm)
     remedies = [
@@ -190,14 +202,14 @@ def plan(
         tuple(scene.groups),
         sum(len(m.image_index) for m in models),
         float(np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models]).mean())),
-        whole,
-        variance_shares(whole, without_sources(models, setup, whole.derivatives)),
+        expected,
+        variance_shares(expected, without_sources(models, setup, expected.derivatives)),
         tuple(remedies),
     )
 
 
 def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Scene:
-    """The nominal geometry: nothing is misplaced."""
+    """Returns the scene with the nominal geometry, in which nothing is misplaced."""
     file = options.camera
     height = round(options.width * 2 / 3)
     shape = SceneOptions(
@@ -241,22 +253,22 @@ def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
 
 
 def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
-    """The faces of all groups, each linked to the reference face.
+    """Returns the faces of all groups, after a check that each is linked to the reference face.
 
     Raises
     ------
     InputError
-        One is not.
+        If a face is not linked to it.
     """
     planned = {face for pair in pairs for face in pair}
     linked = {reference}
     for _ in planned:
         linked |= {face for pair in pairs if linked & set(pair) for face in pair}
     if len(linked) < 2 or planned - linked:
-        apart = ", ".join(sorted(planned - linked)) or "any other face"
+        unlinked = ", ".join(sorted(planned - linked)) or "any other face"
         raise InputError(
             "E-PLAN-UNLINKED",
-            f"plan: no group links face {apart} to reference face {reference}; add a group that shows one of each",
+            f"plan: no group links face {unlinked} to reference face {reference}; add a group that shows one of each",
         )
     return linked
 
@@ -276,7 +288,7 @@ def _remedy(what: str, options: PlanOptions, target: TargetDesign, board: BoardD
 
 
 def _wider(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Remedy:
-    """The largest spread that leaves enough views."""
+    """Returns the remedy of the largest spread at which there are enough views."""
     remedy = Remedy("larger spread", None, f"±{options.spread_deg:g}° is as far as both faces and the board show")
     for spread in SPREADS_DEG:
         if spread > options.spread_deg:

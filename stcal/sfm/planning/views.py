@@ -1,4 +1,4 @@
-"""Photographs that could still be taken: what they would show, and where the photographer has to stand for them."""
+"""Candidates for further photographs: what they would show, and where the photographer has to stand."""
 
 from dataclasses import dataclass, replace
 
@@ -17,21 +17,22 @@ from stcal.synthetic.observe import MAX_FOUND_TILT_RAD, image_circles
 from stcal.synthetic.scene import Group, Scene
 
 REACH_DEG = 50.0
-"""Candidates stand up to this far from the middle of a group's views, in azimuth and in elevation …"""
+"""Largest distance of candidates from the middle of a group's views, in azimuth and in elevation."""
 GRID_DEG = 10.0
-"""… on a grid of this step."""
+"""Step of the grid of candidates, in azimuth and in elevation."""
 ROLLS_DEG = (0.0, 90.0)
-"""A camera turned by 90° separates intrinsics from poses, and is tried where they are refined."""
+"""Rolls of the camera. A turn by 90° separates intrinsics from poses, and is tried only if intrinsics are refined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedView:
     """A photograph to take in a group.
 
-    ``model`` : the group's model of this one image; ``azimuth_deg``, ``elevation_deg`` : to the right of and above the
-    middle of the group's views, as that photograph (``middle``) shows right and up; ``roll_deg`` : the camera turned
-    about its axis; ``distance_mm`` : to the middle of board and faces; ``tilts_deg`` : by face and ``board``, between
-    its normal and the line of sight; ``nearest`` photograph and ``nearest_deg`` to it, seen from the middle.
+    ``model`` : the group's model of this one image; ``middle`` : name of the photograph in the middle of the group's
+    views; ``azimuth_deg``, ``elevation_deg`` : angles from there to the right and up, as that photograph shows right
+    and up; ``roll_deg`` : rotation of the camera about its axis; ``distance_mm`` : distance from the middle of board
+    and faces; ``tilts_deg`` : angle between normal and line of sight, by face and ``board``; ``nearest`` : name of the
+    nearest photograph; ``nearest_deg`` : angle to it, seen from the middle of board and faces.
     """
 
     group: str
@@ -48,8 +49,12 @@ class PlannedView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stand:
-    """Where a group's views are: ``centre`` (3,) of board and faces, ``axes`` (3, 3) rows right, up, towards the
-    cameras, ``directions`` (m, 3) of the views from the centre; target frame."""
+    """Arrangement of a group's views, target frame.
+
+    ``centre`` : (3,) middle of board and faces; ``axes`` : (3, 3) rows right, up, towards the cameras;
+    ``distance_mm`` : median distance of the cameras from the centre; ``directions`` : (m, 3) unit vectors from the
+    centre to the cameras; ``middle`` : name of the image in the middle of the views.
+    """
 
     centre: np.ndarray
     axes: np.ndarray
@@ -64,9 +69,9 @@ class _Stand:
     @classmethod
     def of(cls, model: MetricModel) -> "_Stand":
         centre = (model.xyz_model.min(0) + model.xyz_model.max(0)) / 2
-        away = np.array([pose.inverse().translation for pose in model.camera_from_model]) - centre
-        distance = np.linalg.norm(away, axis=1)
-        directions = away / distance[:, None]
+        from_centre = np.array([pose.inverse().translation for pose in model.camera_from_model]) - centre
+        distance = np.linalg.norm(from_centre, axis=1)
+        directions = from_centre / distance[:, None]
         towards = directions.mean(0) / np.linalg.norm(directions.mean(0))
         middle = int(np.argmax(directions @ towards))
         up = -model.camera_from_model[middle].rotation[1]
@@ -76,7 +81,7 @@ class _Stand:
         return cls(centre, axes, float(np.median(distance)), directions, model.images[middle])
 
     def pose(self, azimuth_deg: float, elevation_deg: float, roll_deg: float) -> Rigid:
-        """camera_from_target that looks at the centre."""
+        """Returns camera_from_target of a camera that looks at the centre."""
         azimuth, elevation, roll = np.radians([azimuth_deg, elevation_deg, roll_deg])
         local = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
         forward = -np.array(local) @ self.axes
@@ -89,7 +94,7 @@ class _Stand:
 
 
 def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
-    """What a run knows, as a scene: calibrated faces and circles, its boards, no views yet; target frame."""
+    """Returns the scene of a run, target frame: its calibrated faces and circles and its boards, without views."""
     circles = dict(zip(joint.labels, joint.xyz_model, strict=True))
     groups = {}
     for model in models:
@@ -122,7 +127,10 @@ def _calibrated_part(target: TargetDesign, target_from_face: dict[str, Rigid], c
 
 
 def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
-    """Views of a group on a grid about its present ones that show the whole board and at least one whole face."""
+    """Returns the views of a group that show the whole board and at least one whole face.
+
+    They stand on a grid about the middle of the present views.
+    """
     stand = _Stand.of(model)
     steps = np.arange(-REACH_DEG, REACH_DEG + 1e-9, GRID_DEG)
     places = [
@@ -137,10 +145,10 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
     limit = _largest_tilt(scene, model)
     views = []
     for i, place in enumerate(places):
-        seen = set(model.labels) & shown(scene, model.group, i, limit)
-        if not _worth_it(seen, model):
+        labels = set(model.labels) & shown(scene, model.group, i, limit)
+        if not _worth_it(labels, model):
             continue
-        single = _single(model, f"{model.group}/view {place}", poses[i], sorted(seen), setup.camera)
+        single = _single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup.camera)
         position = poses[i].inverse().translation
         cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
         views.append(
@@ -149,7 +157,7 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
                 noise.applied(single, setup.camera, setup.radius_mm()),
                 *place,
                 stand.distance_mm,
-                _tilts_deg(scene, model.group, position, seen),
+                _tilts_deg(scene, model.group, position, labels),
                 stand.middle,
                 model.images[int(np.argmax(cosine))],
                 float(np.degrees(np.arccos(np.clip(cosine.max(), -1, 1)))),
@@ -159,7 +167,7 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
 
 
 def _largest_tilt(scene: Scene, model: MetricModel) -> float:
-    """Of the circles that the run found in this group, rad; no more than a simulation believes in."""
+    """Returns the largest tilt of the circles that the run measured in the group, rad, up to ``MAX_FOUND_TILT_RAD``."""
     normal = {face.id: scene.target_from_face[face.id].rotation[:, 2] for face in scene.target.faces}
     board = -scene.groups[model.group].target_from_board.rotation[:, 2]
     normals = np.array([board if isinstance(x, DotLabel) else normal.get(x.face, board) for x in model.labels])
@@ -170,35 +178,35 @@ def _largest_tilt(scene: Scene, model: MetricModel) -> float:
 
 
 def shown(scene: Scene, group: str, image: int, max_tilt_rad: float) -> set[str]:
-    """Labels of the group's circles that a view shows whole, neither too slantwise nor behind a face or the board."""
-    seen = image_circles(scene, group, image)
+    """Returns the labels of the group's circles that a view shows whole, not too oblique and not hidden by a plate."""
+    circles = image_circles(scene, group, image)
     camera_from_target = scene.groups[group].camera_from_target[image]
     plates = [scene.face_outline(face.id) for face in scene.target.faces] + [scene.board_outline(group)]
-    hidden = np.zeros(len(seen.labels), bool)
+    hidden = np.zeros(len(circles.labels), bool)
     for corners in plates:
-        hidden |= _behind(seen.xyz_camera, camera_from_target @ corners)
-    keep = seen.must_find & (seen.tilt_rad <= max_tilt_rad) & ~hidden
-    return {label for label, k in zip(seen.labels, keep, strict=True) if k}
+        hidden |= _behind(circles.xyz_camera, camera_from_target @ corners)
+    visible = circles.must_find & (circles.tilt_rad <= max_tilt_rad) & ~hidden
+    return {label for label, is_visible in zip(circles.labels, visible, strict=True) if is_visible}
 
 
 def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
-    """Whether a rectangle, (4, 3) corners in turn, is between the camera and points (n, 3)."""
+    """Returns whether a rectangle, (4, 3) corners in turn, is between the camera and each of the points (n, 3)."""
     origin, a, b = corners_camera[0], corners_camera[1] - corners_camera[0], corners_camera[3] - corners_camera[0]
     normal = np.cross(a, b)
-    with np.errstate(divide="ignore", invalid="ignore"):  # sight lines in the plane meet it nowhere
-        part = (origin @ normal) / (xyz_camera @ normal)
-        away = part[:, None] * xyz_camera - origin
-        u, v = away @ a / (a @ a), away @ b / (b @ b)
-        return (part > 0) & (part < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # lines of sight parallel to the plane never meet it
+        depth_ratio = (origin @ normal) / (xyz_camera @ normal)
+        from_corner = depth_ratio[:, None] * xyz_camera - origin
+        u, v = from_corner @ a / (a @ a), from_corner @ b / (b @ b)
+        return (depth_ratio > 0) & (depth_ratio < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
 
 
 def _worth_it(seen: set[Label], model: MetricModel) -> bool:
     members = {key: {model.labels[i] for i in rows} for key, rows in model.points_by_face().items()}
-    return members["board"] <= seen and any(own <= seen for key, own in members.items() if key != "board")
+    return members["board"] <= seen and any(labels <= seen for key, labels in members.items() if key != "board")
 
 
 def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label]) -> dict[str, float]:
-    """Between normals and lines of sight of the board and of the faces in view."""
+    """Returns the angles between normal and line of sight, by ``board`` and face in view."""
     board = scene.groups[group].target_from_board.rotation[:, 2]
     plates = {"board": (-board, scene.board_outline(group).mean(0))}
     for face_id in sorted({label.face for label in seen if isinstance(label, CircleLabel)}):
@@ -210,7 +218,7 @@ def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label])
 
 
 def _single(model: MetricModel, name: str, pose: Rigid, labels: list[Label], camera: Camera) -> MetricModel:
-    """The model of one image of the group that sees these points."""
+    """Returns the model of one image of the group that shows these points."""
     place = {label: i for i, label in enumerate(model.labels)}
     points = np.array([place[label] for label in labels])
     n = len(points)

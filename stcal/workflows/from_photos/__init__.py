@@ -1,1 +1,1 @@
-"""The way from photographs of the target on an arm to joint values that reach points, in one go."""
+"""Joint values that reach points, from photographs of the target on an arm, in one run."""

@@ -122,11 +122,11 @@ def _at_targets(result: FromPhotos) -> list[str]:
     """Returns sentences on the predicted error of the identified arm at the targets, and on the motion of the
     joints."""
     sentences, sigma, moves = [], result.sigma_mm(), result.moves()
-    known, moved = sigma[np.isfinite(sigma)], moves[np.isfinite(moves).all(axis=1)]
+    finite, moved = sigma[np.isfinite(sigma)], moves[np.isfinite(moves).all(axis=1)]
     prediction = result.identified.predicted
-    if len(known) and prediction is not None:
+    if len(finite) and prediction is not None:
         sentences.append(
-            f"predicted σ of the tool's position there: {known.min():.2g} to {known.max():.2g} mm; at the measured "
+            f"predicted σ of the tool's position there: {finite.min():.2g} to {finite.max():.2g} mm; at the measured "
             f"rows {np.sqrt((prediction.here_mm**2).mean()):.2g} mm RMS"
         )
     if len(moved):

@@ -1,4 +1,4 @@
-"""The run from photographs of the target on an arm to joint values that reach points.
+"""All steps from photographs of the target on an arm to joint values that reach points.
 
 The steps are measure, axes, identify, compensate. It is the method of Zhang & Wei (2017) in one go. The files of every
 step are those of its own command, so that each step can be repeated by itself.
@@ -67,7 +67,7 @@ def from_photos(
     key : str
         Name of the column of photographs.
     measure_options, options
-        Options of measuring and of identifying; the defaults where None.
+        Options of measuring and of identifying; the defaults if None.
 
     Returns
     -------

@@ -79,10 +79,10 @@ def two_files(
     InputError
         As in :func:`~stcal.handeye.data.inputs.read_two`; or options were given that tables do not need.
     """
-    told = read_two(first, second, said, key, quaternions, timing.tolerance_s, timing.offset)
-    if told is None:
+    joined = read_two(first, second, said, key, quaternions, timing.tolerance_s, timing.offset)
+    if joined is None:
         _require_unsaid(said, f"{first}, {second}")
-    return told
+    return joined
 
 
 @one_thread()
@@ -127,9 +127,9 @@ def read_input(
         return HandEyeInput(source.where, read_poses(source, quaternions))
     if isinstance(source, Told):
         return _from_told(source, said)
-    told = read_pairs(source, said, quaternions=quaternions)
-    if told is not None:
-        return _from_told(told, said)
+    pairs = read_pairs(source, said, quaternions=quaternions)
+    if pairs is not None:
+        return _from_told(pairs, said)
     _require_unsaid(said, str(source))
     return HandEyeInput(source.name, read_poses(source, quaternions))
 
@@ -148,10 +148,10 @@ def _require_no_images(source: Source, poses: Path | None, camera: Path | None, 
     if isinstance(source, Path) and not source.exists():
         raise InputError("E-FILE-UNREADABLE", f"{source}: does not exist; a file of poses or a folder of images needed")
     if extra:
-        what = f"{source} is a file of poses"
+        description = f"{source} is a file of poses"
         if not isinstance(source, Path):
-            what = f"{source.where if isinstance(source, Table) else source.pairs.where} are poses"
-        raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {what}")
+            description = f"{source.where if isinstance(source, Table) else source.pairs.where} are poses"
+        raise InputError("E-OPTION-NEEDS", f"{', '.join(extra)}: only with a folder of images; {description}")
 
 
 def _require_by_name(timing: Timing) -> None:

@@ -26,7 +26,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AtImages:
-    """``robot`` : its poses by image, unchanged where no times were needed; ``left_out`` : (image, why); ``stream``,
+    """``robot`` : its poses by image, unchanged if no times were needed; ``left_out`` : (image, why); ``stream``,
     ``seconds`` : the stream and the time of each remaining image, by name."""
 
     robot: RobotPoses
@@ -35,7 +35,7 @@ class AtImages:
     seconds: dict[str, float] | None = None
 
     def timed(self, names: Sequence[str]) -> Timed | None:
-        """Returns the stream and the times of these images; None where no times were needed."""
+        """Returns the stream and the times of these images; None if no times were needed."""
         if self.stream is None or self.seconds is None:
             return None
         return Timed(self.stream, np.array([self.seconds[name] for name in names]))
@@ -66,26 +66,28 @@ def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | No
         return AtImages(_of_rows(robot, rows))
     times = [time for time in samples if time is not None]
     stream = Stream.of(times, robot.base_from_flange, robot.file)
-    known = list(images)
-    seconds = stream.after_origin([images[name] for name in known])
-    taken = taken_at(stream, seconds, timing.tolerance_s)
-    if not taken.kept.any():
-        raise InputError("E-POSES-UNMATCHED", f"{robot.where}: no image has a pose: {known[0]}: {taken.why[0]}")
-    names_kept = [known[i] for i in np.flatnonzero(taken.kept)]
+    image_names = list(images)
+    seconds = stream.after_origin([images[name] for name in image_names])
+    interpolated = taken_at(stream, seconds, timing.tolerance_s)
+    if not interpolated.kept.any():
+        raise InputError(
+            "E-POSES-UNMATCHED", f"{robot.where}: no image has a pose: {image_names[0]}: {interpolated.why[0]}"
+        )
+    names_kept = [image_names[i] for i in np.flatnonzero(interpolated.kept)]
     note = "" if robot.covariance is None else "; its covariances are of other times and not used"
     robot_then = replace(
         robot,
         images=tuple(names_kept),
-        base_from_flange=taken.base_from_flange,
+        base_from_flange=interpolated.base_from_flange,
         covariance=None,
         places=tuple(f"time of {name}" for name in names_kept),
-        understood=f"{robot.understood}{note}; {taken.said}",
+        understood=f"{robot.understood}{note}; {interpolated.said}",
         own=False,
         timed=False,
     )
-    left_out = [(name, why) for name, why in zip(known, taken.why, strict=True) if why]
+    left_out = [(name, why) for name, why in zip(image_names, interpolated.why, strict=True) if why]
     left_out += [(name, f"no time in {timing.image_times}") for name in names if name not in images]
-    return AtImages(robot_then, tuple(left_out), stream, dict(zip(known, seconds.tolist(), strict=True)))
+    return AtImages(robot_then, tuple(left_out), stream, dict(zip(image_names, seconds.tolist(), strict=True)))
 
 
 def _of_rows(robot: RobotPoses, rows: dict[str, int]) -> RobotPoses:

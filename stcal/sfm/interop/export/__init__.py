@@ -1,4 +1,4 @@
-"""A finished run in files of other programs: robots' software, drawings, viewers, tables."""
+"""Export of a finished run to files of other programs: robots' software, drawings, viewers, tables."""
 
 import os
 from collections.abc import Callable
@@ -13,14 +13,17 @@ from stcal.sfm.interop.export.viewers import write_rrd
 from stcal.sfm.runs.saved import load_run
 
 ROOT = "target"
-"""Name of the target frame where none is given."""
+"""Default name of the target frame."""
 RERUN = "rerun"
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """``suffix`` : of its files; ``write`` : their content, None where a library writes the file itself; ``lost`` :
-    what of faces, circles, σ and cameras they do not hold."""
+    """A form of export.
+
+    ``suffix`` : suffix of its files; ``write`` : returns their content, None if a library writes the file; ``lost`` :
+    results among faces, circles, σ and cameras that the files do not hold.
+    """
 
     suffix: str
     write: Callable[[Content], str | bytes] | None
@@ -41,12 +44,12 @@ FORMS = {
     "glb": Form(".glb", viewers.glb, "the lens's distortion but as numbers in extras"),
     RERUN: Form(".rrd", None, "the lens's distortion; covariances but as ellipsoids"),
 }
-"""By the word of ``--form``."""
+"""Forms by the value of ``--form``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportedRun:
-    """What was written: ``path``, ``form``, counts, and ``notes`` on what is missing."""
+    """An export that was written. ``notes`` : on missing parts."""
 
     path: Path
     form: str
@@ -55,23 +58,23 @@ class ExportedRun:
 
 
 def export_run(run: str | Path, path: str | Path, form: str = "", name: str = ROOT) -> ExportedRun:
-    """Write faces and circles, and where the form holds them σ, cameras and photographs, to a new file.
+    """Writes faces and circles to a new file, with σ, cameras and photographs if the form holds them.
 
     Parameters
     ----------
     run : path
-        A finished run's folder.
+        Folder of a finished run.
     path : path
-        Of a new file; its suffix tells the form.
+        New file, whose suffix gives the form.
     form : str
-        Of :data:`FORMS`, where the suffix shall not.
+        Form of :data:`FORMS`, in place of the one of the suffix.
     name : str
-        Of the target frame; the others' names begin with it.
+        Name of the target frame, and prefix of the other frames' names.
 
     Raises
     ------
     InputError
-        Not a finished run, a file that exists, no known form, a library that is not installed, or a bad name.
+        If it is no finished run, the file exists, the form is unknown, a library is not installed, or the name is bad.
     """
     path = Path(path)
     form = form or form_of(path)
@@ -96,12 +99,12 @@ def export_run(run: str | Path, path: str | Path, form: str = "", name: str = RO
 
 
 def form_of(path: Path) -> str:
-    """By its suffix.
+    """Returns the form for the suffix of a path.
 
     Raises
     ------
     InputError
-        None of ours.
+        If no form has the suffix.
     """
     suffixes = {form.suffix: name for name, form in FORMS.items()}
     if path.suffix.lower() not in suffixes:

@@ -1,4 +1,4 @@
-"""What of a finished run goes to other programs: faces, circles, cameras and their σ; target frame, mm."""
+"""Content of the exports of a finished run: faces, circles, cameras and their σ; target frame, mm."""
 
 from dataclasses import dataclass
 
@@ -24,12 +24,12 @@ FACES_RGB = (
     (213, 94, 0),
     (204, 121, 167),
 )
-"""By the face's place in the design, over again after the last: Okabe and Ito's palette, for the colour-blind too."""
+"""Okabe and Ito's palette, which colour-blind people can tell apart, used in a cycle in the order of the faces."""
 BOARD_RGB = (150, 150, 150)
 
 
 class _Report(Part):
-    """What of ``report.json`` is needed."""
+    """The parts of ``report.json`` that are exported."""
 
     camera: ReportCamera
     scene: Space
@@ -37,7 +37,7 @@ class _Report(Part):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photograph:
-    """A mapped one: its name, its group, and where its camera stands."""
+    """A mapped photograph with its group and the pose of its camera."""
 
     name: str
     group: str
@@ -46,7 +46,7 @@ class Photograph:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Circle:
-    """A circle of the target: centre ``xyz_mm`` (3,), and its ``covariance_mm2`` (3, 3), target frame, or None."""
+    """A circle of the target. ``xyz_mm`` : (3,) centre; ``covariance_mm2`` : (3, 3) or None; target frame."""
 
     label: CircleLabel
     xyz_mm: np.ndarray
@@ -55,16 +55,16 @@ class Circle:
 
     @property
     def sigma_mm(self) -> np.ndarray | None:
-        """Of x, y, z."""
+        """σ of x, y, z, mm, or None without a covariance."""
         return None if self.covariance_mm2 is None else np.sqrt(np.diag(self.covariance_mm2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Content:
-    """What a file is made of.
+    """Content of an export.
 
     ``root`` : name of the target frame; ``camera`` : as the run refined it; ``faces`` : target_from_face;
-    ``covariances`` : of those, 6×6, empty where the run states none; ``photographs`` : of the run, in its order;
+    ``covariances`` : of the faces, 6×6, empty if the run states none; ``photographs`` : in the run's order;
     ``boards`` : dots by group, (n, 3); ``rgb`` : by face.
     """
 
@@ -79,36 +79,36 @@ class Content:
     rgb: dict[str, tuple[int, int, int]]
 
     def of_face(self, face: str) -> list[Circle]:
-        """Its circles, in the order of the design."""
+        """Returns the circles of a face, in the order of the design."""
         return [circle for circle in self.circles if circle.label.face == face]
 
     def face_frame(self, face: str) -> str:
-        """Name of its frame."""
+        """Returns the name of the frame of a face."""
         return f"{self.root}_{face}"
 
     def circle_frame(self, label: CircleLabel) -> str:
-        """Name of a frame at its centre, with the face's axes."""
+        """Returns the name of the frame at the centre of a circle, with the face's axes."""
         return f"{self.root}_{label.face}_{label.circle}"
 
     def statics(self) -> list[Static]:
-        """Frames of faces in the target's, and of circles in the faces'."""
-        found = []
+        """Returns the frames of faces relative to the target, and of circles relative to their faces."""
+        frames = []
         for face, pose in self.faces.items():
-            found.append(Static(self.root, self.face_frame(face), pose))
+            frames.append(Static(self.root, self.face_frame(face), pose))
             for circle in self.of_face(face):
-                own = Rigid(np.eye(3), pose.inverse() @ circle.xyz_mm)
-                found.append(Static(self.face_frame(face), self.circle_frame(circle.label), own))
-        return found
+                face_from_circle = Rigid(np.eye(3), pose.inverse() @ circle.xyz_mm)
+                frames.append(Static(self.face_frame(face), self.circle_frame(circle.label), face_from_circle))
+        return frames
 
     def face_sigma(self, face: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """σ of its rotation, rad, and of its position, mm, about and along x, y, z of the target frame."""
+        """Returns σ of a face's rotation, rad, and position, mm, about and along the target's axes, or None."""
         if face not in self.covariances:
             return None
-        sigma = np.sqrt(np.maximum(np.diag(self.covariances[face]), 0))  # that of the reference is 0 up to rounding
+        sigma = np.sqrt(np.maximum(np.diag(self.covariances[face]), 0))  # the reference face has 0 up to rounding
         return sigma[:3], sigma[3:]
 
     def said(self) -> list[str]:
-        """Lines for comments: where it is from, and σ of every face."""
+        """Returns lines for comments: the origin of the content, and σ of every face."""
         faces = self.run.faces
         lines = [
             f"stcal {stcal.__version__}: target {self.run.target.name}, {len(self.faces)} faces, "
@@ -122,18 +122,18 @@ class Content:
             turn, shift = self.face_sigma(face) or (np.zeros(3), np.zeros(3))
             um = " ".join(number(1e3 * v, 2) for v in shift)
             mdeg = " ".join(number(1e3 * v, 3) for v in np.degrees(turn))
-            own = "reference" if face == faces.reference_face else f"sigma x y z {um} um, about x y z {mdeg} mdeg"
-            lines.append(f"face {face}: {own}")
+            text = "reference" if face == faces.reference_face else f"sigma x y z {um} um, about x y z {mdeg} mdeg"
+            lines.append(f"face {face}: {text}")
         return lines
 
 
 def content_of(run: SavedRun, root: str) -> Content:
-    """What a run holds, under the name of its target frame.
+    """Returns the content of a run. ``root`` : name of the target frame.
 
     Raises
     ------
     InputError
-        The name is none, two frames would have the same one, or the run's report is of another version.
+        If the name is invalid, two frames would have the same name, or the run's report is of another version.
     """
     if not root.isprintable() or root.split() != [root]:
         raise InputError("E-FRAME-NAME", f"--name {root!r}: a word of visible characters without spaces needed")
@@ -172,22 +172,25 @@ def content_of(run: SavedRun, root: str) -> Content:
 
 
 def colours(run: SavedRun) -> dict[str, tuple[int, int, int]]:
-    """By face."""
+    """Returns the colour of each face, by id."""
     return {face.id: FACES_RGB[i % len(FACES_RGB)] for i, face in enumerate(run.target.faces)}
 
 
 def ellipsoid(circle: Circle, target_from_face: Rigid) -> tuple[np.ndarray, np.ndarray]:
-    """σ (3,) of its centre along its own axes, the columns (3, 3) in the face's frame; for one with a covariance."""
+    """Returns σ (3,) of a centre along the principal axes, and these axes as columns (3, 3) in the face's frame.
+
+    The circle must have a covariance.
+    """
     turn = np.array(target_from_face.rotation)
     values, axes = np.linalg.eigh(turn.T @ np.array(circle.covariance_mm2) @ turn)
     return np.sqrt(np.maximum(values, 0)), axes * [np.sign(np.linalg.det(axes)), 1, 1]
 
 
 def exaggeration(content: Content) -> float:
-    """By which σ is drawn larger: a power of ten with which the balls are no larger than the circles."""
-    known = [(circle, circle.sigma_mm) for circle in content.circles]
-    sigma = [float(np.linalg.norm(own)) for _, own in known if own is not None]
+    """Returns the factor with which σ is drawn, a power of ten. The median ball is no larger than the median circle."""
+    sigmas = [(circle, circle.sigma_mm) for circle in content.circles]
+    sigma = [float(np.linalg.norm(sigma_mm)) for _, sigma_mm in sigmas if sigma_mm is not None]
     if not sigma or max(sigma) == 0:
         return 1.0
-    radius = float(np.median([circle.radius_mm for circle, own in known if own is not None]))
+    radius = float(np.median([circle.radius_mm for circle, sigma_mm in sigmas if sigma_mm is not None]))
     return 10.0 ** np.floor(np.log10(radius / np.median(sigma)))

@@ -1,4 +1,4 @@
-"""Circles as discs: triangles for viewers (PLY), circles and points for drawings and coordinate measuring (DXF)."""
+"""Export of circles as triangles for viewers (PLY), and for drawings and coordinate measuring (DXF)."""
 
 import numpy as np
 
@@ -6,15 +6,15 @@ from stcal.drawing.formats import dxf_text, new_drawing
 from stcal.sfm.interop.export.content import BOARD_RGB, Content, Photograph
 
 EDGES = 48
-"""Of a disc: its triangles leave out 0.3 % of its area."""
+"""Number of edges of a disc. Its triangles leave out 0.3 % of its area."""
 ACI = 1
-"""First colour of a DXF layer where its reader knows no true colours."""
+"""First colour of a DXF layer for readers without true colours."""
 CAMERA_SHARE = 0.06
-"""Depth of a camera's pyramid in parts of the scene's extent."""
+"""Depth of a camera's pyramid as a share of the scene's extent."""
 
 
 def disc(radius_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (EDGES + 1, 3), the middle first, and triangles (EDGES, 3), seen from +Z against the clock."""
+    """Returns points (EDGES + 1, 3), the centre first, and triangles (EDGES, 3), counter-clockwise seen from +Z."""
     angle = 2 * np.pi * np.arange(EDGES) / EDGES
     rim = radius_mm * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(EDGES)])
     around = 1 + np.arange(EDGES)
@@ -22,25 +22,25 @@ def disc(radius_mm: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def discs(content: Content, face: str) -> tuple[np.ndarray, np.ndarray]:
-    """Of a face's circles: points and triangles, target frame, mm."""
-    points, triangles, before = [], [], 0
+    """Returns points and triangles of a face's circles, target frame, mm."""
+    points, triangles, count = [], [], 0
     for circle in content.of_face(face):
-        own, around = disc(circle.radius_mm)
-        points.append(own @ content.faces[face].rotation.T + circle.xyz_mm)
-        triangles.append(around + before)
-        before += len(own)
+        points_of_disc, triangles_of_disc = disc(circle.radius_mm)
+        points.append(points_of_disc @ content.faces[face].rotation.T + circle.xyz_mm)
+        triangles.append(triangles_of_disc + count)
+        count += len(points_of_disc)
     return np.vstack([np.empty((0, 3)), *points]), np.vstack([np.empty((0, 3), int), *triangles])
 
 
 def camera_depth_mm(content: Content) -> float:
-    """Of the pyramids that show cameras."""
+    """Returns the depth of the pyramids that show cameras, mm."""
     places = [circle.xyz_mm for circle in content.circles]
-    places += [each.target_from_camera.translation for each in content.photographs]
+    places += [photograph.target_from_camera.translation for photograph in content.photographs]
     return CAMERA_SHARE * float(np.ptp(np.array(places), axis=0).max())
 
 
 def pyramid(content: Content, photograph: Photograph, depth_mm: float) -> np.ndarray:
-    """Projection centre and the image's corners at that depth as a camera without distortion sees them, (5, 3)."""
+    """Returns the projection centre and the image's corners at that depth, without distortion, (5, 3), target frame."""
     camera = content.camera
     corners = [[-0.5, -0.5], [camera.width - 0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]]
     corners += [[-0.5, camera.height - 0.5]]
@@ -50,27 +50,27 @@ def pyramid(content: Content, photograph: Photograph, depth_mm: float) -> np.nda
 
 
 def ply(content: Content) -> str:
-    """Text PLY in double precision: discs in the faces' colours, cameras as grey pyramids; labels as comments."""
-    points, triangles, rgb, comments, before = [], [], [], [], 0
+    """Returns text PLY in double precision: coloured discs, cameras as grey pyramids, and labels as comments."""
+    points, triangles, rgb, comments, count = [], [], [], [], 0
     for face in content.faces:
-        own, around = discs(content, face)
+        points_of_face, triangles_of_face = discs(content, face)
         for place, circle in enumerate(content.of_face(face)):
-            comments.append(f"vertex {before + place * (EDGES + 1)}: centre of {circle.label}")
-        points.append(own)
-        triangles.append(around + before)
-        rgb += [content.rgb[face]] * len(own)
-        before += len(own)
+            comments.append(f"vertex {count + place * (EDGES + 1)}: centre of {circle.label}")
+        points.append(points_of_face)
+        triangles.append(triangles_of_face + count)
+        rgb += [content.rgb[face]] * len(points_of_face)
+        count += len(points_of_face)
     depth = camera_depth_mm(content)
     sides = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]])
     for photograph in content.photographs:
-        comments.append(f"vertex {before}: projection centre of {photograph.name}")
+        comments.append(f"vertex {count}: projection centre of {photograph.name}")
         points.append(pyramid(content, photograph, depth))
-        triangles.append(sides + before)
+        triangles.append(sides + count)
         rgb += [BOARD_RGB] * 5
-        before += 5
+        count += 5
     header = ["ply", "format ascii 1.0"]
     header += [f"comment {line}" for line in (*content.said(), "mm", *comments)]
-    header += [f"element vertex {before}", *(f"property double {axis}" for axis in "xyz")]
+    header += [f"element vertex {count}", *(f"property double {axis}" for axis in "xyz")]
     header += [f"property uchar {name}" for name in ("red", "green", "blue")]
     corners = np.vstack(triangles)
     header += [f"element face {len(corners)}", "property list uchar int vertex_indices", "end_header"]
@@ -79,12 +79,12 @@ def ply(content: Content) -> str:
 
 
 def dxf(content: Content) -> str:
-    """DXF R2010 in mm: a layer for each face with a CIRCLE and a POINT for each circle, and one with their labels.
+    """Returns DXF R2010 in mm: a layer per face with a CIRCLE and a POINT for each circle, and a layer of labels.
 
     Raises
     ------
     InputError
-        ``stcal[cad]`` is not installed.
+        If ``stcal[cad]`` is not installed.
     """
     drawing = new_drawing()
     from ezdxf.colors import rgb2int
@@ -100,15 +100,17 @@ def dxf(content: Content) -> str:
         normal = Vec3(pose.rotation[:, 2])
         plane = OCS(normal)
         for circle in content.of_face(face):
-            named = [(1000, str(circle.label))]
+            xdata = [(1000, str(circle.label))]
             if circle.sigma_mm is not None:
-                named += [(1000, "sigma x y z, mm"), *((1040, float(v)) for v in circle.sigma_mm)]
+                xdata += [(1000, "sigma x y z, mm"), *((1040, float(v)) for v in circle.sigma_mm)]
             centre = Vec3(circle.xyz_mm)
-            own = {"layer": layer}
-            drawn = space.add_circle(plane.from_wcs(centre), circle.radius_mm, dxfattribs=own | {"extrusion": normal})
-            point = space.add_point(centre, dxfattribs=own)
-            for entity in (drawn, point):
-                entity.set_xdata("STCAL", named)
+            attributes = {"layer": layer}
+            rim = space.add_circle(
+                plane.from_wcs(centre), circle.radius_mm, dxfattribs=attributes | {"extrusion": normal}
+            )
+            point = space.add_point(centre, dxfattribs=attributes)
+            for entity in (rim, point):
+                entity.set_xdata("STCAL", xdata)
             text = space.add_text(
                 str(circle.label),
                 height=0.6 * circle.radius_mm,

@@ -1,4 +1,4 @@
-"""Exports of a target as tables and for robot programs."""
+"""Export of a target as tables and for robot programs."""
 
 import csv
 import io
@@ -26,25 +26,32 @@ COLUMNS = (
 
 
 def table(content: Content) -> str:
-    """A row for each face and each circle, target frame; the circles have their faces' axes and normals."""
+    """Returns CSV with a row per face and circle, target frame. Circles have the axes and normals of their faces."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(COLUMNS)
     for face, pose in content.faces.items():
         turned = [*_wxyz(pose.rotation), *pose.rotation[:, 2].tolist()]
         sigma = content.face_sigma(face)
-        own = [""] * 6 if sigma is None else [_digits(v) for v in (*(1e3 * sigma[1]), *(1e3 * np.degrees(sigma[0])))]
-        writer.writerow(["face", face, "", *pose.translation.tolist(), *turned, "", *own])
+        sigma_cells = (
+            [""] * 6 if sigma is None else [_digits(v) for v in (*(1e3 * sigma[1]), *(1e3 * np.degrees(sigma[0])))]
+        )
+        writer.writerow(["face", face, "", *pose.translation.tolist(), *turned, "", *sigma_cells])
         for circle in content.of_face(face):
-            own = [""] * 3 if circle.sigma_mm is None else [_digits(1e3 * v) for v in circle.sigma_mm]
+            sigma_cells = [""] * 3 if circle.sigma_mm is None else [_digits(1e3 * v) for v in circle.sigma_mm]
             place = circle.xyz_mm.tolist()
-            writer.writerow(["circle", face, circle.label.circle, *place, *turned, circle.radius_mm, *own, "", "", ""])
+            writer.writerow(
+                ["circle", face, circle.label.circle, *place, *turned, circle.radius_mm, *sigma_cells, "", "", ""]
+            )
     return stream.getvalue()
 
 
 def opencv(content: Content) -> str:
-    """For ``cv2.FileStorage``: a list of faces, each with 4×4, covariance, names of circles, centres (n, 3), radii and
-    the centres' covariances (n, 9); mm, rad."""
+    """Returns YAML for ``cv2.FileStorage``, mm and rad.
+
+    It has a list of faces, each with its 4×4 pose, covariance, names of circles, centres (n, 3), radii and the
+    covariances (n, 9) of the centres.
+    """
     lines = ["%YAML:1.0", "---", 'unit: "mm"', f"target: {_quoted(content.run.target.name)}"]
     lines += [
         f"reference_face: {_quoted(content.run.faces.reference_face)}",
@@ -52,17 +59,17 @@ def opencv(content: Content) -> str:
         "faces:",
     ]
     for face, pose in content.faces.items():
-        own = content.of_face(face)
-        centres = np.array([circle.xyz_mm for circle in own]).reshape(-1, 3)
-        covariances = [circle.covariance_mm2 for circle in own if circle.covariance_mm2 is not None]
+        circles = content.of_face(face)
+        centres = np.array([circle.xyz_mm for circle in circles]).reshape(-1, 3)
+        covariances = [circle.covariance_mm2 for circle in circles if circle.covariance_mm2 is not None]
         matrices = {"target_from_face": pose.matrix()}
         if face in content.covariances:
             matrices["target_from_face_covariance"] = content.covariances[face]
-        if own:
-            matrices |= {"centres": centres, "radii": np.array([[circle.radius_mm] for circle in own])}
+        if circles:
+            matrices |= {"centres": centres, "radii": np.array([[circle.radius_mm] for circle in circles])}
         if covariances:
             matrices["centres_covariance"] = np.array(covariances).reshape(-1, 9)
-        lines += ["   -", f"      id: {_quoted(face)}", f"      circles: {_list([c.label.circle for c in own])}"]
+        lines += ["   -", f"      id: {_quoted(face)}", f"      circles: {_list([c.label.circle for c in circles])}"]
         matrix_lines = [line for name, values in matrices.items() for line in opencv_matrix(name, values)]
         lines.append(indent("\n".join(matrix_lines), "      "))
     return "\n".join(lines) + "\n"
@@ -86,18 +93,21 @@ def _list(texts) -> str:
 
 
 PLATE_M = 1e-4
-"""Height of the cylinders that show circles; their outer sides lie in the faces' planes."""
+"""Height of the cylinders that show circles. Their outer ends lie in the faces' planes."""
 MM_M = 1e-3
 
 
 def urdf(content: Content) -> str:
-    """A ``robot`` of links without mass: target, faces with their circles to look at, circles."""
+    """Returns a ``robot`` of massless links: the target, the faces with visible circles, and the circles."""
     head = ['<?xml version="1.0"?>', *_comments(content), f"<robot name={quoteattr(content.root)}>"]
     return "\n".join([*head, f"<link name={quoteattr(content.root)}/>", *_body(content, str), "</robot>\n"])
 
 
 def xacro(content: Content) -> str:
-    """A macro of the same, to hold the target anywhere and more than once: ``prefix``, ``parent``, ``origin``."""
+    """Returns the same as a macro with ``prefix``, ``parent`` and ``origin``.
+
+    It places the target anywhere, and more than once.
+    """
 
     def prefixed(name: str) -> str:
         return "${prefix}" + _escaped(name)
@@ -114,17 +124,17 @@ def xacro(content: Content) -> str:
 
 
 def tf2(content: Content) -> str:
-    """``geometry_msgs/TransformStamped``, a document for each frame; metres."""
+    """Returns a YAML document of ``geometry_msgs/TransformStamped`` for each frame; metres."""
     return "".join(f"# {line}\n" for line in content.said()) + messages(content.statics())
 
 
 def launch_ros2(content: Content) -> str:
-    """A launch file of ROS 2 that publishes the frames."""
+    """Returns a launch file of ROS 2 that publishes the frames."""
     return ros2_launch(content.statics(), content.said())
 
 
 def launch_ros1(content: Content) -> str:
-    """A launch file of ROS 1 that publishes the frames."""
+    """Returns a launch file of ROS 1 that publishes the frames."""
     return ros1_launch(content.statics(), [line.replace("--", "- -") for line in content.said()])
 
 
@@ -145,15 +155,17 @@ def _body(content: Content, named: Callable[[str], str]) -> list[str]:
             ]
         links.append("</link>")
         links += [f"<link name={quoteattr(named(content.circle_frame(c.label)))}/>" for c in content.of_face(face)]
-    joints = [fixed_joint(Static(named(each.parent), named(each.child), each.pose)) for each in content.statics()]
+    joints = [
+        fixed_joint(Static(named(static.parent), named(static.child), static.pose)) for static in content.statics()
+    ]
     return [*links, *(joint.rstrip("\n") for joint in joints)]
 
 
 def _comments(content: Content) -> list[str]:
-    """In XML; ``--`` may not stand in them."""
+    """Returns XML comments. ``--`` is not allowed in them and is written with a space."""
     return [f"<!-- {line.replace('--', '- -')} -->" for line in content.said()]
 
 
 def _escaped(text: str) -> str:
-    """Where xacro would put a value."""
+    """Escapes expressions that xacro would evaluate."""
     return text.replace("$(", "$$(").replace("${", "$${")

@@ -1,4 +1,4 @@
-"""A finished run for viewers: glTF 2.0, and recordings of Rerun."""
+"""Export of a finished run for viewers: glTF 2.0, and recordings of Rerun."""
 
 import base64
 import json
@@ -21,24 +21,24 @@ VERTICES, INDICES = 34962, 34963
 LINES, TRIANGLES = 1, 4
 NEAR_M = 0.01
 RINGS, SEGMENTS = 8, 12
-"""Of the ball that shows σ."""
+"""Numbers of rings and segments of the ball that shows σ."""
 Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
-"""Quaternion x y z w: the target's Z upwards, as glTF has Y."""
+"""Quaternion x y z w that turns the target's Z to glTF's Y, which points up."""
 GL_FROM_CV = np.diag([1.0, -1.0, -1.0])
-"""glTF's cameras look along −Z, Y up."""
+"""Rotation from OpenCV's to glTF's camera axes. glTF's cameras look along −Z, with Y up."""
 UNLIT = "KHR_materials_unlit"
 
 
 @dataclass(slots=True, eq=False)
 class _Buffer:
-    """Numbers of the file as they gather."""
+    """Numerical data of a file, to which arrays are added."""
 
     data: bytearray = field(default_factory=bytearray)
     views: list[dict] = field(default_factory=list)
     accessors: list[dict] = field(default_factory=list)
 
     def add(self, values: np.ndarray, target: int) -> int:
-        """Accessor of points (n, 3), m, or of indices (n,)."""
+        """Adds points (n, 3), m, or indices (n,), and returns the index of their accessor."""
         points = target == VERTICES
         raw = np.ascontiguousarray(values, "<f4" if points else "<u4")
         accessor = {"bufferView": len(self.views), "componentType": FLOAT if points else UNSIGNED, "count": len(raw)}
@@ -53,14 +53,14 @@ class _Buffer:
 
 
 def gltf(content: Content) -> str:
-    """JSON with its buffer inside."""
+    """Returns glTF as JSON with its buffer inside."""
     tree, data = _tree(content)
     uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode("ascii")
     return json.dumps(tree | {"buffers": [{"uri": uri, "byteLength": len(data)}]}, ensure_ascii=False, indent=1) + "\n"
 
 
 def glb(content: Content) -> bytes:
-    """One binary file."""
+    """Returns glTF as one binary file."""
     tree, data = _tree(content)
     text = json.dumps(tree | {"buffers": [{"byteLength": len(data)}]}, ensure_ascii=False).encode()
     text += b" " * (-len(text) % 4)
@@ -133,18 +133,21 @@ def _cameras(content: Content, buffer: _Buffer, mesh, node) -> list[int]:
     lines = np.array([0, 1, 0, 2, 0, 3, 0, 4, 1, 2, 2, 3, 3, 4, 4, 1])
     parts = buffer.add(MM_M * shape @ GL_FROM_CV, VERTICES), buffer.add(lines, INDICES)
     frustum = mesh("image at depth", parts, len(content.faces) + 1, LINES)
-    found = []
-    for each in content.photographs:
-        pose = Rigid(each.target_from_camera.rotation @ GL_FROM_CV, each.target_from_camera.translation)
-        extras = {"group": each.group, "target_from_camera_mm": each.target_from_camera.matrix().tolist()}
-        found.append(node(name=each.name, camera=0, mesh=frustum, **_placed(pose), extras=extras))
-    return found
+    nodes = []
+    for photograph in content.photographs:
+        pose = Rigid(photograph.target_from_camera.rotation @ GL_FROM_CV, photograph.target_from_camera.translation)
+        extras = {"group": photograph.group, "target_from_camera_mm": photograph.target_from_camera.matrix().tolist()}
+        nodes.append(node(name=photograph.name, camera=0, mesh=frustum, **_placed(pose), extras=extras))
+    return nodes
 
 
 def _lens(content: Content) -> dict:
-    """glTF knows field of view alone: no distortion, principal point in the middle."""
+    """Returns a glTF camera with the field of view, and all intrinsics as extras.
+
+    glTF supports neither distortion nor a principal point off the centre.
+    """
     camera = content.camera
-    own = {
+    parameters = {
         "model": camera.colmap_model,
         "size_px": [camera.width, camera.height],
         "focal_px": list(map(float, camera.focal)),
@@ -159,12 +162,12 @@ def _lens(content: Content) -> dict:
             "aspectRatio": float(camera.width / camera.focal[0] / (camera.height / camera.focal[1])),
             "znear": NEAR_M,
         },
-        "extras": own,
+        "extras": parameters,
     }
 
 
 def _sigma(circle: Circle, pose: Rigid, factor: float) -> dict:
-    """The ball of radius 1 m as the ellipsoid of σ in the face's axes, ``factor`` times as large."""
+    """Returns the node that turns the unit ball into the ellipsoid of σ in the face's axes, times ``factor``."""
     sigma, axes = ellipsoid(circle, pose)
     turned = xyzw(Rigid(axes, np.zeros(3)))
     size = (factor * MM_M * sigma).tolist()
@@ -172,8 +175,8 @@ def _sigma(circle: Circle, pose: Rigid, factor: float) -> dict:
 
 
 def _of_circle(circle: Circle) -> dict:
-    own = {"label": str(circle.label), "xyz_mm": circle.xyz_mm.tolist(), "radius_mm": circle.radius_mm}
-    return own if circle.covariance_mm2 is None else own | {"covariance_mm2": circle.covariance_mm2.tolist()}
+    extras = {"label": str(circle.label), "xyz_mm": circle.xyz_mm.tolist(), "radius_mm": circle.radius_mm}
+    return extras if circle.covariance_mm2 is None else extras | {"covariance_mm2": circle.covariance_mm2.tolist()}
 
 
 def _placed(pose: Rigid) -> dict:
@@ -187,31 +190,33 @@ def _material(rgb: tuple[int, int, int]) -> dict:
 
 
 def _ball() -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of radius 1, and corners of triangles (3t,)."""
+    """Returns points (n, 3) of the unit sphere, and the corners of its triangles (3t,)."""
     polar, turn = np.pi * np.arange(RINGS + 1) / RINGS, 2 * np.pi * np.arange(SEGMENTS) / SEGMENTS
     p, t = (v.ravel() for v in np.meshgrid(polar, turn, indexing="ij"))
     points = np.column_stack([np.sin(p) * np.cos(t), np.sin(p) * np.sin(t), np.cos(p)])
     ring, segment = (v.ravel() for v in np.meshgrid(np.arange(RINGS), np.arange(SEGMENTS), indexing="ij"))
-    here, beside = ring * SEGMENTS + segment, ring * SEGMENTS + (segment + 1) % SEGMENTS
-    quads = np.column_stack([here, here + SEGMENTS, beside, beside, here + SEGMENTS, beside + SEGMENTS])
+    corner, next_corner = ring * SEGMENTS + segment, ring * SEGMENTS + (segment + 1) % SEGMENTS
+    quads = np.column_stack(
+        [corner, corner + SEGMENTS, next_corner, next_corner, corner + SEGMENTS, next_corner + SEGMENTS]
+    )
     return points, quads.ravel()
 
 
 CORNER_PX = 0.5
-"""Rerun counts pixels from the image's corner."""
+"""Offset of Rerun's pixel origin, which is the corner of the image."""
 MEDIA = {".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".png": "image/png"}
 APPLICATION = "stcal"
 
 
 def write_rrd(content: Content, path: Path) -> list[str]:
-    """Write it; what it lacks is returned in lines.
+    """Writes a recording of Rerun, and returns notes on photographs that it lacks.
 
-    Photographs are in it as their files are, where those are JPEG or PNG. A step of the time ``photograph`` each.
+    JPEG and PNG photographs are copied as they are. Each is a step of the time line ``photograph``.
 
     Raises
     ------
     InputError
-        ``stcal[rerun]`` is not installed.
+        If ``stcal[rerun]`` is not installed.
     """
     try:
         import rerun as rr
@@ -221,32 +226,36 @@ def write_rrd(content: Content, path: Path) -> list[str]:
     recording.save(path)
     factor = exaggeration(content)
     root = f"world/{_part(content.root)}"
-    said = [*content.said(), f"ellipsoids: sigma, {factor:g} times as large"]
-    said.append("cameras are drawn without their distortion; circles found are those of the photographs as they are")
-    recording.log("about", rr.TextDocument("\n\n".join(said), media_type="text/markdown"), static=True)
+    about = [*content.said(), f"ellipsoids: sigma, {factor:g} times as large"]
+    about.append("cameras are drawn without their distortion; circles found are those of the photographs as they are")
+    recording.log("about", rr.TextDocument("\n\n".join(about), media_type="text/markdown"), static=True)
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for face, pose in content.faces.items():
-        own = content.of_face(face)
-        where = f"{root}/{_part(face)}"
-        placed = rr.Transform3D(translation=pose.translation, quaternion=rr.Quaternion(xyzw=xyzw(pose)))
-        recording.log(where, placed, rr.TransformAxes3D(20.0), static=True)
-        centres = np.array([pose.inverse() @ circle.xyz_mm for circle in own]).reshape(-1, 3)
-        names = [str(circle.label) for circle in own]
-        flat = [[circle.radius_mm, circle.radius_mm, 0.0] for circle in own]
-        shown = rr.Ellipsoids3D(
+        circles = content.of_face(face)
+        entity = f"{root}/{_part(face)}"
+        pose_of_face = rr.Transform3D(translation=pose.translation, quaternion=rr.Quaternion(xyzw=xyzw(pose)))
+        recording.log(entity, pose_of_face, rr.TransformAxes3D(20.0), static=True)
+        centres = np.array([pose.inverse() @ circle.xyz_mm for circle in circles]).reshape(-1, 3)
+        names = [str(circle.label) for circle in circles]
+        flat = [[circle.radius_mm, circle.radius_mm, 0.0] for circle in circles]
+        discs = rr.Ellipsoids3D(
             centers=centres, half_sizes=flat, colors=content.rgb[face], labels=names, show_labels=False, fill_mode=3
         )
-        recording.log(f"{where}/circles", shown, static=True)
-        known = [(at, circle) for at, circle in zip(centres, own, strict=True) if circle.covariance_mm2 is not None]
-        if known:
-            parts = [ellipsoid(circle, pose) for _, circle in known]
+        recording.log(f"{entity}/circles", discs, static=True)
+        uncertain = [
+            (centre, circle)
+            for centre, circle in zip(centres, circles, strict=True)
+            if circle.covariance_mm2 is not None
+        ]
+        if uncertain:
+            parts = [ellipsoid(circle, pose) for _, circle in uncertain]
             ellipsoids = rr.Ellipsoids3D(
-                centers=[at for at, _ in known],
+                centers=[centre for centre, _ in uncertain],
                 half_sizes=[factor * sigma for sigma, _ in parts],
                 quaternions=[rr.Quaternion(xyzw=xyzw(Rigid(axes, np.zeros(3)))) for _, axes in parts],
                 colors=(40, 40, 40),
             )
-            recording.log(f"{where}/sigma", ellipsoids, static=True)
+            recording.log(f"{entity}/sigma", ellipsoids, static=True)
     for group, dots in content.boards.items():
         recording.log(f"world/board/{_part(group)}", rr.Points3D(dots, colors=BOARD_RGB, radii=1.0), static=True)
     missing = _photographs(content, recording, rr)
@@ -258,15 +267,15 @@ def write_rrd(content: Content, path: Path) -> list[str]:
 def _photographs(content: Content, recording, rr) -> list[str]:
     files = {}
     if content.run.images.is_dir():
-        files = {each.name: each.path for each in find_images(content.run.images)[0]}
+        files = {item.name: item.path for item in find_images(content.run.images)[0]}
     camera, depth = content.camera, camera_depth_mm(content)
-    found = {each.name: each for each in content.run.observations}
-    absent, unread = [], []
+    observations = {item.name: item for item in content.run.observations}
+    missing, unreadable = [], []
     for place, photograph in enumerate(content.photographs):
         recording.set_time("photograph", sequence=place)
-        where = f"world/cameras/{_part(photograph.name)}"
+        entity = f"world/cameras/{_part(photograph.name)}"
         pose = photograph.target_from_camera
-        recording.log(where, rr.Transform3D(translation=pose.translation, quaternion=rr.Quaternion(xyzw=xyzw(pose))))
+        recording.log(entity, rr.Transform3D(translation=pose.translation, quaternion=rr.Quaternion(xyzw=xyzw(pose))))
         lens = rr.Pinhole(
             focal_length=camera.focal,
             principal_point=camera.centre + CORNER_PX,
@@ -274,33 +283,33 @@ def _photographs(content: Content, recording, rr) -> list[str]:
             camera_xyz=rr.ViewCoordinates.RDF,
             image_plane_distance=depth,
         )
-        recording.log(f"{where}/image", lens)
-        own = found[photograph.name]
-        colours = [content.rgb.get(label.plane, BOARD_RGB) for label in own.labels]
-        spots = rr.Points2D(
-            own.centre_px + CORNER_PX,
+        recording.log(f"{entity}/image", lens)
+        observed = observations[photograph.name]
+        colours = [content.rgb.get(label.plane, BOARD_RGB) for label in observed.labels]
+        centres = rr.Points2D(
+            observed.centre_px + CORNER_PX,
             colors=colours,
-            labels=list(map(str, own.labels)),
+            labels=list(map(str, observed.labels)),
             show_labels=False,
             radii=3.0,
         )
-        recording.log(f"{where}/image/circles", spots)
+        recording.log(f"{entity}/image/circles", centres)
         path = files.get(photograph.name)
         if path is None:
-            absent.append(photograph.name)
+            missing.append(photograph.name)
         elif path.suffix.lower() not in MEDIA:
-            unread.append(photograph.name)
+            unreadable.append(photograph.name)
         else:
             picture = rr.EncodedImage(contents=path.read_bytes(), media_type=MEDIA[path.suffix.lower()])
-            recording.log(f"{where}/image", picture)
+            recording.log(f"{entity}/image", picture)
     lines = []
-    if absent:
-        lines.append(f"{len(absent)} photographs are no longer in {content.run.images}, {absent[0]} first: left out")
-    if unread:
-        lines.append(f"{len(unread)} photographs are neither JPEG nor PNG, {unread[0]} first: left out")
+    if missing:
+        lines.append(f"{len(missing)} photographs are no longer in {content.run.images}, {missing[0]} first: left out")
+    if unreadable:
+        lines.append(f"{len(unreadable)} photographs are neither JPEG nor PNG, {unreadable[0]} first: left out")
     return lines
 
 
 def _part(name: str) -> str:
-    """A part of an entity's path."""
+    """Returns a name as part of an entity's path, with special characters escaped."""
     return "".join(c if c.isalnum() or c in "-_." else "\\" + c for c in name)
