@@ -62,7 +62,12 @@ def simulate(
     ] = None,
     focus: Annotated[
         float | None,
-        typer.Option("--focus-mm", min=10, max=1e7, help="Focus the thin lens at this depth; at --distance if none."),
+        typer.Option(
+            "--focus-mm",
+            min=10,
+            max=1e7,
+            help="Set the lens's plane of focus at this depth; at --distance if none.",
+        ),
     ] = None,
     focal: Annotated[
         float | None,

@@ -1,6 +1,6 @@
 """Checks of the board and its scale, and of the measured radius of every circle."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,12 +9,12 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.align import align_similarity
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import robust_sigma
 from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import Network
+from stcal.sfm.adjust.rims import Rim, radius_views
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import ImageObservations
 
@@ -70,48 +70,20 @@ def measure_radii(
     networks: Sequence[Network], images: Sequence[ImageObservations], design_mm: dict[Label, float], camera: Camera
 ) -> Radii:
     """Computes radii from the areas of the ellipses and the positions and planes of the circles."""
-    shapes = {image.name: image.shape for image in images}
+    by_name = {image.name: image for image in images}
     ratio: dict[Label, list[np.ndarray]] = {}
     size: dict[Label, list[np.ndarray]] = {}
-    focal = float(np.sqrt(camera.focal.prod()))
     for network in networks:
-        model = network.model
-        designed = np.array([design_mm[label] for label in model.labels])
-        measured = np.concatenate([shapes[model.images[i]][model.keypoint[rows]]
-                                   for i, rows in enumerate(model.rows_by_image())])  # fmt: skip
-        order = np.concatenate(model.rows_by_image())
-        expected = _areas(network, designed)[order]
-        ratios = np.sqrt(np.maximum(np.linalg.det(measured), 0) / expected)
-        point = model.point_index[order]
-        for k, label in enumerate(model.labels):
-            ratio.setdefault(label, []).append(ratios[point == k])
-            size.setdefault(label, []).append(focal * np.sqrt(expected[point == k]))
+        views = radius_views(network.model, by_name, design_mm, camera)
+        for k, label in enumerate(network.model.labels):
+            ratio.setdefault(label, []).append(views.ratio[views.point_index == k])
+            size.setdefault(label, []).append(views.size_px[views.point_index == k])
     return Radii(
         tuple(ratio),
         np.array([design_mm[label] for label in ratio]),
         np.array([np.median(np.concatenate(values)) for values in ratio.values()]),
         np.array([np.median(np.concatenate(values)) for values in size.values()]),
     )
-
-
-def _areas(network: Network, radius_mm: np.ndarray) -> np.ndarray:
-    """Returns the areas over π of the circles' images in normalised coordinates, (n,).
-
-    They follow from the dual conic r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3), with the estimated planes of
-    the faces.
-    """
-    model = network.model
-    normal = np.zeros((len(model.labels), 3))
-    for members in model.points_by_face().values():
-        normal[members] = fit_plane(model.xyz_model[members]).normal
-    rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
-    n = np.einsum("nij,nj->ni", rotation, normal[model.point_index])
-    c = model.xyz_camera()
-    square = radius_mm[model.point_index, None, None] ** 2
-    dual = square * (np.eye(3) - n[:, :, None] * n[:, None, :]) - c[:, :, None] * c[:, None, :]
-    middle = dual[:, :2, 2] / dual[:, 2:, 2]
-    shape2 = middle[:, :, None] * middle[:, None, :] - dual[:, :2, :2] / dual[:, 2:, 2:]
-    return np.sqrt(np.maximum(np.linalg.det(shape2), 1e-300))
 
 
 def radius_checks(radii: Radii) -> list[Check]:
@@ -143,6 +115,43 @@ def radius_checks(radii: Radii) -> list[Check]:
         judge("radius", "Radius of each circle against those made alike", single, "circles", single_remedy),
         judge("radius-design", "Radii against the design", whole, "kinds of circle", class_remedy),
     ]
+
+
+RIM_SIGMAS = 4.0
+"""Height of a rim, in its σ, that is taken as seen: by chance in one of 16 000 kinds of circle."""
+
+
+def rim_check(rims: Mapping[str, Rim], sigma_mm: float | None) -> Check:
+    """Tests whether circles lie behind a rim, from the change of their radii with tilt.
+
+    ``rims`` : by kind of circle; ``sigma_mm`` : largest σ of a face's position; a rim that moves the faces by less
+    than this is seen and does no harm.
+    """
+    key, title = "rim", "Rim in front of the circles"
+    if not rims:
+        return impossible(key, title, "too few tilts of circles to tell", "photograph faces from several angles")
+    measured, names, reasons = [], [], []
+    for kind, rim in rims.items():
+        limit = max(RIM_SIGMAS * rim.sigma_mm, 2 * (sigma_mm or 0.0))
+        what = "circles of the faces" if kind == "circles" else "dots of the board"
+        measured.append(Measured(what, 1e3 * rim.height_mm, 1e3 * limit, "µm", None))
+        if abs(rim.height_mm) > limit:
+            names.append(what)
+            surface = "the faces lie" if kind == "circles" else "the board lies"
+            where = "in front of" if rim.height_mm > 0 else "behind"
+            reasons.append(
+                f"{what} look {rim.height_mm:.3f} ± {rim.sigma_mm:.3f} mm deep: {surface} "
+                f"{abs(rim.height_mm) / 2:.3f} mm {where} the luminous surface"
+            )
+    if not names:
+        deepest = max(rims.values(), key=lambda rim: abs(rim.height_mm) / rim.sigma_mm)
+        reason = f"radii change with tilt as those of flat circles: {deepest.height_mm:.3f} ± {deepest.sigma_mm:.3f} mm"
+        return Check(key, title, "passed", reason, tuple(measured), len(rims), (), "")
+    remedy = (
+        "faces are where their circles seem to lie; for the luminous surface run with --rim, or state rim_mm in "
+        "target.toml"
+    )
+    return Check(key, title, "suspicious", "; ".join(reasons), tuple(measured), len(rims), tuple(names), remedy)
 
 
 def size_by_radii(radii: Radii) -> Size | None:

@@ -1,6 +1,6 @@
 """Checks that residuals cannot fake: each asks a question that a wrong result with small residuals answers wrongly."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -14,7 +14,8 @@ from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_fac
 from stcal.sfm.adjust.network import Network, free_network, solve_score
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust
-from stcal.sfm.checks.board import board_checks, measure_radii, pitch_check, radius_checks
+from stcal.sfm.adjust.rims import Rim, find_rims
+from stcal.sfm.checks.board import board_checks, measure_radii, pitch_check, radius_checks, rim_check
 from stcal.sfm.checks.faces import (
     Again,
     agreement_check,
@@ -79,6 +80,14 @@ class Evidence:
         return [free_network(with_sigma(m.metric(scales[m.group].group_from_world()), factors), camera) for m in models]
 
 
+def _rims(evidence: Evidence, networks: Sequence[Network]) -> tuple[dict[str, Rim], float | None]:
+    """Returns the rims by kind of circle, and the largest σ of a face's position, mm, None if it is not known."""
+    radius = evidence.target.radius_of() | evidence.board.radius_of()
+    rims = find_rims([n.model for n in networks], evidence.images, radius, evidence.calibration.camera)
+    known = [np.sqrt(np.diag(c)[3:].max()) for c in evidence.calibration.target.face_covariance.values()]
+    return rims, float(max(known)) if known else None
+
+
 def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
     """Returns all checks of a run in the order of the report; ``progress`` is called with (``check``, done, total)."""
     networks, calibration = evidence.networks(), evidence.calibration
@@ -97,6 +106,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: board_checks(networks, board),
         lambda: pitch_check(calibration.target, target, radii),
         lambda: radius_checks(radii),
+        lambda: rim_check(*_rims(evidence, networks)),
         lambda: flatness_check(networks, evidence.options.flatness_mm),
         lambda: control_check(evidence, networks),
     )

@@ -66,7 +66,7 @@ class _Views:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Law:
-    """Squared blur = c₀ + c₁ u + c₂ u², u the inverse depth about its mean, ``about``, in units of ``unit``.
+    """Law of the squared blur: c₀ + c₁ u + c₂ u², u the inverse depth about its mean, ``about``, in units of ``unit``.
 
     This is σ₀² + a² (1/z − 1/z_f)²: the variance of a uniform disc, the image of the pupil, is proportional to the
     square of its radius, and this to the difference of the inverse depths (thin lens). ``covariance`` : (3, 3) of the

@@ -1,0 +1,137 @@
+"""Rims in front of luminous circles: radii of circles as each view shows them, and the height of a rim from them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.geometry.camera import Camera
+from stcal.geometry.plane import fit_plane
+from stcal.geometry.robust import huber_weights, robust_sigma
+from stcal.labels import DotLabel, Label
+from stcal.sfm.data.model import GroupModel, ImageObservations
+
+MAX_TAN = 2.75
+"""Largest tangent of the tilt (70°) of views that tell of a rim: beyond it the ellipse's short axis is a few pixels."""
+SECOND_ORDER = 0.085
+"""Second-order share of the loss of radius, (h tan τ)²/r: of the ellipse that fits the lens-shaped area best."""
+MIN_VIEWS, MIN_SPREAD = 30, 0.15
+"""Smallest number of views of a kind of circle, and of the standard deviation of their tan τ, for a rim."""
+BLUR_SHARE = 0.3
+"""σ of the blur's effect on the radius that is left after its correction, as a share of it (``defocus_study.py``)."""
+LEAST_SIGMA_MM = 0.003
+"""Smallest σ of a rim: what light that falls towards the edge of a circle adds."""
+HUBER = 2.0
+STEPS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RadiusViews:
+    """The n observations of circles of one group as their radii show.
+
+    ``point_index`` : (n,) of the model; ``design_mm`` : (n,) designed radius; ``ratio`` : (n,) measured over designed;
+    ``size_px`` : (n,) designed radius in the image; ``blur_mm`` : (n,) correction of the radius for blur, which is in
+    the ratio; ``tan_tilt`` : (n,) tangent of the angle between the normal and the line of sight.
+    """
+
+    point_index: np.ndarray
+    design_mm: np.ndarray
+    ratio: np.ndarray
+    size_px: np.ndarray
+    blur_mm: np.ndarray
+    tan_tilt: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class Rim:
+    """Height of the rim in front of circles of one kind, mm, its σ, and the number of ``views`` that tell it."""
+
+    height_mm: float
+    sigma_mm: float
+    views: int
+
+
+def radius_views(
+    model: GroupModel, images: Mapping[str, ImageObservations], design_mm: Mapping[Label, float], camera: Camera
+) -> RadiusViews:
+    """Returns the radii from the areas of the ellipses and the positions and planes of the circles.
+
+    The areas of the circles' images follow from the dual conic r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3),
+    with the estimated planes of the faces. A blur of σ takes σ²/2R off the radius R of a disc's image, and the fit
+    follows by 0.9 to 1.2 of it; this is put back.
+    """
+    focal = float(np.sqrt(camera.focal.prod()))
+    rows = model.rows_by_image()
+    order = np.concatenate(rows)
+    seen = [(images[name], model.keypoint[own]) for name, own in zip(model.images, rows, strict=True)]
+    shape = np.concatenate([image.shape[keypoint] for image, keypoint in seen])
+    blur = np.concatenate([image.blur_px[keypoint] for image, keypoint in seen])
+    point = model.point_index[order]
+    radius = np.array([design_mm[label] for label in model.labels])[point]
+    normal = np.zeros((len(model.labels), 3))
+    for members in model.points_by_face().values():
+        normal[members] = fit_plane(model.xyz_model[members]).normal
+    rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index[order]]
+    n = np.einsum("nij,nj->ni", rotation, normal[point])
+    c = model.xyz_camera()[order]
+    dual = radius[:, None, None] ** 2 * (np.eye(3) - n[:, :, None] * n[:, None, :]) - c[:, :, None] * c[:, None, :]
+    middle = dual[:, :2, 2] / dual[:, 2:, 2]
+    shape2 = middle[:, :, None] * middle[:, None, :] - dual[:, :2, :2] / dual[:, 2:, 2:]
+    size = focal * np.sqrt(np.sqrt(np.maximum(np.linalg.det(shape2), 1e-300)))
+    measured = focal * np.sqrt(np.maximum(np.linalg.det(shape), 0))
+    lost = np.divide(blur**2, 2 * measured, out=np.zeros_like(measured), where=measured > 0)
+    cosine = np.abs((n * c).sum(1)) / np.linalg.norm(c, axis=1)
+    return RadiusViews(
+        point,
+        radius,
+        (measured + lost) / size,
+        size,
+        lost / size * radius,
+        np.sqrt(np.maximum(1 - cosine**2, 0)) / cosine,
+    )
+
+
+def find_rims(
+    models: Sequence[GroupModel], images: Sequence[ImageObservations], design_mm: Mapping[Label, float], camera: Camera
+) -> dict[str, Rim]:
+    """Returns the height of the rim in front of the faces' ``circles`` and of the board's ``dots``.
+
+    A kind with too few views is left out.
+
+    A disc of radius r behind a rim of the same radius and height h is seen as the area that both have in common; from a
+    tilt τ they are h tan τ apart. The area lies as if it stood h/2 in front of the disc, and its radius is less by
+    h tan τ/π.
+    """
+    by_name = {image.name: image for image in images}
+    parts: dict[str, list[tuple[np.ndarray, ...]]] = {"circles": [], "dots": []}
+    for model in models:
+        views = radius_views(model, by_name, design_mm, camera)
+        is_dot = np.array([isinstance(label, DotLabel) for label in model.labels])[views.point_index]
+        short = (views.ratio - 1) * views.design_mm
+        near = (views.tan_tilt < MAX_TAN) & (views.ratio > 0)
+        for kind, own in (("circles", ~is_dot & near), ("dots", is_dot & near)):
+            parts[kind].append((short[own], views.tan_tilt[own], views.design_mm[own], views.blur_mm[own]))
+    rims = {}
+    for kind, found in parts.items():
+        short, tangent, radius, blur = (np.concatenate(values) for values in zip(*found, strict=True))
+        if len(short) >= MIN_VIEWS and tangent.std() >= MIN_SPREAD:
+            rims[kind] = _rim(short, tangent, radius, blur)
+    return rims
+
+
+def _rim(short: np.ndarray, tangent: np.ndarray, radius: np.ndarray, blur: np.ndarray) -> Rim:
+    """Returns the rim from the radii's excess ``short`` (mm) over the design, with an offset of each radius."""
+    _, kind = np.unique(radius, return_inverse=True)
+    rows = np.column_stack([np.eye(kind.max() + 1)[kind], -tangent / np.pi])
+    height, weight, sigma, inverse = 0.0, np.ones(len(short)), 1.0, np.eye(1)
+    for _ in range(STEPS):
+        right = short + SECOND_ORDER * height * abs(height) * tangent**2 / radius
+        inverse = np.linalg.pinv((rows.T * weight) @ rows, hermitian=True)
+        solution = inverse @ ((rows.T * weight) @ right)
+        height = float(solution[-1])
+        length = np.abs(right - rows @ solution)
+        sigma = float(robust_sigma(length, redundancy=max(1 - rows.shape[1] / len(rows), 0.1)))
+        weight = huber_weights(length / max(sigma, 1e-9), HUBER)
+    of_blur = float((inverse @ ((rows.T * weight) @ blur))[-1])
+    spread = sigma * float(np.sqrt(inverse[-1, -1]))
+    return Rim(height, float(np.sqrt(spread**2 + (BLUR_SHARE * of_blur) ** 2 + LEAST_SIGMA_MM**2)), len(short))
