@@ -23,7 +23,9 @@ class FaceDesign:
     ``origin``, ``x``, ``y`` : ids of the circles that define the frame;
     ``rough_target_from_face`` : approximate pose of the face in a frame that all faces share, or None if the design
     states none. Plans and simulations use it, a calibration does not;
-    ``outline_mm`` : (k, 2) corners of its plate in order, face frame, for drawings, or None if the design states none.
+    ``outline_mm`` : (k, 2) corners of its plate in order, face frame, for drawings, or None if the design states none;
+    ``rim_mm`` : (n,) heights of the rims in front of the circles, negative for discs that stand out, or None if the
+    circles lie in the surface of the plate.
     """
 
     id: str
@@ -35,12 +37,15 @@ class FaceDesign:
     y: str
     rough_target_from_face: Rigid | None = None
     outline_mm: Array | None = None
+    rim_mm: Array | None = None
 
     def __post_init__(self):
         freeze(self, "xy_mm", (len(self.ids), 2), f"face {self.id}: circles")
         freeze(self, "radius_mm", (len(self.ids),), f"face {self.id}: radii")
         if self.outline_mm is not None:
             freeze(self, "outline_mm", (None, 2), f"face {self.id}: outline")
+        if self.rim_mm is not None:
+            freeze(self, "rim_mm", (len(self.ids),), f"face {self.id}: rims")
 
     def labels(self) -> list[CircleLabel]:
         """Returns the label ``face:circle`` of every circle, in order."""
@@ -79,6 +84,15 @@ class TargetDesign:
             label: float(radius)
             for face in self.faces
             for label, radius in zip(face.labels(), face.radius_mm, strict=True)
+        }
+
+    def rim_of(self) -> dict[CircleLabel, float]:
+        """Returns the height of the rim in mm by label, of faces that state it."""
+        return {
+            label: float(height)
+            for face in self.faces
+            if face.rim_mm is not None
+            for label, height in zip(face.labels(), face.rim_mm, strict=True)
         }
 
 

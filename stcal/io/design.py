@@ -46,11 +46,16 @@ Name = Annotated[
 ]
 
 
+RimHeight = Annotated[float, Field(ge=-20, le=20)]
+"""Height in mm of a rim in front of a circle; negative of a disc that stands out of its plate."""
+
+
 class _CircleFile(Strict):
     id: Name
     x_mm: Finite
     y_mm: Finite
     radius_mm: Positive
+    rim_mm: RimHeight | None = None
 
 
 class _RoughPoseFile(Strict):
@@ -68,6 +73,7 @@ class _FaceFile(Strict):
     y: Name
     rough_pose: _RoughPoseFile | None = None
     outline_mm: list[tuple[Finite, Finite]] | None = Field(default=None, min_length=3, max_length=1000)
+    rim_mm: RimHeight | None = None
     circles: list[_CircleFile] = Field(min_length=4)
 
 
@@ -243,7 +249,9 @@ def _face(face: _FaceFile, where: str) -> FaceDesign:
     if face.outline_mm is not None:
         _require_inside(ids, xy, radius, np.array(face.outline_mm), where)
         outline = (np.array(face.outline_mm) - origin) @ face_from_drawing.T
-    return FaceDesign(face.id, tuple(ids), xy_face, radius, face.origin, face.x, face.y, rough, outline)
+    stated = [face.rim_mm if circle.rim_mm is None else circle.rim_mm for circle in face.circles]
+    rims = None if all(rim is None for rim in stated) else np.array([rim or 0.0 for rim in stated])
+    return FaceDesign(face.id, tuple(ids), xy_face, radius, face.origin, face.x, face.y, rough, outline, rims)
 
 
 def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline: np.ndarray, where: str) -> None:
@@ -343,11 +351,19 @@ def target_toml(target: TargetDesign) -> str:
             "circles = [",
         ]
         lines += [
-            f"  {{ id = {toml_string(circle)}, x_mm = {_number(x)}, y_mm = {_number(y)}, radius_mm = {_number(r)} }},"
-            for circle, (x, y), r in zip(face.ids, face.xy_mm, face.radius_mm, strict=True)
+            f"  {{ id = {toml_string(circle)}, x_mm = {_number(x)}, y_mm = {_number(y)}, "
+            f"radius_mm = {_number(r)}{rim} }},"
+            for circle, (x, y), r, rim in zip(face.ids, face.xy_mm, face.radius_mm, _rims(face), strict=True)
         ]
         lines += ["]"]
     return "\n".join(lines) + "\n"
+
+
+def _rims(face: FaceDesign) -> list[str]:
+    """Returns the key of each circle's rim, empty where the design states none."""
+    if face.rim_mm is None:
+        return [""] * len(face.ids)
+    return [f", rim_mm = {_number(height)}" for height in face.rim_mm]
 
 
 def _rough_lines(pose: Rigid | None) -> list[str]:

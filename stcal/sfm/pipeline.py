@@ -4,15 +4,16 @@ from dataclasses import replace
 from pathlib import Path
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import StcalError
+from stcal.errors import InputError, StcalError
 from stcal.io.cameras.model import CameraModel, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_of, target_of
 from stcal.io.files import save
 from stcal.io.images import chosen_images
 from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread
-from stcal.sfm.adjust.calibration import calibrate, calibrate_board
+from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
+from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.detect.board_alone import is_board_alone, label_boards
@@ -86,6 +87,7 @@ def run(
             published = _published(images, model, folder, *designs, options, progress)
             result = replace(result, comparison=compare_with_paper(result, published))
         result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera)), progress))
+        result = replace(result, calibration=_on_surface(result))
         return replace(result, judgement=write_run(result, folder.stage, progress, reload_s))
 
 
@@ -101,6 +103,26 @@ def _calibrated(
     detection, labelled = labelled_images(images, model, folder, target, board, options, progress)
     with overlays_beside(detection, labelled, target, folder.stage, progress):
         return _solved(detection, labelled, model, folder, target, board, options, progress)
+
+
+def _on_surface(result: RunResult) -> Calibration:
+    """Returns the calibration, of the luminous surface if the circles' rims are stated or are to be estimated."""
+    design, calibration = result.target_design, result.calibration
+    heights, sigma_mm = design.rim_of(), 0.0
+    if result.options.rim:
+        radius = design.radius_of() | result.board_design.radius_of()
+        rim = find_rims(calibration.models, result.observations(), radius, calibration.camera).get("circles")
+        if rim is None:
+            raise InputError(
+                "E-RIM-UNKNOWN",
+                f"--rim: circles of the faces in fewer than {MIN_VIEWS} views or at too few tilts; photograph the faces "
+                "from several angles, or state rim_mm in target.toml",
+            )
+        heights, sigma_mm = dict.fromkeys(calibration.target.circles, rim.height_mm), rim.sigma_mm
+    if not any(heights.values()):
+        return calibration
+    frame = result.options.adjustment(design).frame
+    return on_luminous_surface(calibration, heights, sigma_mm, design, frame)
 
 
 def _published(

@@ -112,6 +112,10 @@ def run(
         bool,
         typer.Option("--refine-camera", help="Adjust the intrinsics too, from the given ones with their σ."),
     ] = False,
+    rim: Annotated[
+        bool,
+        typer.Option("--rim", help="Estimate the rim in front of circles, and give faces of the surface behind it."),
+    ] = False,
     board_only: Annotated[
         bool,
         typer.Option("--board-only", help="Take the board alone, though other circles are in view: λ and residuals."),
@@ -153,6 +157,7 @@ def run(
         reference_face=reference_face,
         flatness_mm=_flatness(flatness),
         refine_camera=refine_camera,
+        rim=rim,
         board_only=board_only,
         compare=compare.value if compare is not None else None,
         graph=pairs.value if pairs is not None else None,

@@ -1,19 +1,20 @@
 """Calibration of the target from the models of the groups: scale, faces, chaining, joint adjustment."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
-from stcal.errors import MappingError
+from stcal.errors import InputError, MappingError
 from stcal.geometry.camera import Camera
+from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
-from stcal.labels import DotLabel
+from stcal.labels import CircleLabel, DotLabel
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
-from stcal.sfm.adjust.faces import FaceInGroup, faces_of_group, missing_frame_circles
+from stcal.sfm.adjust.faces import FaceInGroup, FrameKind, faces_of_group, missing_frame_circles
 from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.options import AdjustOptions
@@ -49,7 +50,8 @@ class Calibration:
     if it was requested; ``sigma_factors`` : ratios of the residuals of the single groups to the centres' own σ;
     ``models`` : models that the result rests on, mm, target frame, without groups that are not linked to it;
     ``camera`` : refined camera if it was refined, else the given one; ``notes`` : faces without a frame and the
-    reasons, and an adjustment that did not settle.
+    reasons, and an adjustment that did not settle; ``rim_mm`` : heights of the rims behind which circles lie, if the result
+    is of the luminous surface, empty if it is of what is seen.
     """
 
     target: CalibratedTarget
@@ -60,6 +62,7 @@ class Calibration:
     models: tuple[MetricModel, ...]
     camera: Camera
     notes: tuple[str, ...]
+    rim_mm: Mapping[CircleLabel, float] = field(default_factory=dict)
 
 
 def calibrate(
@@ -147,6 +150,48 @@ def calibrate_board(
         camera=camera,
         notes=(),
     )
+
+
+def on_luminous_surface(
+    calibration: Calibration,
+    rim_mm: Mapping[CircleLabel, float],
+    sigma_mm: float,
+    target: TargetDesign,
+    frame: FrameKind,
+) -> Calibration:
+    """Returns the calibration with circles on their luminous surface, behind rims.
+
+    A circle behind a rim of height h is seen h/2 in front of its surface. ``sigma_mm`` : σ of all heights together.
+
+    Raises
+    ------
+    InputError
+        The calibration has no joint adjustment.
+    """
+    joint = calibration.joint
+    if joint is None:
+        raise InputError("E-RIM-SOLVE", "rims are corrected by the joint adjustment alone; use --solve joint")
+    outward = _outward(joint, calibration.target.target_from_face)
+    height = np.array([rim_mm.get(label, 0.0) for label in joint.labels])
+    common = np.where(height != 0, -0.5, 0.0)[:, None] * outward
+    moved = replace(
+        joint,
+        xyz_model=joint.xyz_model - 0.5 * height[:, None] * outward,
+        covariance_mm2=joint.covariance_mm2 + sigma_mm**2 * np.outer(common, common),
+    )
+    surface = calibrated_target(moved, calibration.target, target, frame)
+    models = tuple(m.moved(surface.target_from_group[m.group]) for m in joint.models)
+    return replace(calibration, target=surface, models=models, rim_mm=dict(rim_mm))
+
+
+def _outward(joint: JointResult, target_from_face: Mapping[str, Rigid]) -> np.ndarray:
+    """Returns the outward normals of the circles' faces, (c, 3), in the frame of the adjustment; zero of faces without
+    a pose."""
+    outward = np.zeros_like(joint.xyz_model)
+    for face, pose in target_from_face.items():
+        members = [i for i, label in enumerate(joint.labels) if label.face == face]
+        outward[members] = fit_plane(joint.xyz_model[members], pose.rotation[:, 2]).normal
+    return outward
 
 
 def _faces(

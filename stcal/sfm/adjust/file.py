@@ -1,5 +1,6 @@
 """``faces.json``: the calibrated target as a file."""
 
+from collections.abc import Mapping
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -22,6 +23,7 @@ from stcal.io.json import (
     Vector3,
     mistake,
 )
+from stcal.labels import CircleLabel
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import AdjustOptions, Solve
@@ -77,6 +79,14 @@ class FacesFile(ResultFile):
     solve: Solve = Field(
         description="one adjustment over all groups (`joint`), group by group (`chain`), or as published (`paper`)"
     )
+    surface: Literal["seen", "luminous"] = Field(
+        "seen",
+        description="of which surface the faces are: `seen`, where circles seem to lie, or `luminous`, behind the rims "
+        "of `rim_mm`",
+    )
+    rim_mm: dict[ByLabel, float] = Field(
+        {}, description="`face:circle` → height of the rim in front of the circle, stated or estimated, mm"
+    )
     eccentricity: bool = Field(
         description="whether it was corrected; without it `solve` is `chain` and `frame` is `three-point`, as "
         "published, unless they are given"
@@ -107,9 +117,17 @@ class FacesFile(ResultFile):
 
     @classmethod
     def of(
-        cls, target: CalibratedTarget, design: TargetDesign, options: AdjustOptions, centre_sigma_factor: float
+        cls,
+        target: CalibratedTarget,
+        design: TargetDesign,
+        options: AdjustOptions,
+        centre_sigma_factor: float,
+        rim_mm: Mapping[CircleLabel, float] | None = None,
     ) -> "FacesFile":
-        """Returns the file of a calibrated target, with covariances if the target states them."""
+        """Returns the file of a calibrated target, with covariances if the target states them.
+
+        ``rim_mm`` : heights of rims if the target is of the luminous surface behind them.
+        """
         radius = design.radius_of()
         content: dict[str, Any] = {
             "format": "stcal faces 1",
@@ -117,6 +135,7 @@ class FacesFile(ResultFile):
             "reference_face": target.reference_face,
             "frame": options.frame,
             "solve": options.solve,
+            **({"surface": "luminous", "rim_mm": rim_mm} if rim_mm else {}),
             "eccentricity": options.eccentricity,
             "target_from_face": target.target_from_face,
             "circles": target.circles,

@@ -121,11 +121,12 @@ RIM_SIGMAS = 4.0
 """Height of a rim, in its σ, that is taken as seen: by chance in one of 16 000 kinds of circle."""
 
 
-def rim_check(rims: Mapping[str, Rim], sigma_mm: float | None) -> Check:
+def rim_check(rims: Mapping[str, Rim], sigma_mm: float | None, allowed_mm: float | None = 0.0) -> Check:
     """Tests whether circles lie behind a rim, from the change of their radii with tilt.
 
     ``rims`` : by kind of circle; ``sigma_mm`` : largest σ of a face's position; a rim that moves the faces by less
-    than this is seen and does no harm.
+    than this is seen and does no harm; ``allowed_mm`` : height in front of the faces' circles that the result allows
+    for, None if it takes what is estimated here.
     """
     key, title = "rim", "Rim in front of the circles"
     if not rims:
@@ -133,17 +134,26 @@ def rim_check(rims: Mapping[str, Rim], sigma_mm: float | None) -> Check:
     measured, names, reasons = [], [], []
     for kind, rim in rims.items():
         limit = max(RIM_SIGMAS * rim.sigma_mm, 2 * (sigma_mm or 0.0))
+        allowed = 0.0 if kind == "dots" else rim.height_mm if allowed_mm is None else allowed_mm
+        beyond = rim.height_mm - allowed
         what = "circles of the faces" if kind == "circles" else "dots of the board"
         measured.append(Measured(what, 1e3 * rim.height_mm, 1e3 * limit, "µm", None))
-        if abs(rim.height_mm) > limit:
+        if abs(beyond) > limit:
             names.append(what)
             surface = "the faces lie" if kind == "circles" else "the board lies"
-            where = "in front of" if rim.height_mm > 0 else "behind"
+            where = "in front of" if beyond > 0 else "behind"
             reasons.append(
                 f"{what} look {rim.height_mm:.3f} ± {rim.sigma_mm:.3f} mm deep: {surface} "
-                f"{abs(rim.height_mm) / 2:.3f} mm {where} the luminous surface"
+                f"{abs(beyond) / 2:.3f} mm {where} the luminous surface"
             )
     if not names:
+        if allowed_mm != 0 and "circles" in rims:
+            rim = rims["circles"]
+            source = "estimated" if allowed_mm is None else f"{allowed_mm:g} mm stated"
+            reason = (
+                f"circles look {rim.height_mm:.3f} ± {rim.sigma_mm:.3f} mm deep, {source}; faces are of the surface"
+            )
+            return Check(key, title, "passed", reason, tuple(measured), len(rims), (), "")
         deepest = max(rims.values(), key=lambda rim: abs(rim.height_mm) / rim.sigma_mm)
         reason = f"radii change with tilt as those of flat circles: {deepest.height_mm:.3f} ± {deepest.sigma_mm:.3f} mm"
         return Check(key, title, "passed", reason, tuple(measured), len(rims), (), "")

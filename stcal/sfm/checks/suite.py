@@ -1,6 +1,6 @@
 """Checks that residuals cannot fake: each asks a question that a wrong result with small residuals answers wrongly."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -55,7 +55,7 @@ class Evidence:
 
     ``models`` : adjusted models of the single groups, without unit; ``outliers`` : observations left out of the models;
     ``images`` : all observations; ``camera`` : as given; ``prior`` : of the intrinsics if they were refined;
-    ``blur_px`` : blur of the edges by image, may be empty.
+    ``blur_px`` : blur of the edges by image, may be empty; ``rim`` : whether rims are estimated for the result.
     """
 
     models: tuple[WorldModel, ...]
@@ -68,6 +68,7 @@ class Evidence:
     calibration: Calibration
     prior: CameraPrior | None
     blur_px: dict[str, float]
+    rim: bool = False
 
     def networks(self) -> list[Network]:
         """Returns the free networks of all groups, mm, at the intrinsics of the result."""
@@ -80,12 +81,15 @@ class Evidence:
         return [free_network(with_sigma(m.metric(scales[m.group].group_from_world()), factors), camera) for m in models]
 
 
-def _rims(evidence: Evidence, networks: Sequence[Network]) -> tuple[dict[str, Rim], float | None]:
-    """Returns the rims by kind of circle, and the largest σ of a face's position, mm, None if it is not known."""
+def _rims(evidence: Evidence) -> tuple[dict[str, Rim], float | None, float | None]:
+    """Returns the rims by kind of circle; the largest σ of a face's position, mm, None if it is not known; and the
+    height that the result allows for, None if it is to be estimated."""
     radius = evidence.target.radius_of() | evidence.board.radius_of()
-    rims = find_rims([n.model for n in networks], evidence.images, radius, evidence.calibration.camera)
+    rims = find_rims(evidence.calibration.models, evidence.images, radius, evidence.calibration.camera)
     known = [np.sqrt(np.diag(c)[3:].max()) for c in evidence.calibration.target.face_covariance.values()]
-    return rims, float(max(known)) if known else None
+    stated = list(evidence.target.rim_of().values())
+    allowed = None if evidence.rim else float(np.mean(stated)) if stated else 0.0
+    return rims, float(max(known)) if known else None, allowed
 
 
 def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
@@ -106,7 +110,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: board_checks(networks, board),
         lambda: pitch_check(calibration.target, target, radii),
         lambda: radius_checks(radii),
-        lambda: rim_check(*_rims(evidence, networks)),
+        lambda: rim_check(*_rims(evidence)),
         lambda: flatness_check(networks, evidence.options.flatness_mm),
         lambda: control_check(evidence, networks),
     )

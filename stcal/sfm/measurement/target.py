@@ -121,6 +121,7 @@ def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
     try:
         labels = circle_labels(faces.circles)
         xyz = np.array(list(faces.circles.values())).reshape(-1, 3)
+        xyz = xyz + _seen_in_front(faces, labels)
         radius = np.array([faces.radius_mm[label] for label in labels])
         covariance, notes = _covariance(labels, _joint(faces, labels), faces.circle_covariance_mm2)
         if faces.centre_sigma_factor is None:
@@ -134,6 +135,13 @@ def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
         ) from error
     _require_design(target, design, path)
     return target
+
+
+def _seen_in_front(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray:
+    """Returns how far in front of their luminous surface circles behind rims are seen, (c, 3), mm."""
+    outward = {face: pose.rotation[:, 2] for face, pose in faces.poses().items()}
+    shifts = [0.5 * faces.rim_mm.get(label, 0.0) * outward.get(label.face, np.zeros(3)) for label in labels]
+    return np.array(shifts).reshape(-1, 3)
 
 
 def _joint(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray | None:

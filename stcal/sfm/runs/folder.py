@@ -113,7 +113,7 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
     report = judged(report_of(result).content())
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.circles
-        faces = FacesFile.of(result.target, result.target_design, options, factor)
+        faces = FacesFile.of(result.target, result.target_design, options, factor, result.calibration.rim_mm)
         save(out / "faces.json", json_text(faces.content()))
     write_report(out, report, out, reload_s)
     progress("report", 1, 1)

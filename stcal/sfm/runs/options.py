@@ -42,6 +42,9 @@ class RunOptions:
         σ of a circle about the plane of its face, mm; None if it is unknown.
     refine_camera : bool
         Whether to adjust the intrinsics, with the given ones as observations.
+    rim : bool
+        Whether to estimate the height of a rim in front of the faces' circles, and to give the faces of their luminous
+        surface.
     board_only : bool
         Whether the board alone was photographed, so that λ and its residuals are the result. If False, the images tell.
     compare : {"paper"}, optional
@@ -65,6 +68,7 @@ class RunOptions:
     workers: int | None = None
     flatness_mm: float | None = 0.02
     refine_camera: bool = False
+    rim: bool = False
     board_only: bool = False
     compare: Compare | None = None
     exclude: tuple[str, ...] = ()
