@@ -11,6 +11,7 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
+from stcal.io.toml import MOST_LINK_MM
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain
 from stcal.robot.kinematics.forward import carried_poses, flange_poses, forward
 from stcal.robot.kinematics.model import Chain, Convention, DHRow, Grown, Joint, JointType, Robot, Tree
@@ -130,6 +131,13 @@ def read_urdf(
     for option, name in (("--from-link", from_link), *(("--to-link", name) for name in given)):
         if name and name not in links:
             raise InputError("E-URDF-LINKS", f"{where}: {option} {name}: no such link; there are {_few(links)}")
+    farthest = max(joints.values(), key=_far, default=None)
+    if farthest is not None and _far(farthest) > MOST_LINK_MM:
+        raise InputError(
+            "E-LENGTH-UNIT",
+            f"{where}: joint {farthest.name}: origin {_far(farthest) / METRE_MM:g} m from its parent, up to "
+            f"{MOST_LINK_MM / METRE_MM:g} possible: URDF is in metres; divide lengths in mm by 1000",
+        )
     start = from_link or _root(joints, links, where)
     ends = {name if given[1:] else "": name for name in given} if any(given) else _tools(joints, start, where)
     paths = {name: _path(joints, start, end, where) for name, end in ends.items()}
@@ -364,6 +372,10 @@ def _path(joints: dict[str, _UrdfJoint], start: str, end: str, where: str) -> li
         found.append(joints[end])
         end = joints[end].parent
     return found[::-1]
+
+
+def _far(joint: _UrdfJoint) -> float:
+    return float(np.linalg.norm(joint.parent_from_child.translation))
 
 
 def _few(names: list[str], most: int = 12) -> str:
