@@ -1,5 +1,6 @@
 """Readers of board files: dots (``stcal.io.design``), chessboards, ChArUco boards, AprilGrids, and Kalibr's YAML."""
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -9,6 +10,8 @@ import numpy as np
 import yaml
 from pydantic import AfterValidator, Field, model_validator
 
+from stcal.boards.bundle import KEYS as BUNDLE_KEYS
+from stcal.boards.bundle import bundle_content, tags_of_bundle
 from stcal.boards.design import (
     AprilGridDesign,
     AsymmetricCirclesDesign,
@@ -32,6 +35,7 @@ from stcal.io.toml import (
     Positive,
     Sized,
     Strict,
+    load_toml,
     radius,
     require_millimetres,
     side,
@@ -55,14 +59,28 @@ OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_m
 """Keys that occur only in files of other boards than dots."""
 
 
+OF_OPENCV = ("tag36h11", "tag36h10", "tag25h9", "tag16h5")
+"""Families of AprilTag that OpenCV detects."""
+_APRILTAG = re.compile(r"(?:april)?[_ -]?t(?:ag)?[_ -]?(standard|circle|custom)?[_ -]?(\d{2}h\d{1,2})", re.I)
+
+
 def known_dictionary(name: str) -> str:
     """Return the full name of a dictionary of ``cv2.aruco``; ``name`` may lack ``DICT_``, and be in any case.
+
+    Families of AprilTag have their own names, too: ``tag36h11``, ``t36h11``.
 
     Raises
     ------
     ValueError
-        The name is unknown; the message lists similar names.
+        The name is unknown; the message lists similar names. Or OpenCV lacks the family.
     """
+    family = _APRILTAG.fullmatch(name.strip())
+    if family is not None:
+        if family[1] is not None or f"DICT_APRILTAG_{family[2].lower()}" not in dir(cv2.aruco):
+            raise ValueError(
+                f"OpenCV does not detect this family of AprilTag; print tags of {', '.join(OF_OPENCV)} for the target"
+            )
+        name = f"APRILTAG_{family[2]}"
     plain = name.strip().upper()
     plain = plain if plain.startswith("DICT_") else f"DICT_{plain}"
     known = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
@@ -189,6 +207,24 @@ class TagsFile(Sized):
         return self
 
 
+def load_tags(path: str | Path, what: str) -> TagsFile:
+    """Read a layout of tags: TOML, or bundles of apriltag_ros (YAML).
+
+    Raises
+    ------
+    InputError
+        The file is unreadable or invalid; the message begins with ``what``, and names file, place and reason.
+    """
+    try:
+        content = bundle_content(read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig"))
+    except (OSError, UnicodeDecodeError):
+        content = None  # the error of the reader of TOML says why
+    if content is None:
+        return load_toml(path, TagsFile, what, REMEDY)
+    where = f"{what} {path}"
+    return validated(tags_of_bundle(content, where), TagsFile, where)
+
+
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
     """Read a file of one board of any kind (form: ``data_layout.md``); without ``type`` it is a board of dots.
 
@@ -211,6 +247,8 @@ def design_of(path: str | Path, content: dict[str, Any] | None) -> BoardDesign |
 
 def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
     """Return the board of keys and values; errors as :func:`load_flat_board`, with ``where`` in front."""
+    if any(key in content for key in BUNDLE_KEYS):
+        return _tags(validated(tags_of_bundle(content, where), TagsFile, where), where)
     if "target_type" in content:
         return kalibr_board_of(content, where)
     kind = content.get("type", "circles")
@@ -251,7 +289,7 @@ def board_content(path: str | Path) -> dict[str, Any] | None:
     except UnicodeDecodeError:
         return None
     except (ValueError, RecursionError):
-        return _kalibr_content(text) if "target_type" in text else None
+        return _kalibr_content(text) if "target_type" in text else bundle_content(text)
 
 
 def _kalibr_content(text: str) -> dict[str, Any] | None:

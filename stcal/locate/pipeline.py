@@ -217,7 +217,10 @@ def _mistakes(
     pose: ObjPose | None,
 ) -> list[str]:
     """Returns the likely mistake in the layout as a reason of a verdict, or no reason."""
-    mistake = likely_mistake(merged.seen, layout, camera.sized(*size), prior, pose)
+    try:
+        mistake = likely_mistake(merged.seen, layout, camera.sized(*size), prior, pose)
+    except StcalError:  # it is the camera's fault
+        return []
     return [f"all tags would fit if {mistake}; correct the layout file"] if mistake else []
 
 

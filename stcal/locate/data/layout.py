@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.file import REMEDY, TagsFile, require_sizes
+from stcal.boards.file import TagsFile, load_tags, require_sizes
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
-from stcal.io.toml import load_toml, side, stated_unusual, toml_string
+from stcal.io.toml import side, stated_unusual, toml_string
 
 WHAT = "layout file"
 
@@ -94,7 +94,7 @@ def load_plan(path: str | Path) -> LayoutPlan:
     Parameters
     ----------
     path : str or Path
-        The TOML file.
+        The file: TOML, or YAML of apriltag_ros.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def load_plan(path: str | Path) -> LayoutPlan:
     InputError
         The file is unreadable, does not follow ``data_layout.md``, or repeats an id.
     """
-    return _plan(load_toml(path, TagsFile, WHAT, REMEDY), f"{WHAT} {path}")
+    return _plan(load_tags(path, WHAT), f"{WHAT} {path}")
 
 
 def load_layout(path: str | Path) -> TargetLayout:
@@ -114,7 +114,7 @@ def load_layout(path: str | Path) -> TargetLayout:
     Parameters
     ----------
     path
-        The TOML file.
+        The file: TOML, or YAML of apriltag_ros.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def load_layout(path: str | Path) -> TargetLayout:
         See :func:`load_plan`; or a tag has no place.
     """
     where = f"{WHAT} {path}"
-    data = load_toml(path, TagsFile, WHAT, REMEDY)
+    data = load_tags(path, WHAT)
     plan = _plan(data, where)
     open_places = [tag for tag, corners in zip(plan.tags, plan.corners_mm, strict=True) if np.isnan(corners).any()]
     if open_places:

@@ -18,8 +18,11 @@ FITS = 0.02
 is turned or elsewhere misses by half a side and more; lens and print by less than a hundredth."""
 BETTER = 3.0
 """Factor by which this distance must shrink for a mistake to be named."""
+ALIKE = 1.5
+"""Mistakes that fit within this factor of the best one fit as well: the first of them is named, the simplest."""
 TURNS = {
-    2: "every tag stood half a turn the other way (add 180 to each angle_deg; corners_mm begin at the opposite corner)",
+    2: "every tag stood half a turn the other way (add 180 to each angle_deg; corners_mm begin at the opposite corner; "
+    "of apriltag_ros give upright: true)",
     1: "every tag were turned by 90° more (add 90 to each angle_deg)",
     3: "every tag were turned by 90° less (subtract 90 from each angle_deg)",
 }
@@ -59,7 +62,8 @@ def likely_mistake(
             continue
         if misfit < allowed:
             fitting.append((misfit, reason))
-    return min(fitting)[1] if fitting else None
+    best = min((misfit for misfit, _ in fitting), default=0.0)
+    return next((reason for misfit, reason in fitting if misfit <= ALIKE * best), None)
 
 
 def _misfit_px(seen: SeenTags, layout: TargetLayout, camera: Camera, pose: ObjPose) -> float:
