@@ -28,6 +28,8 @@ from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, J
 
 WHAT = "robot file"
 REMEDY = "`stcal robot init FILE` writes one to edit"
+OTHERS = (".urdf", ".xml", ".yaml", ".yml", ".conf")
+"""Endings of files of robots that are converted first."""
 POSE_KEYS = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
 MOST_JOINTS = 60
 """Largest number of joints, that of a humanoid with hands."""
@@ -118,6 +120,12 @@ def load_robot(path: str | Path) -> Robot:
         Unreadable, unknown or missing keys, limits that are swapped or of the wrong unit, a coupling matrix that does
         not fit, quaternions that are not unit; the message names the file and the place.
     """
+    if Path(path).suffix.lower() in OTHERS and Path(path).is_file():
+        raise InputError(
+            "E-ROBOT-FORM",
+            f"{WHAT} {path}: TOML needed; `stcal robot convert {Path(path).name} robot.toml` makes it of URDF, and of "
+            "the calibration of an arm of Universal Robots",
+        )
     data = load_toml(path, _RobotFile, WHAT, REMEDY)
     where = f"{WHAT} {path}"
     rows, joints = [], []

@@ -62,7 +62,7 @@ class UrdfRobot:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _UrdfJoint:
+class UrdfJoint:
     """``parent_from_child`` with the joint at 0; ``axis`` : (3,) of length 1, in the child; ``limit`` : rad or mm."""
 
     name: str
@@ -148,7 +148,7 @@ def read_urdf(
         world, start = first[0].parent_from_child, first[0].child
         paths = {name: path[1:] for name, path in paths.items()}
     name = root.get("name") or "robot"
-    robot = _robot_of(paths, name, convention) if "" in paths else _tree_of(paths, name, convention)
+    robot = robot_of(paths, name, convention) if "" in paths else _tree_of(paths, name, convention)
     moving = list({joint.name: joint for path in paths.values() for joint in path if joint.kind != "fixed"}.values())
     notes = tuple(f"joint {j.name} has no limits" for j in moving if j.limit is None and j.kind != "continuous")
     robot = replace(robot, world_from_base=world @ robot.world_from_base)
@@ -171,7 +171,7 @@ def require_near(found: Poses, wanted: Poses) -> None:
         )
 
 
-def _require_chain(path: list[_UrdfJoint], start: str, end: str, where: str) -> None:
+def _require_chain(path: list[UrdfJoint], start: str, end: str, where: str) -> None:
     moving = [joint for joint in path if joint.kind != "fixed"]
     if not moving:
         raise InputError(
@@ -188,7 +188,7 @@ def _require_chain(path: list[_UrdfJoint], start: str, end: str, where: str) -> 
             )
 
 
-def _robot_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convention) -> Robot:
+def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Convention) -> Robot:
     """Returns the robot of the paths from one link to each tool, ``""`` among them; they part behind the last moving
     joint."""
     moving = [joint for joint in paths[""] if joint.kind != "fixed"]
@@ -217,7 +217,7 @@ def _robot_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convent
     return robot
 
 
-def _tree_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convention) -> Robot:
+def _tree_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Convention) -> Robot:
     """Returns the robot of the paths from one link to tools on several branches."""
     place: dict[str, int] = {}
     moving, gaps, mounts, carriers, tools = [], [], {}, {}, {}
@@ -247,7 +247,7 @@ def _tree_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Conventi
     return robot
 
 
-def _along(path: list[_UrdfJoint]) -> Rigid:
+def _along(path: list[UrdfJoint]) -> Rigid:
     """Returns the product of the transforms of successive fixed joints."""
     product = Rigid()
     for joint in path:
@@ -255,7 +255,7 @@ def _along(path: list[_UrdfJoint]) -> Rigid:
     return product
 
 
-def _limited(joint: _UrdfJoint) -> Joint:
+def _limited(joint: UrdfJoint) -> Joint:
     kind = MOVING[joint.kind]
     most = UNLIMITED * (METRE_MM if kind == "prismatic" else 1.0)
     low, high = joint.limit or (-np.inf, np.inf)
@@ -276,7 +276,7 @@ def _parsed(content: bytes, where: str) -> ElementTree.Element:
     return root
 
 
-def _read_joint(element: ElementTree.Element, where: str) -> _UrdfJoint:
+def _read_joint(element: ElementTree.Element, where: str) -> UrdfJoint:
     name, kind = element.get("name", ""), element.get("type", "")
     where = f"{where}: joint {name}"
     parts = {part.tag: part.attrib for part in element}
@@ -300,7 +300,7 @@ def _read_joint(element: ElementTree.Element, where: str) -> _UrdfJoint:
             limit = (float(ends[0] * unit), float(ends[1] * unit))
     mimics = parts.get("mimic", {}).get("joint", "")
     pose = Rigid(from_roll_pitch_yaw(turn), METRE_MM * place)
-    return _UrdfJoint(name, kind, parent, child, pose, axis / length, limit, mimics)
+    return UrdfJoint(name, kind, parent, child, pose, axis / length, limit, mimics)
 
 
 def _three(text: str, where: str) -> np.ndarray:
@@ -322,7 +322,7 @@ def _z_to(axis: np.ndarray) -> Rigid:
     return Rigid.exp([*(np.arctan2(across, z) * np.array([-y, x, 0.0]) / across), 0.0, 0.0, 0.0])
 
 
-def _root(joints: dict[str, _UrdfJoint], links: list[str], where: str) -> str:
+def _root(joints: dict[str, UrdfJoint], links: list[str], where: str) -> str:
     roots = [link for link in links if link not in joints]
     if len(roots) != 1:
         raise InputError(
@@ -331,9 +331,9 @@ def _root(joints: dict[str, _UrdfJoint], links: list[str], where: str) -> str:
     return roots[0]
 
 
-def _tools(joints: dict[str, _UrdfJoint], start: str, where: str) -> dict[str, str]:
+def _tools(joints: dict[str, UrdfJoint], start: str, where: str) -> dict[str, str]:
     """Links by names of tools, behind the last joint that moves."""
-    below: dict[str, list[_UrdfJoint]] = {}
+    below: dict[str, list[UrdfJoint]] = {}
     for joint in joints.values():
         below.setdefault(joint.parent, []).append(joint)
     last, pending, branches = start, [start], []
@@ -361,8 +361,8 @@ def _tools(joints: dict[str, _UrdfJoint], start: str, where: str) -> dict[str, s
     raise InputError("E-URDF-LINKS", f"{where}: several links may be the tool; give --to-link, one of {_few(every)}")
 
 
-def _path(joints: dict[str, _UrdfJoint], start: str, end: str, where: str) -> list[_UrdfJoint]:
-    found: list[_UrdfJoint] = []
+def _path(joints: dict[str, UrdfJoint], start: str, end: str, where: str) -> list[UrdfJoint]:
+    found: list[UrdfJoint] = []
     while end != start:
         if end not in joints or len(found) > len(joints):
             raise InputError(
@@ -374,7 +374,7 @@ def _path(joints: dict[str, _UrdfJoint], start: str, end: str, where: str) -> li
     return found[::-1]
 
 
-def _far(joint: _UrdfJoint) -> float:
+def _far(joint: UrdfJoint) -> float:
     return float(np.linalg.norm(joint.parent_from_child.translation))
 
 
