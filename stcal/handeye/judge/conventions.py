@@ -28,8 +28,8 @@ WELL = np.radians(0.5), 5.0
 LOST = 0.25
 """Share of the spread of the poses that the solution leaves unexplained, above which the poses of robot and camera have
 nothing in common."""
-NAMED = "name the columns or keys so, or give --poses-are"
-NAMED_ORDER = "name columns so, or reorder the numbers in other files"
+NAMED = "name the columns so, or give --poses-are"
+NAMED_ORDER = "name the columns so, or reorder the numbers in other files"
 MIRROR = np.diag([1.0, -1.0, 1.0])
 Guess = Callable[[Loop, bool], tuple[Rigid, Rigid, float]]
 
