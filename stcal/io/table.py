@@ -323,7 +323,9 @@ SEPARATORS = {";": "';' between columns", "\t": "tabs between columns", " ": "sp
 _UNIT = re.compile(r"(.*?)\s*[\[(]\s*(mm|cm|um|µm|m|in|rad|deg|°)\s*[\])]", re.I)
 _ENDS_IN_UNIT = re.compile(r".+_(mm|cm|um|m|in|rad|deg)")
 _UNIT_SAID = re.compile(
-    r"\bunits?\b\W*(mm|millimet(?:er|re)s?|cm|centimet(?:er|re)s?|met(?:er|re)s?|m|inch(?:es)?|in)\b", re.I
+    r"\bunits?\b(?:\W+(?:are|is|in|of|lengths?|distances?))*\W+"
+    r"(mm|millimet(?:er|re)s?|cm|centimet(?:er|re)s?|met(?:er|re)s?|m|inch(?:es)?|(?<=[:=] )in|(?<=[:=])in)\b",
+    re.I,
 )
 """What a comment says of the unit of lengths."""
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -360,8 +362,9 @@ def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
     In ``euler_ZYX_1_deg`` the case means turned axes: such names stay. ``comments`` : lines; one of them may state the
     unit of columns x, y, z without one.
     """
-    said = next((match[1].lower() for line in comments if (match := _UNIT_SAID.search(line))), "")
-    unit = next((u for u in ("mm", "cm", "m", "in") if said.startswith((u, _WORDS[u]))), "")
+    said = [match[1].lower() for line in comments for match in _UNIT_SAID.finditer(line)]
+    units = {next(u for u in ("mm", "cm", "m", "in") if word.startswith((u, _WORDS[u]))) for word in said}
+    unit = units.pop() if len(units) == 1 else ""
     found = []
     for name in names:
         bracketed = _UNIT.fullmatch(name)

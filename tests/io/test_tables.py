@@ -88,6 +88,22 @@ def test_the_unit_of_a_comment(tmp_path, said, factor):
     np.testing.assert_allclose(found.points(), [[factor, 2 * factor, 3 * factor]], rtol=1e-15)
 
 
+@pytest.mark.parametrize(
+    ("comment", "axis"),
+    [
+        ("// Units in mm", "x_mm"),
+        ("// units are in millimetres, deg", "x_mm"),
+        ("# Unit: in", "x_in"),
+        ("// Length units = m", "x_m"),
+        ("// Units in deg", "X"),
+        ("// a unit in the workshop", "X"),
+        ("// Units mm // units m", "X"),  # two are none
+    ],
+)
+def test_what_comments_say_of_units(tmp_path, comment, axis):
+    assert next(iter(table(tmp_path, f"{comment}\nX;Y\n1,5;2\n").columns)) == axis
+
+
 def test_a_unit_that_nothing_states_is_asked_for(tmp_path):
     with fails_with("E-TABLE-COLUMN-MISSING … X … open … x_mm = 'X' … --columns"):
         table(tmp_path, "Point Name;X;Y;Z\np0;1,5;2,5;3,5\n").quantity("x", LENGTHS)
