@@ -1,5 +1,6 @@
 """Readers of board files: dots (``stcal.io.design``), chessboards, ChArUco boards, AprilGrids, and Kalibr's YAML."""
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -9,6 +10,8 @@ import numpy as np
 import yaml
 from pydantic import AfterValidator, Field, model_validator
 
+from stcal.boards.bundle import KEYS as BUNDLE_KEYS
+from stcal.boards.bundle import bundle_content, tags_of_bundle
 from stcal.boards.design import (
     AprilGridDesign,
     AsymmetricCirclesDesign,
@@ -24,7 +27,20 @@ from stcal.io.design import BoardEntry, Count, Squares, board_design, load_board
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.json import mistake
 from stcal.io.plain_yaml import load_yaml
-from stcal.io.toml import Finite, Positive, Strict, validated
+from stcal.io.toml import (
+    LEAST_SIDE_MM,
+    MOST_SIDE_MM,
+    Finite,
+    Length,
+    Positive,
+    Sized,
+    Strict,
+    load_toml,
+    radius,
+    require_millimetres,
+    side,
+    validated,
+)
 
 KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles")
 """Types of flat boards."""
@@ -37,18 +53,34 @@ MOST_MARKER = 0.99
 """Largest ratio of a ChArUco tag's side to its square's: detection needs white around a tag."""
 LEAST_AREA = 1e-6
 """Smallest area of a tag over its longest side squared; below it the corners lie on a line."""
+NESTED = 0.5
+"""Largest ratio of the sides of two tags of which one may be inside the other, as in nested markers."""
 OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_mm", "board"}
 """Keys that occur only in files of other boards than dots."""
+
+
+OF_OPENCV = ("tag36h11", "tag36h10", "tag25h9", "tag16h5")
+"""Families of AprilTag that OpenCV detects."""
+_APRILTAG = re.compile(r"(?:april)?[_ -]?t(?:ag)?[_ -]?(standard|circle|custom)?[_ -]?(\d{2}h\d{1,2})", re.I)
 
 
 def known_dictionary(name: str) -> str:
     """Return the full name of a dictionary of ``cv2.aruco``; ``name`` may lack ``DICT_``, and be in any case.
 
+    Families of AprilTag have their own names, too: ``tag36h11``, ``t36h11``.
+
     Raises
     ------
     ValueError
-        The name is unknown; the message lists similar names.
+        The name is unknown; the message lists similar names. Or OpenCV lacks the family.
     """
+    family = _APRILTAG.fullmatch(name.strip())
+    if family is not None:
+        if family[1] is not None or f"DICT_APRILTAG_{family[2].lower()}" not in dir(cv2.aruco):
+            raise ValueError(
+                f"OpenCV does not detect this family of AprilTag; print tags of {', '.join(OF_OPENCV)} for the target"
+            )
+        name = f"APRILTAG_{family[2]}"
     plain = name.strip().upper()
     plain = plain if plain.startswith("DICT_") else f"DICT_{plain}"
     dictionaries = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
@@ -63,7 +95,7 @@ TagId = Annotated[int, Field(ge=0, strict=True)]
 Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
 
 
-class _Chessboard(Strict):
+class _Chessboard(Sized):
     type: Literal["chessboard"]
     rows: Squares
     columns: Squares
@@ -71,7 +103,7 @@ class _Chessboard(Strict):
     sigma_mm: Positive = 0.01
 
 
-class _Charuco(Strict):
+class _Charuco(Sized):
     type: Literal["charuco"]
     rows: Squares
     columns: Squares
@@ -83,7 +115,7 @@ class _Charuco(Strict):
     first_id: TagId = 0
 
 
-class _AprilGrid(Strict):
+class _AprilGrid(Sized):
     type: Literal["aprilgrid"]
     rows: Few
     columns: Few
@@ -96,7 +128,7 @@ class _AprilGrid(Strict):
     sigma_mm: Positive = 0.01
 
 
-class _AsymmetricCircles(Strict):
+class _AsymmetricCircles(Sized):
     type: Literal["asymmetric-circles"]
     rows: Count
     columns: Count
@@ -139,7 +171,7 @@ class TagEntry(Strict):
         return square @ np.array([[cosine, sine], [-sine, cosine]]) + [self.x_mm, self.y_mm]
 
 
-class TagsFile(Strict):
+class TagsFile(Sized):
     """A layout of tags; a board does not need the keys that ``stcal locate`` adds."""
 
     type: Literal["tags"]
@@ -175,6 +207,24 @@ class TagsFile(Strict):
         return self
 
 
+def load_tags(path: str | Path, what: str) -> TagsFile:
+    """Read a layout of tags: TOML, or bundles of apriltag_ros (YAML).
+
+    Raises
+    ------
+    InputError
+        The file is unreadable or invalid; the message begins with ``what``, and names file, place and reason.
+    """
+    try:
+        content = bundle_content(read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig"))
+    except (OSError, UnicodeDecodeError):
+        content = None  # the error of the reader of TOML says why
+    if content is None:
+        return load_toml(path, TagsFile, what, REMEDY)
+    where = f"{what} {path}"
+    return validated(tags_of_bundle(content, where), TagsFile, where)
+
+
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
     """Read a file of one board of any kind (form: ``data_layout.md``); without ``type`` it is a board of dots.
 
@@ -197,6 +247,8 @@ def design_of(path: str | Path, content: dict[str, Any] | None) -> BoardDesign |
 
 def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
     """Return the board of keys and values; errors as :func:`load_flat_board`, with ``where`` in front."""
+    if any(key in content for key in BUNDLE_KEYS):
+        return _tags(validated(tags_of_bundle(content, where), TagsFile, where), where)
     if "target_type" in content:
         return kalibr_board_of(content, where)
     kind = content.get("type", "circles")
@@ -204,6 +256,7 @@ def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
         return board_design(validated(content, BoardEntry, where), where)
     if kind == "chessboard":
         data = validated(content, _Chessboard, where)
+        require_millimetres([side("square_mm", data.square_mm)], data.unusual_size, where)
         return ChessboardDesign(data.rows, data.columns, data.square_mm, data.sigma_mm)
     if kind == "charuco":
         return _charuco(validated(content, _Charuco, where), where)
@@ -236,7 +289,7 @@ def board_content(path: str | Path) -> dict[str, Any] | None:
     except UnicodeDecodeError:
         return None
     except (ValueError, RecursionError):
-        return _kalibr_content(text) if "target_type" in text else None
+        return _kalibr_content(text) if "target_type" in text else bundle_content(text)
 
 
 def _kalibr_content(text: str) -> dict[str, Any] | None:
@@ -248,6 +301,8 @@ def _kalibr_content(text: str) -> dict[str, Any] | None:
 
 
 def _charuco(data: _Charuco, where: str) -> CharucoDesign:
+    lengths = [side("square_mm", data.square_mm), side("marker_mm", data.marker_mm)]
+    require_millimetres(lengths, data.unusual_size, where)
     if data.marker_mm > MOST_MARKER * data.square_mm:
         raise InputError(
             "E-BOARD-MARKER-SIZE",
@@ -269,6 +324,7 @@ def _charuco(data: _Charuco, where: str) -> CharucoDesign:
 
 
 def _tags(data: TagsFile, where: str) -> TagLayout:
+    require_sizes(data, where)
     corners = [tag.corners(where) for tag in data.tag]
     for tag, place in zip(data.tag, corners, strict=True):
         place_of_tag = f"{where}: tag {tag.id}"
@@ -285,6 +341,46 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
         raise InputError(error.code, f"{where}: {error}") from error
 
 
+def require_sizes(data: TagsFile, where: str) -> None:
+    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other, for their places are.
+
+    Raises
+    ------
+    InputError
+        The message names the tag or the tags, and how to correct the file.
+    """
+    require_millimetres(tag_sides(data, where), data.unusual_size, where)
+    places = [(tag, corners) for tag in data.tag if (corners := tag.corners(where)) is not None]
+    if not places:
+        return
+    middles = np.array([corners.mean(axis=0) for _, corners in places])
+    sides = np.array([np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean() for _, corners in places])
+    for i in range(1, len(places)):
+        apart = np.linalg.norm(middles[:i] - middles[i], axis=1)
+        smaller, larger = np.minimum(sides[:i], sides[i]), np.maximum(sides[:i], sides[i])
+        other = np.array([tag.id != places[i][0].id for tag, _ in places[:i]])
+        over = np.flatnonzero((apart < smaller / 2) & (smaller > NESTED * larger) & other)
+        if len(over):
+            j = over[0]
+            raise InputError(
+                "E-TAG-OVERLAP",
+                f"{where}: tags {places[j][0].id} and {places[i][0].id} lie on each other: {apart[j]:.3g} mm apart, "
+                f"sides {sides[j]:.3g} and {sides[i]:.3g} mm; are the places metres? correct them",
+            )
+
+
+def tag_sides(data: TagsFile, where: str = "") -> list[Length]:
+    """Returns the stated or measured side of each tag."""
+    sides = []
+    for tag in data.tag:
+        if tag.size_mm is not None:
+            sides.append(side(f"size_mm of tag {tag.id}", tag.size_mm))
+        elif (corners := tag.corners(where)) is not None:
+            length = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean()
+            sides.append(side(f"side of tag {tag.id} by corners_mm", float(length)))
+    return sides
+
+
 def _require_convex(corners: np.ndarray, where: str) -> None:
     """Refuse corners (4, 2) of a tag that are not in cyclic order, clockwise with Y downwards, as printed."""
     side = np.roll(corners, -1, axis=0) - corners
@@ -299,6 +395,7 @@ def _require_convex(corners: np.ndarray, where: str) -> None:
 
 
 def _aprilgrid(data: _AprilGrid, where: str) -> AprilGridDesign:
+    require_millimetres([side("tag_mm", data.tag_mm)], data.unusual_size, where)
     board = AprilGridDesign(
         data.rows,
         data.columns,
@@ -333,26 +430,36 @@ def _tags_of(dictionary: str) -> int:
 def _asymmetric(data: _AsymmetricCircles, where: str) -> AsymmetricCirclesDesign:
     if (data.radius_mm is None) == (data.diameter_mm is None):
         raise InputError("E-BOARD-RADIUS", f"{where}: radius_mm or diameter_mm needed, one of them")
-    radius = data.radius_mm if data.diameter_mm is None else data.diameter_mm / 2
+    radius_mm = data.radius_mm if data.diameter_mm is None else data.diameter_mm / 2
+    lengths = [side("spacing_mm", data.spacing_mm), radius("radius of the circles", radius_mm or 0.0)]
+    require_millimetres(lengths, data.unusual_size, where)
     most = data.spacing_mm / np.sqrt(2)
-    if radius is None or radius >= most:
+    if radius_mm is None or radius_mm >= most:
         raise InputError(
             "E-BOARD-RADIUS",
-            f"{where}: radius {radius:g} mm, under {most:g} mm needed for circles apart; spacing_mm is half of what "
+            f"{where}: radius {radius_mm:g} mm, under {most:g} mm needed for circles apart; spacing_mm is half of what "
             "neighbours in a row are apart",
         )
-    return AsymmetricCirclesDesign(data.rows, data.columns, data.spacing_mm, radius, data.polarity, data.sigma_mm)
+    return AsymmetricCirclesDesign(data.rows, data.columns, data.spacing_mm, radius_mm, data.polarity, data.sigma_mm)
 
 
 METRE_MM = 1000.0
-MOST_M = 100.0
-"""Longest tag, square or spacing, m; a larger value is a wrong unit."""
+
+
+def _metres(value: float) -> float:
+    if not LEAST_M <= value <= MOST_M:
+        raise ValueError(f"{LEAST_M:g} … {MOST_M:g} m needed: Kalibr's lengths are metres, not mm")
+    return value
+
+
+LEAST_M, MOST_M = LEAST_SIDE_MM / METRE_MM, MOST_SIDE_MM / METRE_MM
+"""Tags, squares and spacings that hardware has, m; another value is in a wrong unit, for Kalibr's are metres."""
 SAME_WITHIN = 1e-6
 """Largest relative difference between the sides of a square."""
 FAMILY = "DICT_APRILTAG_36h11"
 KALIBR_KINDS = ("aprilgrid", "checkerboard", "circlegrid")
 
-Metres = Annotated[Positive, Field(le=MOST_M)]
+Metres = Annotated[Positive, AfterValidator(_metres)]
 
 
 class _KalibrAprilGrid(Strict):

@@ -158,6 +158,10 @@ def run(
         typer.Option("--robot-poses", help="Read base_from_flange of each scene from this file (CSV)."),
     ] = None,
     key: Annotated[str, typer.Option("--key", help="Match scenes and rows of --robot-poses by this column.")] = "scene",
+    columns: Annotated[
+        Path | None,
+        typer.Option("--columns", help="Read --robot-poses with the columns, delimiter … of this file (TOML)."),
+    ] = None,
     registration: Annotated[
         Path | None,
         typer.Option(
@@ -248,7 +252,7 @@ def run(
             "--offset: only with --hand-eye or --registration, which lead from the camera to the robot",
         )
     if hand_eye:
-        chain = read_chain(hand_eye, robot_poses, offset, quaternions.value, key)
+        chain = read_chain(hand_eye, robot_poses, offset, quaternions.value, key, columns)
     elif registration:
         chain = read_registered(registration, offset)
     target, model = load_layout(layout), read_camera(camera)

@@ -153,7 +153,12 @@ FirstTable = Annotated[
 SecondTable = Annotated[
     Path | None, typer.Option("--b", help="Read what belongs to the rows of --a from this file (CSV).")
 ]
-Key = Annotated[str, typer.Option("--key", help="Match rows of --a and --b by this column.")]
+Key = Annotated[
+    str,
+    typer.Option(
+        "--key", help="Match rows of --a and --b by this column; or by A=B, a column of --a and another one of --b."
+    ),
+]
 
 
 ColumnsFile = Annotated[
@@ -166,6 +171,12 @@ ColumnsFile = Annotated[
 ]
 
 
+FirstColumns = Annotated[
+    Path | None,
+    typer.Option("--columns-a", help="Read the file of --a with the columns, delimiter … of this file (TOML)."),
+]
+
+
 def one_table(
     given: Path | None,
     first: Path | None,
@@ -175,9 +186,12 @@ def one_table(
     prefixes: tuple[str, str] = ("", ""),
     quaternions: "Order" = "wxyz",
     columns: Path | None = None,
+    columns_a: Path | None = None,
 ) -> "Path | Table":
     """Returns the file given as argument, or the table of --a and --b joined. Notes on rows left out are printed."""
-    tables = several_tables(given, first, [second] if second else [], key, what, prefixes, quaternions, columns)
+    tables = several_tables(
+        given, first, [second] if second else [], key, what, prefixes, quaternions, columns, columns_a
+    )
     return tables[0] if isinstance(tables, list) else tables
 
 
@@ -190,6 +204,7 @@ def several_tables(
     prefixes: tuple[str, str] = ("", ""),
     quaternions: "Order" = "wxyz",
     columns: Path | None = None,
+    columns_a: Path | None = None,
 ) -> "Path | Table | list[Table]":
     """Returns the file given as argument, or a table for each --b joined with --a.
 
@@ -198,6 +213,8 @@ def several_tables(
     if (given is None) == (first is None) or (first is None) != (not seconds):
         raise InputError("E-OPTION-FILES", f"{what}: one file, or --a and --b with --key, needed")
     if given is not None:
+        if columns_a is not None:
+            raise InputError("E-OPTION-NEEDS", f"--columns-a {columns_a}: only with --a; give --columns")
         if columns is None:
             return given
         from stcal.io.poses.columns import read_mapped
@@ -205,9 +222,9 @@ def several_tables(
         return read_mapped(given, columns, what, quaternions)
     from stcal.io.join import join
 
-    joined = [join(str(first), str(second), key, prefixes, quaternions, columns) for second in seconds]
-    print_each("note", (note for result in joined for note in result.notes))
-    return [result.table for result in joined]
+    joined = [join(str(first), str(second), key, prefixes, quaternions, columns, columns_a) for second in seconds]
+    print_each("note", (note for each in joined for note in each.notes))
+    return [each.table for each in joined]
 
 
 def exports_of(words: Sequence[str], require_form: Callable[[str], None]) -> list[tuple[str, Path]]:

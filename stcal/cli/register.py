@@ -7,7 +7,17 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import MOST_SEED, FirstTable, Key, ReportFile, SecondTable, name_of, one_table
+from stcal.cli.options import (
+    MOST_SEED,
+    ColumnsFile,
+    FirstColumns,
+    FirstTable,
+    Key,
+    ReportFile,
+    SecondTable,
+    name_of,
+    one_table,
+)
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 
@@ -87,6 +97,8 @@ def register(
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "name",
+    columns: ColumnsFile = None,
+    columns_a: FirstColumns = None,
     out: Annotated[
         Path | None, typer.Option("--out", writable=True, help="Write everything to this file (JSON).")
     ] = None,
@@ -107,7 +119,7 @@ def register(
     if published and method != Method.liu2017:
         raise InputError("E-OPTION-NEEDS", "--sample, --share, --tries, --orthogonality: only with --method liu2017")
     liu2017 = replace(Liu2017Options(), **published) if method == Method.liu2017 else None
-    source = one_table(pairs_file, first, second, key, "PAIRS", ("a", "b"))
+    source = one_table(pairs_file, first, second, key, "PAIRS", ("a", "b"), columns=columns, columns_a=columns_a)
     pairs = read_pairs(source)
     if not isinstance(source, Path) and any("cov_" in column for column in source.columns):
         say("note: the covariances of --a and --b are not used; the noise of the points is estimated")

@@ -18,7 +18,19 @@ from stcal.design import (
 )
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.toml import Finite, Positive, Strict, load_toml, toml_string
+from stcal.io.toml import (
+    Finite,
+    Length,
+    Positive,
+    Sized,
+    Strict,
+    load_toml,
+    radius,
+    require_millimetres,
+    side,
+    stated_unusual,
+    toml_string,
+)
 from stcal.labels import BOARD
 from stcal.lookalikes import MAX_GAP, MAX_RADIUS_RATIO, whole_likeness
 
@@ -77,7 +89,7 @@ class _FaceFile(Strict):
     circles: list[_CircleFile] = Field(min_length=4)
 
 
-class _TargetFile(Strict):
+class _TargetFile(Sized):
     name: Annotated[str, AfterValidator(lambda v: " ".join(v.split()))] = "target"
     polarity: Polarity
     face: list[_FaceFile] = Field(min_length=1)
@@ -127,6 +139,7 @@ class BoardEntry(BoardSizeEntry):
     polarity: Polarity
     sigma_mm: Positive = 0.005
     corner: _CornerFile | None = None
+    unusual_size: bool = False
 
 
 def load_target(path: str | Path) -> TargetDesign:
@@ -140,6 +153,11 @@ def load_target(path: str | Path) -> TargetDesign:
     """
     data = load_toml(path, _TargetFile, "target file", REMEDY)
     where = f"target file {path}"
+    require_millimetres(
+        [radius(f"radius_mm of circle {face.id}:{c.id}", c.radius_mm) for face in data.face for c in face.circles],
+        data.unusual_size,
+        where,
+    )
     _no_duplicates([face.id for face in data.face], f"{where}: face id")
     for face in data.face:
         if face.id == BOARD:
@@ -156,6 +174,7 @@ def load_board(path: str | Path) -> BoardDesign:
 
 def board_design(data: BoardEntry, where: str) -> BoardDesign:
     """Return the board of an entry; the message of an InputError begins with ``where``."""
+    require_millimetres(_board_lengths(data.pitch_mm, data.radius_mm), data.unusual_size, where)
     if 2 * data.radius_mm >= data.pitch_mm:
         raise InputError(
             "E-BOARD-RADIUS", f"{where}: radius {data.radius_mm:g} mm, under half the pitch {data.pitch_mm:g} mm needed"
@@ -185,6 +204,10 @@ def board_design(data: BoardEntry, where: str) -> BoardDesign:
         data.corner.radius_mm if data.corner else None,
         data.stated(),
     )
+
+
+def _board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:
+    return [side("pitch_mm", pitch_mm), radius("radius_mm", radius_mm)]
 
 
 def target_of(given: str | Path | TargetDesign | None) -> TargetDesign:
@@ -336,6 +359,7 @@ def target_toml(target: TargetDesign) -> str:
         "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
         f"name = {toml_string(target.name)}",
         f'polarity = "{target.polarity}"  # circles are "bright" or "dark" against what surrounds them',
+        *stated_unusual(radius("", float(r)) for face in target.faces for r in face.radius_mm),
     ]
     for face in target.faces:
         lines += [
@@ -404,6 +428,7 @@ def board_toml(board: BoardDesign) -> str:
                 f'polarity = "{board.polarity}"  # dots are "bright" or "dark" against the board',
                 f"sigma_mm = {_number(board.sigma_mm)}  # standard deviation of the dots' positions, per axis",
                 *(f"{key} = {_number(value)}" for key, value in sizes if value is not None),
+                *stated_unusual(_board_lengths(board.pitch_mm, board.radius_mm)),
                 "",
                 "# One larger dot in a corner of the grid tells the orientation; without it the board looks the",
                 "# same after half a turn, which a run settles by comparing the images of a group.",

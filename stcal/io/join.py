@@ -31,6 +31,7 @@ def join(
     prefixes: tuple[str, str] = ("", ""),
     quaternions: Order = "wxyz",
     columns: str | Path | None = None,
+    columns_a: str | Path | None = None,
 ) -> Joined:
     """Return the rows of two CSV files that have the same ``key``, joined.
 
@@ -39,7 +40,7 @@ def join(
     a, b
         Files with a column ``key`` that holds each value once; or tables read from them.
     key
-        Name of the key column.
+        Name of the key column; or ``image=Point Name``, that of ``a`` and that of ``b``.
     prefixes
         Prefix for the columns of a pose or a position in each file, ``x_mm`` to ``qz`` and covariances. Other columns
         keep their names; if both files have a column of that name, the one of ``a`` is used.
@@ -47,6 +48,8 @@ def join(
         See :func:`~stcal.io.table.read_table`.
     columns
         Map of the columns of ``b``, see :func:`~stcal.io.poses.columns.read_mapped`.
+    columns_a
+        Map of the columns of ``a``.
 
     Returns
     -------
@@ -59,13 +62,11 @@ def join(
         A file is no table or lacks the key column, a key occurs twice, no key is common to both, or both files have
         the same pose column.
     """
-    if columns and not isinstance(b, Table):
-        second = read_mapped(b, columns, "table", quaternions)
-    else:
-        second = read_table(b, "table", quaternions)
-    tables = [read_table(a, "table", quaternions), second]
+    tables = [table_of(a, columns_a, "table", quaternions), table_of(b, columns, "table", quaternions)]
     a, b = (source.where if isinstance(source, Table) else source for source in (a, b))
-    places = [_places(table, key) for table in tables]
+    keys = keys_of(key, tables[0])
+    places = [_places(table, own, i) for i, (table, own) in enumerate(zip(tables, keys, strict=True))]
+    key = keys[0]
     common = [name for name in places[0] if name in places[1]]
     if not common:
         first = [next(iter(row_of_key)) for row_of_key in places]
@@ -130,11 +131,28 @@ def stack(tables: Sequence[Table], names: Sequence[str], called: dict[str, str],
     return Table(", ".join(table.where for table in tables), columns, lines, tables[0].quaternions)
 
 
-def _places(table: Table, key: str) -> dict[str, int]:
+def table_of(path: str | Path | Table, columns: str | Path | None, what: str, quaternions: Order = "wxyz") -> Table:
+    """Return the table of a file, with its columns mapped if there is a file of ``columns``."""
+    if columns and not isinstance(path, Table):
+        return read_mapped(path, columns, what, quaternions)
+    return read_table(path, what, quaternions)
+
+
+def keys_of(key: str, first: Table | None = None) -> tuple[str, str]:
+    """Return the names of the key columns of both tables; ``key`` : one name, or two with ``=`` between them."""
+    own, equals, theirs = key.partition("=")
+    if not equals or not own or not theirs or (first is not None and key in first):
+        return key, key
+    return own.strip(), theirs.strip()
+
+
+def _places(table: Table, key: str, number: int) -> dict[str, int]:
     if key not in table:
+        both = f"{key}=NAME" if number else f"NAME={key}"
         raise InputError(
             "E-TABLE-COLUMN-MISSING",
-            f"{table.where}: no column {key}; the header is {table.header()}; give another --key",
+            f"{table.where}: no column {key}; the header is {table.header()}; give another --key, or --key {both!r} "
+            "where the columns of both files have different names",
         )
     row_of: dict[str, int] = {}
     for row, name in enumerate(table.text(key)):

@@ -1,4 +1,4 @@
-"""CSV files with a header: units stand in the names of the columns, and messages name the line of a bad row."""
+"""Tables with a header: units stand in the names of the columns, and messages name the line of a bad row."""
 
 import csv
 import io
@@ -34,7 +34,8 @@ class Table:
     """The rows of a CSV file.
 
     ``lines`` : (m,) line number of each row in the file, from 1; ``quaternions`` : order of quaternion components;
-    ``rows`` : (m,) text of the lines if all columns are numbers, since a name such as 01 must be kept.
+    ``rows`` : (m,) text of the lines if all columns are numbers, since a name such as 01 must be kept; ``form`` : in
+    words, where it is not that of the package: ``; between columns, decimal commas``.
     """
 
     where: str
@@ -42,6 +43,7 @@ class Table:
     lines: Sequence[int]
     quaternions: Order = "wxyz"
     rows: Sequence[str] = ()
+    form: str = ""
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -102,9 +104,19 @@ class Table:
             wanted = " or ".join(f"{name}_{unit}" for unit in units)
             finding = "no such column" if not given else f"{len(given)} of them"
             raise InputError(
-                "E-TABLE-COLUMN-MISSING", f"{self.where}: {finding}, {wanted} needed; the header is {self.header()}"
+                "E-TABLE-COLUMN-MISSING",
+                f"{self.where}: {finding}, {wanted} needed; the header is {self.header()}{self.open_unit(name, units)}",
             )
         return given[0]
+
+    def open_unit(self, name: str, units: dict[str, float]) -> str:
+        """Return the remedy for a column ``name`` without a unit, or for any other header."""
+        bare_name = name[-1:] if name[-1:] in "xyz" else name
+        bare = next((column for column in self.columns if column.lower() in (name, bare_name)), None)
+        if bare is None:
+            return ""
+        likely = f"{bare_name}_{next(iter(units))}"
+        return f"; the unit of {bare} is open: call it {likely} …, or give {likely} = {bare!r} … in a file of --columns"
 
     def has(self, name: str, units: dict[str, float]) -> bool:
         """Return True if there is a column ``name_unit``."""
@@ -222,7 +234,11 @@ class Table:
 
 
 def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz") -> Table:
-    """Read a CSV file with a header line; empty lines and lines that start with ``#`` are ignored.
+    """Read a table with a header line; empty lines and lines that start with ``#`` or ``//`` are ignored.
+
+    Commas, semicolons, tabs or spaces separate columns, as in the header. Without commas between columns, numbers may
+    have decimal commas. Points of SpatialAnalyzer, ``Collection::Group::Target x y z``, need no header. Units in
+    brackets, or in another case, are read as the package writes them: ``X [mm]`` is ``x_mm``.
 
     ``path`` : a :class:`Table` is returned unchanged; ``quaternions`` : ``xyzw`` if the quaternion columns hold x, y,
     z, w in this order, whatever their names.
@@ -230,8 +246,8 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     Raises
     ------
     InputError
-        The file is unreadable, not UTF-8, has no header, no rows or another separator, a column name occurs twice, or
-        a row has another length than the header.
+        The file is unreadable, not UTF-8, has no header or no rows, a column name occurs twice, a row has another
+        length than the header, or its commas may be of decimals or of thousands.
     """
     if isinstance(path, Table):
         return path
@@ -242,27 +258,32 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
         raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
     except UnicodeDecodeError as error:
         raise InputError("E-TABLE-ENCODING", f"{where}: not UTF-8 text; save it as CSV in UTF-8") from error
-    lines = text.splitlines()
-    used = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    comments = [line for _, line in lines if is_comment(line)]
+    used = [(i, line) for i, line in lines if not is_comment(line)]
     if not used:
         raise InputError("E-TABLE-EMPTY", f"{where}: empty; a header and rows needed")
+    if "::" in used[0][1] and (points := _points_of_analyzer(used, comments, where, quaternions)) is not None:
+        return points
+    between = _separator([line for _, line in used])
+    if separator_stated(used[0][1]):
+        used = used[1:] or used
+    if between in ";\t" and used[0][1].rstrip(" ").endswith(between):  # behind the last column, too
+        used = [(i, line.rstrip(" ").removesuffix(between)) for i, line in used]
     try:
-        names = [name.strip() for name in next(csv.reader([used[0][1]]))]
+        names = [name.strip() for name in cells_of(used[0][1], between)]
     except csv.Error as error:
         raise InputError(
             "E-TABLE-HEADER", f"{where}: line {used[0][0]}: {error}; a header with names and units needed"
         ) from error
-    if len(names) == 1 and any(separator in names[0] for separator in ";\t"):
-        raise InputError(
-            "E-TABLE-DELIMITER", f"{where}: columns separated by ';' or tabs; commas needed, and '.' in numbers"
-        )
+    names = canonical(names, comments)
     for name in names:
         if names.count(name) > 1 or not name:
             shown = name or "without a name"
             raise InputError(
                 "E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; every name once needed"
             )
-    if all(_is_number(name) for name in names):
+    if all(_is_number(name.replace(",", ".")) for name in names):
         raise InputError(
             "E-TABLE-HEADER",
             f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm",
@@ -271,6 +292,8 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
         raise InputError("E-TABLE-EMPTY", f"{where}: a header but no rows; rows needed")
     numbers = [i for i, _ in used[1:]]
     rows = [line for _, line in used[1:]]
+    if between != ",":
+        return _other_form(names, used[1:], between, where, quaternions)
     try:
         fast = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", ndmin=2, comments=None)
         if fast.shape == (len(rows), len(names)):
@@ -293,6 +316,160 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
                 "E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header"
             )
     return Table(where, {n: [row[k].strip() for row in cells] for k, n in enumerate(names)}, numbers, quaternions)
+
+
+SEPARATORS = {";": "';' between columns", "\t": "tabs between columns", " ": "spaces between columns"}
+"""Separators beside the comma, in words."""
+_UNIT = re.compile(r"(.*?)\s*[\[(]\s*(mm|cm|um|µm|m|in|rad|deg|°)\s*[\])]", re.I)
+_ENDS_IN_UNIT = re.compile(r".+_(mm|cm|um|m|in|rad|deg)")
+_UNIT_SAID = re.compile(
+    r"\bunits?\b(?:\W+(?:are|is|in|of|lengths?|distances?))*\W+"
+    r"(mm|millimet(?:er|re)s?|cm|centimet(?:er|re)s?|met(?:er|re)s?|m|inch(?:es)?|(?<=[:=] )in|(?<=[:=])in)\b",
+    re.I,
+)
+"""What a comment says of the unit of lengths."""
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_COMMA_NUMBER = r"[+-]?\d+(?:,\d+)?(?:[eE][+-]?\d+)?"
+_POINT = re.compile(rf"(.*?::.*?)[\s,;]+({_NUMBER})[\s,;]+({_NUMBER})[\s,;]+({_NUMBER})[\s,;]*")
+_COMMA_POINT = re.compile(rf"(.*?::.*?)[\s;]+({_COMMA_NUMBER})[\s;]+({_COMMA_NUMBER})[\s;]+({_COMMA_NUMBER})[\s;]*")
+_STATES_SEPARATOR = re.compile(r"sep=([,;\t])")
+"""First line of a table that Excel wrote, or is to read."""
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+"""A number that may be of thousands as well as a decimal."""
+
+
+def is_comment(line: str) -> bool:
+    """Return True if a line of a table is a comment."""
+    return line.lstrip().startswith(("#", "//"))
+
+
+def separator_stated(line: str) -> str:
+    """Return the separator that the first line of a table states, as Excel takes it; empty for other lines."""
+    stated = _STATES_SEPARATOR.fullmatch(line.strip(" \r"))
+    return stated[1] if stated else ""
+
+
+def cells_of(line: str, between: str) -> list[str]:
+    """Return the cells of a line, without surrounding white space; ``between`` : comma, ``;``, tab or space."""
+    if between == " ":
+        return line.split()
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=between))]
+
+
+def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
+    """Return the names of columns as the package writes them, where they differ in the case or form of the unit alone.
+
+    In ``euler_ZYX_1_deg`` the case means turned axes: such names stay. ``comments`` : lines; one of them may state the
+    unit of columns x, y, z without one.
+    """
+    said = [match[1].lower() for line in comments for match in _UNIT_SAID.finditer(line)]
+    units = {next(u for u in ("mm", "cm", "m", "in") if word.startswith((u, _WORDS[u]))) for word in said}
+    unit = units.pop() if len(units) == 1 else ""
+    found = []
+    for name in names:
+        bracketed = _UNIT.fullmatch(name)
+        new = (
+            name
+            if bracketed is None
+            else f"{bracketed[1]}_{bracketed[2].lower().replace('µ', 'u').replace('°', 'deg')}"
+        )
+        lower = new.lower()
+        if unit and lower in ("x", "y", "z"):
+            lower = new = f"{lower}_{unit}"
+        known = (_ENDS_IN_UNIT.fullmatch(lower) and "euler" not in lower) or lower in QUATERNION
+        found.append(lower if known and lower not in names else new)
+    return found
+
+
+_WORDS = {"mm": "millimet", "cm": "centimet", "m": "met", "in": "inch"}
+
+
+def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> tuple[dict[str, list[str]], bool]:
+    """Return the columns with decimal points in place of decimal commas, and whether there were such.
+
+    Semicolons stand between columns where commas are decimal. Tabs and spaces do elsewhere too, so that a number must
+    show that its comma is not of thousands.
+
+    Raises
+    ------
+    InputError
+        There are decimal points, too, or no number shows what the commas are.
+    """
+    numeric = {name: cells for name, cells in columns.items() if all(re.fullmatch(_COMMA_NUMBER, c) for c in cells)}
+    with_comma = {name: cells for name, cells in numeric.items() if any("," in cell for cell in cells)}
+    if not with_comma:
+        return columns, False
+    commas = [cell for cells in with_comma.values() for cell in cells if "," in cell]
+    points = [cell for cells in columns.values() for cell in cells if "." in cell and re.fullmatch(_NUMBER, cell)]
+    if points or (between != ";" and all(_THOUSANDS.fullmatch(cell) for cell in commas)):
+        beside = f" beside {points[0]}" if points else ""
+        raise InputError(
+            "E-TABLE-DECIMAL",
+            f"{where}: {commas[0]}{beside}: the comma may be of a decimal or of thousands; give decimal_comma in a "
+            "file of --columns, or write points",
+        )
+    return columns | {n: [cell.replace(",", ".") for cell in cells] for n, cells in with_comma.items()}, True
+
+
+def _separator(lines: Sequence[str]) -> str:
+    """Return what separates the columns of a table, by its header; a comma where nothing does."""
+    header = lines[0]
+    if separator_stated(header):
+        return separator_stated(header)
+    if ";" in header and header.count(";") >= header.count(","):
+        return ";"
+    if "," in header:
+        return ","
+    if "\t" in header.strip():
+        return "\t"
+    count = len(header.split())
+    return " " if count > 1 and len(lines) > 1 and all(len(line.split()) == count for line in lines[1:]) else ","
+
+
+def _other_form(
+    names: list[str], used: Sequence[tuple[int, str]], between: str, where: str, quaternions: Order
+) -> Table:
+    """Return a table whose columns are not separated by commas."""
+    rows = []
+    for line, text in used:
+        try:
+            row = cells_of(text, between)
+        except csv.Error as error:
+            raise InputError("E-TABLE-CELLS", f"{where}: line {line}: {error}; correct it") from error
+        if len(row) != len(names):
+            raise InputError(
+                "E-TABLE-CELLS", f"{where}: line {line}: {len(row)} cells, {len(names)} needed as in the header"
+            )
+        rows.append(row)
+    columns, commas = decimal_points({name: [row[k] for row in rows] for k, name in enumerate(names)}, between, where)
+    form = SEPARATORS[between] + (", decimal commas" if commas else "")
+    return Table(where, dict(columns), [line for line, _ in used], quaternions, form=form)
+
+
+def _points_of_analyzer(
+    used: Sequence[tuple[int, str]], comments: Sequence[str], where: str, quaternions: Order
+) -> Table | None:
+    """Return the points of SpatialAnalyzer, a name and three numbers on each line; None for any other table.
+
+    Columns are ``name``, and ``collection``, ``group``, ``target`` where all names have these three parts.
+    """
+    matches = [_COMMA_POINT.fullmatch(line.strip()) for _, line in used]
+    commas = all(matches) and any("," in match[k] for match in matches if match for k in (2, 3, 4))
+    if not commas:
+        matches = [_POINT.fullmatch(line.strip()) for _, line in used]
+    points = [match.groups() for match in matches if match is not None]
+    if len(points) < len(used):
+        return None
+    names = [point[0].strip() for point in points]
+    columns = {"name": names}
+    parts = [name.split("::") for name in names]
+    if all(len(part) == 3 for part in parts):
+        columns |= {key: [part[k] for part in parts] for k, key in enumerate(("collection", "group", "target"))}
+    axes = canonical("xyz", comments)
+    columns |= {axis: [point[k] for point in points] for k, axis in enumerate(axes, 1)}
+    if commas:
+        columns, _ = decimal_points(columns, " ", where)
+    return Table(where, dict(columns), [line for line, _ in used], quaternions, form="points of SpatialAnalyzer")
 
 
 def common_columns(count: int) -> list[str]:

@@ -13,6 +13,7 @@ from stcal.locate.data.exposures import SceneFiles, SceneTags, read_scenes
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pose.estimate import ObjPose, locate
 from stcal.locate.pose.merge import Merged, Shift, merge
+from stcal.locate.pose.misread import likely_mistake
 from stcal.locate.pose.patent import PatentOptions, PatentPose, locate_as_patent
 from stcal.locate.pose.verdict import Verdict, VerdictOptions, judge
 
@@ -140,11 +141,18 @@ def locate_scene(
             return Located(scene, merged, None, patent_pose.verdict, tuple(notes), patent_pose)
         pose = locate(merged.seen, layout, camera.sized(*size), prior, scene.name)
     except StcalError as error:
-        return Located(scene, merged, None, _rejected([str(error).removeprefix(f"{scene.name}: ")]), tuple(notes))
+        reasons = [str(error).removeprefix(f"{scene.name}: "), *_mistakes(merged, layout, camera, size, prior, None)]
+        return Located(scene, merged, None, _rejected(reasons), tuple(notes))
+    mistakes = []
     if pose.outliers:
         names = ", ".join(str(layout.tags[row][1]) for row in pose.outliers)
         notes.append(f"tags that contradict the others, left out: {names}")
+        mistakes = _mistakes(merged, layout, camera, size, prior, pose)
     pose, verdict = judge(pose, options.verdict)
+    if mistakes or verdict.decision == "reject":
+        mistakes = mistakes or _mistakes(merged, layout, camera, size, prior, pose)
+        verdict = replace(verdict, decision="reject" if mistakes else verdict.decision)
+        verdict = replace(verdict, reasons=(*verdict.reasons, *mistakes))
     return Located(scene, merged, pose, verdict, tuple(notes))
 
 
@@ -198,6 +206,22 @@ def _notes(merged: Merged) -> list[str]:
         return []
     names = ", ".join(str(tag) for _, tag in merged.unknown[:5]) + (", …" if len(merged.unknown) > 5 else "")
     return [f"tags in view that the layout does not have: {names}"]
+
+
+def _mistakes(
+    merged: Merged,
+    layout: TargetLayout,
+    camera: CameraModel,
+    size: tuple[int, int],
+    prior: CameraPrior | None,
+    pose: ObjPose | None,
+) -> list[str]:
+    """Returns the likely mistake in the layout as a reason of a verdict, or no reason."""
+    try:
+        mistake = likely_mistake(merged.seen, layout, camera.sized(*size), prior, pose)
+    except StcalError:  # it is the camera's fault
+        return []
+    return [f"all tags would fit if {mistake}; correct the layout file"] if mistake else []
 
 
 def _rejected(reasons: Sequence[str]) -> Verdict:

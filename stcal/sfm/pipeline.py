@@ -115,7 +115,7 @@ def _on_surface(result: RunResult) -> Calibration:
         if rim is None:
             raise InputError(
                 "E-RIM-UNKNOWN",
-                f"--rim: circles of the faces in fewer than {MIN_VIEWS} views or at too few tilts; photograph the faces "
+                f"--rim: circles of the faces in fewer than {MIN_VIEWS} views or at too few tilts; photograph them "
                 "from several angles, or state rim_mm in target.toml",
             )
         heights, sigma_mm = dict.fromkeys(calibration.target.circles, rim.height_mm), rim.sigma_mm

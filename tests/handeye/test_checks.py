@@ -279,7 +279,11 @@ def test_units_of_one_side_are_named(factor, unit):
 def test_metres_on_both_sides_are_said():
     pairs = simulated(np.random.default_rng(19), 12, **NOISE).pairs
     both = (Poses(p.rotation, p.translation / 1000) for p in (pairs.base_from_flange, pairs.camera_from_board))
-    assert handeye(HandEyePoses(*both)).notes[0].endswith("if lengths are in metres, name the columns _m")
+    assert (
+        handeye(HandEyePoses(*both))
+        .notes[0]
+        .endswith("if lengths are in metres, name the columns _m, or give --length-unit m")
+    )
 
 
 def test_four_dof_at_one_place():

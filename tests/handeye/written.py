@@ -5,6 +5,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
@@ -234,6 +235,97 @@ def of_ur(folder: Path, pairs: HandEyePoses) -> Arguments:
     return [*two(folder, "\n".join(rows), b), "--rotation", "ur-rotvec"]
 
 
+def kuka_export(folder: Path, pairs: HandEyePoses) -> Arguments:
+    """Semicolons, decimal commas, a number for each row, units in brackets, and a separator behind the last column."""
+    angles = Rotation.from_matrix(np.array(pairs.base_from_flange.rotation)).as_euler("ZYX", degrees=True)
+    table = np.hstack([pairs.base_from_flange.translation, angles])
+    rows = [f"{i};{line(row, ';')};".replace(".", ",") for i, row in enumerate(table, 1)]
+    (folder / "robot.csv").write_text("\n".join(["Nr;X [mm];Y [mm];Z [mm];A [deg];B [deg];C [deg];", *rows]) + "\n")
+    named = {f"img{i:02d}.png": m.tolist() for i, m in enumerate(matrices(pairs.camera_from_board), 1)}
+    (folder / "camera.json").write_text(json.dumps(named))
+    return ["--a", str(folder / "robot.csv"), "--b", str(folder / "camera.json")]
+
+
+def tab_export(folder: Path, pairs: HandEyePoses) -> Arguments:
+    """Tabs and decimal commas, a line of Excel before them; KUKA's names without a unit."""
+    angles = Rotation.from_matrix(np.array(pairs.base_from_flange.rotation)).as_euler("ZYX", degrees=True)
+    rows = [line(row, "\t").replace(".", ",") for row in np.hstack([pairs.base_from_flange.translation, angles])]
+    (folder / "robot.txt").write_text("\n".join(["sep=\t", "X\tY\tZ\tA\tB\tC", *rows]) + "\n")
+    np.save(folder / "camera.npy", matrices(pairs.camera_from_board))
+    given = ["--rotation", "robot=kuka-abc", "--length-unit", "robot=mm"]
+    return ["--a", str(folder / "robot.txt"), "--b", str(folder / "camera.npy"), *given]
+
+
+def capital_columns(folder: Path, pairs: HandEyePoses) -> Arguments:
+    turns = Rotation.from_matrix(np.array(pairs.base_from_flange.rotation)).as_rotvec()
+    rows = [line(row, ",") for row in np.hstack([pairs.base_from_flange.translation, turns])]
+    (folder / "robot.csv").write_text("\n".join(["X_mm,Y_mm,Z_mm,RX,RY,RZ", *rows]) + "\n")
+    np.save(folder / "camera.npy", matrices(pairs.camera_from_board))
+    return ["--a", str(folder / "robot.csv"), "--b", str(folder / "camera.npy"), "--rotation", "robot=ur-rotvec"]
+
+
+def kinova(folder: Path, pairs: HandEyePoses) -> Arguments:
+    """Angles about the fixed axes X, Y, Z, in this order, degrees; places in metres."""
+    angles = Rotation.from_matrix(np.array(pairs.base_from_flange.rotation)).as_euler("xyz", degrees=True)
+    rows = [line(row, ",") for row in np.hstack([pairs.base_from_flange.translation / 1000, angles])]
+    head = "x_m,y_m,z_m,theta_x_deg,theta_y_deg,theta_z_deg"
+    (folder / "robot.csv").write_text("\n".join([head, *rows]) + "\n")
+    np.save(folder / "camera.npy", matrices(pairs.camera_from_board))
+    return ["--a", str(folder / "robot.csv"), "--b", str(folder / "camera.npy")]
+
+
+def both_in_a_row(commas: bool = False) -> Callable:
+    """Six numbers of the robot's pose and six of the camera's in each line, metres, with decimal commas or without."""
+
+    def write(folder: Path, pairs: HandEyePoses) -> Arguments:
+        sides = [
+            np.hstack([p.translation / 1000, Rotation.from_matrix(np.array(p.rotation)).as_rotvec()])
+            for p in (pairs.base_from_flange, pairs.camera_from_board)
+        ]
+        rows = [line(row, ";" if commas else ",") for row in np.hstack(sides)]
+        text = "# both\n" + "\n".join(rows) + "\n"
+        (folder / "both.csv").write_text(text.replace(".", ",") if commas else text)
+        return [str(folder / "both.csv"), "--rotation", "rotvec-rad"]
+
+    return write
+
+
+def quaternions_in_a_row(folder: Path, pairs: HandEyePoses) -> Arguments:
+    both = zip(in_metres(pairs.base_from_flange), in_metres(pairs.camera_from_board), strict=True)
+    rows = [line([*a[:3, 3], *xyzw(a), *b[:3, 3], *xyzw(b)]) for a, b in both]
+    (folder / "both.txt").write_text("\n".join(rows) + "\n")
+    return [str(folder / "both.txt"), "--rotation", "xyzw"]
+
+
+def counted(folder: Path, pairs: HandEyePoses) -> Arguments:
+    """The number of matrices before them, and a number before each."""
+    parts = [str(len(pairs))]
+    for i, m in enumerate(matrices(pairs.camera_from_board)):
+        parts += [str(i), *(line(row) for row in m)]
+    (folder / "camera.txt").write_text("\n".join(parts) + "\n")
+    named = {str(i): m.tolist() for i, m in enumerate(matrices(pairs.base_from_flange))}
+    (folder / "robot.json").write_text(json.dumps(named))
+    return ["--a", str(folder / "robot.json"), "--b", str(folder / "camera.txt")]
+
+
+def count_alone(folder: Path, pairs: HandEyePoses) -> Arguments:
+    blocks = [str(len(pairs)), *(line(row) for m in matrices(pairs.base_from_flange) for row in m)]
+    rows = [str(len(pairs)), *(line(m.ravel()) for m in matrices(pairs.camera_from_board))]
+    return two(folder, "\n".join(blocks), "\n".join(rows))
+
+
+def camodocal(folder: Path, pairs: HandEyePoses) -> Arguments:
+    """What handeye_calib_camodocal records, by OpenCV's FileStorage."""
+    storage = cv2.FileStorage(str(folder / "pairs.yml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("frameCount", len(pairs))
+    both = zip(in_metres(pairs.base_from_flange), in_metres(pairs.camera_from_board), strict=True)
+    for i, (tip, tag) in enumerate(both):
+        storage.write(f"T1_{i}", tip)
+        storage.write(f"T2_{i}", tag)
+    storage.release()
+    return [str(folder / "pairs.yml")]
+
+
 def zivid_folders(folder: Path, pairs: HandEyePoses) -> Arguments:
     """A file for each pose: Zivid's for the robot, OpenCV's FileStorage for the camera."""
     for name in ("robot", "camera"):
@@ -302,6 +394,16 @@ FORMATS: dict[str, Callable[[Path, HandEyePoses], Arguments]] = {
     "zyx by axis": robots("zyx", "zyx", ("rx", "ry", "rz"), "rad"),
     "rotation vector": robots("rotvec", "rotvec", ("rx", "ry", "rz"), "rad"),
     "UR": of_ur,
+    "KUKA's export": kuka_export,
+    "tabs and decimal commas": tab_export,
+    "columns in capitals": capital_columns,
+    "Kinova": kinova,
+    "rows of 6 + 6": both_in_a_row(),
+    "rows of 6 + 6, decimal commas": both_in_a_row(commas=True),
+    "rows of 7 + 7": quaternions_in_a_row,
+    "numbered matrices": counted,
+    "count of matrices": count_alone,
+    "camodocal": camodocal,
     "Zivid and OpenCV folders": zivid_folders,
     "COLMAP text": colmap_text,
     "COLMAP binary": colmap_binary,

@@ -1,5 +1,6 @@
 """Scenes of drawn photographs: poses under changing light, and everything that must be named and rejected."""
 
+import dataclasses
 import re
 
 import cv2
@@ -180,3 +181,38 @@ def test_a_camera_file_of_another_camera(located, plain):
     model = CameraModel(far_off.focal, far_off.centre, far_off.distortion, "PINHOLE", 1200, 900, "test")
     scene = located([plain]).tags
     assert locate_scene(scene, LAYOUT, model).verdict.decision == "reject"
+
+
+def turned(angle_deg, flip=1.0, orientation=1.0) -> TargetLayout:
+    """The layout with each tag about its middle, places with Y times ``flip`` and angles times ``orientation``."""
+    corners = LAYOUT.corners_mm
+    middle = corners.mean(axis=1, keepdims=True)
+    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    about = (corners - middle) @ np.array([[cosine, sine], [-sine, cosine]])
+    if orientation < 0:  # a square that is turned the other way
+        about = (about * [1, -1])[:, [3, 2, 1, 0]]
+    return dataclasses.replace(LAYOUT, corners_mm=about + middle * [1, flip])
+
+
+@pytest.mark.parametrize(
+    ("layout", "remedy"),
+    [
+        (turned(180), "add 180 to each angle_deg"),
+        (turned(-90), "add 90 to each angle_deg"),
+        (turned(90), "subtract 90 from each angle_deg"),
+        (turned(0, -1, -1), "change the signs of y_mm and angle_deg"),
+        (turned(0, -1), "change the signs of y_mm"),
+    ],
+)
+def test_tags_that_are_turned_in_the_layout(located, plain, layout, remedy):
+    result = located([plain], layout)
+    assert result.verdict.decision == "reject"
+    assert remedy in result.verdict.reasons[-1]
+
+
+def test_one_tag_that_is_wrong_is_left_out_and_nothing_is_made_of_it(located, plain):
+    corners = LAYOUT.corners_mm.copy()
+    corners[1] = np.roll(corners[1], 2, axis=0)
+    result = located([plain], dataclasses.replace(LAYOUT, corners_mm=corners))
+    assert result.pose.outliers == (1,)
+    assert not any("fit if" in reason for reason in result.verdict.reasons)

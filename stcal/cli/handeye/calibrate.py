@@ -1,6 +1,7 @@
 """Command ``stcal handeye``: the pose of a camera on the robot's flange, or beside the robot, with its uncertainty."""
 
 import math
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,6 +23,8 @@ from stcal.cli.handeye.inputs import (
 )
 from stcal.cli.options import (
     MOST_SEED,
+    ColumnsFile,
+    FirstColumns,
     FirstTable,
     JsonFile,
     Key,
@@ -239,6 +242,8 @@ def handeye(
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",
+    columns: ColumnsFile = None,
+    columns_a: FirstColumns = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
     workers: Workers = None,
     json_file: JsonFile = None,
@@ -263,8 +268,9 @@ def handeye(
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
     statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
     timing = Timing(time_tolerance, image_times, time_offset)
-    pairs = source_of(source, first, second, key, statements, quaternions.value, timing)
+    pairs = source_of(source, first, second, key, statements, quaternions.value, timing, columns, columns_a)
     folder = isinstance(pairs, Path) and pairs.is_dir()
+    statements = replace(statements, columns=columns) if folder else statements
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None

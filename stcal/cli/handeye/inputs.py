@@ -100,14 +100,21 @@ def source_of(
     said: "Said",
     quaternions: "Order",
     timing: "Timing | None" = None,
+    columns: Path | None = None,
+    columns_a: Path | None = None,
 ) -> "Source":
     """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
+    from stcal.handeye.data.inputs import mapped_pairs
     from stcal.workflows.handeye.inputs import two_files
     from stcal.workflows.handeye.times import Timing
 
     if source is None and first is not None and second is not None:
-        joined = two_files(first, second, key, said, quaternions, timing or Timing())
-        if joined is not None:
-            return joined
+        told = two_files(first, second, key, said, quaternions, timing or Timing(), (columns_a, columns))
+        if told is not None:
+            return told
+    if source is not None and columns is not None and source.is_file():
+        return mapped_pairs(source, columns, said, key, quaternions)
+    if source is not None and source.is_dir():
+        columns = None  # of the robot's poses
     prefixes = ("base_from_flange_", "camera_from_board_")
-    return one_table(source, first, second, key, "POSES|IMAGES", prefixes, quaternions)
+    return one_table(source, first, second, key, "POSES|IMAGES", prefixes, quaternions, columns, columns_a)

@@ -1,5 +1,6 @@
 """Command ``stcal handeye plan``: choice of the next robot poses."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -18,6 +19,8 @@ from stcal.cli.handeye.inputs import (
 )
 from stcal.cli.options import (
     MOST_SEED,
+    ColumnsFile,
+    FirstColumns,
     FirstTable,
     JsonFile,
     Key,
@@ -53,6 +56,8 @@ def plan(
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",
+    columns: ColumnsFile = None,
+    columns_a: FirstColumns = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
     workers: Workers = None,
     json_file: JsonFile = None,
@@ -65,7 +70,8 @@ def plan(
     from stcal.workflows.handeye.plan import plan_next
 
     statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
-    pairs = source_of(source, first, second, key, statements, quaternions.value)
+    pairs = source_of(source, first, second, key, statements, quaternions.value, None, columns, columns_a)
+    statements = replace(statements, columns=columns) if isinstance(pairs, Path) and pairs.is_dir() else statements
     robot = load_robot(robot_file) if robot_file else None
     with StageProgress() as progress:
         inputs = read_input(pairs, poses, camera, board, workers, progress, quaternions.value, statements)

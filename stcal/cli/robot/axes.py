@@ -8,6 +8,7 @@ import typer
 
 from stcal.cli.options import (
     ColumnsFile,
+    FirstColumns,
     FirstTable,
     JsonFile,
     Key,
@@ -50,6 +51,7 @@ def axes(
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",
+    columns_a: FirstColumns = None,
     columns: ColumnsFile = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
@@ -62,7 +64,7 @@ def axes(
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
-    source = one_table(sweeps, first, second, key, "SWEEPS", columns=columns)
+    source = one_table(sweeps, first, second, key, "SWEEPS", columns=columns, columns_a=columns_a)
     data = read_measurements(source, nominal, rotation=rotation)
     if len(set(data.stations)) > 1:
         raise InputError(

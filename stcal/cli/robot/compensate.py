@@ -7,6 +7,8 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import (
+    ColumnsFile,
+    FirstColumns,
     FirstTable,
     JsonFile,
     Key,
@@ -76,6 +78,8 @@ def compensate(
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "pose",
+    columns: ColumnsFile = None,
+    columns_a: FirstColumns = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -94,7 +98,9 @@ def compensate(
     )
     require_new([("--export", path) for _, path in exports])
     identified = load_robot(robot_file)
-    source = one_table(targets, first, second, key, "TARGETS", quaternions=quaternions.value)
+    source = one_table(
+        targets, first, second, key, "TARGETS", quaternions=quaternions.value, columns=columns, columns_a=columns_a
+    )
     wanted = read_targets(source, identified, quaternions.value, rotation, payload_kg)
     result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
     say(stage.compensated_text(result, identified))

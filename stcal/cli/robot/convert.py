@@ -2,14 +2,19 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import InputError
 
+if TYPE_CHECKING:
+    from stcal.robot.kinematics.model import Convention, Robot
+
 XML = (".urdf", ".xml")
+LEAST_OFF_MM = 1e-3
+"""A micrometre: what angles of few digits round off."""
 
 
 class ConventionName(StrEnum):
@@ -21,10 +26,15 @@ class ConventionName(StrEnum):
 
 def convert(
     source: Annotated[
-        Path, typer.Argument(metavar="A", help="Read the robot from this file: a robot file (TOML), or URDF.")
+        Path,
+        typer.Argument(
+            metavar="A",
+            help="Read the robot from this file: a robot file (TOML), URDF, or the calibration of an arm of Universal "
+            "Robots: YAML of ur_calibration, or calibration.conf.",
+        ),
     ],
     out: Annotated[
-        Path, typer.Argument(metavar="B", writable=True, help="Write the other of both to this file: .toml or .urdf.")
+        Path, typer.Argument(metavar="B", writable=True, help="Write the other form to this file: .toml or .urdf.")
     ],
     from_link: Annotated[
         str, typer.Option("--from-link", help="Begin at this link of a URDF; at its root if not given.")
@@ -40,14 +50,36 @@ def convert(
     convention: Annotated[
         ConventionName, typer.Option(help="Write rows of Denavit and Hartenberg in this convention.")
     ] = ConventionName.standard,
+    nominal: Annotated[
+        Path | None,
+        typer.Option(
+            "--nominal", help="Add the deviations of a calibration.conf to the rows of this robot file (TOML)."
+        ),
+    ] = None,
 ) -> None:
-    """Write a robot file as URDF, or the joints between links of a URDF as a robot file."""
+    """Write a robot file as URDF, or the joints of a URDF or an arm of Universal Robots as a robot file."""
     from stcal.robot.kinematics.file import load_robot, robot_toml
     from stcal.robot.urdf.read import load_urdf
     from stcal.robot.urdf.write import coupled, require_same_poses, robot_urdf
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
+    made = None if source.suffix.lower() in (*XML, ".toml") else _of_universal(source, nominal, convention.value)
+    if made is None and nominal is not None:
+        raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
+    if made is not None:
+        if from_link or to_link:
+            raise InputError("E-OPTION-NEEDS", "--from-link, --to-link: only of a URDF that is read; leave them out")
+        robot, said = made
+        say(f"robot {robot.name}: {len(robot.rows)} joints, of Universal Robots")
+        print_each(f"note: {source}", said)
+        if out.suffix.lower() in XML:
+            text = robot_urdf(robot)
+            require_same_poses(robot, text)
+        else:
+            text = robot_toml(robot, [f"From {source.name}, calibration of Universal Robots."])
+        write(out, text)
+        return
     if _is_xml(source) == (out.suffix.lower() in XML):
         raise InputError(
             "E-OPTION-FILES",
@@ -72,6 +104,34 @@ def convert(
     if coupled(robot):
         say("note: URDF has no coupling; its joint values are the coupling times the controller's, with wider limits")
     write(out, text)
+
+
+def _of_universal(source: Path, nominal: Path | None, convention: "Convention") -> "tuple[Robot, list[str]] | None":
+    """The arm of a file of Universal Robots, with notes; None for any other file."""
+    from stcal.io.files import SETTINGS_BYTES, read_bytes
+    from stcal.robot.kinematics.file import load_robot
+    from stcal.robot.urdf.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
+
+    try:
+        text = read_bytes(source, SETTINGS_BYTES).decode("utf-8-sig")
+    except OSError as error:
+        raise InputError("E-FILE-UNREADABLE", f"{source}: {error.strerror or error}; check the path") from error
+    except UnicodeDecodeError:
+        return None
+    if is_conf(text):
+        robot = robot_of_conf(text, str(source), load_robot(nominal) if nominal else None, convention)
+        return robot, []
+    content = kinematics_content(text)
+    if content is None:
+        return None
+    if nominal is not None:
+        raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
+    robot, off_mm = robot_of_kinematics(content, str(source), convention)
+    said = (
+        "angles are read about turned axes, as ur_calibration computes them and the controller moves; a URDF with the "
+    )
+    said += f"same numbers takes them about fixed ones, and its flange is {off_mm:.2g} mm off at joint values of 0"
+    return robot, [said] if off_mm >= LEAST_OFF_MM else []
 
 
 def _is_xml(path: Path) -> bool:

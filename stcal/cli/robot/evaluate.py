@@ -8,6 +8,7 @@ import typer
 
 from stcal.cli.options import (
     ColumnsFile,
+    FirstColumns,
     FirstTable,
     JsonFile,
     Key,
@@ -52,6 +53,8 @@ def evaluate(
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",
+    columns: ColumnsFile = None,
+    columns_a: FirstColumns = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -62,7 +65,9 @@ def evaluate(
     from stcal.robot.use.evaluation import evaluate as evaluated
 
     robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
-    source = one_table(data_file, first, second, key, "DATA", quaternions=quaternions.value)
+    source = one_table(
+        data_file, first, second, key, "DATA", quaternions=quaternions.value, columns=columns, columns_a=columns_a
+    )
     data = [  # within reach of each
         read_measurements(source, robot, quaternions.value, payload_kg=payload_kg) for robot in robots.values()
     ]
@@ -96,6 +101,7 @@ def verify(
         ),
     ] = None,
     key: Key = "pose",
+    columns_a: FirstColumns = None,
     columns: ColumnsFile = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
@@ -106,7 +112,9 @@ def verify(
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
         raise InputError("E-OUTPUT-SUFFIX", f"--plot {plot}: a name ending in .png or .svg needed")
-    tables = several_tables(measured, first, seconds or [], key, "MEASURED", ("commanded_", ""), columns=columns)
+    tables = several_tables(
+        measured, first, seconds or [], key, "MEASURED", ("commanded_", ""), columns=columns, columns_a=columns_a
+    )
     source = (
         tables if not isinstance(tables, list) else stack(tables, [path.stem for path in seconds or ()], {"pose": key})
     )

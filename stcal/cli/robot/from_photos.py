@@ -47,6 +47,10 @@ def from_photos(
         bool, typer.Option("--partial", help="Keep parameters nominal that the photographs leave open.")
     ] = False,
     key: Annotated[str, typer.Option("--key", help="Match photographs and joint values by this column.")] = "image",
+    columns: Annotated[
+        Path | None,
+        typer.Option("--columns", help="Read --joints with the columns, delimiter … of this file (TOML)."),
+    ] = None,
     workers: Workers = None,
 ) -> None:
     """Measure the target on an arm in photographs, find axes and kinematics, and compensate targets: one folder."""
@@ -77,6 +81,7 @@ def from_photos(
             MeasureOptions(workers=workers),
             IdentifyOptions(model=model.value, partial=partial),
             progress,
+            columns,
         )
     print_each("note", result.notes)
     for line in story(result):

@@ -9,6 +9,7 @@ import typer
 from stcal.cli.options import (
     MOST_SEED,
     ColumnsFile,
+    FirstColumns,
     FirstTable,
     JsonFile,
     Key,
@@ -107,6 +108,7 @@ def identify(
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",
+    columns_a: FirstColumns = None,
     columns: ColumnsFile = None,
     json_file: JsonFile = None,
     report: ReportFile = None,
@@ -120,7 +122,9 @@ def identify(
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
-    source = one_table(data_file, first, second, key, "DATA", quaternions=quaternions.value, columns=columns)
+    source = one_table(
+        data_file, first, second, key, "DATA", quaternions=quaternions.value, columns=columns, columns_a=columns_a
+    )
     data = read_measurements(source, nominal, quaternions.value, rotation, payload_kg)
     kind = observe.value if observe else None
     options = IdentifyOptions(

@@ -9,12 +9,13 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.formats.numeric import read_columns
+from stcal.handeye.data.formats.numeric import read_columns, todays
 from stcal.handeye.data.formats.recognise import read_content
 from stcal.handeye.data.formats.record import FRAMES, Content, Frames, Role, Said, Side
 from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance
 from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
-from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.join import keys_of
+from stcal.io.poses.columns import read_mapped
 from stcal.io.quaternions import Order
 from stcal.io.table import FARTHEST, LENGTHS, Table, read_table
 
@@ -75,8 +76,27 @@ def read_pairs(path: Path, said: Said, key: str = "image", quaternions: Order = 
         The message says what is wrong with the file, or that it holds poses of one side only.
     """
     content = read_content(path, said, key, quaternions)
-    if content is None:
-        return None
+    return None if content is None else _told(content, path, said)
+
+
+def mapped_pairs(path: Path, columns: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Told:
+    """Returns the pose pairs of a table with a map of its ``columns``; errors as :func:`read_pairs`."""
+    return _told(mapped_content(path, columns, said, key, quaternions), path, said)
+
+
+def mapped_content(path: Path, columns: Path, said: Said, key: str, quaternions: Order) -> Content:
+    """Returns the poses of a table with a map of its ``columns``.
+
+    Raises
+    ------
+    InputError
+        The map does not fit the table, or there are no poses in its columns.
+    """
+    return _of_table(read_mapped(path, columns, "table", quaternions), said, key)
+
+
+def _told(content: Content, path: Path, said: Said) -> Told:
+    """Returns the pose pairs of a file's content; errors as :func:`read_pairs`."""
     if not content.both:
         side = content.sides[0]
         held = f"{side.frames.name} alone" if side.frames is not None else "poses of one side, which is not said,"
@@ -103,28 +123,31 @@ def read_two(
     quaternions: Order = "wxyz",
     tolerance_s: float = TOLERANCE_S,
     timed: bool = False,
+    columns: tuple[Path | None, Path | None] = (None, None),
 ) -> Told | None:
     """Returns the robot's poses and the camera's, from two files, as pairs.
 
     The result is None where both files are the package's own tables. The rows are joined by image or time, or by their
     order where neither file has names. Where times are not equal, and for all rows where ``timed``, the robot's poses
-    are those at the camera's times, within ``tolerance_s``.
+    are those at the camera's times, within ``tolerance_s``. ``columns`` : maps of the columns of both files.
 
     Raises
     ------
     InputError
         The message says what is wrong with a file, or that no rows belong together.
     """
-    by_role = [said.of(role) for role in FRAMES]
+    keys = keys_of(key)
     contents = [
-        read_content(path, side_options, key, quaternions)
-        for path, side_options in zip((first, second), by_role, strict=True)
+        read_content(path, said.of(role), own, quaternions)
+        if form is None
+        else mapped_content(path, form, said.of(role), own, quaternions)
+        for role, path, form, own in zip(FRAMES, (first, second), columns, keys, strict=True)
     ]
     if contents[0] is None and contents[1] is None:
         return None
     sides = []
-    for role, path, content in zip(FRAMES, (first, second), contents, strict=True):
-        content_of_side = content or own_table(path, said, key, quaternions)
+    for role, path, content, own in zip(FRAMES, (first, second), contents, keys, strict=True):
+        content_of_side = content or own_table(path, said, own, quaternions)
         sides.append(settled(_side(content_of_side, role, path), role, content_of_side, path, said))
     robot, camera = sides
     setup = next((content.setup for content in contents if content is not None and content.setup), None)
@@ -151,7 +174,10 @@ def read_robot(path: Path, said: Said, key: str = "image", quaternions: Order = 
     InputError
         The message says what is wrong with the file or folder.
     """
-    content = read_content(path, said.of("robot"), key, quaternions)
+    if said.columns is not None:
+        content = mapped_content(path, said.columns, said.of("robot"), key, quaternions)
+    else:
+        content = read_content(path, said.of("robot"), key, quaternions)
     return None if content is None else settled(_side(content, "robot", path), "robot", content, path, said)
 
 
@@ -169,13 +195,37 @@ def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
     return lines
 
 
+def require_own(path: Path, quaternions: Order = "wxyz") -> None:
+    """Refuse a table without poses in its columns.
+
+    Raises
+    ------
+    InputError
+        The message says which columns are needed.
+    """
+    table = read_table(path, "table", quaternions)
+    if not todays(table):
+        raise _no_poses(table)
+
+
 def own_table(path: Path, said: Said, key: str, quaternions: Order) -> Content:
     """Returns the poses of one of the package's own tables, of one side."""
-    table = read_table(path, "table", quaternions)
-    content = read_columns(table, read_bytes(path, TABLE_BYTES).decode("utf-8-sig"), key, said)
+    return _of_table(read_table(path, "table", quaternions), said, key)
+
+
+def _of_table(table: Table, said: Said, key: str) -> Content:
+    content = read_columns(table, key, said)
     if content is None:
-        raise InputError("E-POSES-NOT-FOUND", f"{table.where}: no poses in its columns; the header is {table.header()}")
+        raise _no_poses(table)
     return content
+
+
+def _no_poses(table: Table) -> InputError:
+    return InputError(
+        "E-POSES-NOT-FOUND",
+        f"{table.where}: no poses in its columns; a place (x, y, z or x_mm …) and a rotation (qw … qz, rx, ry, rz, "
+        f"a, b, c …) needed; the header is {table.header()}; rename them, or map them by --columns",
+    )
 
 
 def _by_time(

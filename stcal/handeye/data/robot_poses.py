@@ -10,7 +10,7 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.formats.recognise import SUFFIXES, NotToldError
 from stcal.handeye.data.formats.record import Said, require_each_once
-from stcal.handeye.data.inputs import partners, read_robot, trailing_number
+from stcal.handeye.data.inputs import partners, read_robot, require_own, trailing_number
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.plain_yaml import load_yaml
@@ -130,6 +130,8 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", said: Said |
     if (poses_of_others := _of_others(path, said, quaternions)) is not None:
         return poses_of_others
     if said.options():
+        if path.is_file() and path.suffix.lower() not in YAML:
+            require_own(path, quaternions)
         raise InputError(
             "E-OPTION-NEEDS", f"robot poses {path}: its columns or keys say all; leave {', '.join(said.options())} out"
         )

@@ -28,6 +28,8 @@ WELL = np.radians(0.5), 5.0
 LOST = 0.25
 """Share of the spread of the poses that the solution leaves unexplained, above which the poses of robot and camera have
 nothing in common."""
+NAMED = "name the columns so, or give --poses-are"
+NAMED_ORDER = "name the columns so, or reorder the numbers in other files"
 MIRROR = np.diag([1.0, -1.0, 1.0])
 Guess = Callable[[Loop, bool], tuple[Rigid, Rigid, float]]
 
@@ -87,7 +89,7 @@ def check_conventions(
     if behind.all():
         return (
             *notes,
-            Grave("the board lies behind the camera in all poses: if these are board_from_camera, name the columns so"),
+            Grave(f"the board lies behind the camera in all poses: if these are board_from_camera, {NAMED}"),
         )
     if behind.any():
         return (*notes, f"the board lies behind the camera in {pairs.names[int(behind.argmax())]}: check its pose")
@@ -102,14 +104,14 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
     # A rotation by the mirror is absorbed by X and Z, so mirroring the robot is the same as mirroring the camera.
     mirrored = Poses(MIRROR @ eye.rotation @ MIRROR, eye.translation @ MIRROR)
     named = "flange_from_base" if by_images else "board_from_camera or flange_from_base"
-    metres = "if they are metres, name the columns _m"
+    metres = "if they are metres, name the columns _m, or give --length-unit m"
     size = "if the size in its file is in metres, correct that" if by_images else metres
     states = "the robot states" if by_images else "robot or camera states"
     remedy = "change the signs of its y, qx and qz" + (
         "; or images are mirrored: use them as taken" if by_images else ""
     )
     variants = {
-        f"{INVERTED}: if these are {named}, name the columns so; if all are named rightly, the setup is {kind}": (
+        f"{INVERTED}: if these are {named}, {NAMED}; if all are named rightly, the setup is {kind}": (
             replace(loop, camera_from_board=eye.inverse())
         ),
         f"with the board's lengths times 1000: {size}": (
@@ -124,7 +126,7 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
         robot, board = _read_as(reading, hand, loop.inverted), _read_as(reading, eye)
         kind = "conjugated" if reading.conjugated else "in another order"
         one_side = f"quaternions {kind}: if {reading.held}, "
-        one_side += reading.remedy if reading.conjugated else "name the columns so"
+        one_side += reading.remedy if reading.conjugated else NAMED_ORDER
         both_sides = f"quaternions {kind}: if {reading.held}, {reading.remedy}"
         variants[f"with the robot's {both_sides if by_images else one_side}"] = replace(loop, stand_from_mount=robot)
         if not by_images:

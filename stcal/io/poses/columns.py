@@ -24,7 +24,7 @@ from stcal.io.poses.rotations import (
 )
 from stcal.io.quaternions import COLUMNS as QUATERNION
 from stcal.io.quaternions import Order
-from stcal.io.table import ANGLES, Table
+from stcal.io.table import ANGLES, Table, is_comment
 from stcal.io.toml import Strict, load_toml
 
 TRIPLES = {
@@ -32,12 +32,18 @@ TRIPLES = {
     ("a", "b", "c"): {"deg": "kuka-abc"},
     ("w", "p", "r"): {"deg": "fanuc-wpr"},
     ("o", "a", "t"): {"deg": "kawasaki-oat"},
+    ("theta_x", "theta_y", "theta_z"): {"deg": "kinova"},
     ("roll", "pitch", "yaw"): {"deg": "rpy", "rad": "rpy"},
     ("rpy_roll", "rpy_pitch", "rpy_yaw"): {"deg": "rpy", "rad": "rpy"},
 }
 """Default conventions of columns with these three names, by the unit that follows the names; with another unit, or
 none, the convention is open."""
-BY_AXIS = (("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("rpy_roll", "rpy_pitch", "rpy_yaw"))
+BY_AXIS = (
+    ("rx", "ry", "rz"),
+    ("theta_x", "theta_y", "theta_z"),
+    ("roll", "pitch", "yaw"),
+    ("rpy_roll", "rpy_pitch", "rpy_yaw"),
+)
 _EULER = re.compile(r"euler_([xyz]{3}|[XYZ]{3})_1_(deg|rad)")
 
 
@@ -221,7 +227,7 @@ def read_mapped(path: str | Path, columns: str | Path, what: str, quaternions: O
             "E-TABLE-ENCODING", f"{where}: not {form.encoding} text; give `encoding` in {columns}"
         ) from error
     used = [(i, line) for i, line in enumerate(text.splitlines(), 1) if i > form.skip_lines and line.strip()]
-    used = [(i, line) for i, line in used if not line.lstrip().startswith(("#", "//"))]
+    used = [(i, line) for i, line in used if not is_comment(line)]
     if len(used) < 1 + form.header:
         raise InputError(
             "E-TABLE-EMPTY", f"{where}: no rows below {form.skip_lines} lines; check skip_lines in {columns}"

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.file import REMEDY, TagsFile
+from stcal.boards.file import TagsFile, load_tags, require_sizes
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
-from stcal.io.toml import load_toml, toml_string
+from stcal.io.toml import side, stated_unusual, toml_string
 
 WHAT = "layout file"
 
@@ -94,7 +94,7 @@ def load_plan(path: str | Path) -> LayoutPlan:
     Parameters
     ----------
     path : str or Path
-        The TOML file.
+        The file: TOML, or YAML of apriltag_ros.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def load_plan(path: str | Path) -> LayoutPlan:
     InputError
         The file is unreadable, does not follow ``data_layout.md``, or repeats an id.
     """
-    return _plan(load_toml(path, TagsFile, WHAT, REMEDY), f"{WHAT} {path}")
+    return _plan(load_tags(path, WHAT), f"{WHAT} {path}")
 
 
 def load_layout(path: str | Path) -> TargetLayout:
@@ -114,7 +114,7 @@ def load_layout(path: str | Path) -> TargetLayout:
     Parameters
     ----------
     path
-        The TOML file.
+        The file: TOML, or YAML of apriltag_ros.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def load_layout(path: str | Path) -> TargetLayout:
         See :func:`load_plan`; or a tag has no place.
     """
     where = f"{WHAT} {path}"
-    data = load_toml(path, TagsFile, WHAT, REMEDY)
+    data = load_tags(path, WHAT)
     plan = _plan(data, where)
     open_places = [tag for tag, corners in zip(plan.tags, plan.corners_mm, strict=True) if np.isnan(corners).any()]
     if open_places:
@@ -148,6 +148,7 @@ def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
     lines = [f"# {comment}" for comment in comments]
     lines += ['type = "tags"', f"name = {toml_string(layout.name)}", f"origin = {layout.tags[layout.origin][1]}"]
     lines += [f"sigma_px = {layout.sigma_px:.6g}", f"tag_sigma_px = {layout.tag_sigma_px:.6g}"]
+    lines += stated_unusual(side("", float(np.linalg.norm(c[1] - c[0]))) for c in layout.corners_mm)
     lines.append("# Lower triangle; coordinates tag by tag, corner by corner, x before y.")
     rows = (", ".join(f"{v:.6g}" for v in row[: k + 1]) for k, row in enumerate(_finite(layout.covariance_mm2)))
     lines += ["covariance_mm2 = [", *(f"  [{row}]," for row in rows), "]"]
@@ -179,6 +180,7 @@ def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _plan(data: TagsFile, where: str) -> LayoutPlan:
+    require_sizes(data, where)
     ids = [tag.id for tag in data.tag]
     repeated = [i for i in ids if ids.count(i) > 1]
     if repeated:

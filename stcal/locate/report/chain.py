@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.geometry.uncertain import UncertainRigid
+from stcal.io.join import table_of
 from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, read_result
 from stcal.io.quaternions import READINGS, Order
-from stcal.io.table import LENGTHS, UNIT_WORDS, read_table
+from stcal.io.table import LENGTHS, UNIT_WORDS
 
 MOVING, FIXED = "flange_from_camera", "base_from_camera"
 ROBOT = "base_from_flange_"
@@ -91,11 +92,12 @@ def read_chain(
     offset: str | Path | None = None,
     quaternions: Order = "wxyz",
     key: str = "scene",
+    columns: str | Path | None = None,
 ) -> GoalChain:
     """Reads the hand-eye file of ``stcal handeye``, the robot's poses by scene, and the offset.
 
     ``quaternions`` : order of the robot's quaternions, ``xyzw`` if their columns hold x, y, z, w in this order.
-    ``key`` : column of the robot's poses that names the scenes.
+    ``key`` : column of the robot's poses that names the scenes; ``columns`` : map of their columns.
 
     Raises
     ------
@@ -121,7 +123,7 @@ def read_chain(
         raise InputError(
             "E-OPTION-NEEDS", f"{where}: the camera is fixed; it needs no robot poses, leave --robot-poses away"
         )
-    flange = read_robot_poses(robot_poses, quaternions, key) if robot_poses else {}
+    flange = read_robot_poses(robot_poses, quaternions, key, columns) if robot_poses else {}
     return GoalChain(mount, moving, flange, _offset(offset))
 
 
@@ -156,12 +158,14 @@ def _offset(offset: str | Path | None) -> Rigid:
     return Rigid.from_matrix(read.obj_from_goal)
 
 
-def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", key: str = "scene") -> dict[str, UncertainRigid]:
+def read_robot_poses(
+    path: str | Path, quaternions: Order = "wxyz", key: str = "scene", columns: str | Path | None = None
+) -> dict[str, UncertainRigid]:
     """Reads base_from_flange of each scene from the columns ``x_mm … qz``, or ``base_from_flange_x_mm …``.
 
-    Column ``key`` names the scenes.
+    Column ``key`` names the scenes; ``columns`` : map of the columns.
     """
-    table = read_table(path, "robot poses", quaternions)
+    table = table_of(path, columns, "robot poses", quaternions)
     prefix = ROBOT if any(column.startswith(ROBOT) for column in table.columns) else ""
     poses, covariances = table.poses(prefix), table.pose_covariances(prefix)
     pose_of_scene = {}

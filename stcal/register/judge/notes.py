@@ -21,6 +21,8 @@ LOW_REDUNDANCY = 6
 """Degrees of freedom below which the relative uncertainty of σ exceeds 30 %."""
 MAJORITY = 0.5
 """Fraction of the point pairs below which a note says that few agree."""
+SMALL_MM = 20.0
+"""Extent of points below which they may be in metres: 20 m are 20 mm then. Few parts that are measured are smaller."""
 TIGHT = 2.5
 """Threshold in σ below which the covariance of few points is too small. 2.5 σ cuts off a tenth of the good points."""
 
@@ -177,5 +179,8 @@ def _layout(subject: Subject, sigma: float) -> list[str]:
         for factor, (name, _) in UNITS.items():
             if abs(max(scale, 1 / scale) / factor - 1) < UNIT_WITHIN:
                 notes.append(f"the scale is {scale:.6g}: is {'a' if scale > 1 else 'b'} in {name}?")
+    extent = max(float(np.ptp(xyz[rows], axis=0).max()) for xyz in (subject.problem.xyz_a, subject.problem.xyz_b))
+    if 0 < extent < SMALL_MM:
+        notes.append(f"all points lie within {extent:.2g} mm: if lengths are metres, name the columns _m")
     found = symmetry(inside, fitted.threshold if np.isfinite(fitted.threshold) else 4 * sigma)
     return notes if found is None else [*notes, symmetry_note(found, rows, subject.name)]

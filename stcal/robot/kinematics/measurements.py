@@ -218,7 +218,7 @@ def read_measurements(
         raise InputError(
             "E-MEASURED-KIND",
             f"{table.where}: neither x_mm, y_mm, z_mm nor distance_mm; what was measured is needed; "
-            f"the header is {table.header()}",
+            f"the header is {table.header()}{table.open_unit('x', LENGTHS)}",
         )
     distances = table.quantity("distance", LENGTHS)
     within(table, "distance", distances, "mm")

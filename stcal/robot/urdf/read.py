@@ -11,6 +11,7 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
+from stcal.io.toml import MOST_LINK_MM
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain
 from stcal.robot.kinematics.forward import carried_poses, flange_poses, forward
 from stcal.robot.kinematics.model import Chain, Convention, DHRow, Grown, Joint, JointType, Robot, Tree
@@ -61,7 +62,7 @@ class UrdfRobot:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _UrdfJoint:
+class UrdfJoint:
     """``parent_from_child`` with the joint at 0; ``axis`` : (3,) of length 1, in the child; ``limit`` : rad or mm."""
 
     name: str
@@ -130,6 +131,13 @@ def read_urdf(
     for option, name in (("--from-link", from_link), *(("--to-link", name) for name in given)):
         if name and name not in links:
             raise InputError("E-URDF-LINKS", f"{where}: {option} {name}: no such link; there are {_few(links)}")
+    farthest = max(joints.values(), key=_far, default=None)
+    if farthest is not None and _far(farthest) > MOST_LINK_MM:
+        raise InputError(
+            "E-LENGTH-UNIT",
+            f"{where}: joint {farthest.name}: origin {_far(farthest) / METRE_MM:g} m from its parent, up to "
+            f"{MOST_LINK_MM / METRE_MM:g} possible: URDF is in metres; divide lengths in mm by 1000",
+        )
     start = from_link or _root(joints, links, where)
     ends = {name if given[1:] else "": name for name in given} if any(given) else _tools(joints, start, where)
     paths = {name: _path(joints, start, end, where) for name, end in ends.items()}
@@ -140,7 +148,7 @@ def read_urdf(
         world, start = first[0].parent_from_child, first[0].child
         paths = {name: path[1:] for name, path in paths.items()}
     name = root.get("name") or "robot"
-    robot = _robot_of(paths, name, convention) if "" in paths else _tree_of(paths, name, convention)
+    robot = robot_of(paths, name, convention) if "" in paths else _tree_of(paths, name, convention)
     moving = list({joint.name: joint for path in paths.values() for joint in path if joint.kind != "fixed"}.values())
     notes = tuple(f"joint {j.name} has no limits" for j in moving if j.limit is None and j.kind != "continuous")
     robot = replace(robot, world_from_base=world @ robot.world_from_base)
@@ -163,7 +171,7 @@ def require_near(found: Poses, wanted: Poses) -> None:
         )
 
 
-def _require_chain(path: list[_UrdfJoint], start: str, end: str, where: str) -> None:
+def _require_chain(path: list[UrdfJoint], start: str, end: str, where: str) -> None:
     moving = [joint for joint in path if joint.kind != "fixed"]
     if not moving:
         raise InputError(
@@ -180,7 +188,7 @@ def _require_chain(path: list[_UrdfJoint], start: str, end: str, where: str) -> 
             )
 
 
-def _robot_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convention) -> Robot:
+def robot_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Convention) -> Robot:
     """Returns the robot of the paths from one link to each tool, ``""`` among them; they part behind the last moving
     joint."""
     moving = [joint for joint in paths[""] if joint.kind != "fixed"]
@@ -209,7 +217,7 @@ def _robot_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convent
     return robot
 
 
-def _tree_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Convention) -> Robot:
+def _tree_of(paths: dict[str, list[UrdfJoint]], name: str, convention: Convention) -> Robot:
     """Returns the robot of the paths from one link to tools on several branches."""
     place: dict[str, int] = {}
     moving, gaps, mounts, carriers, tools = [], [], {}, {}, {}
@@ -239,7 +247,7 @@ def _tree_of(paths: dict[str, list[_UrdfJoint]], name: str, convention: Conventi
     return robot
 
 
-def _along(path: list[_UrdfJoint]) -> Rigid:
+def _along(path: list[UrdfJoint]) -> Rigid:
     """Returns the product of the transforms of successive fixed joints."""
     product = Rigid()
     for joint in path:
@@ -247,7 +255,7 @@ def _along(path: list[_UrdfJoint]) -> Rigid:
     return product
 
 
-def _limited(joint: _UrdfJoint) -> Joint:
+def _limited(joint: UrdfJoint) -> Joint:
     kind = MOVING[joint.kind]
     most = UNLIMITED * (METRE_MM if kind == "prismatic" else 1.0)
     low, high = joint.limit or (-np.inf, np.inf)
@@ -268,7 +276,7 @@ def _parsed(content: bytes, where: str) -> ElementTree.Element:
     return root
 
 
-def _read_joint(element: ElementTree.Element, where: str) -> _UrdfJoint:
+def _read_joint(element: ElementTree.Element, where: str) -> UrdfJoint:
     name, kind = element.get("name", ""), element.get("type", "")
     where = f"{where}: joint {name}"
     parts = {part.tag: part.attrib for part in element}
@@ -292,7 +300,7 @@ def _read_joint(element: ElementTree.Element, where: str) -> _UrdfJoint:
             limit = (float(ends[0] * unit), float(ends[1] * unit))
     mimics = parts.get("mimic", {}).get("joint", "")
     pose = Rigid(from_roll_pitch_yaw(turn), METRE_MM * place)
-    return _UrdfJoint(name, kind, parent, child, pose, axis / length, limit, mimics)
+    return UrdfJoint(name, kind, parent, child, pose, axis / length, limit, mimics)
 
 
 def _three(text: str, where: str) -> np.ndarray:
@@ -314,7 +322,7 @@ def _z_to(axis: np.ndarray) -> Rigid:
     return Rigid.exp([*(np.arctan2(across, z) * np.array([-y, x, 0.0]) / across), 0.0, 0.0, 0.0])
 
 
-def _root(joints: dict[str, _UrdfJoint], links: list[str], where: str) -> str:
+def _root(joints: dict[str, UrdfJoint], links: list[str], where: str) -> str:
     roots = [link for link in links if link not in joints]
     if len(roots) != 1:
         raise InputError(
@@ -323,9 +331,9 @@ def _root(joints: dict[str, _UrdfJoint], links: list[str], where: str) -> str:
     return roots[0]
 
 
-def _tools(joints: dict[str, _UrdfJoint], start: str, where: str) -> dict[str, str]:
+def _tools(joints: dict[str, UrdfJoint], start: str, where: str) -> dict[str, str]:
     """Links by names of tools, behind the last joint that moves."""
-    below: dict[str, list[_UrdfJoint]] = {}
+    below: dict[str, list[UrdfJoint]] = {}
     for joint in joints.values():
         below.setdefault(joint.parent, []).append(joint)
     last, pending, branches = start, [start], []
@@ -353,8 +361,8 @@ def _tools(joints: dict[str, _UrdfJoint], start: str, where: str) -> dict[str, s
     raise InputError("E-URDF-LINKS", f"{where}: several links may be the tool; give --to-link, one of {_few(every)}")
 
 
-def _path(joints: dict[str, _UrdfJoint], start: str, end: str, where: str) -> list[_UrdfJoint]:
-    found: list[_UrdfJoint] = []
+def _path(joints: dict[str, UrdfJoint], start: str, end: str, where: str) -> list[UrdfJoint]:
+    found: list[UrdfJoint] = []
     while end != start:
         if end not in joints or len(found) > len(joints):
             raise InputError(
@@ -364,6 +372,10 @@ def _path(joints: dict[str, _UrdfJoint], start: str, end: str, where: str) -> li
         found.append(joints[end])
         end = joints[end].parent
     return found[::-1]
+
+
+def _far(joint: UrdfJoint) -> float:
+    return float(np.linalg.norm(joint.parent_from_child.translation))
 
 
 def _few(names: list[str], most: int = 12) -> str:

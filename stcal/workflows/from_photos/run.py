@@ -17,7 +17,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.files import save
 from stcal.io.images import find_images
-from stcal.io.join import join
+from stcal.io.join import join, table_of
 from stcal.io.table import POSE, Table, read_table
 from stcal.robot.axes.model import AxesResult, robot_from_sweeps
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
@@ -51,6 +51,7 @@ def from_photos(
     measure_options: MeasureOptions | None = None,
     options: IdentifyOptions | None = None,
     progress: Callable[[str, int, int], None] | None = None,
+    columns: str | Path | None = None,
 ) -> FromPhotos:
     """Measure the target in photographs, identify the arm that carried it, and compensate targets.
 
@@ -68,6 +69,8 @@ def from_photos(
         Name of the column of photographs.
     measure_options, options
         Options of measuring and of identifying; the defaults if None.
+    columns : path, optional
+        Map of the columns of ``joints``.
 
     Returns
     -------
@@ -80,14 +83,16 @@ def from_photos(
         One of its subclasses, from the step that failed, with a one-line message that says what to do.
     """
     # Both are read before the work, as both may be refused.
-    values = read_joints(joints, key, [file.name for file in find_images(images)[0]], nominal)
+    values = read_joints(joints, key, [file.name for file in find_images(images)[0]], nominal, columns)
     carried = dict.fromkeys(targets_of(values), Rigid())
     wanted = None if targets is None else read_targets(targets, replace(nominal, tools=carried))
     measured = measure(images, camera, target, design, board, measure_options, progress)
     return from_measured(str(images), measured, values, nominal, wanted, options)
 
 
-def read_joints(path: str | Path, key: str, photographs: Sequence[str], nominal: Robot) -> Table:
+def read_joints(
+    path: str | Path, key: str, photographs: Sequence[str], nominal: Robot, columns: str | Path | None = None
+) -> Table:
     """Returns joint values with the name of each row's photograph in the column ``image``, which replaces ``key``.
 
     Raises
@@ -96,7 +101,7 @@ def read_joints(path: str | Path, key: str, photographs: Sequence[str], nominal:
         No such column, no row of the photographs, one twice, poses beside the joint values, or other joints than the
         robot's.
     """
-    values, nowhere = read_table(path, "joints"), np.zeros(len(photographs))
+    values, nowhere = table_of(path, columns, "joints"), np.zeros(len(photographs))
     files = Table(PHOTOGRAPHS, {key: list(photographs)} | dict.fromkeys(POSE, nowhere), range(len(photographs)))
     join(files, values, key)
     joint_values(values, nominal)

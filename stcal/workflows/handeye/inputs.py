@@ -11,7 +11,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyePoses, View, Views, pairs_of_views, read_poses
 from stcal.handeye.data.formats.record import Said
-from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two
+from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
 from stcal.handeye.data.pairs import SETUPS, Loop, Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import Timed
@@ -69,20 +69,24 @@ def two_files(
     said: Said,
     quaternions: Order = "wxyz",
     timing: Timing = WITHOUT_OPTIONS,
+    columns: tuple[Path | None, Path | None] = (None, None),
 ) -> Told | None:
     """Returns the robot's poses and the camera's, joined.
 
-    The result is None for two tables of the package's own, which are joined as tables.
+    The result is None for two tables of the package's own, which are joined as tables. ``columns`` : maps of the
+    columns of both, where they are tables of other programs.
 
     Raises
     ------
     InputError
         As in :func:`~stcal.handeye.data.inputs.read_two`; or options were given that tables do not need.
     """
-    joined = read_two(first, second, said, key, quaternions, timing.tolerance_s, timing.offset)
-    if joined is None:
+    told = read_two(first, second, said, key, quaternions, timing.tolerance_s, timing.offset, columns)
+    if told is None:
+        for path in (first, second):
+            require_own(path, quaternions)
         _require_unsaid(said, f"{first}, {second}")
-    return joined
+    return told
 
 
 @one_thread()
@@ -127,11 +131,12 @@ def read_input(
         return HandEyeInput(source.where, read_poses(source, quaternions))
     if isinstance(source, Told):
         return _from_told(source, said)
-    pairs = read_pairs(source, said, quaternions=quaternions)
-    if pairs is not None:
-        return _from_told(pairs, said)
+    told = read_pairs(source, said, quaternions=quaternions)
+    if told is not None:
+        return _from_told(told, said)
+    pairs = read_poses(source, quaternions)  # first: a table that is not understood is no table whose columns say all
     _require_unsaid(said, str(source))
-    return HandEyeInput(source.name, read_poses(source, quaternions))
+    return HandEyeInput(source.name, pairs)
 
 
 def _all_three(source: Path, poses: Path | None, camera: Path | None, board: Path | None) -> tuple[Path, Path, Path]:

@@ -137,3 +137,10 @@ def test_points_that_cannot_be():
         register(s.xyz_a, bad)
     with fails_with("E-POINTS-FEW … 0 … 3"):
         register(np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def test_points_in_metres_are_doubted():
+    s = scene(2, 20)
+    said = "if lengths are metres"
+    assert any(said in note for note in register(s.xyz_a / 1000, s.xyz_b / 1000, folds=0).notes)
+    assert not any(said in note for note in register(s.xyz_a, s.xyz_b, folds=0).notes)

@@ -1,10 +1,9 @@
 """Readers of tables of numbers: 4×4 matrices, TUM's trajectories, and CSV files with columns of other programs."""
 
-import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from stcal.handeye.data.formats.record import (
     EVERY_FRAME,
     FRAMES,
     MATRICES,
+    ROLES,
     Content,
     Frames,
     Role,
@@ -33,6 +33,14 @@ _BRACKETS = str.maketrans("[]()", "    ")
 _QUATERNION = re.compile(r"(?<![a-z])q[a-z_]*?([wxyz])\b")
 TUM, MATRIX = 8, 16
 """Numbers in a line that holds a whole pose."""
+PAIRS = (12, 14)
+"""Numbers in a line that holds the poses of both sides, three angles or a quaternion each."""
+THREE_ROWS = 12
+ORTHOGONAL = 0.05
+"""Largest deviation of RRᵀ from the identity of numbers that are a rotation; six other numbers of a pose deviate by
+their size."""
+COMMENTS = ("#", "//", "%")
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +63,18 @@ def read_numbers(text: str, said: Said, where: str) -> Content | None:
         Lines of unequal length, 3×4 matrices, no rotations, or a convention that must be stated.
     """
     lines, comments = [], []
-    for i, raw in enumerate(text.splitlines(), 1):
+    for i, raw in enumerate(_with_points(text.splitlines()), 1):
         stripped = raw.strip()
-        if stripped.startswith(("#", "//", "%")):
+        if stripped.startswith(COMMENTS):
             comments.append(stripped)
         elif stripped:
             line = _line(i, stripped)
-            if line is None:
+            if line is None or _half_commas(stripped):
                 return None
             lines.append(line)
     if not any(line.values for line in lines):
         return None
+    lines = _without_counts(lines, where)
     labels_alone = [line for line in lines if not line.values]
     widths = Counter(len(line.values) for line in lines if line.values)
     width = widths.most_common(1)[0][0]
@@ -79,11 +88,11 @@ def read_numbers(text: str, said: Said, where: str) -> Content | None:
         return _blocks(lines, where)
     if labels_alone:
         return None
-    if width in (12, 3):
+    if width == 3 or (width == THREE_ROWS and _three_rows(lines)):
         raise InputError(
             "E-MATRIX-ROWS", f"{where}: {width} numbers in a line, as of a matrix 3×4 or 3×3; 4×4 needed: add 0 0 0 1"
         )
-    if width not in (6, 7, TUM, MATRIX):
+    if width not in (6, 7, TUM, MATRIX, *PAIRS):
         return None
     values, places = np.array([line.values for line in lines]), tuple(f"line {line.number}" for line in lines)
     require_finite(values, places, where)
@@ -94,8 +103,76 @@ def read_numbers(text: str, said: Said, where: str) -> Content | None:
     if width == MATRIX:
         rotation, translation = of_matrices(values.reshape(-1, 4, 4), places, where)
         return Content("4×4 matrices, a row each", (Side(rotation, translation, places, MATRICES, names=names),))
+    if width in PAIRS:
+        return _pairs(values, said, places, names, where)
     rotation, words = turned_values(values[:, 3:], said.rotation, "the numbers after x, y, z", places, where)
     return Content("rows of numbers", (Side(rotation, values[:, :3], places, words, names=names),))
+
+
+def _pairs(values: np.ndarray, said: Said, places: tuple[str, ...], names: tuple[str, ...], where: str) -> Content:
+    """Returns the poses of both sides in rows of numbers (m, 12) or (m, 14), the robot's first."""
+    half, sides = values.shape[1] // 2, []
+    for role, numbers in zip(ROLES, (values[:, :half], values[:, half:]), strict=True):
+        what = f"the numbers after x, y, z of the {role}'s pose"
+        rotation, words = turned_values(numbers[:, 3:], said.of(role).rotation, what, places, where)
+        frames = Frames(FRAMES[role][0], "by default", False)
+        sides.append(Side(rotation, numbers[:, :3], places, words, None, frames, names))
+    return Content(f"rows of {half} + {half} numbers, the robot's pose first", tuple(sides))
+
+
+def _three_rows(lines: list[Line]) -> bool:
+    """True if lines of twelve numbers are matrices 3×4."""
+    turn = np.array([line.values for line in lines]).reshape(-1, 3, 4)[:, :, :3]
+    if not np.isfinite(turn).all() or np.abs(turn).max() > 2:
+        return False
+    return bool(np.abs(turn @ np.swapaxes(turn, 1, 2) - np.eye(3)).max() < ORTHOGONAL)
+
+
+def _without_counts(lines: list[Line], where: str) -> list[Line]:
+    """Returns the lines without a first one that holds the number of poses alone; a number alone before each matrix is
+    its name.
+
+    Raises
+    ------
+    InputError
+        There are not as many poses as the first line says.
+    """
+    single = [i for i, line in enumerate(lines) if len(line.values) == 1 and not line.label]
+    matrix_lines = 4
+    wide = [line for line in lines if len(line.values) > 1]
+    if not single or not wide:
+        return lines
+    if single[0] == 0 and (len(single) == 1 or single[1] == 1):
+        poses = len(wide) // matrix_lines if len(wide[0].values) == matrix_lines else len(wide)
+        if lines[0].values[0] != poses:
+            raise InputError(
+                "E-POSES-COUNT",
+                f"{where}: line {lines[0].number} says {lines[0].first} poses, {poses} follow; correct it",
+            )
+        lines, single = lines[1:], [i - 1 for i in single[1:]]
+    if single and single == list(range(0, len(lines), matrix_lines + 1)):
+        lines = [replace(line, label=line.first, values=[]) if i in single else line for i, line in enumerate(lines)]
+    return lines
+
+
+def _with_points(lines: list[str]) -> list[str]:
+    """Returns lines of numbers with decimal points in place of decimal commas, where semicolons or white space stand
+    between numbers."""
+    used = [line.strip().translate(_BRACKETS).strip(" ;\t") for line in lines if not line.startswith(COMMENTS)]
+    cells = [re.split(r"[;\s]+", line) for line in used if line]
+    numbers = [cell for row in cells for cell in row if cell != row[0] or _number(cell.replace(",", ".")) is not None]
+    if not numbers or not all(_DECIMAL_COMMA.fullmatch(cell) for cell in numbers):
+        return lines
+    if max(map(len, cells)) == 1 or not any("," in cell for cell in numbers):
+        return lines
+    return [line.replace(",", ".") for line in lines]
+
+
+def _half_commas(line: str) -> bool:
+    """True if commas may be those of decimals: between semicolons, one at most, with digits on both sides. In a matrix
+    such as ``[1, 2; 3, 4]`` with more columns there are more."""
+    cells = line.split(";")
+    return len(cells) > 1 and max(cell.count(",") for cell in cells) == 1 and re.search(r"\d,\d", line) is not None
 
 
 def _line(number: int, text: str) -> Line | None:
@@ -171,6 +248,8 @@ NAMES = (
     *("field.header.stamp", "header.stamp", "header_stamp", "timestamp", "stamp", "%time", "__time", "time_s", "time"),
 )
 """Columns that name a row, in order of preference."""
+NUMBERS = ("nr", "no", "number", "index", "id", "#")
+"""Columns that name a row where no value occurs twice: elsewhere they number something else, such as the board."""
 _MESSAGE = re.compile(r"(?P<of>.*?)[./_]?(?:position|translation)[./_]x", re.IGNORECASE)
 _STAMP = (("secs", "nsecs"), ("sec", "nanosec"))
 
@@ -181,7 +260,7 @@ def todays(table: Table) -> bool:
     return any(table.has(f"{prefix}x", LENGTHS) and f"{prefix}qw" in table for prefix in prefixes)
 
 
-def read_columns(table: Table, text: str, key: str, said: Said) -> Content | None:
+def read_columns(table: Table, key: str, said: Said) -> Content | None:
     """Returns the poses in the columns of a table; None where it has none.
 
     Raises
@@ -192,8 +271,8 @@ def read_columns(table: Table, text: str, key: str, said: Said) -> Content | Non
     """
     messages = _messages(table)
     if messages:
-        return _of_messages(table, messages, _row_names(table, text, key))
-    names = _row_names(table, text, key)
+        return _of_messages(table, messages, _row_names(table, key))
+    names = _row_names(table, key)
     sides = []
     for frame in EVERY_FRAME:
         side = _side(table, f"{frame}_", Frames(frame, f"by the columns {frame}_…"), names, said)
@@ -210,31 +289,31 @@ def read_columns(table: Table, text: str, key: str, said: Said) -> Content | Non
         raise InputError(
             "E-POSES-MIXED", f"{table.where}: columns of {both}; one of each side needed, take the others out"
         )
-    return Content(TABLE, tuple(sides))
+    return Content(f"{TABLE} ({table.form})" if table.form else TABLE, tuple(sides))
 
 
-def _row_names(table: Table, text: str, key: str) -> tuple[str, ...]:
+def _row_names(table: Table, key: str) -> tuple[str, ...]:
     """Returns the image or time of each row as text, since nanoseconds have more digits than a float; empty where no
     column names the rows."""
     column = next((name for name in (key, *NAMES) if name in table), None)
+    lower = {name.lower(): name for name in table.columns}
     if column is None:
-        lower = {name.lower(): name for name in table.columns}
         column = next((lower[name] for name in NAMES if name in lower), None)
     if column is not None:
-        return _cells(text, column, table)
+        return _cells(column, table)
     for prefix in ("field.header.stamp.", "header.stamp.", "stamp."):
         for seconds, fractions in _STAMP:
             if f"{prefix}{seconds}" in table and f"{prefix}{fractions}" in table:
-                whole, nanoseconds = (_cells(text, f"{prefix}{field}", table) for field in (seconds, fractions))
+                whole, nanoseconds = (table.text(f"{prefix}{field}") for field in (seconds, fractions))
                 return tuple(f"{s}.{n.zfill(9)}" for s, n in zip(whole, nanoseconds, strict=True))
+    number = next((lower[name] for name in NUMBERS if name in lower), None)
+    if number is not None and len(set(table.text(number))) == len(table):
+        return tuple(table.text(number))
     return ()
 
 
-def _cells(text: str, column: str, table: Table) -> tuple[str, ...]:
-    rows = [row for row in text.splitlines() if row.strip() and not row.lstrip().startswith("#")]
-    cells = list(csv.reader(rows))
-    at = [name.strip() for name in cells[0]].index(column)
-    values = tuple(row[at].strip() for row in cells[1:])
+def _cells(column: str, table: Table) -> tuple[str, ...]:
+    values = tuple(table.text(column))
     require_each_once(values, places_of(table), table.where)
     return values
 

@@ -16,7 +16,7 @@ from stcal.handeye.data.formats.tree import read_tree
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes
 from stcal.io.plain_yaml import load_yaml
 from stcal.io.quaternions import Order
-from stcal.io.table import read_table
+from stcal.io.table import is_comment, read_table, separator_stated
 
 KNOWN = (
     "4×4 matrices (text, npy, npz, JSON, YAML), CSV with a header, samples of easy_handeye or MoveIt, TUM, Zivid, a "
@@ -24,6 +24,10 @@ KNOWN = (
 )
 SUFFIXES = (".yaml", ".yml", ".json", ".txt", ".csv", ".npy", ".npz")
 """Endings of files with one pose each, in a folder."""
+
+
+_BRACKETED_UNIT = re.compile(r"(?<=\w)\s*\[[a-zµ°]{1,3}\]", re.I)
+"""A unit in the header of a table, which is no list of YAML."""
 
 
 class NotToldError(InputError):
@@ -42,7 +46,7 @@ def read_content(path: Path, said: Said, key: str = "image", quaternions: Order 
         The message says what is wrong with the file.
     """
     content = _read(path, said, key, quaternions)
-    if content is not None and quaternions != "wxyz" and content.form != TABLE:
+    if content is not None and quaternions != "wxyz" and not content.form.startswith(TABLE):
         raise InputError(
             "E-OPTION-NEEDS",
             f"{path}: --quaternions {quaternions} is of a CSV file's columns, not of {content.form}; leave it out",
@@ -78,7 +82,8 @@ def _read(path: Path, said: Said, key: str, quaternions: Order) -> Content | Non
 
 def _of_text(text: str, path: Path, said: Said, key: str, quaternions: Order) -> Content | None:
     where = str(path)
-    first = next((line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
+    used = (line for line in text.splitlines() if line.strip() and not is_comment(line))
+    first = next((line.strip() for line in used if not separator_stated(line)), "")
     if not first:
         return None
     if first[0] in "{[" and (content := _json(text)) is not None:
@@ -88,9 +93,9 @@ def _of_text(text: str, path: Path, said: Said, key: str, quaternions: Order) ->
     content = read_numbers(text, said, where)
     if content is not None:
         return content
-    if re.match(r"[^:\[{]*,", first):
+    if re.match(r"[^:\[{]*[,;\t]", _BRACKETED_UNIT.sub("", first)):
         table = read_table(path, "pose file", quaternions)
-        return None if todays(table) else read_columns(table, text, key, said)
+        return None if todays(table) else read_columns(table, key, said)
     value = _yaml(text, where)
     if not isinstance(value, list | dict):
         return None

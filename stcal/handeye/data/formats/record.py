@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -115,7 +116,8 @@ class Said:
 
     ``rotation`` : a name of :data:`stcal.io.poses.rotations.ALIASES` or an order of axes; ``length_unit`` : one of
     :data:`stcal.io.table.LENGTHS`; ``frames`` : names of :data:`EVERY_FRAME`, at most one of each role; ``setup``;
-    ``own`` : rotation and unit of one role's poses, where they differ.
+    ``own`` : rotation and unit of one role's poses, where they differ; ``columns`` : map of the columns of the robot's
+    poses beside images.
     """
 
     rotation: str | None = None
@@ -123,6 +125,7 @@ class Said:
     frames: tuple[str, ...] = ()
     setup: str | None = None
     own: tuple[tuple[Role, str, str], ...] = ()
+    columns: Path | None = None
 
     @classmethod
     def of_options(
@@ -161,9 +164,8 @@ class Said:
     def of(self, role: Role) -> "Said":
         """Returns the statements that hold for poses of this role."""
         values = {name: value for entry_role, name, value in self.own if entry_role == role}
-        return Said(
-            values.get("rotation", self.rotation), values.get("length_unit", self.length_unit), self.frames, self.setup
-        )
+        rotation, unit = values.get("rotation", self.rotation), values.get("length_unit", self.length_unit)
+        return Said(rotation, unit, self.frames, self.setup, columns=self.columns)
 
     def options(self) -> list[str]:
         """Returns the names of the options that were given."""

@@ -1,5 +1,6 @@
 """Reader of poses in JSON, YAML and npz files: it finds which values are poses, and of which side."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,6 +12,7 @@ from stcal.handeye.data.formats.keys import frames_of, role_of
 from stcal.handeye.data.formats.record import (
     FRAMES,
     MATRICES,
+    ROLES,
     Content,
     Frames,
     Role,
@@ -27,6 +29,7 @@ HOLDERS = ("poses", "data", "samples", "pairs", "frames", "transforms", "measure
 LISTED_NAMES = ("images", "image_names", "names", "files", "filenames", "timestamps", "stamps")
 """Keys of lists that name the poses of the stacks beside them."""
 MOVEIT = {"effector_wrt_world", "object_wrt_sensor"}
+_CAMODOCAL = re.compile(r"T([12])_(\d+)")
 OPENCV = "OpenCV's hand-eye arrays"
 
 
@@ -45,6 +48,8 @@ def read_tree(value: Any, form: str, said: Said, where: str) -> Content | None:
                 f"{where}: the result of an easy_handeye calibration; give its samples, NAME.samples",
             )
         if (content := easy_handeye(value, said, where)) is not None:
+            return content
+        if (content := camodocal(value, where)) is not None:
             return content
         if (content := _of_keys(value, form, said, where)) is not None:
             return content
@@ -102,6 +107,36 @@ def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
             )
         sides.append(side)
     return Content("easy_handeye samples", _same_count(sides, where), setup)
+
+
+def camodocal(value: Mapping, where: str) -> Content | None:
+    """Returns the pairs that handeye_calib_camodocal records: ``T1_0``, ``T2_0`` …, tip in base and tag in camera.
+
+    Raises
+    ------
+    InputError
+        A matrix is missing, is none, or ``frameCount`` is another number.
+    """
+    found = {key: match for key in value if (match := _CAMODOCAL.fullmatch(str(key)))}
+    if "frameCount" not in value or not found:
+        return None
+    count = value["frameCount"]
+    sides = []
+    for role, number in zip(ROLES, ("1", "2"), strict=True):
+        keys = sorted((key for key, match in found.items() if match[1] == number), key=lambda key: int(found[key][2]))
+        if [int(found[key][2]) for key in keys] != list(range(count if isinstance(count, int) else 0)):
+            raise InputError(
+                "E-POSES-COUNT",
+                f"{where}: {len(keys)} matrices T{number}_…, frameCount is {count}; as many from T{number}_0 on needed",
+            )
+        matrices = [numbers(value[key]) for key in keys]
+        wrong = next((key for key, m in zip(keys, matrices, strict=True) if m is None or m.shape != (4, 4)), None)
+        if wrong is not None:
+            raise InputError("E-POSE-VALUE", f"{where}: {wrong}: not a 4×4 matrix; record the pairs anew")
+        rotation, translation = of_matrices(np.array(matrices), keys, where)
+        frames = Frames(FRAMES[role][0], "as handeye_calib_camodocal writes it", False)
+        sides.append(Side(rotation, translation, tuple(f"pose {found[key][2]}" for key in keys), MATRICES, ROS, frames))
+    return Content("pairs of handeye_calib_camodocal", tuple(sides))
 
 
 def _of_keys(value: Mapping, form: str, said: Said, where: str) -> Content | None:

@@ -12,6 +12,8 @@ import pytest
 from stcal.errors import InputError
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import partners, read_pairs, read_robot, read_two
+from stcal.handeye.data.robot_poses import read_robot_poses
+from stcal.workflows.handeye.inputs import read_input, two_files
 from tests.handeye.written import easy_handeye, in_metres, line, matrices, message, moveit, ros_csv, tum
 from tests.outcome import fails_with
 from tests.support.handeye import simulated
@@ -343,3 +345,58 @@ def test_a_folder_of_one_kind(tmp_path):
 def test_a_damaged_model_is_said(tmp_path):
     (tmp_path / "images.bin").write_bytes(b"\5" + b"\0" * 20)
     assert "not a COLMAP model's images.bin" in refused(tmp_path / "images.bin")
+
+
+def written(folder, text, name="poses.txt"):
+    (folder / name).write_text(text)
+    return folder / name
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("7\n" + "\n".join(line(m.ravel()) for m in GOOD), "E-POSES-COUNT … line 1 … 7 … 5"),
+        ("\n".join(line(m[:3].ravel()) for m in GOOD), "E-MATRIX-ROWS … 12 numbers … 0 0 0 1"),
+        ("1,2,3,4,5,6,7,8,9,10,11,12\n", "E-ROTATION-AMBIGUOUS … robot … --rotation"),
+        ("frameCount: 2\nT1_0: [1]\nT2_0: [1]\n", "E-POSES-COUNT … T1_ … 2"),
+        ("frameCount: 1\nT1_0: [1]\nT2_0: [1]\n", "E-POSE-VALUE … T1_0"),
+    ],
+)
+def test_mistakes_in_counts_and_pairs(tmp_path, text, error):
+    with fails_with(error):
+        read_pairs(written(tmp_path, text), Said())
+
+
+@pytest.mark.parametrize("name", ["p.csv", "p.txt"])
+@pytest.mark.parametrize("head", ["u,v,w,RX,RY,RZ", "u;v;w;RX;RY;RZ"])
+def test_a_table_that_is_not_understood_is_not_told_to_leave_options_out(tmp_path, head, name):
+    between = ";" if ";" in head else ","
+    path = written(tmp_path, f"{head}\n{between.join('123456')}\n", name)
+    said = Said(rotation="ur-rotvec")
+    with fails_with("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm"):
+        read_input(path, said=said)
+    with fails_with("E-POSES-NOT-FOUND … u … --columns"):
+        two_files(path, path, "image", said)
+    with fails_with("E-POSES-NOT-FOUND … u … --columns"):
+        read_robot_poses(path, said=said)
+
+
+def test_half_of_decimal_commas_is_no_list_of_numbers(tmp_path):
+    with fails_with("E-TABLE-HEADER"):
+        read_input(written(tmp_path, "1.5;2,5;3,5;4,5;5,5;6,5\n" * 2), said=Said(rotation="ur-rotvec"))
+
+
+def test_maps_of_columns(tmp_path):
+    text = "\n".join(line([*m[:3, 3], *(1, 0, 0, 0)], ";") for m in GOOD)
+    map_file = written(
+        tmp_path,
+        'delimiter = "semicolon"\nheader = false\n[columns]\n'
+        + "".join(f"{name} = {k}\n" for k, name in enumerate(("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"), 1)),
+        "map.toml",
+    )
+    table = written(tmp_path, text, "robot.csv")
+    np.save(tmp_path / "camera.npy", GOOD)
+    found = two_files(table, tmp_path / "camera.npy", "image", Said(), columns=(map_file, None))
+    np.testing.assert_array_equal(found.pairs.base_from_flange.translation, GOOD[:, :3, 3])
+    robot = read_robot_poses(table, said=Said(columns=map_file))
+    np.testing.assert_array_equal(robot.base_from_flange.translation, GOOD[:, :3, 3])

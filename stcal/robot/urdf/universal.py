@@ -1,0 +1,161 @@
+"""Calibration of an arm of Universal Robots: YAML of ur_calibration (ROS), and the controller's calibration.conf."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated
+
+import numpy as np
+import yaml
+from pydantic import ConfigDict, Field
+from scipy.spatial.transform import Rotation
+
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.io.plain_yaml import load_yaml
+from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
+from stcal.io.toml import Strict, validated
+from stcal.robot.kinematics.dh import robot_between
+from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.model import Convention, DHRow, Joint, Robot
+from stcal.robot.urdf.read import UrdfJoint, fixed_values, require_near, robot_of
+
+LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+JOINTS = 6
+NAME = "ur"
+DELTAS = ("theta", "a", "d", "alpha")
+_LIST = re.compile(r"^\s*(?P<key>\w+)\s*=\s*\[(?P<values>[^\]]*)\]", re.MULTILINE)
+Number = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
+
+
+class _Link(Strict):
+    x: Number
+    y: Number
+    z: Number
+    roll: Number
+    pitch: Number
+    yaw: Number
+
+
+class _Kinematics(Strict):
+    # The hash of the robot stands among the links.
+    model_config = ConfigDict(extra="ignore", frozen=True)
+    shoulder: _Link
+    upper_arm: _Link
+    forearm: _Link
+    wrist_1: _Link
+    wrist_2: _Link
+    wrist_3: _Link
+
+
+class _File(Strict):
+    kinematics: _Kinematics
+
+
+def kinematics_content(text: str) -> Mapping | None:
+    """Returns the keys and values of the YAML of ur_calibration; None for any other text."""
+    if "kinematics" not in text:
+        return None
+    try:
+        content = load_yaml(text)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return None
+    return content if isinstance(content, dict) and "kinematics" in content else None
+
+
+def is_conf(text: str) -> bool:
+    """True if a text is the calibration.conf of a controller."""
+    return re.search(r"^\s*delta_(theta|a|d|alpha)\s*=", text, re.MULTILINE) is not None
+
+
+def robot_of_kinematics(content: Mapping, where: str, convention: Convention) -> tuple[Robot, float]:
+    """Returns the arm of the YAML of ur_calibration, and by how far (mm) a URDF with the same numbers is off at joint
+    values of 0.
+
+    The program computes roll, pitch and yaw as turns about the axes X, Y, Z that turn with them, and URDF takes its
+    three as turns about fixed axes. The upper arm of every such file has a pitch of zero in the first reading alone.
+    The base is that of the controller; ROS's base_link is turned by half a turn about Z.
+
+    Raises
+    ------
+    InputError
+        A link is missing, or its values are no numbers.
+    """
+    links = validated(content, _File, where).kinematics
+    chains = []
+    for turned in (_turning, from_roll_pitch_yaw):
+        joints = []
+        for parent, name in zip(("base", *LINKS), LINKS, strict=False):
+            link = getattr(links, name)
+            pose = Rigid(turned([link.roll, link.pitch, link.yaw]), METRE_MM * np.array([link.x, link.y, link.z]))
+            joints.append(UrdfJoint(name, "continuous", parent, name, pose, np.array([0.0, 0.0, 1.0]), None, ""))
+        chains.append(joints)
+    product = [Rigid(), Rigid()]
+    for pair in zip(*chains, strict=True):
+        product = [so_far @ joint.parent_from_child for so_far, joint in zip(product, pair, strict=True)]
+    off = float(np.linalg.norm(product[0].translation - product[1].translation))
+    return robot_of({"": chains[0]}, NAME, convention), off
+
+
+def _turning(angles) -> np.ndarray:
+    return Rotation.from_euler("XYZ", angles).as_matrix()
+
+
+def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Convention) -> Robot:
+    """Returns the arm of a calibration.conf: the nominal one, of the [DH] section or ``nominal``, and its deviations.
+
+    The axes of upper arm, forearm and wrist are nearly parallel, so that the controller's rows have lengths of many
+    metres that cancel. The same axes are written as rows with Hayati's angle.
+
+    Raises
+    ------
+    InputError
+        There is no nominal arm, it is no arm of six joints in the standard convention, or a list has not six numbers.
+    """
+    lists = {match["key"]: match["values"] for match in _LIST.finditer(text)}
+    deltas = np.column_stack([_six(lists, f"delta_{name}", where) for name in DELTAS])
+    if all(name in lists for name in ("a", "d", "alpha")):
+        a, d, alpha = (_six(lists, name, where) for name in ("a", "d", "alpha"))
+        rows = [DHRow(METRE_MM * a[i], alpha[i], METRE_MM * d[i], 0.0) for i in range(JOINTS)]
+        base, tools, name = Rigid(), {"": Rigid()}, NAME
+    elif nominal is None:
+        raise InputError(
+            "E-ROBOT-NOMINAL",
+            f"{where}: deviations from a nominal arm, which it does not state; give --nominal robot.toml with the rows "
+            "of the model, or add [DH] with a, d and alpha of urcontrol.conf",
+        )
+    elif len(nominal.rows) != JOINTS or nominal.convention != "standard" or nominal.prismatic.any():
+        raise InputError(
+            "E-ROBOT-NOMINAL",
+            f"{where}: --nominal: {len(nominal.rows)} joints, convention {nominal.convention}; six that turn, "
+            "standard, needed",
+        )
+    else:
+        rows, base, tools, name = list(nominal.rows), nominal.world_from_base, nominal.tools, nominal.name
+    corrected = tuple(
+        replace(
+            row,
+            theta=row.theta + theta,
+            a=row.a + METRE_MM * length,
+            d=row.d + METRE_MM * offset,
+            alpha=row.alpha + twist,
+        )
+        for row, (theta, length, offset, twist) in zip(rows, deltas, strict=True)
+    )
+    joints = nominal.joints if nominal is not None else (Joint(),) * JOINTS
+    controller = Robot(name, "standard", corrected, joints, tools=tools)
+    found = robot_between(controller.chain(), tools, name, convention, joints)
+    q = fixed_values(JOINTS)
+    for tool in tools:
+        require_near(found.world_from_base @ forward(found, q, tool), forward(controller, q, tool))
+    return replace(found, world_from_base=base @ found.world_from_base)
+
+
+def _six(lists: Mapping[str, str], key: str, where: str) -> np.ndarray:
+    try:
+        values = np.array([float(value) for value in lists.get(key, "").split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    if values.shape != (JOINTS,) or not np.isfinite(values).all():
+        raise InputError("E-ROBOT-ENTRIES", f"{where}: {key}: a list of six numbers needed; give the controller's file")
+    return values

@@ -1,0 +1,110 @@
+"""Lengths of hardware that files state in metres, as it is read in mm."""
+
+import numpy as np
+import pytest
+
+from stcal.boards.file import load_flat_board
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.io.design import load_target, target_toml
+from stcal.locate.data.layout import TargetLayout, layout_toml, load_layout, square
+from stcal.robot.kinematics.file import load_robot, robot_toml
+from stcal.robot.kinematics.model import DHRow, Joint, Robot
+from stcal.robot.urdf.read import load_urdf
+from tests.outcome import fails_with
+
+TAGS = 'type = "tags"\n' + "".join(
+    f'[[tag]]\ndictionary = "APRILTAG_36h11"\nid = {i}\nsize_mm = {{0}}\nx_mm = {{{i + 1}}}\ny_mm = 0.0\n'
+    for i in (0, 1)
+)
+BOARDS = {
+    "dots": 'rows = 7\ncolumns = 9\npitch_mm = {0}\nradius_mm = {1}\npolarity = "dark"\n',
+    "chessboard": 'type = "chessboard"\nrows = 5\ncolumns = 7\nsquare_mm = {0}\n',
+    "charuco": 'type = "charuco"\nrows = 5\ncolumns = 7\nsquare_mm = {0}\nmarker_mm = {1}\ndictionary = "4X4_50"\n',
+    "aprilgrid": 'type = "aprilgrid"\nrows = 3\ncolumns = 3\ntag_mm = {0}\nspacing = 0.3\n',
+    "circles": 'type = "asymmetric-circles"\nrows = 11\ncolumns = 4\nspacing_mm = {0}\nradius_mm = {1}\n'
+    'polarity = "dark"\n',
+}
+ROBOT = 'convention = "standard"\n[[joint]]\na_mm = {0}\nalpha_deg = 90\n[[joint]]\na_mm = {1}\n'
+
+
+def written(tmp_path, text, name="file.toml"):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("kind", BOARDS)
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_boards_in_another_unit_are_refused(tmp_path, kind, factor):
+    text = BOARDS[kind]
+    load_flat_board(written(tmp_path, text.format(30.0, 7.0)))
+    wrong = text.format(30.0 * factor, 7.0 * factor)
+    with fails_with("E-LENGTH-UNIT … unusual_size"):
+        load_flat_board(written(tmp_path, wrong))
+    head = "unusual_size = true\n"
+    load_flat_board(written(tmp_path, head + wrong))
+
+
+@pytest.mark.parametrize("size", ["30", "0.5e-4"])
+def test_lengths_of_kalibr_are_metres(tmp_path, size):
+    text = "target_type: aprilgrid\ntagCols: 3\ntagRows: 3\ntagSize: {}\ntagSpacing: 0.3\n"
+    load_flat_board(written(tmp_path, text.format("0.03"), "kalibr.yaml"))
+    with pytest.raises(InputError, match="tagSize") as caught:
+        load_flat_board(written(tmp_path, text.format(size), "kalibr.yaml"))
+    assert "metres" in str(caught.value)
+
+
+def test_layouts_in_metres_and_places_in_metres(tmp_path):
+    load_layout(written(tmp_path, TAGS.format(60.0, 0.0, 120.0)))
+    with fails_with("E-LENGTH-UNIT … tag 0 … 0.06"):
+        load_layout(written(tmp_path, TAGS.format(0.06, 0.0, 0.12)))
+    with fails_with("E-TAG-OVERLAP … 0 … 1 … 0.12"):
+        load_layout(written(tmp_path, TAGS.format(60.0, 0.0, 0.12)))
+
+
+def test_a_tag_may_be_inside_another(tmp_path):
+    text = TAGS.format(60.0, 0.0, 0.0).replace("id = 1\nsize_mm = 60.0", "id = 1\nsize_mm = 6.0")
+    assert len(load_layout(written(tmp_path, text)).tags) == 2
+
+
+def test_targets_in_metres(tmp_path):
+    circles = ", ".join(
+        f"{{id = {i}, x_mm = {x}, y_mm = {y}, radius_mm = 0.006}}"
+        for i, (x, y) in enumerate([(0.01, 0.012), (0.078, 0.01), (0.014, 0.074), (0.046, 0.04)], 1)
+    )
+    text = f'polarity = "dark"\n[[face]]\nid = "1"\norigin = 1\nx = 2\ny = 3\ncircles = [{circles}]\n'
+    with fails_with("E-LENGTH-UNIT … 1:1 … 0.006"):
+        load_target(written(tmp_path, text))
+    small = load_target(written(tmp_path, "unusual_size = true\n" + text))
+    assert load_target(written(tmp_path, target_toml(small))).faces[0].radius_mm[0] == 0.006
+
+
+def test_robots_in_metres(tmp_path):
+    load_robot(written(tmp_path, ROBOT.format(0, -612.0)))
+    for wrong in (-0.612, -612000.0):
+        with fails_with(f"E-LENGTH-UNIT … joint 2 … {wrong:g}"):
+            load_robot(written(tmp_path, ROBOT.format(0, wrong)))
+    load_robot(written(tmp_path, ROBOT.format(0, 0)))  # axes that meet: zeros are meant
+
+
+def test_a_robot_without_links_comes_back(tmp_path):
+    rows = (DHRow(0.02, np.pi / 2, 0.0, 0.0), DHRow(0.0, 0.0, 0.01, 0.0))
+    robot = Robot("gimbal", "standard", rows, (Joint(), Joint()), tools={"": Rigid()})
+    assert load_robot(written(tmp_path, robot_toml(robot))).rows[0].a == 0.02
+
+
+def test_a_layout_of_tiny_tags_comes_back(tmp_path):
+    tags = (("DICT_APRILTAG_36h11", 0),)
+    layout = TargetLayout("tiny", tags, square(0.5)[None], np.eye(8) * 1e-8, 0)
+    assert load_layout(written(tmp_path, layout_toml(layout))).corners_mm[0, 1, 0] == pytest.approx(0.25)
+
+
+def test_urdf_in_millimetres(tmp_path):
+    text = (
+        '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="revolute"><parent link="a"/>'
+        '<child link="b"/><origin xyz="{} 0 0"/><axis xyz="0 0 1"/><limit lower="-1" upper="1"/></joint></robot>'
+    )
+    load_urdf(written(tmp_path, text.format(0.612), "r.urdf"))
+    with fails_with("E-LENGTH-UNIT … j … 612"):
+        load_urdf(written(tmp_path, text.format(612), "r.urdf"))

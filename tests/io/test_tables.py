@@ -1,0 +1,130 @@
+"""Tables of other programs without a map: separators, decimal commas, units in brackets, SpatialAnalyzer."""
+
+import numpy as np
+import pytest
+
+from stcal.io.join import join
+from stcal.io.table import LENGTHS, read_table
+from tests.outcome import fails_with
+
+POINTS = np.array([[-594.288, -1.155, 162.397], [1616.584, -790.796, 506.870], [0.125, 2.0, -3.5]])
+
+
+def table(tmp_path, text, name="t.csv"):
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    return read_table(tmp_path / name, "data")
+
+
+def lines(separator, comma=False):
+    rows = [separator.join([f"P{i}", *(f"{v:.3f}" for v in row)]) for i, row in enumerate(POINTS)]
+    return "\n".join(rows).replace(".", "," if comma else ".")
+
+
+@pytest.mark.parametrize("separator", [";", "\t", " "])
+@pytest.mark.parametrize("comma", [False, True])
+def test_separators_and_decimal_commas(tmp_path, separator, comma):
+    head = separator.join(["name", "x_mm", "y_mm", "z_mm"])
+    found = table(tmp_path, f"// a comment\n{head}\n{lines(separator, comma)}\n")
+    np.testing.assert_array_equal(found.points(), POINTS)
+    assert found.text("name") == ["P0", "P1", "P2"]
+    assert list(found.lines) == [3, 4, 5]
+    assert ("decimal commas" in found.form) == comma
+
+
+@pytest.mark.parametrize(
+    "head",
+    ["name;X [mm];Y [mm];Z [mm]", "name;X_mm;Y_MM;z_mm", "name;x (mm);y(mm);z (MM)", "name;X;Y;Z;"],
+)
+def test_names_of_columns(tmp_path, head):
+    text = f"# Units: Millimeters\nsep=;\n{head}\n{lines(';')}\n"
+    if head.endswith(";"):
+        text = text.replace("\nP", ";\nP").replace(f"{head};", head).rstrip() + ";\n"
+    np.testing.assert_array_equal(table(tmp_path, text).points(), POINTS)
+
+
+def test_the_case_of_turned_axes_stays(tmp_path):
+    found = table(tmp_path, "euler_ZYX_1_deg,X_mm,QW\n1,2,3\n")
+    assert list(found.columns) == ["euler_ZYX_1_deg", "x_mm", "qw"]
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("a;b\n1,5;2.5\n", "1,5 beside 2.5"),
+        ("a\tb\n594,288\t1,155\n-2,000\t3\n", "594,288"),  # of thousands as well
+    ],
+)
+def test_commas_that_may_be_of_thousands(tmp_path, text, named):
+    with fails_with(f"E-TABLE-DECIMAL … {named} … decimal_comma"):
+        table(tmp_path, text)
+
+
+def test_one_number_shows_what_a_comma_is(tmp_path):
+    np.testing.assert_array_equal(table(tmp_path, "a\tb\n594,288\t0,155\n").numbers("a"), [594.288])
+
+
+def test_text_that_holds_commas_stays(tmp_path):
+    assert table(tmp_path, "a;b\nx, y;1\n1,5;2\n").text("a") == ["x, y", "1,5"]
+
+
+def test_a_number_alone_in_a_line_is_no_other_separator(tmp_path):
+    with fails_with("E-TABLE-CELLS … line 3"):
+        table(tmp_path, "a;b\n1;2\n3\n")
+
+
+@pytest.mark.parametrize(("separator", "comma"), [(" ", False), (", ", False), (";", True), ("  ", True), (",", False)])
+def test_points_of_spatial_analyzer(tmp_path, separator, comma):
+    rows = [separator.join([f"A::Main group::P {i}", *(f"{v:.4f}" for v in row)]) for i, row in enumerate(POINTS)]
+    text = "\n".join(rows).replace(".", "," if comma else ".")
+    found = table(tmp_path, f"// SA 2021.1  Frame: World\n// units mm\n{text}\n")
+    np.testing.assert_array_equal(found.points(), POINTS)
+    assert found.text("name")[1] == "A::Main group::P 1"
+    assert (found.text("group")[0], found.text("target")[2]) == ("Main group", "P 2")
+
+
+@pytest.mark.parametrize(("said", "factor"), [("Inches", 25.4), ("meters", 1000.0), ("mm", 1.0)])
+def test_the_unit_of_a_comment(tmp_path, said, factor):
+    found = table(tmp_path, f"// Units: {said}\nA::T::P0 1.0 2.0 3.0\n")
+    np.testing.assert_allclose(found.points(), [[factor, 2 * factor, 3 * factor]], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("comment", "axis"),
+    [
+        ("// Units in mm", "x_mm"),
+        ("// units are in millimetres, deg", "x_mm"),
+        ("# Unit: in", "x_in"),
+        ("// Length units = m", "x_m"),
+        ("// Units in deg", "X"),
+        ("// a unit in the workshop", "X"),
+        ("// Units mm // units m", "X"),  # two are none
+    ],
+)
+def test_what_comments_say_of_units(tmp_path, comment, axis):
+    assert next(iter(table(tmp_path, f"{comment}\nX;Y\n1,5;2\n").columns)) == axis
+
+
+def test_a_unit_that_nothing_states_is_asked_for(tmp_path):
+    with fails_with("E-TABLE-COLUMN-MISSING … X … open … x_mm = 'X' … --columns"):
+        table(tmp_path, "Point Name;X;Y;Z\np0;1,5;2,5;3,5\n").quantity("x", LENGTHS)
+
+
+def test_key_columns_of_two_names(tmp_path):
+    (tmp_path / "a.csv").write_text("image,q1_deg\np2,20\np1,10\n")
+    (tmp_path / "b.csv").write_text("Point Name;X [mm]\np1;1,5\np2;2,5\n")
+    found = join(tmp_path / "a.csv", tmp_path / "b.csv", "image=Point Name").table
+    np.testing.assert_array_equal(found.numbers("x_mm"), [2.5, 1.5])
+    with fails_with("E-TABLE-COLUMN-MISSING … b.csv … image … image=NAME"):
+        join(tmp_path / "a.csv", tmp_path / "b.csv", "image")
+
+
+def test_both_files_with_a_map(tmp_path):
+    (tmp_path / "a.csv").write_text("Nr;J1\n1;10,5\n")
+    (tmp_path / "b.csv").write_text("Nr\tX\n1\t1.5\n", encoding="utf-8")
+    (tmp_path / "a.toml").write_text(
+        'delimiter = "semicolon"\ndecimal_comma = true\n[columns]\nimage = "Nr"\nq1_deg = "J1"\n'
+    )
+    (tmp_path / "b.toml").write_text('delimiter = "tab"\n[columns]\nimage = "Nr"\nx_m = "X"\n')
+    maps = {"columns": tmp_path / "b.toml", "columns_a": tmp_path / "a.toml"}
+    found = join(tmp_path / "a.csv", tmp_path / "b.csv", "image", **maps).table
+    assert (found.numbers("q1_deg")[0], found.quantity("x", LENGTHS)[0]) == (10.5, 1500.0)
