@@ -37,7 +37,7 @@ class Form(StrEnum):
 
 
 NameOption = Annotated[
-    str, typer.Option("--name", help="Choose this camera of a file of several, such as cam1; and write this name.")
+    str, typer.Option("--name", help="Choose this camera of a file of several, such as cam1 or 2; and write this name.")
 ]
 SizeOption = Annotated[
     str,
@@ -64,7 +64,7 @@ def convert(
     size: SizeOption = "",
 ) -> None:
     """Convert a camera file to the form of another program, and say what that has no place for."""
-    from stcal.io.cameras.forms import SUFFIXES, written
+    from stcal.io.cameras.forms import SUFFIXES, name_to_write, written
 
     kind = form.value if form else SUFFIXES.get(out.suffix.lower())
     if kind is None:
@@ -73,7 +73,7 @@ def convert(
             f"{out}: no form of suffix {out.suffix or 'none'}; give --form, or one of {', '.join(SUFFIXES)}",
         )
     camera = _camera(source, name, size)
-    made = written(camera, kind, name or "cam0")
+    made = written(camera, kind, name_to_write(name))
     say(f"{source}: {camera.colmap_model}, {camera.width}×{camera.height} px; written as {kind}")
     print_each(f"note: not in {kind}", made.lost)
     write(out, made.content)

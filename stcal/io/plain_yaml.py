@@ -35,7 +35,22 @@ def load_yaml(text: str):
     yaml.YAMLError
         The text is not YAML, or has aliases.
     """
-    return yaml.load(re.sub(r"\A\s*%YAML:?\s*[\d.]+\s*\n", "", text), _Loader)
+    return yaml.load(_without_directive(text), _Loader)
+
+
+def load_documents(text: str) -> list:
+    """Return the values of each document of a text, as ``rostopic echo`` ends each with ``---``.
+
+    Raises
+    ------
+    yaml.YAMLError
+        The text is not YAML, or has aliases.
+    """
+    return list(yaml.load_all(_without_directive(text), _Loader))
+
+
+def _without_directive(text: str) -> str:
+    return re.sub(r"\A\s*%YAML:?[ \t]*[\d.]+[ \t]*(#[^\r\n]*)?(\r\n|\r|\n|\Z)", "", text)
 
 
 def opencv_matrix(name: str, values: np.ndarray) -> list[str]:
