@@ -13,14 +13,13 @@ from stcal.errors import InputError, StcalError
 from stcal.io.cameras.forms import kalibr_chain
 from stcal.io.cameras.model import CalibratedCamera, CameraModel, cameras_txt
 from stcal.io.files import json_text
-from stcal.io.images import ImageFile, find_images, name_fault
+from stcal.io.images import ImageFile, find_images, name_fault, require_common_size
 from stcal.io.json import ResultFile
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, one_thread
 from stcal.sfm.camera.calibrate import (
     CameraCalibration,
     calibrate_camera,
-    first_size,
     judged,
     of_chosen_model,
     require_determined,
@@ -81,7 +80,7 @@ def calibrate_camera_by_corners(
     require_model(colmap_model)
     progress = progress or (lambda *_: None)
     files, skipped_files = find_images(images)
-    camera = start_camera(*first_size(files), colmap_model)
+    camera = start_camera(*require_common_size(files)[0], colmap_model)
     rounds = 2 if isinstance(board, CharucoDesign) else 1  # a ChArUco board's corners are found by the camera
     for done in range(1, rounds + 1):
         model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
