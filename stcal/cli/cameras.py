@@ -11,6 +11,7 @@ from stcal.cli.terminal import print_each, say, write
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
+    from stcal.io.cameras.difference import SizedLens
     from stcal.io.cameras.model import CalibratedCamera
 
 app = typer.Typer(
@@ -110,7 +111,7 @@ def compare(
     from stcal.report.camera import comparison_figure, comparison_text
     from stcal.report.figure import save
 
-    one, two = _camera(first, name, size), _camera(second, name, size)
+    one, two = _lens(first, name, size), _lens(second, name, size)
     found = camera_difference(one, two)
     say("\n".join(comparison_text(found)))
     if plot:
@@ -119,7 +120,15 @@ def compare(
 
 
 def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
-    from stcal.io.cameras.difference import fit_lens
+    from stcal.io.cameras.difference import SizedLens
+
+    lens = _lens(path, name, size)
+    return lens.near.camera if isinstance(lens, SizedLens) else lens
+
+
+def _lens(path: Path, name: str, size: str) -> "CalibratedCamera | SizedLens":
+    """Return the camera of a file, or a lens of another model with the fit to it, whose quality is printed."""
+    from stcal.io.cameras.difference import SizedLens, fit_lens
     from stcal.io.cameras.model import CameraModel
     from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
     from stcal.io.cameras.read import read_lens
@@ -139,5 +148,5 @@ def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
     if isinstance(lens, CameraModel):
         return lens.calibrated(width, height)
     found = fit_lens(lens, width, height)
-    print_each("note", fitted_text(lens.called, found))
-    return found.camera
+    print_each("note", fitted_text(lens.called, found, lens.region is not None))
+    return SizedLens(lens, width, height, found)

@@ -52,7 +52,8 @@ class ForeignLens:
     """A lens that is known by its projection only.
 
     ``called`` : name of its model; ``project`` : returns pixels (n, 2) of rays (n, 3), z > 0, centre of the first pixel
-    at (0, 0); ``width``, ``height`` : px, or None if the file states none; ``source`` : the file.
+    at (0, 0); ``width``, ``height`` : px, or None if the file states none; ``source`` : the file; ``region`` : polygon
+    (n, 2), px, within which the lens was determined, or None if the file states none.
     """
 
     called: str
@@ -60,6 +61,18 @@ class ForeignLens:
     width: int | None
     height: int | None
     source: str
+    region: np.ndarray | None = None
+
+    def determined(self, pixels: np.ndarray) -> np.ndarray:
+        """Return which pixels (n, 2) lie in the region, (n,) bool; all of them if the file states none."""
+        if self.region is None:
+            return np.ones(len(pixels), bool)
+        inside = np.zeros(len(pixels), bool)
+        for (x0, y0), (x1, y1) in zip(self.region, np.roll(self.region, -1, axis=0), strict=True):
+            crosses = (pixels[:, 1] < y0) != (pixels[:, 1] < y1)
+            if y0 != y1:
+                inside ^= crosses & (pixels[:, 0] < x0 + (pixels[:, 1] - y0) * (x1 - x0) / (y1 - y0))
+        return inside
 
 
 def of_colmap(model: str, width: float, height: float, params, source: str) -> CameraModel | ForeignLens:

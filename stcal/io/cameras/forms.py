@@ -8,7 +8,7 @@ import ast
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,19 +77,37 @@ def from_mrcal(text: str, source: str) -> CameraModel | ForeignLens:
         raise InputError(
             "E-CAMERA-UNREADABLE", f"camera file {source}: not mrcal's form ({reason}); write it anew with mrcal"
         ) from error
+    region = _region(values.get("valid_intrinsics_region"), source)
     taken = ("lensmodel", "intrinsics", "imagersize", "valid_intrinsics_region")
     require_known({key: value for key, value in values.items() if key not in taken}, source, MRCAL_HARMLESS)
     if str(lens).startswith("LENSMODEL_SPLINED"):
-        return of_splines(lens, numbers, width, height, source)
-    if lens == "LENSMODEL_CAHVOR":
-        return of_cahvor(numbers, width, height, source)
-    if lens not in MRCAL or len(numbers) != 4 + MRCAL[lens]:
+        made = of_splines(lens, numbers, width, height, source)
+    elif lens == "LENSMODEL_CAHVOR":
+        made = of_cahvor(numbers, width, height, source)
+    elif lens in MRCAL and len(numbers) == 4 + MRCAL[lens]:
+        made = of_opencv(numbers[:4], np.array(numbers[4:]), width, height, source)
+    else:
         raise InputError(
             "E-CAMERA-MODEL",
             f"camera file {source}: {lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)}, CAHVOR and splined "
             "ones are read: mrcal-convert-lensmodel makes one of another",
         )
-    return of_opencv(numbers[:4], np.array(numbers[4:]), width, height, source)
+    return replace(made, region=region) if isinstance(made, ForeignLens) else made
+
+
+def _region(stated: object, source: str) -> np.ndarray | None:
+    """Return mrcal's polygon (n, 2), px, in which the intrinsics are valid; None if the file states none."""
+    try:
+        region = None if stated is None else np.array(stated, float)
+    except (TypeError, ValueError):
+        region = np.zeros(0)
+    if region is not None and not region.size:
+        return None
+    if region is not None and (region.ndim != 2 or region.shape[1] != 2 or not np.isfinite(region).all()):
+        raise InputError(
+            "E-CAMERA-CONTENT", f"camera file {source}: valid_intrinsics_region is no list of pixels; remove it"
+        )
+    return region
 
 
 def is_colmap_binary(content: bytes) -> bool:
