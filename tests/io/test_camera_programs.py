@@ -147,6 +147,11 @@ ZIVID = (
     "__version__: 1\nCameraMatrix: {FX: 911.5, FY: 910.25, CX: 639.0, CY: 359.0}\n"
     "Distortion: {K1: -0.2, K2: 0.05, K3: 0.01, P1: 0.001, P2: -0.0005}\n"
 )
+MESHROOM = (
+    '{{"version": ["1", "2", "1"], "views": [], "intrinsics": [{{"intrinsicId": "42", "width": "1280", '
+    '"height": "720", "sensorWidth": "25.6", "serialNumber": "1", "type": "{kind}", {focal}, "scaleLocked": "false", '
+    '"principalPoint": ["{x}", "{y}"], "distortionParams": [{k}], "locked": "false"}}]}}'
+)
 OLD_NAMES = ("Camera_Matrix", "Distortion_Coefficients", "image_Width", "image_Height")
 SKEWED = "911.5 0.7 639. 0. 910.25 359. 0. 0. 1."
 
@@ -204,6 +209,26 @@ FILES = {
     "Kalibr": (CHAIN, perspective(D4)),
     "mrcal": (MRCAL, perspective(D5)),
     "Zivid": (ZIVID, perspective(D5)),
+    "stella_vslam": (
+        "Camera:\n  name: cam\n  setup: monocular\n  model: perspective\n  fx: 911.5\n  fy: 910.25\n  cx: 639.0\n"
+        "  cy: 359.0\n  k1: -0.2\n  k2: 0.05\n  p1: 0.001\n  p2: -0.0005\n  k3: 0.01\n  fps: 30.0\n  cols: 1280\n"
+        "  rows: 720\n  color_order: RGB\n",
+        perspective(D5),
+    ),
+    "Meshroom, px": (
+        MESHROOM.format(
+            kind="brown", focal='"pxFocalLength": "911.5"', x=639, y=359, k='"-0.2","0.05","0.01","0.001","-0.0005"'
+        ),
+        perspective(D5, (911.5, 911.5, 639.0, 359.0)),
+    ),
+    "Meshroom, mm": (
+        MESHROOM.format(kind="radial3", focal='"focalLength": "18.23"', x=-1, y=-1, k='"-0.2","0.05","0.01"'),
+        perspective([-0.2, 0.05, 0, 0, 0.01], (911.5, 911.5, 639.0, 359.0)),
+    ),
+    "Meshroom, fisheye": (
+        MESHROOM.format(kind="fisheye4", focal='"focalLength": "18.23"', x=-1, y=-1, k=",".join(f'"{k}"' for k in K4)),
+        equidistant(K4, (911.5, 911.5, 639.0, 359.0)),
+    ),
 }
 """A file of each program, and the pixels of RAYS."""
 XML = [name for name, (text, _) in FILES.items() if text.lstrip().startswith("<")]
@@ -254,11 +279,11 @@ def with_key(text: str, key: str, value: str) -> str:
     if text.startswith("{\n    'lens"):
         return text.replace("{", f"{{ '{key}': {value}, ", 1)
     if text.startswith("{"):
-        at = text.rindex('"width"') if '"projection_type"' in text else 1
+        at = text.rindex('"width"') if '"projection_type"' in text or "intrinsicId" in text else 1
         return f'{text[:at]}"{key}": {value}, {text[at:]}'
     if "[narrow_stereo]" in text:
         return f"{text}\n{key}\n{value}\n"
-    if text.startswith("cam0:"):
+    if text.startswith(("cam0:", "Camera:")):
         return f"{text}  {key}: {value}\n"
     return text.removesuffix("---\n") + f"{key}: {value}\n"
 
@@ -296,7 +321,9 @@ def test_a_key_of_the_projection_is_taken_or_refused(tmp_path, name, key):
     assert key.split("_")[0] in str(refused)
 
 
-REORDERED = {name: text for name, (text, _) in FILES.items() if name not in (*XML, "mrcal", "ROS, ini", "Kalibr")}
+REORDERED = {
+    name: text for name, (text, _) in FILES.items() if name not in (*XML, "mrcal", "ROS, ini", "Kalibr", "stella_vslam")
+}
 
 
 @pytest.mark.parametrize("name", REORDERED)
@@ -345,6 +372,8 @@ REFUSED = {
         "E-CAMERA-SIZE … 720×1280 px … 1280×720 px",
     ),
     "two matrices": (OST.format(model=f"K: {EYE}", values=D4), "E-CAMERA-REPEATED … K"),
+    "size of a shape": (f"K: {FLAT}\nimage_size: [720, 1280]\n", "E-CAMERA-SIZE … 720×1280 px … width first"),
+    "YAML key twice": (f"K: {FLAT}\nD: {D4}\nD: {D5}\n", "E-CAMERA-UNREADABLE … D twice"),
     "JSON key twice": ('{"K": [1, 0, 1, 0, 1, 1, 0, 0, 1], "K": 5}', "E-CAMERA-UNREADABLE … K twice"),
     "documents that differ": (
         CAMERA_INFO.format(model="none", values=[], **ROS1)
@@ -384,10 +413,23 @@ def test_a_camera_of_a_pair_is_chosen(tmp_path):
             np.testing.assert_allclose(project(read_camera(path)), wanted, atol=1e-9)
 
 
+def test_a_camera_of_a_list_is_chosen(tmp_path):
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps({"cameras": [{"name": "a", "K": EYE}, {"name": "b", "K": FLAT, "D": {"k1": -0.2}}]}))
+    np.testing.assert_allclose(project(read_lens(path, "b")), perspective([-0.2, 0, 0, 0]), atol=1e-9)
+    path.write_text(
+        ORB.format(kind="PinHole", distortion="") + f"LEFT.height: 480\nLEFT.K: {EYE}\nLEFT.D: {D4}\nRIGHT.K: {EYE}\n"
+    )
+    np.testing.assert_allclose(project(read_lens(path, "Camera")), perspective([0.0] * 4), atol=1e-9)
+    np.testing.assert_allclose(project(read_lens(path, "LEFT")), perspective(D4, (1, 1, 0, 0)), atol=1e-9)
+
+
 def test_the_camera_of_kittis_odometry_is_that_of_rectified_images(tmp_path):
     path = tmp_path / "calib.txt"
     path.write_text("P0: 911.5 0 639 0 0 910.25 359 0 0 0 1 0\nP1: 911.5 0 639 -386 0 910.25 359 0 0 0 1 0\n")
-    np.testing.assert_allclose(project(read_lens(path, "1")), perspective([0.0] * 4), atol=1e-9)
+    with pytest.warns(InputNote, match="rectified"):
+        lens = read_lens(path, "1")
+    np.testing.assert_allclose(project(lens), perspective([0.0] * 4), atol=1e-9)
 
 
 def test_metashapes_p3_and_p4_are_taken(tmp_path):

@@ -6,13 +6,14 @@ something else in one program. What is left goes through :func:`stcal.io.cameras
 
 import json
 import re
+import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from stcal.errors import InputError
+from stcal.errors import InputError, InputNote
 from stcal.io.cameras.foreign import SQUARE, ForeignLens, of_kalibr, of_opencv, of_parts, one_of
 from stcal.io.cameras.keys import is_neutral, leaves, plain, require_known
 from stcal.io.cameras.model import (
@@ -53,7 +54,7 @@ ROLES: Mapping[str, str] = {
 """What a key holds, by its name in small letters and digits."""
 CONTAINERS = re.compile(
     r"(camera|cam|camerainfo|cameraparameters|cameramatrix|distortion|intrinsics?|projectionparameters|calibration"
-    r"|distortionparameters|mirrorparameters|intrinsicparameters|image|opencvstorage|value0)\d*$"
+    r"|d|distortioncoefficients|distortioncoeffs|distcoeffs|distortionparameters|mirrorparameters|intrinsicparameters|image|opencvstorage|value0)\d*$"
 )
 """Keys that hold others and add nothing to their meaning."""
 RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -72,6 +73,8 @@ INVERSE = frozenset(["inversebrownconrady", "distortioninversebrownconrady", "mo
 OTHER_WAY = "its coefficients are those of another formula, and under another name they make a wrong camera"
 NUMBERED = re.compile(r"(.*?)[ _]?(\d+|left|right|l|r)$|(left|right|cam\d+)[ _.](.*)$", re.IGNORECASE)
 """A key with the number or the side of its camera, behind or in front."""
+TAB = 4
+"""Spaces in place of a tab, which YAML does not allow."""
 NEAR = 0.25
 """Share of the image's size within which the principal point is from the middle of the image."""
 
@@ -107,6 +110,20 @@ TABLES = (
         origin=COLMAP_PIXEL_ORIGIN,
         harmless=("cameraanglex", "cameraangley", "plyfilepath", "orientationoverride", "aabbscale", "scale", "offset"),
     ),
+    Table(
+        "stella_vslam",
+        frozenset(["cols", "rows", "fx"]),
+        {"cols": "width", "rows": "height"},
+        harmless=("setup", "colororder", "focalxbaseline", "depththreshold", "keyframe*", "mapping*", "feature*"),
+    ),
+    Table(
+        "Meshroom",
+        frozenset(["intrinsicid"]),
+        harmless=(
+            *("initial*", "px*", "sensor*", "locked", "pixelratio*", "distortioninit*", "distortionlocked"),
+            *("scalelocked", "offsetlocked", "intrinsicid"),
+        ),
+    ),
     Table("OpenSfM", frozenset(["projectiontype"]), {"focal": "f"}, relative=True, harmless=("focalprior*",)),
     Table("a file", frozenset()),
 )
@@ -134,7 +151,7 @@ def values_of(text: str) -> dict:
     elif sections := _ini_values(text):
         return sections
     else:
-        documents = [each for each in load_documents(text) if each is not None]
+        documents = [each for each in load_documents(text.replace("\t", " " * TAB)) if each is not None]
         if not documents:
             raise ValueError("no keys")
         values, *more = documents
@@ -276,6 +293,9 @@ def _cameras(values: dict) -> dict[str, dict]:
             return {"": shared | kept[0]}
         names = [str(frame.get("file_path", i)) for i, frame in enumerate(frames) if isinstance(frame, dict)]
         return {name: shared | own for name, own in zip(names, kept, strict=True)}
+    if isinstance(values.get("intrinsics"), list) and any(isinstance(each, dict) for each in values["intrinsics"]):
+        own = [_of_meshroom(each) for each in values["intrinsics"] if isinstance(each, dict)]
+        return {str(each.get("intrinsicId", i)): each for i, each in enumerate(own)}
     if numbered := _numbered(values):
         return numbered
     inner = {str(key): value for key, value in values.items() if _holds_lens(value)}
@@ -286,9 +306,63 @@ def _cameras(values: dict) -> dict[str, dict]:
     if inner:
         return {name: own | value for name, value in inner.items()}
     for value in values.values():  # a list or a mapping of cameras, one level down
+        if isinstance(value, list) and any(_holds_lens(each) for each in value):
+            named = {
+                str(next((each[k] for k in ("name", "id", "camera_name") if k in each), i)): each
+                for i, each in enumerate(value)
+                if isinstance(each, dict)
+            }
+            return named if len(named) == len(value) else {str(i): each for i, each in enumerate(value)}
         if isinstance(value, dict) and any(_holds_lens(each) for each in value.values()):
             return _cameras(value)
     return {}
+
+
+MESHROOM = {
+    "pinhole": ("pinhole", ""),
+    "none": ("pinhole", ""),
+    "radial1": ("opencv", "k1"),
+    "radialk1": ("opencv", "k1"),
+    "radial3": ("opencv", "k1 k2 k3"),
+    "radialk3": ("opencv", "k1 k2 k3"),
+    "brown": ("opencv", "k1 k2 k3 p1 p2"),
+    "fisheye4": ("fisheye", "k1 k2 k3 k4"),
+}
+"""Meshroom's lenses: the model, and its parameters in their order (AliceVision, ``camera/Distortion*.hpp``)."""
+
+
+def _of_meshroom(stated: dict) -> dict:
+    """Return an entry of ``intrinsics`` with lengths in px: Meshroom's are in mm, its centre is an offset or absolute.
+
+    Raises
+    ------
+    ValueError
+        The lens is another one, or a number is missing.
+    """
+    kind = plain(stated.get("distortionType", stated.get("type", "")))
+    kind = plain(stated.get("type", "")) if kind == "none" and "distortionType" in stated else kind
+    if kind not in MESHROOM:
+        raise ValueError(f"lens {kind[:40]!r} of Meshroom; {', '.join(MESHROOM)} are read")
+    model, names = MESHROOM[kind]
+    size = np.array([float(stated["width"]), float(stated["height"])])
+    if "pxFocalLength" in stated:
+        focal = np.broadcast_to(_numbers(stated["pxFocalLength"]), 2)
+    else:
+        focal = np.full(2, float(stated["focalLength"]) / float(stated["sensorWidth"]) * size[0])
+        focal = focal * [1, float(stated.get("pixelRatio", 1))]
+    point = _numbers(stated["principalPoint"])
+    if (np.abs(point) < NEAR * size).all():
+        point = point + size / 2
+    elif not (np.abs(point - size / 2) < NEAR * size).all():
+        raise ValueError(f"principalPoint {point.tolist()} is neither in nor relative to the middle of the image")
+    given = _numbers(stated.get("distortionParams", []))
+    names_given = names.split()
+    if len(given) != len(names_given) and given.any():
+        raise ValueError(f"{len(given)} distortionParams of {kind}; {len(names_given)} needed")
+    taken = ("type", "distortionType", "focalLength", "pxFocalLength", "principalPoint", "distortionParams")
+    others = {key: value for key, value in stated.items() if key not in taken}
+    lens = {"fx": focal[0], "fy": focal[1], "cx": point[0], "cy": point[1], "model": model}
+    return others | lens | (dict(zip(names_given, given.tolist(), strict=True)) if given.any() else {})
 
 
 def _numbered(values: dict) -> dict[str, dict]:
@@ -306,6 +380,9 @@ def _numbered(values: dict) -> dict[str, dict]:
     if not sides:
         return {}
     shared = {key: value for key, value in values.items() if key not in split or split[key][1] not in sides}
+    whole = shared
+    if wanted == "matrix" and _holds_lens(shared):  # ORB-SLAM's rectified camera beside LEFT.K and RIGHT.K
+        shared = {key: value for key, value in shared.items() if not str(key).startswith("Camera.")}
     cameras = {
         side: shared | {base: values[key] for key, (base, own) in split.items() if own == side} for side in sides
     }
@@ -313,7 +390,8 @@ def _numbered(values: dict) -> dict[str, dict]:
         for camera in cameras.values():
             if "P" in camera:
                 camera["K"] = np.reshape(_numbers(camera.pop("P")), (3, 4))[:, :3].ravel().tolist()
-    return cameras
+        warnings.warn("the camera is that of P, which is for rectified images", InputNote, stacklevel=2)
+    return cameras | ({"Camera": whole} if whole is not shared else {})
 
 
 def _is_matrix(value: object, base: str, role: str) -> bool:
@@ -405,6 +483,19 @@ class _Reading:
                 f"{self.keys['height']} {width:g}×{height:g} px; correct one of them",
             )
         return float(numbers[0]), float(numbers[1])
+
+    def require_order(self, flat: list[float]) -> None:
+        """Refuse a list of height and width, by the principal point, which is near the middle."""
+        if "size" not in self.known:
+            return
+        size = np.array(self.size())
+        near = [(np.abs(np.array(flat[2:]) - each / 2) < NEAR * each).all() for each in (size, size[::-1])]
+        if not near[0] and near[1]:
+            raise self.fault(
+                "E-CAMERA-SIZE",
+                f"{self.keys['size']} {size[0]:g}×{size[1]:g} px, but the principal point ({flat[2]:g}, {flat[3]:g}) "
+                "px is near the middle of the sides exchanged; width first needed",
+            )
 
     def intrinsics(self) -> tuple[list[float], float]:
         """Return fx, fy, cx, cy and the skew, px."""
@@ -563,6 +654,7 @@ class _Reading:
         kind = self.model()
         flat, skew = self.intrinsics()
         given, (width, height) = self.coefficients(kind), self.size()
+        self.require_order(flat)
         if kind not in ("perspective", "equidistant", "unified"):
             raise self.fault("E-CAMERA-MODEL", f"{kind!r} needs the intrinsics as one list, as Kalibr writes them")
         if kind == "perspective" and self.industrial and "distortion" not in self.known and not given.size:
@@ -613,6 +705,7 @@ class _Reading:
             raise self.fault(
                 "E-CAMERA-MODEL", f"{self.keys['distortion']} without a distortion model; add distortion_model"
             )
+        self.require_order(numbers.tolist())
         coefficients = given if distortion != "none" else np.zeros(0)
         return camera_from_opencv(
             numbers.tolist(), coefficients, distortion == "equidistant", width, height, self.source
