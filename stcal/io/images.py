@@ -21,6 +21,15 @@ from stcal.errors import InputError
 from stcal.io.files import IMAGE_BYTES, RUN_MARKER, read_bytes
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+_RAW = "a raw photograph, which is not read; develop it to TIFF without correction of the lens, crop or turn"
+OTHER_PHOTOGRAPHS = {
+    **dict.fromkeys(
+        (".heic", ".heif"),
+        "a HEIC photograph, which is not read; export it as JPEG or TIFF of its full size, not edited",
+    ),
+    **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), _RAW),
+}
+"""Suffixes of photographs that are not read, and what to do."""
 EXCLUDED = "taken out with --exclude"
 HOLDS_IMAGES = "it holds images"
 """Part of the reason why a folder is left out."""
@@ -126,7 +135,10 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
             _sort_in(path, path.name, TOP_GROUP, files, skipped)
     if not files:
         # A nested folder is the most helpful hint: the images lie deeper than they should.
-        most_telling = sorted(skipped, key=lambda s: (s.gate != "folder", HOLDS_IMAGES not in s.reason))[:1]
+        photographs = set(OTHER_PHOTOGRAPHS.values())
+        most_telling = sorted(
+            skipped, key=lambda s: (s.reason not in photographs, s.gate != "folder", HOLDS_IMAGES not in s.reason)
+        )[:1]
         hint = "".join(f" (left out {s.name}: {s.reason})" for s in most_telling)
         raise InputError(
             "E-IMAGES-NONE",
@@ -177,7 +189,8 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
         skipped.append(Skipped(plain, reason, "folder"))
     elif path.suffix.lower() not in SUFFIXES:
         kinds = ", ".join(SUFFIXES)
-        skipped.append(Skipped(plain, "not an image file", "file_type", path.suffix or "no suffix", kinds))
+        reason = OTHER_PHOTOGRAPHS.get(path.suffix.lower(), "not an image file")
+        skipped.append(Skipped(plain, reason, "file_type", path.suffix or "no suffix", kinds))
     elif plain != name or name_fault(name):
         # Result files cannot store such a name.
         reason = f"its name {name_fault(name) or 'is not UTF-8'}; rename it"

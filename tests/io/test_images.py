@@ -211,3 +211,14 @@ def test_white_is_zero(dtype):
     grey = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (30, 40), dtype)
     np.testing.assert_array_equal(decode(tiff_of(grey, False), "a.tif"), grey)
     np.testing.assert_array_equal(decode(tiff_of(grey, True), "a.tif"), np.iinfo(dtype).max - grey)
+
+
+def test_photographs_of_other_kinds_are_named_with_what_to_do(tmp_path):
+    for name in ("a.HEIC", "b.dng", "c.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    with fails_with("E-IMAGES-NONE … a.HEIC: a HEIC photograph … export it as JPEG"):
+        find_images(tmp_path)
+    cv2.imwrite(str(tmp_path / "d.png"), np.zeros((4, 4), np.uint8))
+    reasons = {each.name: each.reason for each in find_images(tmp_path)[1]}
+    assert "develop it to TIFF" in reasons["b.dng"]
+    assert reasons["c.txt"] == "not an image file"
