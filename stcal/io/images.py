@@ -25,7 +25,7 @@ _RAW = "a raw photograph, which is not read; develop it to TIFF without correcti
 OTHER_PHOTOGRAPHS = {
     **dict.fromkeys(
         (".heic", ".heif"),
-        "a HEIC photograph, which is not read; export it as JPEG or TIFF of its full size, not edited",
+        "a HEIC photograph, which is not read; export it as JPEG of its full size, not edited",
     ),
     **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), _RAW),
 }
