@@ -258,12 +258,15 @@ def _turn(data: bytes) -> int | None:
 
     A program that turns pixels and leaves the orientation as it was also leaves the sides that EXIF states.
     """
-    turn = {6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE}.get(_tag(data, ExifTags.Base.Orientation))
+    turns = {6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE}
     try:
         with Image.open(BytesIO(data)) as image:
-            stated = image.getexif().get_ifd(ExifTags.IFD.Exif)
-            sides = [stated.get(tag) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
-            return turn if None in sides or (sides[0] < sides[1]) == (image.size[0] < image.size[1]) else None
+            exif = image.getexif()
+            stated = exif.get_ifd(ExifTags.IFD.Exif)
+            width, height = (stated.get(tag) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight))
+            if width and height and (width < height) != (image.size[0] < image.size[1]):
+                return None
+            return turns.get(exif.get(ExifTags.Base.Orientation, 1))
     except Exception:  # damaged EXIF fails in many ways
         return None
 

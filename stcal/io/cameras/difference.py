@@ -183,7 +183,7 @@ class FittedLens:
     rms_px: float
     most_px: float
     share: float
-    camera_from_lens: Rigid = field(default_factory=Rigid)
+    camera_from_lens: Rigid = field(default_factory=lambda: Rigid())
 
 
 def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:

@@ -10,6 +10,7 @@ import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -659,9 +660,8 @@ class _Reading:
             raise self.fault("E-CAMERA-MODEL", f"{kind!r} needs the intrinsics as one list, as Kalibr writes them")
         if kind == "perspective" and self.industrial and "distortion" not in self.known and not given.size:
             # The lens may have distortion, though the form has none.
-            return camera_model(
-                np.concatenate([flat, np.zeros(8)]), "OPENCV", width or None, height or None, self.source
-            )  # type: ignore[arg-type]
+            numbers = np.concatenate([flat, np.zeros(8)])
+            return camera_model(numbers, "OPENCV", width or None, height or None, Path(self.source))
         if kind == "unified":
             return self._unified(flat, skew, given, width, height)
         if not abs(skew) <= SQUARE * abs(flat[0]):
