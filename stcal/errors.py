@@ -43,6 +43,10 @@ class InputError(StcalError):
     exit_code = 2
 
 
+class InputNote(UserWarning):
+    """A part of an input file was passed over, and does not change the result as far as it is known."""
+
+
 class DetectionError(StcalError):
     """Circles, faces or boards are not found, or not found uniquely."""
 

@@ -60,6 +60,24 @@ TRIED = (
         "distortion_coefficients: [-0.1, 0.03, 0.001, -0.002, 0.01, 0, 0, 0, 0, 0, 0, 0, 0.002, -0.003]",
     ),
     (
+        "OpenCV",
+        "omnidir",
+        "image_width: {0}\nimage_height: {1}\ncamera_matrix: [920, 0, 641, 0, 921, 479, 0, 0, 1]\nxi: 1.2\n"
+        "distortion_coefficients: [-0.31, 0.12, 0.0003, -0.0002]",
+    ),
+    (
+        "OpenCV",
+        "skew",
+        "image_width: {0}\nimage_height: {1}\ncamera_matrix: [812, 0.5, 640, 0, 809, 478, 0, 0, 1]\n"
+        "distortion_coefficients: [-0.1, 0.03, 0.001, -0.002]",
+    ),
+    (
+        "Metashape",
+        "frame, p3, p4",
+        "<calibration><projection>frame</projection><width>{0}</width><height>{1}</height><f>812</f><cx>0</cx><cy>0</cy>"
+        "<k1>-0.1</k1><k2>0.03</k2><p1>0.001</p1><p2>-0.002</p2><p3>0.8</p3><p4>-0.4</p4></calibration>",
+    ),
+    (
         "mrcal",
         "CAHVOR",
         "{{'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [812, 809, 640, 478, 0.01, -0.02, 0.002, -0.1, 0.03], "
@@ -129,14 +147,16 @@ def main() -> None:
         folder = Path(scratch)
         for form in WRITERS:
             print(f"| `{form}` | {' | '.join(held(form, folder))} |")
-        print("\n| program | lens | fitted | px RMS | px at most |")
-        print("|---|---|---|---|---|")
+        print("\n| program | lens | fitted | px RMS | px at most | turned |")
+        print("|---|---|---|---|---|---|")
         for program, name, text in TRIED:
             (folder / "camera").write_text(text.format(WIDTH, HEIGHT))
             lens = read_lens(folder / "camera")
             assert isinstance(lens, ForeignLens)
             found = fit_lens(lens, WIDTH, HEIGHT)
-            print(f"| {program} | {name} | {found.camera.colmap_model} | {found.rms_px:.4f} | {found.most_px:.3f} |")
+            turn = np.degrees(found.camera_from_lens.angle_rad())
+            figures = f"{found.rms_px:.4f} | {found.most_px:.3f} | {f'{turn:.2f}°' if turn else '–'}"
+            print(f"| {program} | {name} | {found.camera.colmap_model} | {figures} |")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Boards and tags: the places of their corners, and the rotations that leave their appearance unchanged."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,7 @@ from stcal.design import BoardDesign, Polarity
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
+from stcal.labels import Label, dot_cells
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +155,26 @@ class LatticePart(BoardDesign):
     def cells(self) -> np.ndarray:
         """Return row and column of every dot, (n, 2)."""
         return BoardDesign.cells(self) if self.taken is None else self.taken
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UnevenGrid(BoardDesign):
+    """A grid of points whose rows and columns are not equally spaced.
+
+    ``y_mm``, ``x_mm`` : places of the rows and of the columns, mm.
+    """
+
+    y_mm: tuple[float, ...] = ()
+    x_mm: tuple[float, ...] = ()
+
+    def xy_mm(self) -> np.ndarray:
+        """Return the positions, (rows·columns, 2), row-major, mm."""
+        return self.places_mm(self.labels())[:, :2]
+
+    def places_mm(self, labels: Iterable[Label]) -> np.ndarray:
+        """Return the positions of these points, (n, 3), board frame."""
+        row, column = dot_cells(labels).T
+        return np.column_stack([np.array(self.x_mm)[column], np.array(self.y_mm)[row], np.zeros(len(row))])
 
 
 @dataclass(frozen=True, slots=True)

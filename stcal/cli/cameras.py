@@ -11,6 +11,7 @@ from stcal.cli.terminal import print_each, say, write
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
+    from stcal.io.cameras.difference import SizedLens
     from stcal.io.cameras.model import CalibratedCamera
 
 app = typer.Typer(
@@ -37,7 +38,7 @@ class Form(StrEnum):
 
 
 NameOption = Annotated[
-    str, typer.Option("--name", help="Choose this camera of a file of several, such as cam1; and write this name.")
+    str, typer.Option("--name", help="Choose this camera of a file of several, such as cam1 or 2; and write this name.")
 ]
 SizeOption = Annotated[
     str,
@@ -64,7 +65,7 @@ def convert(
     size: SizeOption = "",
 ) -> None:
     """Convert a camera file to the form of another program, and say what that has no place for."""
-    from stcal.io.cameras.forms import SUFFIXES, written
+    from stcal.io.cameras.forms import SUFFIXES, name_to_write, written
 
     kind = form.value if form else SUFFIXES.get(out.suffix.lower())
     if kind is None:
@@ -73,7 +74,7 @@ def convert(
             f"{out}: no form of suffix {out.suffix or 'none'}; give --form, or one of {', '.join(SUFFIXES)}",
         )
     camera = _camera(source, name, size)
-    converted = written(camera, kind, name or "cam0")
+    converted = written(camera, kind, name_to_write(name))
     say(f"{source}: {camera.colmap_model}, {camera.width}×{camera.height} px; written as {kind}")
     print_each(f"note: not in {kind}", converted.lost)
     write(out, converted.content)
@@ -110,8 +111,8 @@ def compare(
     from stcal.report.camera import comparison_figure, comparison_text
     from stcal.report.figure import save
 
-    first_camera, second_camera = _camera(first, name, size), _camera(second, name, size)
-    difference = camera_difference(first_camera, second_camera)
+    first_lens, second_lens = _lens(first, name, size), _lens(second, name, size)
+    difference = camera_difference(first_lens, second_lens)
     say("\n".join(comparison_text(difference)))
     if plot:
         save(comparison_figure(difference), plot)
@@ -119,7 +120,15 @@ def compare(
 
 
 def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
-    from stcal.io.cameras.difference import fit_lens
+    from stcal.io.cameras.difference import SizedLens
+
+    lens = _lens(path, name, size)
+    return lens.near.camera if isinstance(lens, SizedLens) else lens
+
+
+def _lens(path: Path, name: str, size: str) -> "CalibratedCamera | SizedLens":
+    """Return the camera of a file, or a lens of another model with the fit to it, whose quality is printed."""
+    from stcal.io.cameras.difference import SizedLens, fit_lens
     from stcal.io.cameras.model import CameraModel
     from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
     from stcal.io.cameras.read import read_lens
@@ -139,5 +148,5 @@ def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
     if isinstance(lens, CameraModel):
         return lens.calibrated(width, height)
     fitted = fit_lens(lens, width, height)
-    print_each("note", fitted_text(lens.called, fitted))
-    return fitted.camera
+    print_each("note", fitted_text(lens.called, fitted, lens.region is not None))
+    return SizedLens(lens, width, height, fitted)

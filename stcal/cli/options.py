@@ -2,6 +2,7 @@
 
 import inspect
 import os
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
@@ -14,7 +15,7 @@ import typer
 
 from stcal.cli.help import Command, panel_of
 from stcal.cli.terminal import STANDARD_OUTPUT, manner, print_each, said_apart, say
-from stcal.errors import ChecksFailed, InputError, StcalError
+from stcal.errors import ChecksFailed, InputError, InputNote, StcalError
 from stcal.io.files import keep_apart
 
 if TYPE_CHECKING:
@@ -31,6 +32,12 @@ CameraFile = Annotated[
         "--camera", help="Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB."
     ),
 ]
+CAMERA = "--camera"
+CameraName = Annotated[
+    str,
+    typer.Option("--camera-name", help="Take this camera of a --camera file of several: its name, or COLMAP's number."),
+]
+"""Option that every command with ``--camera`` has."""
 TargetFile = Annotated[
     Path | None,
     typer.Option("--target", help="Read the target's design from this target.toml, in place of the reference design."),
@@ -322,7 +329,7 @@ def _protected(command: Callable) -> Callable:
             info.rich_help_panel = panel_of(name, "Path" in str(parameter.annotation), writes)
 
     @wraps(command)
-    def checked(overwrite: bool = False, quiet: bool = False, verbose: bool = False, **given):
+    def checked(overwrite: bool = False, quiet: bool = False, verbose: bool = False, camera_name: str = "", **given):
         paths = [
             (name, path)
             for name, value in given.items()
@@ -344,8 +351,8 @@ def _protected(command: Callable) -> Callable:
         try:
             if command.__name__ not in ALWAYS_NEW and not any(given.get(name) for name in WRITE_NOTHING):
                 require_new(written)
-            with manner(quiet, verbose), said_apart() if to_stdout else nullcontext():
-                return command(**given)
+            with manner(quiet, verbose), said_apart() if to_stdout else nullcontext(), input_notes():
+                return command(**given) if not camera_name else _of_camera(camera_name, command, given)
         finally:
             _replacing.reset(token)
 
@@ -356,10 +363,40 @@ def _protected(command: Callable) -> Callable:
     added = [
         inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=a) for n, a in further.items()
     ]
+    if CAMERA in words.values():
+        further["camera_name"] = CameraName
+        name = inspect.Parameter("camera_name", inspect.Parameter.KEYWORD_ONLY, default="", annotation=CameraName)
+        added.insert(0, name)
     # Typer reads both.
     checked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore[attr-defined]
     checked.__annotations__ = {**command.__annotations__, **further}
     return checked
+
+
+def _of_camera(name: str, command: Callable, given: dict):
+    """Run a command that reads camera files, with the camera of this name of a file of several."""
+    from stcal.io.cameras.read import camera_chosen
+
+    with camera_chosen(name):
+        return command(**given)
+
+
+@contextmanager
+def input_notes() -> Iterator[None]:
+    """Print what readers of files pass over, once each."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", InputNote)
+        before, told = warnings.showwarning, set()
+
+        def show(message, category, *rest, **more) -> None:
+            if not issubclass(category, InputNote):
+                before(message, category, *rest, **more)
+            elif str(message) not in told:
+                told.add(str(message))
+                print_each("note", [str(message)])
+
+        warnings.showwarning = show
+        yield
 
 
 @contextmanager

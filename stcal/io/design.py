@@ -1,5 +1,6 @@
 """Readers of ``target.toml`` and ``board.toml`` that name every mistake, and writers that add comments for editing."""
 
+import re
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,6 +19,7 @@ from stcal.design import (
 )
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
+from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.toml import (
     Finite,
     Length,
@@ -169,7 +171,23 @@ def load_target(path: str | Path) -> TargetDesign:
 
 def load_board(path: str | Path) -> BoardDesign:
     """Read ``board.toml`` (form: ``data_layout.md``); errors as :func:`load_target`."""
+    _require_dots(path)
     return board_design(load_toml(path, BoardEntry, "board file", REMEDY), f"board file {path}")
+
+
+def _require_dots(path: str | Path) -> None:
+    """Refuse a file that names another kind of board; one that cannot be read is left to the reader."""
+    try:
+        text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")
+    except (OSError, ValueError):
+        return
+    named = re.search(r"(?m)^\s*(?:type\s*=|target_type\s*:)\s*[\"']?([\w-]+)", text.split("[[")[0])
+    if named and named[1] != "circles":
+        raise InputError(
+            "E-BOARD-TYPE",
+            f"board file {path}: {named[1]}; a board of dots needed here: `calibrate-camera`, `handeye` and `locate` "
+            "take others",
+        )
 
 
 def board_design(data: BoardEntry, where: str) -> BoardDesign:

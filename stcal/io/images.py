@@ -15,12 +15,21 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 from stcal.errors import InputError
 from stcal.io.files import IMAGE_BYTES, RUN_MARKER, read_bytes
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+_RAW = "a raw photograph, which is not read; develop it to TIFF without correction of the lens, crop or turn"
+OTHER_PHOTOGRAPHS = {
+    **dict.fromkeys(
+        (".heic", ".heif"),
+        "a HEIC photograph, which is not read; export it as JPEG of its full size, not edited",
+    ),
+    **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), _RAW),
+}
+"""Suffixes of photographs that are not read, and what to do."""
 EXCLUDED = "taken out with --exclude"
 HOLDS_IMAGES = "it holds images"
 """Part of the reason why a folder is left out."""
@@ -39,6 +48,9 @@ SAME_EDGES = 1.5
 """Factor on the allowed RMS difference over the whole image, edges included: compression changes edges a little, a
 motion of the camera changes them much."""
 
+MAJORITY = "the majority of the images"
+"""What states the size of images where the camera file does not."""
+TIFF_HEADS = (b"II*\0", b"MM\0*")
 THUMBNAIL_PX = 1400
 THUMBNAIL_QUALITY = 80
 MOST_JPEG_SIDE = 65_000
@@ -123,7 +135,10 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
             _sort_in(path, path.name, TOP_GROUP, files, skipped)
     if not files:
         # A nested folder is the most helpful hint: the images lie deeper than they should.
-        most_telling = sorted(skipped, key=lambda s: (s.gate != "folder", HOLDS_IMAGES not in s.reason))[:1]
+        photographs = set(OTHER_PHOTOGRAPHS.values())
+        most_telling = sorted(
+            skipped, key=lambda s: (s.reason not in photographs, s.gate != "folder", HOLDS_IMAGES not in s.reason)
+        )[:1]
         hint = "".join(f" (left out {s.name}: {s.reason})" for s in most_telling)
         raise InputError(
             "E-IMAGES-NONE",
@@ -174,7 +189,8 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
         skipped.append(Skipped(plain, reason, "folder"))
     elif path.suffix.lower() not in SUFFIXES:
         kinds = ", ".join(SUFFIXES)
-        skipped.append(Skipped(plain, "not an image file", "file_type", path.suffix or "no suffix", kinds))
+        reason = OTHER_PHOTOGRAPHS.get(path.suffix.lower(), "not an image file")
+        skipped.append(Skipped(plain, reason, "file_type", path.suffix or "no suffix", kinds))
     elif plain != name or name_fault(name):
         # Result files cannot store such a name.
         reason = f"its name {name_fault(name) or 'is not UTF-8'}; rename it"
@@ -195,8 +211,11 @@ def name_fault(name: str) -> str | None:
     return None
 
 
-def decode(data: bytes, name: str) -> np.ndarray:
-    """Return the grey image (height, width), uint8 or uint16, of an image file's bytes; EXIF orientation is ignored.
+def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Return the grey image (height, width), uint8 or uint16, of an image file's bytes.
+
+    EXIF orientation is ignored: pixels are as the sensor gave them. Only where ``size``, width and height of the
+    camera's images, is given and the image has its sides swapped, the image is turned as its EXIF says.
 
     Raises
     ------
@@ -226,7 +245,96 @@ def decode(data: bytes, name: str) -> np.ndarray:
         )
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
+    if image.dtype == np.uint16 and data[:4] in TIFF_HEADS and _tag(data, ExifTags.Base.PhotometricInterpretation) == 0:
+        image = np.iinfo(np.uint16).max - image  # white is zero; the decoder turns those of 8 bit alone
+    if size is not None and size[0] != size[1] and image.shape == size:  # (height, width) is (width, height)
+        turn = _turn(data)
+        return image if turn is None else cv2.rotate(image, turn)
     return image
+
+
+def _turn(data: bytes) -> int | None:
+    """Return how to turn an image as its EXIF says, None if it says no quarter turn, or contradicts itself.
+
+    A program that turns pixels and leaves the orientation as it was also leaves the sides that EXIF states.
+    """
+    turns = {6: cv2.ROTATE_90_CLOCKWISE, 8: cv2.ROTATE_90_COUNTERCLOCKWISE}
+    try:
+        with Image.open(BytesIO(data)) as image:
+            exif = image.getexif()
+            stated = exif.get_ifd(ExifTags.IFD.Exif)
+            width, height = (stated.get(tag) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight))
+            if width and height and (width < height) != (image.size[0] < image.size[1]):
+                return None
+            return turns.get(exif.get(ExifTags.Base.Orientation, 1))
+    except Exception:  # damaged EXIF fails in many ways
+        return None
+
+
+def _tag(data: bytes, tag: int) -> object:
+    """Return a tag of a TIFF or of EXIF; None if there is none."""
+    try:
+        with Image.open(BytesIO(data)) as image:
+            return image.getexif().get(tag)
+    except Exception:  # damaged EXIF fails in many ways
+        return None
+
+
+def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | None:
+    """Return width and height, px, of most files, by their headers, and one of their names; None if none is readable.
+
+    Of sizes that are equally frequent it is that of the first readable file.
+    """
+    with_size: dict[tuple[int, int], list[ImageFile]] = {}
+    for file in files:
+        try:
+            with Image.open(BytesIO(file.content) if file.content is not None else file.path) as image:
+                with_size.setdefault(image.size, []).append(file)
+        except Exception:  # a file that is no image fails in many ways
+            with_size.setdefault((0, 0), []).append(file)
+    unknown = with_size.pop((0, 0), [])
+    order = {file.name: i for i, file in enumerate(files)}
+    ranked = sorted(with_size.values(), key=lambda own: (-len(own), order[own[0].name]))
+    for own in (*ranked, unknown):
+        for file in own:
+            try:
+                height, width = decode(file.read(), file.name).shape
+            except (InputError, OSError):
+                continue
+            return (width, height), file.name
+    return None
+
+
+def require_common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str]:
+    """Return width and height, px, of most of the images, and the name of one of them.
+
+    Raises
+    ------
+    InputError
+        No image is readable.
+    """
+    found = common_size(files)
+    if found is None:
+        raise InputError(
+            "E-IMAGES-NONE-READABLE", f"no readable image among {len(files)}, first {files[0].name}; check the files"
+        )
+    return found
+
+
+def size_fault(name: str, own: tuple[int, int], wanted: tuple[int, int], stated_by: str) -> Skipped:
+    """Return why an image of another size is skipped; ``stated_by`` : what says the size that is ``wanted``, px."""
+    own_text, wanted_text = ("{}×{} px".format(*size) for size in (own, wanted))
+    if own == wanted[::-1]:
+        reason = (
+            f"sides swapped: {own_text}, but {stated_by} says {wanted_text}; a program turned it by 90°, and nothing "
+            "says which way: turn it back without loss (jpegtran -rotate), or copy it again as the camera wrote it"
+        )
+    else:
+        reason = (
+            f"{own_text}, but {stated_by} says {wanted_text}; use images as the camera took them, or the camera file "
+            "that belongs to them"
+        )
+    return Skipped(name, reason, "image_size", own_text, wanted_text)
 
 
 def stated_size(data: bytes, name: str) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """YAML as other programs write it: plain values and OpenCV's matrices.
 
-Aliases are refused: with them, ten lines can expand to more than any memory holds.
+Aliases are refused: with them, ten lines can expand to more than any memory holds. So is a key that stands twice, of
+which the last one would count without a word.
 """
 
 import re
@@ -16,6 +17,13 @@ class _Loader(yaml.SafeLoader):
             problem = f"alias *{event.anchor}: write the values out"
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
         return super().compose_node(parent, index)
+
+    def construct_mapping(self, node, deep=False):
+        names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise yaml.MarkedYAMLError(problem=f"the key {twice[:40]} twice", problem_mark=node.start_mark)
+        return super().construct_mapping(node, deep)
 
 
 def _matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict:
@@ -33,9 +41,24 @@ def load_yaml(text: str):
     Raises
     ------
     yaml.YAMLError
-        The text is not YAML, or has aliases.
+        The text is not YAML, has aliases, or a key twice.
     """
-    return yaml.load(re.sub(r"\A\s*%YAML:?\s*[\d.]+\s*\n", "", text), _Loader)
+    return yaml.load(_without_directive(text), _Loader)
+
+
+def load_documents(text: str) -> list:
+    """Return the values of each document of a text, as ``rostopic echo`` ends each with ``---``.
+
+    Raises
+    ------
+    yaml.YAMLError
+        The text is not YAML, has aliases, or a key twice.
+    """
+    return list(yaml.load_all(_without_directive(text), _Loader))
+
+
+def _without_directive(text: str) -> str:
+    return re.sub(r"\A\s*%YAML:?[ \t]*[\d.]+[ \t]*(#[^\r\n]*)?(\r\n|\r|\n|\Z)", "", text)
 
 
 def opencv_matrix(name: str, values: np.ndarray) -> list[str]:

@@ -47,18 +47,25 @@ def exif_text(told: str) -> str:
     )
 
 
-def fitted_text(called: str, found: FittedLens) -> list[str]:
-    """Return lines on the quality of a fitted lens."""
+def fitted_text(called: str, found: FittedLens, region: bool = False) -> list[str]:
+    """Return lines on the quality of a fitted lens; ``region`` : whether the file states where the lens is valid."""
+    where = "its valid_intrinsics_region" if region else "the image"
     lines = [
         f"{called} has no place here: {found.camera.colmap_model} fitted to it is {found.rms_px:.2g} px RMS off over "
-        f"the image, {found.most_px:.2g} px at most"
+        f"{where}, {found.most_px:.2g} px at most"
     ]
+    turn = np.degrees(found.camera_from_lens.log()[:3])
+    if turn.any():
+        lines.append(
+            f"the fitted camera is turned by {np.linalg.norm(turn):.4f}° ({', '.join(f'{v:.4f}' for v in turn)}) about "
+            "the axes of the lens: poses that the other program gave do not apply to it"
+        )
     if found.most_px > POOR_PX:
         lines.append(
             f"a fit more than {POOR_PX:g} px off is a start only: refine it (`--refine-camera`), or calibrate anew"
         )
     if found.share < 1:
-        lines.append(f"in {1 - found.share:.0%} of the directions the image reaches beyond 89° from the axis: unused")
+        lines.append(f"in {1 - found.share:.0%} of the directions {where} reaches beyond 89° from the axis: unused")
     return lines
 
 
@@ -107,7 +114,10 @@ def comparison_text(found: CameraDifference) -> list[str]:
         f"the second camera is turned by {np.linalg.norm(turn):.5f}° ({', '.join(f'{v:.5f}' for v in turn)})",
     ]
     if np.isnan(length).any():
-        lines.append(f"{np.isnan(length).mean():.1%} of the image has no ray in one of both, and is left out")
+        share = np.isnan(length).mean()
+        lines.append(
+            f"{share:.1%} of the image has no ray in one of both, or is outside of where both are valid: unused"
+        )
     return lines
 
 

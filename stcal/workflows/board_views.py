@@ -29,7 +29,16 @@ from stcal.geometry.plane import camera_from_plane, fit_homography, refine_plana
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.image_jobs import run_on_images
-from stcal.io.images import ImageFile, Skipped, decode, find_images, grey_8bit
+from stcal.io.images import (
+    MAJORITY,
+    ImageFile,
+    Skipped,
+    common_size,
+    decode,
+    find_images,
+    grey_8bit,
+    size_fault,
+)
 from stcal.locate.calibration.solve import CalibrationImages
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, find_ellipses
 from stcal.sfm.detect.image import detect_image
@@ -318,51 +327,49 @@ def detect_boards(
     """
     if not files:
         raise InputError("E-IMAGES-NONE", "no image; images of the board needed")
-    jobs = [(file, model, board, tuple(dictionaries)) for file in files]
+    size, stated_by = None, MAJORITY
+    if model.width and model.height:
+        size, stated_by = (model.width, model.height), "the camera file"
+        model.require_inside(*size, "the image")
+    elif (found := common_size(files)) is not None:
+        size, name = found
+        model.require_inside(*size, name)
+    jobs = [(file, model, size, stated_by, board, tuple(dictionaries)) for file in files]
     by_job: dict[int, BoardDetection | Skipped] = {}
     for i, detection in run_on_images(_detect_board, jobs, workers):
         by_job[i] = detection
         if progress:
             progress(len(by_job), len(jobs))
     outcomes = [by_job[i] for i in range(len(jobs))]
-    detections = [outcome for outcome in outcomes if isinstance(outcome, BoardDetection)]
-    if not detections:
+    detections = tuple(outcome for outcome in outcomes if isinstance(outcome, BoardDetection))
+    if size is None or not detections:
         first = next(outcome for outcome in outcomes if isinstance(outcome, Skipped))
         raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {first.name}: {first.reason}")
-    size = detections[0].size
-    model.require_inside(*detections[0].size, detections[0].name)
-    outcomes = [_of_size(outcome, size, detections[0].name) for outcome in outcomes]
-    detections = tuple(outcome for outcome in outcomes if isinstance(outcome, BoardDetection))
     without = (Skipped(s.name, s.why, "board") for s in detections if s.view is None)
     skipped = (*(outcome for outcome in outcomes if isinstance(outcome, Skipped)), *without)
     return BoardDetections(model.sized(*size), detections, skipped, tuple(symmetries(board)))
 
 
 def _detect_board(
-    file: ImageFile, model: CameraModel, board: Board, dictionaries: tuple[str, ...]
+    file: ImageFile,
+    model: CameraModel,
+    size: tuple[int, int] | None,
+    stated_by: str,
+    board: Board,
+    dictionaries: tuple[str, ...],
 ) -> BoardDetection | Skipped:
     try:
-        image = decode(file.read(), file.name)
+        image = decode(file.read(), file.name, size)
     except OSError as error:
         return Skipped(file.name, f"cannot be read: {error.strerror or error}")
     except InputError as error:
         return Skipped(file.name, str(error).removeprefix(f"{file.name}: "))
     height, width = image.shape
-    if (model.width or width, model.height or height) != (width, height):
-        reason = f"{width}×{height} px, the camera file says {model.width}×{model.height} px; use images as taken"
-        return Skipped(file.name, reason, "image_size", f"{width}×{height} px", f"{model.width}×{model.height} px")
+    if size is not None and size != (width, height):
+        return size_fault(file.name, (width, height), size, stated_by)
     tags = find_tags(image, dictionaries) if dictionaries else None
     view, why = find_board(image, file.name, model.sized(width, height), board)
     return BoardDetection(file.name, (width, height), view, why, tags)
-
-
-def _of_size(each: BoardDetection | Skipped, size: tuple[int, int], first: str) -> BoardDetection | Skipped:
-    if isinstance(each, Skipped) or each.size == size:
-        return each
-    own_size, wanted = ("{}×{} px".format(*s) for s in (each.size, size))
-    return Skipped(
-        each.name, f"{own_size}, but {first} has {wanted}; use images of one camera", "image_size", own_size, wanted
-    )
 
 
 def calibration_images(

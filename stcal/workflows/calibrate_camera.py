@@ -7,20 +7,28 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.design import BoardView, CharucoDesign, ChessboardDesign, FlatBoard
+from stcal.boards.design import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    BoardView,
+    CharucoDesign,
+    FlatBoard,
+    LatticePart,
+    TagLayout,
+    UnevenGrid,
+)
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.forms import kalibr_chain
 from stcal.io.cameras.model import CalibratedCamera, CameraModel, cameras_txt
 from stcal.io.files import json_text
-from stcal.io.images import ImageFile, find_images, name_fault
+from stcal.io.images import ImageFile, find_images, name_fault, require_common_size
 from stcal.io.json import ResultFile
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, one_thread
 from stcal.sfm.camera.calibrate import (
     CameraCalibration,
     calibrate_camera,
-    first_size,
     judged,
     of_chosen_model,
     require_determined,
@@ -37,6 +45,8 @@ from stcal.workflows.board_views import detect_boards, kind_of
 CORNER_SIGMA_PX = 0.1
 """σ of corners whose detector states none. Only their equality matters, since the factor is estimated."""
 POINT_RADIUS_MM = 1e-6
+PLACE_DIGITS = 6
+"""Decimals, mm, to which the places of points are the same row or column."""
 """Radius of a corner as a circle: it has no extent and therefore no eccentricity."""
 
 
@@ -73,7 +83,8 @@ def calibrate_camera_by_corners(
     StcalError
         One of its subclasses, with a one-line message that says what to do.
     """
-    grid = corner_grid(board)
+    points = point_grid(board)
+    grid = points.grid
     if colmap_model == AUTO:
         return of_chosen_model(
             lambda model: calibrate_camera_by_corners(images, board, model, workers, progress), grid, workers
@@ -81,12 +92,12 @@ def calibrate_camera_by_corners(
     require_model(colmap_model)
     progress = progress or (lambda *_: None)
     files, skipped_files = find_images(images)
-    camera = start_camera(*first_size(files), colmap_model)
-    rounds = 2 if isinstance(board, CharucoDesign) else 1  # a ChArUco board's corners are found by the camera
+    camera = start_camera(*require_common_size(files)[0], colmap_model)
+    rounds = ROUNDS.get(type(board), 1)
     for done in range(1, rounds + 1):
         model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
         detections = detect_boards(files, model, board, (), workers, partial(progress, f"detect {done}"))
-        views = _observations(files, detections.views(), grid, camera)
+        views = _observations(files, detections.views(), points, camera)
         skipped = (*skipped_files, *detections.skipped)
         require_views(views, len(files), skipped)
         start = camera if done > 1 else closed_form(views, grid, camera)
@@ -96,31 +107,58 @@ def calibrate_camera_by_corners(
     return judged(result, views, skipped, rounds, True, grid)
 
 
-def corner_grid(board: FlatBoard) -> BoardDesign:
-    """Returns the inner corners of a board as a board of dots without extent.
+ROUNDS = {CharucoDesign: 2, AprilGridDesign: 2, AsymmetricCirclesDesign: 3}
+"""Rounds of detection where the camera helps to find the points, and for circles also moves them: an error of their
+eccentricity shrinks to less than a tenth with each round. Corners of a plain chessboard need one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointGrid:
+    """The points of a board as dots without extent.
+
+    ``grid`` : rows and columns of all points; ``cells`` : (n, 2), row and column of each point of the board's views.
+    """
+
+    grid: BoardDesign
+    cells: np.ndarray
+
+
+def point_grid(board: FlatBoard) -> PointGrid:
+    """Returns the points of a board, sorted into rows and columns.
 
     Raises
     ------
     InputError
-        A board of another kind, whose points are not a grid of squares.
+        A board of another kind, whose points are not on a grid.
     """
-    if isinstance(board, ChessboardDesign):
-        rows, columns = board.rows, board.columns
-    elif isinstance(board, CharucoDesign):
-        rows, columns = board.rows - 1, board.columns - 1
-    else:
+    if isinstance(board, TagLayout):
         raise InputError(
             "E-BOARD-TYPE",
-            f"--board: {kind_of(board)}; a board of dots, a chessboard or a ChArUco board needed to calibrate a camera",
+            f"--board: {kind_of(board)}; a board of dots, a chessboard, a ChArUco board, an AprilGrid or asymmetric "
+            "circles needed to calibrate a camera",
         )
-    return BoardDesign(rows, columns, board.square_mm, POINT_RADIUS_MM, "bright", board.sigma_mm)
+    xy = np.round(board.xy_mm(), PLACE_DIGITS)
+    (x, column), (y, row) = (np.unique(values, return_inverse=True) for values in xy.T)
+    cells = np.column_stack([row, column])
+    common = POINT_RADIUS_MM, "bright", board.sigma_mm
+    if isinstance(board, AprilGridDesign):
+        pitch = float(np.ptp(x) / (len(x) - 1))
+        return PointGrid(UnevenGrid(len(y), len(x), pitch, *common, y_mm=tuple(y), x_mm=tuple(x)), cells)
+    if isinstance(board, AsymmetricCirclesDesign):
+        return PointGrid(LatticePart(len(y), len(x), board.spacing_mm, *common, taken=cells), cells)
+    return PointGrid(BoardDesign(len(y), len(x), board.square_mm, *common), cells)
 
 
-def _observations(files: list[ImageFile], views: dict[str, BoardView], grid: BoardDesign, camera):
+def corner_grid(board: FlatBoard) -> BoardDesign:
+    """Returns the points of a board as a board of dots without extent; errors as :func:`point_grid`."""
+    return point_grid(board).grid
+
+
+def _observations(files: list[ImageFile], views: dict[str, BoardView], points: PointGrid, camera):
     group = {file.name: file.group for file in files}
     observations = []
     for name, view in views.items():
-        labels = tuple(DotLabel(*divmod(i, grid.columns)) for i in view.ids.tolist())
+        labels = tuple(DotLabel(*cell) for cell in points.cells[view.ids].tolist())
         covariance = view.covariance_px2
         if covariance is None:
             covariance = np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))
@@ -206,6 +244,11 @@ def calibrate_rig_from_photographs(
     if unknown:
         raise InputError(
             "E-OPTION-VALUE", f"--model {unknown[0]}=…: no folder {unknown[0]} in {folder}; it has {', '.join(names)}"
+        )
+    if isinstance(board, AprilGridDesign | AsymmetricCirclesDesign):
+        raise InputError(
+            "E-BOARD-TYPE",
+            f"--board: {kind_of(board)}; with --rig a board of dots, a chessboard or a ChArUco board needed",
         )
     grid = board if isinstance(board, BoardDesign) else corner_grid(board)
     cameras: dict[str, CameraCalibration] = {}

@@ -335,3 +335,10 @@ def test_a_path_that_cannot_be_read(tmp_path, load, name, message):
 @pytest.mark.parametrize("radius_mm", [8.625, 22.49])
 def test_corner_radii_at_the_bounds_are_taken(tmp_path, radius_mm):
     assert board_of(tmp_path, BOARD + corner(6, 8, radius_mm)).radii_mm()[-1] == radius_mm
+
+
+@pytest.mark.parametrize("text", ['type = "aprilgrid"\nrows = 3\n', "target_type: 'checkerboard'\ntargetCols: 6\n"])
+def test_another_kind_of_board_is_named(tmp_path, text):
+    (tmp_path / "board").write_text(text)
+    with fails_with("E-BOARD-TYPE … board of dots needed … calibrate-camera"):
+        load_board(tmp_path / "board")

@@ -7,7 +7,9 @@ import numpy as np
 import pycolmap
 import pytest
 
-from stcal.io.cameras.difference import fit_lens
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.difference import SizedLens, camera_difference, fit_lens
 from stcal.io.cameras.foreign import COLMAP_FOREIGN, ForeignLens
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera, read_lens
@@ -248,3 +250,70 @@ def test_cahvor_about_the_axis_of_the_image_is_opencvs(tmp_path):
 def test_cahvor_that_is_none(tmp_path):
     with fails_with("E-CAMERA-COEFFICIENTS … 8 … LENSMODEL_CAHVOR"):
         cahvor_file(tmp_path / "a.cameramodel", CAHVOR[:8])
+
+
+def turned_lens(angle_deg, region=None) -> tuple[ForeignLens, Camera, Rigid]:
+    """A supported camera behind a turn that no supported model holds."""
+    camera = Camera(WIDTH, HEIGHT, [812.0, 809.0], [640.0, 478.0], np.pad([-0.1, 0.03, 1e-3, -2e-3], (0, 8)))
+    turn = Rigid.exp([*np.radians(angle_deg), 0, 0, 0])
+
+    def project(rays: np.ndarray) -> np.ndarray:
+        xy = camera.project(turn @ rays)
+        return xy if region is None else np.where(inside(region, xy)[:, None], xy, xy + 3000)
+
+    return ForeignLens("a turned lens", project, WIDTH, HEIGHT, "file", region), camera, turn
+
+
+def inside(polygon: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    contour = np.rint(polygon * 1024).astype(np.int32)
+    return np.array([cv2.pointPolygonTest(contour, (x * 1024, y * 1024), False) > 0 for x, y in pixels.tolist()])
+
+
+def test_a_fit_turns_the_camera_where_that_helps():
+    lens, camera, turn = turned_lens([2.0, -3.0, 1.0])
+    found = fit_lens(lens, WIDTH, HEIGHT)
+    assert found.rms_px < 1e-3
+    np.testing.assert_allclose(found.camera_from_lens.rotation, turn.rotation, atol=1e-5)
+    np.testing.assert_allclose(found.camera.centre, camera.centre, atol=0.1)
+    straight = fit_lens(ForeignLens("", camera.project, WIDTH, HEIGHT, "file"), WIDTH, HEIGHT)
+    assert straight.camera_from_lens.angle_rad() == 0
+
+
+REGION = np.array([[200.0, 100], [1000, 150], [1100, 800], [640, 700], [150, 850]])
+
+
+def test_a_lens_is_fitted_where_it_was_determined():
+    lens, _, turn = turned_lens([1.0, 2.0, 0.0], REGION)  # beyond the region it is 3000 px off
+    pixels = np.random.default_rng(0).uniform([0, 0], [WIDTH, HEIGHT], (500, 2))
+    np.testing.assert_array_equal(lens.determined(pixels), inside(REGION, pixels))
+    found = fit_lens(lens, WIDTH, HEIGHT)
+    assert found.rms_px < 1e-2
+    np.testing.assert_allclose(found.camera_from_lens.rotation, turn.rotation, atol=1e-3)
+
+
+def test_lenses_are_compared_by_their_own_projections():
+    """Not by the models that are fitted to them, which are a pixel off."""
+    lens, camera, turn = turned_lens([1.0, 2.0, 0.0], REGION)
+    sized = SizedLens(lens, WIDTH, HEIGHT, fit_lens(lens, WIDTH, HEIGHT))
+    pixels = np.random.default_rng(0).uniform([300, 200], [900, 600], (50, 2))
+    np.testing.assert_allclose(lens.project(sized.rays(pixels)), pixels, atol=1e-6)
+    for one, two in ((sized, camera), (camera, sized)):
+        found = camera_difference(one, two)
+        assert np.nanmax(found.lengths()) < 1e-5
+        assert 0.3 < np.isnan(found.lengths()).mean() < 0.8
+    np.testing.assert_allclose(found.second_from_first.inverse().rotation, turn.rotation, atol=1e-7)
+    longer = Camera(WIDTH, HEIGHT, camera.focal * 1.001, camera.centre, camera.distortion)
+    # a thousandth of the way from the middle, of which a turn and the offset of the region take a part
+    assert 0.2 < np.nanmax(camera_difference(sized, longer).lengths()) < 0.7
+
+
+def test_mrcals_region_is_read(tmp_path):
+    text = (
+        "{'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [812, 809, 640, 478, 0.01, -0.02, 0.002, -0.1, 0.03], "
+        f"'valid_intrinsics_region': {REGION.tolist()}, 'imagersize': [{WIDTH}, {HEIGHT}]}}"
+    )
+    (tmp_path / "c.cameramodel").write_text(text)
+    np.testing.assert_array_equal(read_lens(tmp_path / "c.cameramodel").region, REGION)
+    (tmp_path / "c.cameramodel").write_text(text.replace(str(REGION.tolist()), "[1, 2, 3]"))
+    with fails_with("E-CAMERA-CONTENT … valid_intrinsics_region"):
+        read_lens(tmp_path / "c.cameramodel")

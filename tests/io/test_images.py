@@ -1,5 +1,7 @@
 """Files found group by group, and decoded as the sensor gave them."""
 
+import io
+import struct
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -7,10 +9,20 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 import pytest
+from PIL import Image, ImageOps
 
 from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER
-from stcal.io.images import TOP_GROUP, decode, find_images, name_fault, percentiles, thumbnail
+from stcal.io.images import (
+    TOP_GROUP,
+    common_size,
+    decode,
+    find_images,
+    name_fault,
+    percentiles,
+    size_fault,
+    thumbnail,
+)
 from tests.outcome import fails_with
 
 
@@ -137,3 +149,76 @@ def test_a_picture_of_one_row_or_column_has_a_thumbnail(shape):
     small = cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)
     assert small.min() > 90
     assert 0 < scale <= 1
+
+
+def portrait(grey: np.ndarray, orientation: int, stated: tuple[int, int] | None = None) -> bytes:
+    """A lossless file whose EXIF has this orientation, and states width and height."""
+    image, exif = Image.fromarray(grey), Image.Exif()
+    exif[0x0112] = orientation
+    if stated is not None:
+        exif.get_ifd(0x8769)[0xA002], exif.get_ifd(0x8769)[0xA003] = stated
+    stream = io.BytesIO()
+    image.save(stream, "PNG", exif=exif)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_an_image_with_sides_swapped_is_turned_as_its_exif_says(orientation):
+    grey = np.random.default_rng(0).integers(0, 255, (60, 40), np.uint8)
+    data = portrait(grey, orientation)
+    wanted = np.array(ImageOps.exif_transpose(Image.open(io.BytesIO(data))))
+    np.testing.assert_array_equal(decode(data, "a.png", (60, 40)), wanted)
+    np.testing.assert_array_equal(decode(data, "a.png"), grey)
+    np.testing.assert_array_equal(decode(data, "a.png", (40, 60)), grey)  # as the sensor gave it
+    np.testing.assert_array_equal(decode(portrait(grey, orientation, (40, 60)), "a.png", (60, 40)), wanted)
+    # the pixels were turned and the orientation was left as it was: nothing says which way
+    np.testing.assert_array_equal(decode(portrait(grey, orientation, (60, 40)), "a.png", (60, 40)), grey)
+    np.testing.assert_array_equal(decode(portrait(grey, 1), "a.png", (60, 40)), grey)
+
+
+def test_most_images_state_the_size(tmp_path):
+    sizes = [(40, 60), (60, 40), (60, 40), (60, 40), (50, 50)]
+    for i, (width, height) in enumerate(sizes):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.zeros((height, width), np.uint8))
+    files, _ = find_images(tmp_path)
+    assert common_size(files) == ((60, 40), "1.png")
+    assert common_size(files[:2]) == ((40, 60), "0.png")  # the first of two
+    files[0].path.write_bytes(files[0].path.read_bytes()[:60])
+    assert common_size(files[:2]) == ((60, 40), "1.png")  # the header of a file that cannot be read does not decide
+    assert common_size(files[:1]) is None
+
+
+def test_swapped_sides_are_said_in_these_words():
+    skipped = size_fault("a.png", (40, 60), (60, 40), "the camera file")
+    assert "sides swapped: 40×60 px" in skipped.reason
+    assert "sides swapped" not in size_fault("a.png", (40, 50), (60, 40), "the camera file").reason
+
+
+def tiff_of(grey: np.ndarray, white_is_zero: bool) -> bytes:
+    """Values as they stand in the file; tag 262 says what they mean (TIFF 6.0, PhotometricInterpretation)."""
+    stream = io.BytesIO()
+    Image.fromarray(grey).save(stream, "TIFF")
+    data = bytearray(stream.getvalue())
+    (at,) = struct.unpack_from("<I", data, 4)
+    for entry in range(at + 2, at + 2 + 12 * struct.unpack_from("<H", data, at)[0], 12):
+        if struct.unpack_from("<H", data, entry)[0] == 262:
+            struct.pack_into("<HHII", data, entry, 262, 3, 1, 0 if white_is_zero else 1)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_white_is_zero(dtype):
+    grey = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (30, 40), dtype)
+    np.testing.assert_array_equal(decode(tiff_of(grey, False), "a.tif"), grey)
+    np.testing.assert_array_equal(decode(tiff_of(grey, True), "a.tif"), np.iinfo(dtype).max - grey)
+
+
+def test_photographs_of_other_kinds_are_named_with_what_to_do(tmp_path):
+    for name in ("a.HEIC", "b.dng", "c.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    with fails_with("E-IMAGES-NONE … a.HEIC: a HEIC photograph … export it as JPEG"):
+        find_images(tmp_path)
+    cv2.imwrite(str(tmp_path / "d.png"), np.zeros((4, 4), np.uint8))
+    reasons = {each.name: each.reason for each in find_images(tmp_path)[1]}
+    assert "develop it to TIFF" in reasons["b.dng"]
+    assert reasons["c.txt"] == "not an image file"

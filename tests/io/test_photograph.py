@@ -42,6 +42,7 @@ def test_the_focal_length_is_that_of_exif(tmp_path, case, suffix):
     sigma = np.sqrt(np.diag(camera.covariance))
     np.testing.assert_allclose(sigma[:2], SIGMA_FOCAL * focal_px, rtol=1e-3)
     assert np.linalg.eigvalsh(camera.covariance).min() > 0
+    assert ("sensor of 24×16 mm" in camera_of_photograph(path).told) == ("FocalLength" in entries)
 
 
 def test_colmap_finds_the_same(tmp_path):
@@ -56,7 +57,8 @@ def test_colmap_finds_the_same(tmp_path):
     [
         ({}, None, "E-CAMERA-EXIF"),
         ({"FocalLengthIn35mmFilm": 0}, None, "E-CAMERA-EXIF"),
-        ({"FocalLength": 35.0}, None, "E-CAMERA-EXIF"),
+        ({"FocalLength": 35.0}, None, "E-CAMERA-EXIF … 35 mm, but no size of its pixels"),
+        ({"FocalLengthIn35mmFilm": 36, "DigitalZoomRatio": 2.0}, None, "E-CAMERA-EXIF … zoom of 2 … 1200 or 2400 px"),
         (None, b"\xff\xd8\xff\xe0\x00\x10JFIF", "E-CAMERA-UNREADABLE"),
     ],
 )

@@ -35,7 +35,8 @@ def calibrate_camera(
         Path | None,
         typer.Option(
             "--board",
-            help="Read the board from this file: dots, chessboard or ChArUco (TOML), in place of the reference board.",
+            help="Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid or "
+            "asymmetric circles, in place of the reference board.",
         ),
     ] = None,
     rig: Annotated[

@@ -1,6 +1,6 @@
 """Difference between two cameras, and the fit of a supported camera model to a lens of another model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -15,6 +15,10 @@ from stcal.io.cameras.model import FISHEYE, CalibratedCamera, intrinsic_basis, p
 CELLS = 24
 """Number of grid points along the shorter side of the image."""
 STEPS, STEP_RAD = 10, 1e-6
+LONGEST_RAD = 0.1
+"""Longest step of Newton's method for a ray."""
+MET_PX = 1e-6
+"""Largest distance between a pixel and the projection of its ray."""
 LEAST_POINTS = 10
 
 
@@ -35,15 +39,56 @@ class CameraDifference:
         return np.linalg.norm(self.apart, axis=2)
 
 
-def camera_difference(one: Camera, two: Camera) -> CameraDifference:
+@dataclass(frozen=True, slots=True, eq=False)
+class SizedLens:
+    """A lens of an unsupported model over an image, by its own projection.
+
+    ``lens`` ; ``width``, ``height`` : px; ``near`` : the model that was fitted to it, from which its rays are sought.
+    """
+
+    lens: ForeignLens
+    width: int
+    height: int
+    near: "FittedLens"
+
+    def project(self, rays: np.ndarray) -> np.ndarray:
+        """Return the pixels (n, 2) of rays (n, 3)."""
+        with np.errstate(all="ignore"):
+            return self.lens.project(rays)
+
+    def rays(self, pixels: np.ndarray) -> np.ndarray:
+        """Return the unit rays (n, 3) of pixels (n, 2) by Newton's method; nan where there is none."""
+        unit = self.near.camera_from_lens.inverse() @ rays(self.near.camera, pixels)
+        unit /= np.linalg.norm(unit, axis=1)[:, None]
+        for _ in range(STEPS):
+            off = self.project(unit) - pixels
+            aside = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit), axis=1)])
+            aside /= np.linalg.norm(aside, axis=1)[:, None]
+            sides = np.stack([aside, np.cross(unit, aside)], axis=1)
+            slope = np.stack([self.project(unit + STEP_RAD * sides[:, i]) - self.project(unit) for i in (0, 1)], axis=2)
+            good = np.isfinite(off).all(1) & (np.abs(np.linalg.det(np.nan_to_num(slope))) > 0)
+            step = np.zeros((len(unit), 2))
+            step[good] = -STEP_RAD * np.linalg.solve(slope[good], off[good, :, None])[..., 0]
+            step *= np.minimum(1, LONGEST_RAD / np.maximum(np.linalg.norm(step, axis=1), LONGEST_RAD))[:, None]
+            unit = unit + (step[:, :, None] * sides).sum(axis=1)
+            unit /= np.linalg.norm(unit, axis=1)[:, None]
+        met = np.linalg.norm(self.project(unit) - pixels, axis=1) < MET_PX
+        return np.where((met & self.lens.determined(pixels))[:, None], unit, np.nan)
+
+    def determined(self, pixels: np.ndarray) -> np.ndarray:
+        """Return which pixels (n, 2) lie in the region in which the lens was determined, (n,) bool."""
+        return self.lens.determined(pixels)
+
+
+def camera_difference(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraDifference:
     """Return the difference between two cameras over the image.
 
     Images that differ by a rotation of the camera count as equal: it acts like a shift of the principal point.
 
     Parameters
     ----------
-    one, two : Camera
-        Cameras of the same image size.
+    one, two : Camera or SizedLens
+        Cameras of the same image size. Of a lens with a region only this is compared.
 
     Raises
     ------
@@ -59,7 +104,7 @@ def camera_difference(one: Camera, two: Camera) -> CameraDifference:
         )
     pixels = image_grid(one)
     flat = pixels.reshape(-1, 2)
-    first, second = rays(one, flat), rays(two, flat)
+    first, second = (each.rays(flat) if isinstance(each, SizedLens) else rays(each, flat) for each in (one, two))
     good = np.isfinite(first).all(1) & np.isfinite(second).all(1)
     if good.sum() < LEAST_POINTS:
         raise DegenerateError(
@@ -79,11 +124,14 @@ def camera_difference(one: Camera, two: Camera) -> CameraDifference:
         if np.abs(step).max() < STEP_RAD**2:
             break
     apart = np.full(flat.shape, np.nan)
-    apart[good] = two.project(turn @ first[good]) - flat[good]
+    seen = two.project(turn @ first[good])
+    if isinstance(two, SizedLens):
+        seen = np.where(two.determined(seen)[:, None], seen, np.nan)
+    apart[good] = seen - flat[good]
     return CameraDifference(pixels, apart.reshape(pixels.shape), turn)
 
 
-def image_grid(camera: Camera) -> np.ndarray:
+def image_grid(camera: Camera | SizedLens) -> np.ndarray:
     """Return a grid of pixels (r, c, 2) over the image, edges included."""
     count = max(round(CELLS * camera.width / camera.height), 2), CELLS
     x, y = (np.linspace(-0.5, side - 0.5, n) for side, n in zip((camera.width, camera.height), count, strict=True))
@@ -112,6 +160,10 @@ BEYOND = 0.01
 FAR_PX = 1e6
 """Residual, in px, where the fitted lens projects a ray to no pixel."""
 MOST_STEPS, SETTLED = 200, 1e-14
+GOOD_PX = 0.05
+"""Largest residual, px, of a fit that needs no turn: a turned camera has other axes, which its user must know of."""
+TURN_HELPS = 0.5
+"""Share of the RMS residual to which a turn of the camera must bring it down."""
 HALF = 0.5
 """Largest share by which a focal length may shrink in the fit."""
 SMALL = 1e-6
@@ -122,14 +174,16 @@ SMALL = 1e-6
 class FittedLens:
     """Result of fitting a lens.
 
-    ``camera`` : the fitted camera; ``rms_px``, ``most_px`` : RMS and largest residual over the image; ``share`` : share
-    of the azimuths in which the image ends within 89° of the axis.
+    ``camera`` : the fitted camera; ``rms_px``, ``most_px`` : RMS and largest residual over the image, or over the
+    region in which the lens was determined; ``share`` : share of the azimuths in which the image, or the region, ends
+    within 89° of the axis; ``camera_from_lens`` : the rotation of the camera's axes, the identity unless it helps much.
     """
 
     camera: CalibratedCamera
     rms_px: float
     most_px: float
     share: float
+    camera_from_lens: Rigid = field(default_factory=lambda: Rigid())
 
 
 def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
@@ -148,12 +202,24 @@ def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
         The lens projects nearly no ray into the image.
     """
     rays, pixels, share = _rays(lens, width, height)
+    straight = _best(lens, rays, pixels, share, (width, height), False)
+    if straight.most_px <= GOOD_PX:
+        return straight
+    turned = _best(lens, rays, pixels, share, (width, height), True)
+    return turned if turned.rms_px < TURN_HELPS * straight.rms_px else straight
+
+
+def _best(
+    lens: ForeignLens, rays: np.ndarray, pixels: np.ndarray, share: float, size: tuple[int, int], turn: bool
+) -> FittedLens:
+    """Return the fit of the model that is nearest; ``turn`` : whether the camera's axes are free."""
     best = None
     for model in CANDIDATES:
-        camera = _fitted(model, rays, pixels, lens, (width, height))
-        off = np.linalg.norm(camera.project(rays) - pixels, axis=1)
+        camera, camera_from_lens = _fitted(model, rays, pixels, lens, size, turn)
+        off = np.linalg.norm(camera.project(camera_from_lens @ rays) - pixels, axis=1)
         if best is None or not off.max() > best.most_px - AS_GOOD_PX:
-            best = FittedLens(camera, float(np.sqrt((off**2).mean())), float(off.max()), share)
+            rms = float(np.sqrt((off**2).mean()))
+            best = FittedLens(camera, rms, float(off.max()), share, camera_from_lens)
     assert best is not None
     return best
 
@@ -175,6 +241,7 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
         inside = ((pixels_of_azimuth >= -0.5 - far) & (pixels_of_azimuth <= np.array([width, height]) - 0.5 + far)).all(
             axis=1
         )
+        inside &= lens.determined(pixels_of_azimuth)
         grows = np.diff(radius, prepend=0) > 0  # beyond this radius the distortion folds over
         good = np.logical_and.accumulate(inside & grows)
         count = int(good.sum())
@@ -192,38 +259,53 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
 
 
 def _fitted(
-    model: str, rays: np.ndarray, pixels: np.ndarray, lens: ForeignLens, size: tuple[int, int]
-) -> CalibratedCamera:
-    """Fit one model by least squares; weights grow with the radius, since outer rays represent a larger area."""
+    model: str, rays: np.ndarray, pixels: np.ndarray, lens: ForeignLens, size: tuple[int, int], turn: bool
+) -> tuple[CalibratedCamera, Rigid]:
+    """Fit one model by least squares; weights grow with the radius, since outer rays represent a larger area.
+
+    Returns the camera, and camera_from_lens, the identity without ``turn``.
+    """
     about = lens.project(np.array([[0, 0, 1], [SMALL, 0, 1], [0, SMALL, 1]]))
     focal = np.linalg.norm(about[1:] - about[0], axis=1) / SMALL
     start = Camera(*size, focal, about[0], np.zeros(12), FISHEYE in model)
     weight = np.sqrt(np.linalg.norm(pixels - about[0], axis=1, keepdims=True) / max(size))
     basis = intrinsic_basis(model)
     names = parameter_names(model)
+    count = len(names)
     scale = np.array([focal[0] if name in ("fx", "fy", "cx", "cy") else 1.0 for name in names])
 
     def camera_at(x: np.ndarray) -> Camera:
-        return start.with_parameters(start.parameters() + basis @ (x * scale))
+        return start.with_parameters(start.parameters() + basis @ (x[:count] * scale))
+
+    def turned(x: np.ndarray) -> Rigid:
+        return Rigid.exp([*x[count:], 0, 0, 0]) if turn else Rigid()
 
     def off(x: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
-            away = weight * (camera_at(x).project(rays) - pixels)
+            away = weight * (camera_at(x).project(turned(x) @ rays) - pixels)
         return np.nan_to_num(away, nan=FAR_PX, posinf=FAR_PX, neginf=-FAR_PX).ravel()
 
     def slope(x: np.ndarray) -> np.ndarray:
-        derivatives = camera_at(x).parameter_jacobian(rays[:, :2]) @ basis * scale
-        return (weight[:, :, None] * derivatives).reshape(-1, len(names))
+        camera, xyz = camera_at(x), turned(x) @ rays
+        with np.errstate(all="ignore"):
+            derivatives = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis * scale
+            if turn:
+                steps = [x + np.eye(len(x))[count + i] * STEP_RAD for i in range(3)]
+                here = camera.project(xyz)
+                by_turn = [(camera.project(turned(step) @ rays) - here) / STEP_RAD for step in steps]
+                derivatives = np.concatenate([derivatives, np.stack(by_turn, axis=2)], axis=2)
+        return np.nan_to_num((weight[:, :, None] * derivatives).reshape(-1, len(x)), posinf=0, neginf=0)
 
+    lowest = np.concatenate([np.where(scale == 1, -np.inf, -HALF), [-np.inf] * 3 * turn])
     solution = least_squares(
         off,
-        np.zeros(len(names)),
+        np.zeros(len(lowest)),
         slope,  # pyright: ignore[reportArgumentType]
-        bounds=(np.where(scale == 1, -np.inf, -HALF), np.inf),
+        bounds=(lowest, np.inf),
         x_scale="jac",
         max_nfev=MOST_STEPS,
         xtol=SETTLED,
         ftol=SETTLED,
         gtol=SETTLED,
     )
-    return CalibratedCamera.of(camera_at(solution.x), model)
+    return CalibratedCamera.of(camera_at(solution.x), model), turned(solution.x)

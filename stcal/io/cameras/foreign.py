@@ -2,7 +2,7 @@
 
 import re
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,7 +52,8 @@ class ForeignLens:
     """A lens that is known by its projection only.
 
     ``called`` : name of its model; ``project`` : returns pixels (n, 2) of rays (n, 3), z > 0, centre of the first pixel
-    at (0, 0); ``width``, ``height`` : px, or None if the file states none; ``source`` : the file.
+    at (0, 0); ``width``, ``height`` : px, or None if the file states none; ``source`` : the file; ``region`` : polygon
+    (n, 2), px, within which the lens was determined, or None if the file states none.
     """
 
     called: str
@@ -60,6 +61,18 @@ class ForeignLens:
     width: int | None
     height: int | None
     source: str
+    region: np.ndarray | None = None
+
+    def determined(self, pixels: np.ndarray) -> np.ndarray:
+        """Return which pixels (n, 2) lie in the region, (n,) bool; all of them if the file states none."""
+        if self.region is None:
+            return np.ones(len(pixels), bool)
+        inside = np.zeros(len(pixels), bool)
+        for (x0, y0), (x1, y1) in zip(self.region, np.roll(self.region, -1, axis=0), strict=True):
+            crosses = (pixels[:, 1] < y0) != (pixels[:, 1] < y1)
+            if y0 != y1:
+                inside ^= crosses & (pixels[:, 0] < x0 + (pixels[:, 1] - y0) * (x1 - x0) / (y1 - y0))
+        return inside
 
 
 def of_colmap(model: str, width: float, height: float, params, source: str) -> CameraModel | ForeignLens:
@@ -128,16 +141,40 @@ def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
         There is no camera, there are several and no choice, or the model is unknown.
     """
     try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
+        # Without its log a database is read as it stands: SQLite would write files beside it.
+        how = "mode=ro" if _has_log(path) else "mode=ro&immutable=1"
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?{how}", uri=True)) as database:
             rows = database.execute("SELECT camera_id, model, width, height, params FROM cameras").fetchall()
         cameras = {str(number): (NUMBERS[model], *rest) for number, model, *rest in rows}
-        model, width, height, params = cameras[one_of(list(cameras), choice if choice.isdigit() else "", str(path))]
+        model, width, height, params = cameras[one_of(list(cameras), numbered(cameras, choice), str(path))]
         return of_colmap(model, width, height, np.frombuffer(params, "<f8"), str(path))
     except (sqlite3.Error, KeyError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())[:100]
+        if isinstance(error, sqlite3.Error) and _logs(path) and not _has_log(path):
+            raise InputError(
+                "E-CAMERA-UNREADABLE",
+                f"camera file {path}: a database whose newest content is in {path.name}-wal, which is missing or empty "
+                f"({reason}); copy both, or close the program that has it open and copy again",
+            ) from error
         raise InputError(
             "E-CAMERA-UNREADABLE", f"camera file {path}: no database of COLMAP ({reason}); check it"
         ) from error
+
+
+def _logs(path: Path) -> bool:
+    """Return True if a database is in SQLite's mode of a write-ahead log (sqlite.org/fileformat.html, 1.3)."""
+    with open(path, "rb") as stream:
+        return stream.read(20)[18:] == b"\2\2"
+
+
+def _has_log(path: Path) -> bool:
+    log = path.with_name(f"{path.name}-wal")
+    return log.is_file() and log.stat().st_size > 0
+
+
+def numbered(cameras: Collection[str], choice: str) -> str:
+    """Return the choice among numbered cameras; of a single one, a word is the name to write, and chooses nothing."""
+    return choice if choice.isdigit() or len(cameras) > 1 else ""
 
 
 def one_of(names: list[str], choice: str, source: str) -> str:
@@ -154,7 +191,8 @@ def one_of(names: list[str], choice: str, source: str) -> str:
         asked = f"no camera {choice}" if choice else f"{len(names)} cameras, 1 needed"
         shown = ", ".join(names[:12]) + (" …" if len(names) > 12 else "")
         raise InputError(
-            "E-CAMERA-SEVERAL", f"camera file {source}: {asked}; choose of {shown} with `stcal camera convert --name`"
+            "E-CAMERA-SEVERAL",
+            f"camera file {source}: {asked}; choose of {shown} with `stcal camera … --name`, elsewhere --camera-name",
         )
     return choice or names[0]
 
@@ -197,19 +235,51 @@ def of_skewed(
     InputError
         The number of coefficients is wrong, or values are impossible.
     """
-    camera = camera_from_opencv(lens, given, False, width, height, source)
+    if abs(skew) <= SQUARE * abs(lens[0]):
+        return camera_from_opencv(lens, given, False, width, height, source)
+    return of_parts(lens, skew, given, "perspective", width, height, source)
+
+
+def of_parts(
+    lens, skew: float, given: np.ndarray, kind: str, width: float, height: float, source: str, xi: float = 0.0
+) -> ForeignLens:
+    """Return a lens of a projection, OpenCV's distortion, and a matrix with skew.
+
+    Parameters
+    ----------
+    lens : sequence of 4 float
+        fx, fy, cx, cy, px.
+    skew : float
+        px, u = fx x + skew y + cx.
+    given : (k,) array
+        Coefficients in OpenCV's order: k1, k2, p1, p2, k3 …; k1 to k4 of an equidistant lens.
+    kind : str
+        perspective, equidistant, or unified: Mei's projection with ``xi``, of OpenCV's omnidir, Kalibr's omni and
+        camodocal's MEI.
+    width, height : float
+        Image size, px; 0 if the file states none.
+
+    Raises
+    ------
+    InputError
+        The number of coefficients is wrong, or values are impossible.
+    """
+    camera = camera_from_opencv(lens, given, kind == "equidistant", width, height, source)
     if not abs(skew) < abs(camera.focal[0]):
         raise InputError("E-CAMERA-SKEW", f"camera file {source}: skew {skew:g} px, less than fx needed; correct it")
-    if abs(skew) <= SQUARE * abs(camera.focal[0]):
-        return camera
+    if not (np.isfinite(xi) and xi >= 0):
+        raise InputError("E-CAMERA-CONTENT", f"camera file {source}: xi {xi:g}; a number from 0 needed")
     (fx, fy), (cx, cy) = camera.focal, camera.centre
-    matrix, flat = np.array([[fx, skew, cx], [0, fy, cy]]), Camera(1, 1, [1, 1], [0, 0], camera.distortion)
+    matrix = np.array([[fx, skew, cx], [0, fy, cy]])
+    flat = Camera(1, 1, [1, 1], [0, 0], camera.distortion, kind == "equidistant")
 
     def project(rays: np.ndarray) -> np.ndarray:
-        distorted = flat.distort(rays[:, :2] / rays[:, 2:])
+        xy = _on_plane(rays, "omni", np.array([xi])) if kind == "unified" else rays[:, :2] / rays[:, 2:]
+        distorted = flat.distort(xy)
         return np.column_stack([distorted, np.ones(len(distorted))]) @ matrix.T
 
-    return ForeignLens("a lens with skewed axes", project, camera.width, camera.height, source)
+    called = f"a unified lens with ξ = {xi:g}" if kind == "unified" else "a lens with skewed axes"
+    return ForeignLens(called, project, camera.width, camera.height, source)
 
 
 def of_kalibr(lens: str, distortion: str, values: dict, source: str) -> ForeignLens:

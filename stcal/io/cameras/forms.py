@@ -1,4 +1,4 @@
-"""Cameras of other programs: readers of Kalibr, mrcal, COLMAP's ``cameras.bin``; and writers of all forms.
+"""Cameras of other programs: readers of mrcal and COLMAP's ``cameras.bin``; and writers of all forms.
 
 Pixel origins: the centre of the first pixel is at (0, 0) in OpenCV, ROS, Kalibr and mrcal, at (0.5, 0.5) in COLMAP and
 Metashape; Metashape's principal point is relative to the middle of the image.
@@ -8,7 +8,7 @@ import ast
 import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,16 +19,17 @@ from stcal.io.cameras.foreign import (
     COLMAP_FOREIGN,
     NUMBERS,
     ForeignLens,
+    numbered,
     of_cahvor,
     of_colmap,
-    of_kalibr,
     of_opencv,
     of_splines,
     one_of,
     refused,
 )
+from stcal.io.cameras.keys import require_known
 from stcal.io.cameras.matlab import mat, zhang
-from stcal.io.cameras.model import CalibratedCamera, CameraModel, camera_from_opencv, cameras_txt, parameter_names
+from stcal.io.cameras.model import CalibratedCamera, CameraModel, cameras_txt, parameter_names
 
 SUFFIXES = {
     ".txt": "colmap",
@@ -42,8 +43,11 @@ SUFFIXES = {
 """The form of a file by its suffix."""
 MRCAL = {f"LENSMODEL_{name}": count for name, count in (("PINHOLE", 0), *((f"OPENCV{n}", n) for n in (4, 5, 8, 12)))}
 """Numbers of coefficients of those models of mrcal that are OpenCV's."""
+MRCAL_HARMLESS = ("extrinsics", "icamintrinsics", "optimizationinputs", "rtcamref", "rtrefcam")
+"""Keys of ``.cameramodel`` that say where a camera is, and from what it was calibrated."""
 MM_PER_M = 1000.0
-KALIBR = ("pinhole", "omni", "eucm", "ds")
+LEAST_CAMERA_BYTES = 48
+"""Bytes of a camera of ``cameras.bin`` with three parameters."""
 SIGMA_FORMS = ("colmap", "metashape-cameras")
 """The forms that have a place for σ and correlations."""
 
@@ -54,34 +58,6 @@ class Written:
 
     content: str | bytes
     lost: tuple[str, ...]
-
-
-def from_kalibr(values: Mapping, choice: str, source: str) -> CameraModel | ForeignLens:
-    """Return a camera of ``camchain.yaml``.
-
-    Raises
-    ------
-    InputError
-        There are several cameras and no choice, the choice is unknown, or the model is not supported.
-    """
-    cameras = {
-        str(name): value for name, value in values.items() if isinstance(value, dict) and "camera_model" in value
-    }
-    entry = cameras[one_of(list(cameras), choice, source)]
-    lens, distortion = entry.get("camera_model"), entry.get("distortion_model", "none")
-    if lens not in KALIBR or distortion not in ("radtan", "equidistant", "fov", "none"):
-        raise InputError(
-            "E-CAMERA-MODEL",
-            f"camera file {source}: {lens} with {distortion}; {', '.join(KALIBR)} with radtan, equidistant, fov or "
-            "none are read",
-        )
-    if lens != "pinhole" or distortion == "fov":
-        return of_kalibr(lens, distortion, entry, source)
-    fx, fy, cx, cy = np.array(entry["intrinsics"], float).tolist()
-    width, height = (float(side) for side in entry.get("resolution", (0, 0)))
-    given = np.array(entry.get("distortion_coeffs", []), float)
-    coefficients = given if distortion != "none" else np.zeros(0)
-    return camera_from_opencv([fx, fy, cx, cy], coefficients, distortion == "equidistant", width, height, source)
 
 
 def from_mrcal(text: str, source: str) -> CameraModel | ForeignLens:
@@ -101,17 +77,45 @@ def from_mrcal(text: str, source: str) -> CameraModel | ForeignLens:
         raise InputError(
             "E-CAMERA-UNREADABLE", f"camera file {source}: not mrcal's form ({reason}); write it anew with mrcal"
         ) from error
+    region = _region(values.get("valid_intrinsics_region"), source)
+    taken = ("lensmodel", "intrinsics", "imagersize", "valid_intrinsics_region")
+    require_known({key: value for key, value in values.items() if key not in taken}, source, MRCAL_HARMLESS)
     if str(lens).startswith("LENSMODEL_SPLINED"):
-        return of_splines(lens, numbers, width, height, source)
-    if lens == "LENSMODEL_CAHVOR":
-        return of_cahvor(numbers, width, height, source)
-    if lens not in MRCAL or len(numbers) != 4 + MRCAL[lens]:
+        made = of_splines(lens, numbers, width, height, source)
+    elif lens == "LENSMODEL_CAHVOR":
+        made = of_cahvor(numbers, width, height, source)
+    elif lens in MRCAL and len(numbers) == 4 + MRCAL[lens]:
+        made = of_opencv(numbers[:4], np.array(numbers[4:]), width, height, source)
+    else:
         raise InputError(
             "E-CAMERA-MODEL",
             f"camera file {source}: {lens} with {len(numbers)} intrinsics; {', '.join(MRCAL)}, CAHVOR and splined "
             "ones are read: mrcal-convert-lensmodel makes one of another",
         )
-    return of_opencv(numbers[:4], np.array(numbers[4:]), width, height, source)
+    return replace(made, region=region) if isinstance(made, ForeignLens) else made
+
+
+def _region(stated: object, source: str) -> np.ndarray | None:
+    """Return mrcal's polygon (n, 2), px, in which the intrinsics are valid; None if the file states none."""
+    try:
+        region = None if stated is None else np.array(stated, float)
+    except (TypeError, ValueError):
+        region = np.full(1, np.nan)  # refused below
+    if region is not None and not region.size:
+        return None
+    if region is not None and (region.ndim != 2 or region.shape[1] != 2 or not np.isfinite(region).all()):
+        raise InputError(
+            "E-CAMERA-CONTENT", f"camera file {source}: valid_intrinsics_region is no list of pixels; remove it"
+        )
+    return region
+
+
+def is_colmap_binary(content: bytes) -> bool:
+    """Return True if a file begins with a number of cameras that it is long enough for; a text states a huge one."""
+    if len(content) < 8:
+        return False
+    (count,) = struct.unpack_from("<Q", content, 0)
+    return count <= (len(content) - 8) // LEAST_CAMERA_BYTES
 
 
 def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
@@ -139,8 +143,19 @@ def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel 
         raise InputError(
             "E-CAMERA-UNREADABLE", f"camera file {source}: neither text nor COLMAP's cameras.bin; check it"
         )
-    model, width, height, params = cameras[one_of(list(cameras), choice if choice.isdigit() else "", source)]
+    model, width, height, params = cameras[one_of(list(cameras), numbered(cameras, choice), source)]
     return of_colmap(model, width, height, params, source)
+
+
+def name_to_write(name: str) -> str:
+    """Return a name that every form can hold, of the name that chose a camera: ``Cam B (35mm)`` gives ``Cam_B_35mm``.
+
+    A number gets ``cam`` in front; without a name it is ``cam0``.
+    """
+    word = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")
+    if not word:
+        return "cam0"
+    return word if word[0].isalpha() else f"cam{word}"
 
 
 def written(camera: CalibratedCamera, form: str, name: str) -> Written:

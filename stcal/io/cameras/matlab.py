@@ -3,7 +3,9 @@
 In MATLAB's toolbox the centre of the first pixel is at (1, 1); in Bouguet's it is at (0, 0), as in OpenCV.
 """
 
+import contextlib
 import io
+import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,6 +16,7 @@ from scipy.io.matlab import MatReadWarning, MatWriteWarning
 
 from stcal.errors import InputError
 from stcal.io.cameras.foreign import ForeignLens, of_skewed, one_of
+from stcal.io.cameras.keys import require_known
 from stcal.io.cameras.model import CalibratedCamera, CameraModel
 
 HEADS = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
@@ -24,6 +27,24 @@ BOUGUET = ("fc", "cc", "kc")
 BOUGUET_SIGMAS = 3.0
 """Factor from σ to Bouguet's ``…_error`` (vision.caltech.edu/bouguetj/calib_doc, "Description of the calibration
 parameters")."""
+TAKEN = {
+    *("K", "IntrinsicMatrix", "FocalLength", "PrincipalPoint", "Skew", "ImageSize", "RadialDistortion"),
+    *("TangentialDistortion", "MappingCoefficients"),
+}
+HARMLESS = (
+    *("worldpoints", "worldunits", "estimateskew", "estimatetangentialdistortion", "reproject*", "rotation*"),
+    *("translation*", "patternextrinsics*", "detectedkeypoints", "numradial*", "numpatterns", "version", "intrinsics"),
+    *("reprojectedpoints", "reprojectionerrors", "meanreprojectionerror", "cameraparameters", "fixedparams"),
+)
+"""Fields of MATLAB's camera that are not of the lens, or repeat it."""
+BOUGUET_TAKEN = {*BOUGUET, *(f"{key}_error" for key in BOUGUET), "alpha_c", "alpha_c_error", "nx", "ny"}
+BOUGUET_HARMLESS = (
+    *("kk", "invkk", "omc*", "tc*", "rc*", "h*", "x*", "y*", "ex*", "dx*", "dy*", "wint*", "nsqu*", "est*", "ima*"),
+    *("ind*", "active*", "center*", "solution*", "param*", "err*", "check*", "init*", "quick*", "dont*", "max*"),
+    *("two*", "thresh*", "recompute*", "format*", "type*", "first*", "last*", "smallcalib*", "n", "nima", "cond*"),
+    *("desactivated*", "save*", "string*", "sol*", "jj*", "pp*", "aspect*", "title*", "manual*", "rosette*", "fp*"),
+)
+"""Variables of Bouguet's toolbox: its settings, points and poses; ``KK`` repeats the intrinsics."""
 HEAD_BYTES = 116
 """Length of the text at the beginning of a file; scipy writes the time into it."""
 
@@ -72,6 +93,8 @@ def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
     InputError
         The lens is a fisheye lens, or a field is missing.
     """
+    unread = {key: _plain_value(value) for key, value in values.items() if key not in TAKEN}
+    require_known(unread, source, HARMLESS)
     if "MappingCoefficients" in values:
         raise InputError(
             "E-CAMERA-MODEL", f"camera file {source}: MATLAB's fisheye model is not supported; calibrate with another"
@@ -99,6 +122,11 @@ def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
     p = [0.0, 0.0] if tangential is None else tangential
     lens = [fx, fy, cx - PIXEL_ORIGIN, cy - PIXEL_ORIGIN]
     return of_skewed(lens, float(skew), np.array([*k[:2], *p, *k[2:]], float), float(width), float(height), source)
+
+
+def _plain_value(value: object) -> object:
+    """Return an array as a list, so that an empty one or one of zeros is seen as such."""
+    return np.asarray(value).ravel().tolist() if isinstance(value, np.ndarray) else value
 
 
 def _structures(values: Mapping, where: str):
@@ -135,6 +163,9 @@ def _known(values: Mapping, key: str, source: str, count: int) -> np.ndarray:
 
 
 def _from_bouguet(values: Mapping, source: str) -> CameraModel | ForeignLens:
+    own = {key: value for key, value in values.items() if not key.startswith("__")}
+    unread = {key: _plain_value(value) for key, value in own.items() if key not in BOUGUET_TAKEN}
+    require_known(unread, source, BOUGUET_HARMLESS)
     focal, centre, k = (_known(values, key, source, n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True))
     width, height = (float(np.asarray(values.get(key, 0)).sum()) for key in ("nx", "ny"))
     skew = float(np.asarray(values.get("alpha_c", 0.0)).sum()) * focal[0]
@@ -146,6 +177,27 @@ def _from_bouguet(values: Mapping, source: str) -> CameraModel | ForeignLens:
     errors = [_known(values, f"{key}_error", source, n) for key, n in zip(BOUGUET, (2, 2, 5), strict=True)]
     sigma = np.concatenate(errors)[:8] / BOUGUET_SIGMAS
     return replace(lens, covariance=np.diag(sigma**2)) if (sigma > 0).all() and np.isfinite(sigma).all() else lens
+
+
+def is_script(text: str) -> bool:
+    """Return True if a text assigns Bouguet's ``fc`` and ``cc`` as his ``Calib_Results.m`` does."""
+    return all(re.search(rf"(?m)^\s*{key}\s*=\s*\[", text) for key in BOUGUET[:2])
+
+
+def from_script(text: str, source: str) -> CameraModel | ForeignLens:
+    """Return the camera of Bouguet's ``Calib_Results.m``; errors as :func:`from_mat`."""
+    lines = "\n".join(line.split("%")[0] for line in text.splitlines())
+    values: dict[str, object] = {}
+    for name, listed, single in re.findall(r"(?m)^\s*(\w+)\s*=\s*(?:\[([^\]]*)\]|([^;\[\n]+))\s*;?", lines):
+        words = re.split(r"[\s,;]+", (listed or single).strip())
+        with contextlib.suppress(ValueError):  # settings in words
+            numbers = np.array(words, float) if words != [""] else np.zeros(0)
+            if name in values and not np.array_equal(np.asarray(values[name]), numbers):
+                raise InputError("E-CAMERA-REPEATED", f"camera file {source}: {name} twice; leave one in")
+            values[name] = numbers
+    if BOUGUET[2] not in values:
+        raise InputError("E-CAMERA-CONTENT", f"camera file {source}: no kc; 5 numbers needed")
+    return _from_bouguet(values, source)
 
 
 def mat(camera: CalibratedCamera, name: str) -> bytes:

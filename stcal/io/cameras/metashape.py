@@ -6,12 +6,15 @@ a ``<covariance>`` of its adjusted parameters, in the units of the parameters.
 """
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.io.cameras.foreign import one_of, refused
+from stcal.geometry.camera import Camera
+from stcal.io.cameras.foreign import ForeignLens, one_of, refused
+from stcal.io.cameras.keys import require_known
 from stcal.io.cameras.model import (
     COLMAP_PIXEL_ORIGIN,
     FISHEYE,
@@ -24,6 +27,10 @@ from stcal.io.cameras.model import (
 from stcal.io.covariance import Rows, require_covariance
 
 NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+MORE_NAMES = ("p3", "p4")
+"""Parameters of Metashape up to version 1.8, and of PhotoScan, that later ones have not."""
+OTHER_KEYS = ("projection", "width", "height", "resolution")
+HARMLESS = ("date", "class", "type", "filmcamera", "sensorid")
 ROOTS = ("document", "chunk", "sensors", "sensor")
 """Root elements of files with sensors."""
 KINDS = ("frame", "fisheye", "equidistant_fisheye")
@@ -34,37 +41,67 @@ OWN = {"f": "fy", "p1": "p2", "p2": "p1"} | {name: name for name in ("cx", "cy",
 """OpenCV's names of Metashape's parameters; ``b1`` and ``f`` together are fx."""
 
 
-def from_calibration(root: ElementTree.Element, source: str) -> CameraModel:
-    """Return the camera of a ``<calibration>`` with frame or fisheye projection and without skew.
+def from_calibration(root: ElementTree.Element, source: str) -> CameraModel | ForeignLens:
+    """Return the camera of a ``<calibration>`` with frame or fisheye projection.
+
+    With ``b2``, ``p3`` or ``p4``, and a frame camera with ``k4``, it is a foreign lens.
 
     Raises
     ------
     InputError
-        The projection is another one, or a value has no place in OpenCV's model.
+        The projection is another one, a key may change it and is not known, or a value is impossible.
     """
-    texts = {child.tag: (child.text or "").strip() for child in root}
+    texts: dict[str, str] = {}
+    for child in root:
+        if child.tag in texts:
+            raise InputError("E-CAMERA-REPEATED", f"camera file {source}: {child.tag[:40]} twice; leave one in")
+        texts[child.tag] = (child.text or "").strip()
     kind = texts.get("projection", root.get("type", "frame"))
     if kind not in KINDS:
         raise InputError("E-CAMERA-MODEL", f"camera file {source}: projection {kind}; frame and fisheye are read")
-    v = {name: float(texts.get(name, 0) or 0) for name in NAMES}
+    names = (*NAMES, *MORE_NAMES)
+    require_known(
+        {key: text for key, text in (texts | root.attrib).items() if key not in (*names, *OTHER_KEYS)}, source, HARMLESS
+    )
+    v = {name: float(texts.get(name, 0) or 0) for name in names}
     size = root.find("resolution")
     stated = texts if size is None else size.attrib
     width, height = float(stated["width"]), float(stated["height"])
-    if v["b2"] or (v["k4"] and kind == "frame"):
-        name = "b2" if v["b2"] else "k4"
-        raise InputError(
-            "E-CAMERA-MODEL",
-            f"camera file {source}: {name} is {v[name]:g}, without place in OpenCV's model; fit without it",
-        )
     centre = width / 2 + v["cx"] - COLMAP_PIXEL_ORIGIN, height / 2 + v["cy"] - COLMAP_PIXEL_ORIGIN
     distortion = np.array([v["k1"], v["k2"], v["p2"], v["p1"], v["k3"], v["k4"]])
     lens = [v["f"] + v["b1"], v["f"], *centre]
+    if v["b2"] or v["p3"] or v["p4"] or (v["k4"] and kind == "frame"):
+        return _foreign(v, lens, kind, width, height, source)
     if kind == "frame":
         return camera_from_opencv(lens, distortion[:5], False, width, height, source)
     return camera_from_opencv(lens, distortion, True, width, height, source, tangential=True)
 
 
-def from_cameras(root: ElementTree.Element, choice: str, source: str) -> CameraModel:
+def _foreign(v: Mapping[str, float], lens, kind: str, width: float, height: float, source: str) -> ForeignLens:
+    """Return the lens by Metashape's formula (PhotoScan's manual, version 1.2, appendix C, with ``p3`` and ``p4``)."""
+    camera = camera_from_opencv(lens, np.array([v["k1"], v["k2"], 0, 0]), False, width, height, source)
+    numbers = np.array([v[name] for name in (*NAMES, *MORE_NAMES)])
+    if not np.isfinite(numbers).all():
+        raise InputError(
+            "E-CAMERA-NOT-FINITE", f"camera file {source}: a camera parameter is not a finite number; correct it"
+        )
+    matrix = np.array([[lens[0], v["b2"], lens[2]], [0, lens[1], lens[3]]])
+    flat = Camera(1, 1, [1, 1], [0, 0], np.zeros(12), kind != "frame")
+
+    def project(rays: np.ndarray) -> np.ndarray:
+        x, y = flat.distort(rays[:, :2] / rays[:, 2:]).T
+        r2 = x * x + y * y
+        radial = 1 + r2 * (v["k1"] + r2 * (v["k2"] + r2 * (v["k3"] + r2 * v["k4"])))
+        grown = 1 + r2 * (v["p3"] + r2 * v["p4"])
+        across = v["p1"] * (r2 + 2 * x * x) + 2 * v["p2"] * x * y
+        up = v["p2"] * (r2 + 2 * y * y) + 2 * v["p1"] * x * y
+        return np.column_stack([x * radial + across * grown, y * radial + up * grown, np.ones(len(x))]) @ matrix.T
+
+    own = ", ".join(f"{name} = {v[name]:g}" for name in ("b2", "k4", "p3", "p4") if v[name])
+    return ForeignLens(f"Metashape's lens with {own}", project, camera.width, camera.height, source)
+
+
+def from_cameras(root: ElementTree.Element, choice: str, source: str) -> CameraModel | ForeignLens:
     """Return a sensor of exported cameras, or of a project's ``doc.xml``, as adjusted, with its covariance.
 
     Raises
@@ -86,7 +123,9 @@ def from_cameras(root: ElementTree.Element, choice: str, source: str) -> CameraM
         )
     chosen, covariance = sensors[one_of(list(sensors), choice, source)]
     camera = from_calibration(chosen, source)
-    return camera if covariance is None else _with_covariance(camera, covariance, source)
+    if covariance is None or isinstance(camera, ForeignLens):
+        return camera
+    return _with_covariance(camera, covariance, source)
 
 
 def _with_covariance(camera: CameraModel, stated: ElementTree.Element, source: str) -> CameraModel:

@@ -68,10 +68,19 @@ def camera_of_photograph(path: str | Path) -> Photograph:
         ) from error
     focal, source = _focal_px(exif, width, height)
     if focal is None:
+        focal_mm = _positive(exif.get(ExifTags.Base.FocalLength))
+        what = f"{focal_mm:g} mm, but no size of its pixels" if focal_mm else "no focal length"
         raise InputError(
             "E-CAMERA-EXIF",
-            f"camera file {path}: a photograph without focal length in its EXIF; give a camera file, or "
+            f"camera file {path}: a photograph whose EXIF states {what}; give a camera file, or "
             "`stcal-sfm calibrate-camera`",
+        )
+    zoom = _positive(exif.get(ExifTags.Base.DigitalZoomRatio)) or 1.0
+    if zoom != 1:
+        raise InputError(
+            "E-CAMERA-EXIF",
+            f"camera file {path}: a photograph with a digital zoom of {zoom:g}; makers differ in whether the focal "
+            f"length includes it, so that it is {focal:.0f} or {zoom * focal:.0f} px; take one without zoom",
         )
     if exif.get(ExifTags.Base.ExifImageWidth, width) not in (width, height):
         source += f", of {exif[ExifTags.Base.ExifImageWidth]} px before it was made {width} px wide"
@@ -92,7 +101,9 @@ def _focal_px(exif: dict, width: int, height: int) -> tuple[float | None, str]:
     unit_mm = UNIT_MM.get(exif.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
     if focal_mm and per_unit and unit_mm:
         pitch_um = 1e3 * unit_mm / per_unit / scale
-        return focal_mm / pitch_um * 1e3, f"focal length {focal_mm:g} mm, pixels of {pitch_um:.3g} µm"
+        sensor = "×".join(f"{1e-3 * pitch_um * side:.3g}" for side in (width, height))
+        told = f"focal length {focal_mm:g} mm, pixels of {pitch_um:.3g} µm, so a sensor of {sensor} mm (check it)"
+        return focal_mm / pitch_um * 1e3, told
     film_mm = _positive(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
     if film_mm:
         return film_mm / FILM_DIAGONAL_MM * float(np.hypot(width, height)), f"{film_mm:g} mm in 35 mm film"

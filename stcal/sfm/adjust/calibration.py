@@ -50,8 +50,8 @@ class Calibration:
     if it was requested; ``sigma_factors`` : ratios of the residuals of the single groups to the centres' own σ;
     ``models`` : models that the result rests on, mm, target frame, without groups that are not linked to it;
     ``camera`` : refined camera if it was refined, else the given one; ``notes`` : faces without a frame and the
-    reasons, and an adjustment that did not settle; ``rim_mm`` : heights of the rims behind which circles lie, if the result
-    is of the luminous surface, empty if it is of what is seen.
+    reasons, and an adjustment that did not settle; ``rim_mm`` : heights of the rims behind which circles lie, if the
+    result is of the luminous surface, empty if it is of what is seen.
     """
 
     target: CalibratedTarget

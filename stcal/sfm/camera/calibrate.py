@@ -11,8 +11,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import COLMAP_MODELS, CameraModel
-from stcal.io.files import IMAGE_BYTES, read_bytes
-from stcal.io.images import ImageFile, Skipped, decode, find_images
+from stcal.io.images import Skipped, find_images, require_common_size
 from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.camera.checks import (
     AUTO,
@@ -126,7 +125,7 @@ def calibrate_camera(
     require_model(colmap_model)
     progress = progress or (lambda *_: None)
     files, not_images = find_images(images)
-    camera = start_camera(*first_size(files), colmap_model)
+    camera = start_camera(*require_common_size(files)[0], colmap_model)
     before: Intrinsics | None = None
     settled = False
     with tempfile.TemporaryDirectory(prefix="stcal-camera-") as cache:
@@ -218,23 +217,10 @@ def rejudged(before: CameraCalibration, result: Intrinsics, board: BoardDesign) 
     return replace(before, intrinsics=result, projection=projection, warnings=warnings)
 
 
-def first_size(files: list[ImageFile]) -> tuple[int, int]:
-    """Returns width and height of the first readable image."""
-    for file in files:
-        try:
-            height, width = decode(read_bytes(file.path, IMAGE_BYTES), file.name).shape
-        except (InputError, OSError):
-            continue
-        return width, height
-    raise InputError(
-        "E-IMAGES-NONE-READABLE", f"no readable image among {len(files)}, first {files[0].name}; check the files"
-    )
-
-
 def _detect(
     files, camera: Camera, colmap_model: str, target, board, ellipses, cache: Path, workers, progress, rounds: int
 ) -> DetectionResult:
-    # No size is given: it comes from the first readable image, and messages should say so.
+    # No size is given: it comes from most of the images, and messages should say so.
     model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
     step = counted(progress, f"detect {rounds}", len(files))
     return detect_files(files, model, target, board, ellipses or EllipseOptions(), cache, workers, step)

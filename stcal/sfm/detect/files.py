@@ -19,7 +19,17 @@ from stcal.io.cache import keep, kept, packed
 from stcal.io.cameras.model import CameraModel
 from stcal.io.files import save
 from stcal.io.image_jobs import run_on_images
-from stcal.io.images import ImageFile, Skipped, decode, grey_8bit, same_photograph, thumbnail
+from stcal.io.images import (
+    MAJORITY,
+    ImageFile,
+    Skipped,
+    decode,
+    grey_8bit,
+    require_common_size,
+    same_photograph,
+    size_fault,
+    thumbnail,
+)
 from stcal.labels import parse_label, parse_labels
 from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -117,19 +127,12 @@ def detect_files(
 
 
 def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera, str]:
-    """The camera, and what its size is from: a file of OpenCV may not say it, then the first readable image does."""
+    """The camera, and what its size is from: a file of OpenCV may not say it, then most of the images do."""
     if camera_model.width and camera_model.height:
         return camera_model.sized(camera_model.width, camera_model.height), "the camera file"
-    for file in files:
-        try:
-            height, width = decode(file.read(), file.name).shape
-        except (InputError, OSError):
-            continue
-        camera_model.require_inside(width, height, file.name)
-        return camera_model.sized(width, height), "the first readable image"
-    raise InputError(
-        "E-IMAGES-NONE-READABLE", f"no readable image among {len(files)}, first {files[0].name}; check the files"
-    )
+    size, name = require_common_size(files)
+    camera_model.require_inside(*size, name)
+    return camera_model.sized(*size), MAJORITY
 
 
 def _fingerprint(
@@ -200,19 +203,12 @@ def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, 
     except OSError as error:
         return Skipped(file.name, f"cannot be read: {error.strerror or error}")
     try:
-        image = decode(data, file.name)
+        image = decode(data, file.name, (camera.width, camera.height))
     except InputError as error:
         return Skipped(file.name, str(error).removeprefix(f"{file.name}: "))
     height, width = image.shape
     if (width, height) != (camera.width, camera.height):
-        return Skipped(
-            file.name,
-            f"{width}×{height} px, but {size_from} says {camera.width}×{camera.height} px; "
-            "use images as the camera took them, or the camera file that belongs to them",
-            "image_size",
-            f"{width}×{height} px",
-            f"{camera.width}×{camera.height} px",
-        )
+        return size_fault(file.name, (width, height), (camera.width, camera.height), size_from)
     return data, image
 
 
@@ -320,7 +316,7 @@ def _look_again(
     file: ImageFile, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
 ) -> SecondLook | None:
     try:
-        image = decode(file.read(), file.name)
+        image = decode(file.read(), file.name, (camera.width, camera.height))
     except (InputError, OSError):
         return None
     return measure_predicted(image, camera, predicted, options)

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.model import CalibratedCamera, camera_from_colmap
 from stcal.io.files import MODEL_BYTES, TABLE_BYTES, read_bytes, require_size
+from stcal.io.poses.colmap_images import image_lines
 from stcal.labels import DotLabel, Label
 from stcal.sfm.data.model import GroupModel, ImageObservations, MetricModel, WorldModel
 from stcal.sfm.mapping.colmap import pycolmap
@@ -249,12 +251,30 @@ def open_model(path: Path) -> pycolmap.Reconstruction:
                 _require_whole(file, skip)
         for file in Path(path).glob("*.txt"):
             require_size(file, TABLE_BYTES)
+        _require_second_lines(Path(path) / "images.txt")
         return pycolmap.Reconstruction(str(path))
     except (RuntimeError, ValueError, IndexError, OverflowError, OSError) as error:
-        reason = " ".join(str(error).split())[-150:]
+        reason = _CHECK.sub("", " ".join(str(error).split()))[-150:] or "a line or record of another form"
         raise InputError(
             "E-MODEL-UNREADABLE", f"model {path}: damaged or incomplete ({reason}); write or copy it again"
         ) from error
+
+
+_CHECK = re.compile(r"\[\w.]+:\d+\] Check failed: .*")
+"""COLMAP's words for a fault of a file: a place in its own source."""
+
+
+def _require_second_lines(file: Path) -> None:
+    """Refuse an ``images.txt`` without the empty lines of images without points: COLMAP passes over such images."""
+    if not file.exists():
+        return
+    for image in image_lines(read_bytes(file, TABLE_BYTES).decode("utf-8-sig", "replace"), f"model {file}"):
+        if not image.followed:
+            raise InputError(
+                "E-MODEL-UNREADABLE",
+                f"model {file}: line {image.number}: {image.name[:80]} has no second line, which is empty without "
+                "points; add it after each such image, or export the model anew",
+            )
 
 
 class _Walk:

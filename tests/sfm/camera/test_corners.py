@@ -7,13 +7,98 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.design import ChessboardDesign, TagLayout
-from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
-from tests.boards.drawn import chessboard_mm, photograph
+from stcal.boards.design import (
+    AprilGridDesign,
+    AsymmetricCirclesDesign,
+    CharucoDesign,
+    ChessboardDesign,
+    TagLayout,
+)
+from stcal.labels import DotLabel
+from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid, point_grid
+from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph
 from tests.outcome import fails_with
 
 FOCAL, CENTRE = (1500.0, 1490.0), (610.0, 440.0)
 CHESSBOARD = 'type = "chessboard"\nrows = 7\ncolumns = 10\nsquare_mm = 12.0\n'
+
+
+def taken(folder, sheet: np.ndarray, origin_mm, middle_mm, count: int, away_mm=(230, 300)) -> None:
+    """Photographs, 1200×900 px, of a sheet (4 px a millimetre) whose board begins at ``origin_mm`` of it."""
+    rng = np.random.default_rng(5)
+    inner = np.array([[FOCAL[0], 0, CENTRE[0]], [0, FOCAL[1], CENTRE[1]], [0, 0, 1]])
+    board_from_sheet = np.array([[1, 0, -origin_mm[0]], [0, 1, -origin_mm[1]], [0, 0, 1.0]])
+    for i in range(count):
+        turn = Rotation.from_euler("xyz", [*rng.uniform(-30, 30, 2), rng.uniform(-30, 30)], degrees=True).as_matrix()
+        place = np.array([rng.uniform(-15, 15), rng.uniform(-12, 12), rng.uniform(*away_mm)]) - turn @ middle_mm
+        image_from_mm = inner @ np.column_stack([turn[:, :2], place])
+        cv2.imwrite(str(folder / f"{i}.png"), photograph(sheet, 4, image_from_mm @ board_from_sheet))
+
+
+def assert_true_camera(found: dict) -> None:
+    for name, true in zip(("fx", "fy", "cx", "cy"), (*FOCAL, *CENTRE), strict=True):
+        assert 0 < found[name]["sigma"] < 5
+        assert abs(found[name]["value"] - true) < 4 * found[name]["sigma"] + 0.5  # half a pixel of drawing
+
+
+KALIBR = "target_type: 'aprilgrid'\ntagCols: 4\ntagRows: 3\ntagSize: 0.02\ntagSpacing: 0.3\n"
+
+
+@pytest.mark.slow
+def test_an_aprilgrid_of_kalibr_gives_the_camera(tmp_path, stcal_sfm):
+    board = AprilGridDesign(3, 4, 20.0, 0.3)
+    sheet, origin = aprilgrid_mm(board, 2)
+    (tmp_path / "photographs").mkdir()
+    taken(tmp_path / "photographs", sheet, origin, np.array([52.0, -36.0, 0.0]), 8)
+    (tmp_path / "april.yaml").write_text(KALIBR)
+    code, text, error = stcal_sfm(
+        *("calibrate-camera", tmp_path / "photographs", "--board", tmp_path / "april.yaml"),
+        *("--out", tmp_path / "cameras.txt", "--model", "PINHOLE"),
+    )
+    assert code == 0, error
+    assert_true_camera(json.loads((tmp_path / "cameras.json").read_text())["parameters"])
+    assert "8 views of the board" in text
+
+
+@pytest.mark.slow
+def test_asymmetric_circles_give_the_camera(tmp_path, stcal_sfm):
+    rows, columns, spacing, radius = 11, 4, 8.0, 4.0
+    sheet = np.full((120 * 4, 100 * 4), 255, np.uint8)
+    for row in range(rows):
+        for place in range(columns):
+            x, y = 20 + spacing * (2 * place + row % 2), 20 + spacing * row
+            centre = (round((4 * x - 0.5) * 16), round((4 * y - 0.5) * 16))  # mm begin at the edge of the first pixel
+            cv2.circle(sheet, centre, round(radius * 4 * 16), 0, -1, cv2.LINE_AA, 4)
+    (tmp_path / "photographs").mkdir()
+    taken(tmp_path / "photographs", sheet, (20, 20), np.array([28.0, 40.0, 0.0]), 8, (190, 240))
+    (tmp_path / "board.toml").write_text(
+        'type = "asymmetric-circles"\nrows = 11\ncolumns = 4\nspacing_mm = 8.0\nradius_mm = 4.0\npolarity = "dark"\n'
+    )
+    code, _, error = stcal_sfm(
+        *("calibrate-camera", tmp_path / "photographs", "--board", tmp_path / "board.toml"),
+        *("--out", tmp_path / "cameras.txt", "--model", "PINHOLE"),
+    )
+    assert code == 0, error
+    assert_true_camera(json.loads((tmp_path / "cameras.json").read_text())["parameters"])
+
+
+@pytest.mark.parametrize(
+    "board",
+    [
+        AprilGridDesign(3, 4, 20.0, 0.3),
+        AsymmetricCirclesDesign(5, 3, 8.0, 2.0, "dark"),
+        AsymmetricCirclesDesign(4, 3, 8.0, None, "dark"),
+        ChessboardDesign(4, 6, 25.0),
+        CharucoDesign(5, 7, 30.0, 20.0, "DICT_4X4_50"),
+    ],
+)
+def test_points_keep_their_places(board):
+    """The label of each point of a view stands where the board has the point."""
+    points = point_grid(board)
+    labels = [DotLabel(*cell) for cell in points.cells.tolist()]
+    places = points.grid.places_mm(labels)[:, :2]
+    np.testing.assert_allclose(places - places[0], board.xy_mm() - board.xy_mm()[0], atol=1e-5)
+    assert len(set(labels)) == len(board.xy_mm())
 
 
 @pytest.fixture(scope="module")

@@ -782,3 +782,18 @@ def test_a_model_that_the_disk_does_not_take_is_said(small_run, tmp_path):
         expected = "is not what was written; check the folder's space" if place.name.endswith("-1000") else "written"
         assert line.startswith(place.name)
         assert expected in line
+
+
+@pytest.mark.parametrize("fault", ["no empty lines", "no last line", "two cells"])
+def test_images_without_their_second_lines_are_named(tmp_path, fault):
+    """COLMAP passes over every other image without a word, or tells a place in its own source."""
+    a, b = (f"{i} 1 0 0 0 0 0 {i} 1 {i}.jpg\n" for i in (1, 2))
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
+    (tmp_path / "points3D.txt").write_text("")
+    (tmp_path / "images.txt").write_text(f"{a}\n{b}\n")
+    assert len(open_model(tmp_path).images) == 2
+    text = {"no empty lines": a + b, "no last line": f"{a}\n{b}", "two cells": f"{a}1 2\n{b}\n"}[fault]
+    (tmp_path / "images.txt").write_text(text)
+    with fails_with("E-MODEL-UNREADABLE … images.txt … line") as caught:
+        open_model(tmp_path)
+    assert "Check failed" not in str(caught.value)

@@ -741,7 +741,7 @@ def test_a_camera_of_opencv_without_a_size(small_set, small_run, stcal_sfm):
     path.write_text(text, encoding="utf-8")
     small.image(3).write_bytes(encoded(".jpg", pixels(small.image(3))[:-100]))
     out = assert_success(stcal_sfm(*small.arguments("--camera", path, *CHAIN)))
-    assert "skipped 12/IMG_1003.jpg: 1296×764 px, but the first readable image says 1296×864 px" in out
+    assert "skipped 12/IMG_1003.jpg: 1296×764 px, but the majority of the images says 1296×864 px" in out
     expected = {key: xy for key, xy in detections(small_run).items() if key[0].startswith("12/IMG_1000")}
     found = {key: xy for key, xy in detections(small.out).items() if key[0].startswith("12/IMG_1000")}
     same_centres(found, expected, 1e-5)

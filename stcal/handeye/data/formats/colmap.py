@@ -9,6 +9,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.handeye.data.formats.record import Content, Frames, Side, require_each_once
 from stcal.io.files import MODEL_BYTES, read_bytes
+from stcal.io.poses.colmap_images import image_lines
 from stcal.io.poses.rotations import of_quaternions, require_finite
 
 TEXT, BINARY = "images.txt", "images.bin"
@@ -39,23 +40,9 @@ def read_text(text: str, where: str) -> Content:
     InputError
         A line does not have the form of the format.
     """
-    rows, names, places, expected = [], [], [], True
-    for i, line in enumerate(text.splitlines(), 1):
-        if expected and (not line.strip() or line.lstrip().startswith("#")):
-            continue
-        if expected:
-            cells = line.split(maxsplit=9)
-            row = _floats(cells[1:8]) if len(cells) == 10 else None
-            if row is None:
-                raise InputError(
-                    "E-MODEL-UNREADABLE",
-                    f"{where}: line {i}: not `id qw qx qy qz tx ty tz camera name`; export the model anew",
-                )
-            rows.append(row)
-            names.append(cells[9].strip())
-            places.append(f"line {i}")
-        expected = not expected
-    return _content(rows, names, places, where)
+    images = image_lines(text, where)
+    places = [f"line {image.number}" for image in images]
+    return _content([image.pose for image in images], [image.name for image in images], places, where)
 
 
 def read_binary(path: Path, where: str) -> Content:

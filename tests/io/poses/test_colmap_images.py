@@ -1,0 +1,34 @@
+"""``images.txt`` with and without its empty lines."""
+
+import numpy as np
+import pytest
+
+from stcal.io.poses.colmap_images import image_lines
+from tests.outcome import fails_with
+
+A, B, C = (f"{i} 1 0 0 0 0 0 {i} 1 {name}\n" for i, name in ((1, "a.jpg"), (2, "b c.jpg"), (3, "0003")))
+
+
+@pytest.mark.parametrize(
+    ("text", "followed"),
+    [
+        (f"# head\n{A}\n{B}\n{C}\n", [True, True, True]),
+        (f"{A}1.5 2.5 -1 3 4 7\n{B}\n{C}5 6 1\n", [True, True, True]),
+        (A + B + C, [False, False, False]),
+        (f"{A}\n{B}\n{C}", [True, True, False]),
+        (f"\n\n{A}{B}1 2 3\n{C}\n", [False, True, True]),
+    ],
+)
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_every_image_is_read(text, followed, end):
+    images = image_lines(text.replace("\n", end), "images.txt")
+    assert [image.name for image in images] == ["a.jpg", "b c.jpg", "0003"]
+    assert [image.followed for image in images] == followed
+    np.testing.assert_array_equal([image.pose for image in images], [[1, 0, 0, 0, 0, 0, z] for z in (1, 2, 3)])
+
+
+def test_a_line_of_another_form_is_named():
+    with fails_with("E-MODEL-UNREADABLE … line 2 … 2 cells"):
+        image_lines(f"{A}1.0 2.0\n{B}\n", "images.txt")
+    with fails_with("E-MODEL-UNREADABLE … line 3"):
+        image_lines(f"{A}\nno image\n", "images.txt")
