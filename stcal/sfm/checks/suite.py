@@ -46,6 +46,8 @@ JOINT = (
 """Checks that need the joint result and its covariances."""
 CONTROL = "Uncorrected control"
 MICRO = 1e3
+IN_PAIRS = 2
+"""Number of functions that make two checks each: of the board, and of the radii."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,12 +102,13 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: flatness_check(networks, evidence.options.flatness_mm),
         lambda: control_check(evidence, networks),
     )
-    step = counted(progress or (lambda *_: None), "check", len(makers))
+    step = counted(progress or (lambda *_: None), "check", len(makers) + IN_PAIRS)
     checks: list[Check] = []
     for make in makers:
         result = make()
-        checks += [result] if isinstance(result, Check) else result
-        step(None)
+        for check in [result] if isinstance(result, Check) else result:
+            checks.append(check)
+            step(None)
     return tuple(checks)
 
 

@@ -30,6 +30,7 @@ def report_of(result: RunResult) -> ReportFile:
                 "solve": result.options.solve,
                 "frame": result.options.frame,
                 "eccentricity": result.options.eccentricity,
+                "refine_camera": result.options.refine_camera,
                 "max_pair_angle_deg": round(float(np.degrees(result.options.pairs.limit_rad())), 9),
             },
             "camera": {
@@ -48,6 +49,9 @@ def report_of(result: RunResult) -> ReportFile:
                 "faces_not_seen": [
                     f.id for f in result.target_design.faces if f.id not in result.target.target_from_face
                 ],
+                "faces_expected": result.options.faces_expected(
+                    {image.file.group for image in result.detection.images}, result.target_design
+                ),
                 "observations": len(all_residuals),
                 "residual_rms_px": float(np.sqrt((all_residuals**2).mean())),
                 "centre_sigma_rms_px": float(
