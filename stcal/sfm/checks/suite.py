@@ -15,6 +15,7 @@ from stcal.sfm.adjust.network import Network, free_network, solve_score
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.checks.board import board_checks, measure_radii, pitch_check, radius_checks
+from stcal.sfm.checks.causes import whole_set_cause
 from stcal.sfm.checks.faces import (
     Again,
     agreement_check,
@@ -82,7 +83,10 @@ class Evidence:
 
 
 def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
-    """Returns all checks of a run in the order of the report; ``progress`` is called with (``check``, done, total)."""
+    """Returns all checks of a run in the order of the report, the cause of the whole set before them if one failed.
+
+    ``progress`` is called with (``check``, done, total).
+    """
     networks, calibration = evidence.networks(), evidence.calibration
     camera, board, target = calibration.camera, evidence.board, evidence.target
     radii = measure_radii(networks, evidence.images, target.radius_of() | board.radius_of(), camera)
@@ -109,7 +113,9 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         for check in [result] if isinstance(result, Check) else result:
             checks.append(check)
             step(None)
-    return tuple(checks)
+    failed = any(check.verdict == "failed" for check in checks)
+    cause = whole_set_cause(networks, camera) if failed else None
+    return (cause, *checks) if cause else tuple(checks)
 
 
 def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[[], Check]]:

@@ -29,6 +29,8 @@ QUESTIONS = {
     "next": "What to do next?",
 }
 Use = Literal["yes", "with care", "no"]
+CAUSE = "cause"
+"""Key of the check that names what all images have in common and makes others fail."""
 LEFT_OUT_WHOLE = "left out whole: "
 """How the note begins on a group that could not be solved."""
 EVERY_SIGMA = "every σ"
@@ -36,6 +38,7 @@ DISTANCES = "all distances and the size"
 PLACES = "the places of all faces"
 CENTRES = "all centres of circles"
 INVALIDATES: dict[str, tuple[str, ...]] = {
+    CAUSE: (PLACES, DISTANCES, EVERY_SIGMA),
     "camera": (PLACES, DISTANCES, EVERY_SIGMA),
     "residual-field": (PLACES, DISTANCES, EVERY_SIGMA),
     "centres": (EVERY_SIGMA,),
@@ -198,10 +201,14 @@ def _missing_faces(report: dict) -> list[str]:
     return [face for face in _absent(report) if face in expected]
 
 
+def lost_groups(notes: Iterable[str]) -> list[str]:
+    """Returns the names of the groups that could not be solved, of all notes of a run."""
+    begin = f"{LEFT_OUT_WHOLE}group "
+    return [note.removeprefix(begin).partition(":")[0] for note in notes if note.startswith(begin)]
+
+
 def _lost_groups(report: dict) -> list[str]:
-    """Returns the groups that could not be solved, as ``group NAME``."""
-    notes = [note.removeprefix(LEFT_OUT_WHOLE) for note in report["notes"] if note.startswith(LEFT_OUT_WHOLE)]
-    return [note.partition(":")[0] for note in notes]
+    return [f"group {name}" for name in lost_groups(report["notes"])]
 
 
 def images_left_out(face: str, notes: Iterable[tuple[str, str]]) -> list[str]:
@@ -246,11 +253,11 @@ def _gaps(report: dict) -> list[str]:
 
 
 def _first(report: dict, verdict: str) -> dict:
-    """Returns the first check with this verdict that names an image, which can be looked at, else the first one."""
+    """Returns the cause of the whole set, else the first check of this verdict that names an image, or the first."""
     images = {image["name"] for image in report["images"]}
     matching = [check for check in report.get("checks", []) if check["verdict"] == verdict]
     naming = [check for check in matching if any(name in images for name in check["names"])]
-    return [*naming, *matching][0]
+    return [*(check for check in matching if check["key"] == CAUSE), *naming, *matching][0]
 
 
 # --- how good ---------------------------------------------------------------------------------------------------------

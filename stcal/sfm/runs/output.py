@@ -9,6 +9,7 @@ from stcal.geometry.plane import fit_plane
 from stcal.labels import DotLabel
 from stcal.sfm.data.model import MIN_POINTS, GroupModel, ImageObservations
 from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
+from stcal.sfm.report.judgement import lost_groups
 from stcal.sfm.runs.report import ReportFile
 from stcal.sfm.runs.result import RunResult
 
@@ -50,7 +51,8 @@ def report_of(result: RunResult) -> ReportFile:
                     f.id for f in result.target_design.faces if f.id not in result.target.target_from_face
                 ],
                 "faces_expected": result.options.faces_expected(
-                    {image.file.group for image in result.detection.images}, result.target_design
+                    {image.file.group for image in result.detection.images} | set(lost_groups(result.notes)),
+                    result.target_design,
                 ),
                 "observations": len(all_residuals),
                 "residual_rms_px": float(np.sqrt((all_residuals**2).mean())),
