@@ -17,13 +17,13 @@ from stcal.labels import CircleLabel
 from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
 from stcal.sfm.checks.images import summed
 from stcal.sfm.checks.verdict import FAILED, Check, Measured
-from stcal.sfm.report.judgement import CAUSE
+from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
 
 EXPLAINS = 0.8
 """Least share, of what the best hypothesis explains, of one that is preferred for its fewer parameters."""
 MOST_IMAGES = 60
 """Largest number of images of a group in which parameters of single images are fitted; more take minutes."""
-FIXED_WITHIN = 0.35
+FIXED_WITHIN = 0.2
 """Largest deviation from 1 of the share of a change that is as a whole or not at all, such as a distortion removed."""
 FEW = 0.25
 """Share of the images that may not explain alone what is taken for a cause of the whole set."""
@@ -32,7 +32,6 @@ ALONE = 0.93
 0.87."""
 LEAST_SHIFT_PX = 3.0
 """Smallest change of the principal point at which photographs that were turned by 180° can be told."""
-TITLE = "Cause of the whole set"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +80,8 @@ def whole_set_cause(networks: Sequence[Network], camera: Camera) -> Check | None
     if not named:
         return None
     best = min(named, key=lambda f: (f.test.freedom, -f.explained))
+    if best.cause.scope == "image" and _explained_by_one(networks, best.left) > EXPLAINS * most:
+        return None  # its checks name that image
     size = best.cause.size(best.test.estimate, np.sqrt(np.maximum(np.diag(best.test.covariance), 0)))
     square = sum(float((n.residual**2).sum()) for n in networks)
     after = float(np.sqrt(best.left * _redundancy(networks) / square))
@@ -93,7 +94,9 @@ def whole_set_cause(networks: Sequence[Network], camera: Camera) -> Check | None
         Measured(f.cause.name, 100 * f.explained / most, None, "% explained", f.probability)
         for f in sorted(fitted, key=lambda f: (f is not best, f.test.freedom))
     )
-    return Check(CAUSE, f"{TITLE}: {best.cause.name}", "failed", reason, measured, len(fitted), (), best.cause.remedy)
+    return Check(
+        CAUSE, f"{OF_WHOLE_SET}{best.cause.name}", "failed", reason, measured, len(fitted), (), best.cause.remedy
+    )
 
 
 def _redundancy(networks: Sequence[Network]) -> float:
@@ -176,6 +179,21 @@ def _explained_by_few(fitted: _Fitted, networks: Sequence[Network]) -> float:
             own = np.concatenate(columns)
             explained += solve_score(normal[np.ix_(own, own)], right[own]).statistic
     return explained
+
+
+def _explained_by_one(networks: Sequence[Network], left: float) -> float:
+    """Returns what any one image explains, if it is taken out.
+
+    ``left`` : squared residual per degree of freedom that is not explained.
+    """
+    most = 0.0
+    for network in networks:
+        for rows in network.model.rows_by_image():
+            columns = np.zeros((len(network.residual), 2, 2 * len(rows)))
+            columns[rows, 0, np.arange(len(rows))] = columns[rows, 1, len(rows) + np.arange(len(rows))] = 1
+            test = solve_score(*network.score(columns))
+            most = max(most, test.statistic - test.freedom * left)
+    return most
 
 
 def _percent(what: str) -> Callable[[np.ndarray, np.ndarray], str]:

@@ -31,6 +31,8 @@ QUESTIONS = {
 Use = Literal["yes", "with care", "no"]
 CAUSE = "cause"
 """Key of the check that names what all images have in common and makes others fail."""
+OF_WHOLE_SET = "Cause of the whole set: "
+"""How the title of that check begins, before the cause."""
 LEFT_OUT_WHOLE = "left out whole: "
 """How the note begins on a group that could not be solved."""
 EVERY_SIGMA = "every σ"
@@ -164,7 +166,7 @@ def _use(report: dict) -> tuple[Use, str]:
 
 def _by_result(report: dict) -> tuple[Use, str]:
     """Returns verdict and answer by what is in the result."""
-    checks = report.get("checks", [])
+    checks = [check for check in report.get("checks", []) if check["key"] != CAUSE]
     counts = {v: sum(c["verdict"] == v for c in checks) for v in ("failed", "suspicious", "passed", "not possible")}
     if not report["faces"]:
         return "no", "No: there is no face in it, λ and residuals of the board alone."
@@ -172,6 +174,9 @@ def _by_result(report: dict) -> tuple[Use, str]:
         return "no", "No: it was made for comparison, and its faces are biased by tens of µm."
     made = len(checks) - counts["not possible"]
     if n := counts["failed"]:
+        if cause := [check for check in report["checks"] if check["key"] == CAUSE]:
+            name = cause[0]["title"].removeprefix(OF_WHOLE_SET)
+            return "no", f"No: {name}; that is the likely cause of {n} of {made} checks that failed."
         return "no", f"No: {n} of {made} checks failed, the first: {_first(report, 'failed')['title']}."
     if different := report.get("crosscheck", {}).get("differences"):
         return "with care", f"With care: the native COLMAP comes to other faces ({different[0]})."

@@ -94,7 +94,7 @@ def so_far_text(result: RunResult) -> str:
         if face != target.reference_face
     }
     faces = f"{len(target.target_from_face)} of {len(result.target_design.faces)} faces"
-    if sigma:
+    if sigma and (result.judgement is None or result.judgement.verdict != "no"):
         worst = max(sigma, key=lambda face: sigma[face])
         faces += f", worst is face {worst}: σ {1e3 * sigma[worst][0]:.1f} µm, {1e3 * sigma[worst][1]:.1f} mdeg"
     mapped = sum(len(solution.model.images) for solution in result.solutions)

@@ -10,9 +10,11 @@ from stcal.report.page import environment
 from stcal.sfm import checks
 from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS
 from stcal.sfm.report.judgement import (
+    CAUSE,
     CHANCE,
     INVALIDATES,
     LEFT_OUT_WHOLE,
+    OF_WHOLE_SET,
     TESTS_OF_CHANCE,
     judged,
     judgement_of,
@@ -79,6 +81,14 @@ def test_the_check_that_names_an_image_comes_first():
     )
     assert found.use == "No: 2 of 2 checks failed, the first: Check b."
     assert found.next == "Look at it."
+
+
+def test_the_cause_of_the_whole_set_is_said_before_all():
+    cause = check(CAUSE, "failed", remedy="give the originals") | {"title": OF_WHOLE_SET + "they are undistorted"}
+    names_an_image = check("moved", "failed", ("a/1.jpg",), "look at it")
+    found = judgement_of(report(names_an_image, check("c", "passed"), cause))
+    assert found.use == "No: they are undistorted; that is the likely cause of 1 of 2 checks that failed."
+    assert found.next == "Give the originals."
 
 
 def test_a_suspicious_check_says_how_often_chance_makes_one():
