@@ -173,10 +173,11 @@ def _by_result(report: dict) -> tuple[Use, str]:
     if _control(report):
         return "no", "No: it was made for comparison, and its faces are biased by tens of µm."
     made = len(checks) - counts["not possible"]
-    if n := counts["failed"]:
-        if cause := [check for check in report["checks"] if check["key"] == CAUSE]:
-            name = cause[0]["title"].removeprefix(OF_WHOLE_SET)
-            return "no", f"No: {name}; that is the likely cause of {n} of {made} checks that failed."
+    n = counts["failed"]
+    if cause := [check for check in report.get("checks", []) if check["key"] == CAUSE]:
+        name = cause[0]["title"].removeprefix(OF_WHOLE_SET)
+        return "no", f"No: {name}; that is the likely cause of {n} of {made} checks that failed."
+    if n:
         return "no", f"No: {n} of {made} checks failed, the first: {_first(report, 'failed')['title']}."
     if different := report.get("crosscheck", {}).get("differences"):
         return "with care", f"With care: the native COLMAP comes to other faces ({different[0]})."
