@@ -150,7 +150,7 @@ def timed_second_run(data: Path, scratch: Path, log: Path) -> float:
     shutil.copytree(data / "images", scratch / "growing")
     last = sorted((scratch / "growing").glob("*/*"))[-1]
     kept = last.rename(scratch / last.name)
-    words = ["run", scratch / "growing", *files_of(data), "--out", scratch / "grown"]
+    words = ["run", "--no-strict", scratch / "growing", *files_of(data), "--out", scratch / "grown"]
     timed_program(words, log)
     kept.rename(last)
     seconds = timed_program(words, log)[0]
@@ -301,7 +301,7 @@ def measure(data: Path, stream: Path, film: Path, scratch: Path) -> dict:
     camera, board = read_camera(data / "cameras.txt"), load_board(data / "board.toml")
     megabytes = sum(len(path.read_bytes()) for path in paths) / 1e6
     rows = {"decoding alone": {"seconds": timed_decoding(paths)}}
-    words = ["run", data / "images", *files_of(data), "--out", scratch / "run"]
+    words = ["run", "--no-strict", data / "images", *files_of(data), "--out", scratch / "run"]
     rows["stcal-sfm run"] = {"seconds": timed_program(words, log)[0]}
     rows["run again, a photograph more"] = {"seconds": timed_second_run(data, scratch, log)}
     seconds, found = timed_detection(data, scratch / "cache")
@@ -322,7 +322,7 @@ def measure(data: Path, stream: Path, film: Path, scratch: Path) -> dict:
     rows["plan, board of 100 × 100 dots"] = {"seconds": seconds, "mib": memory}
     rows["stcal-sfm --help"] = {"seconds": timed_program(["--help"], log)[0]}
     rows["stcal --version"] = {"seconds": timed_program(["--version"], log, "main")[0]}
-    timed_program(["run", stream / "images", *files_of(stream), "--out", scratch / "stream"], log)
+    timed_program(["run", "--no-strict", stream / "images", *files_of(stream), "--out", scratch / "stream"], log)
     rows["measure, 2 Mpx, one core"] = {"seconds": timed_stream(stream, scratch / "stream", 1), "images": STREAM[0]}
     following = timed_following(film, filmed_scene())
     for title, seconds in zip(("measure --sequence, one core", "Tracker.locate, one core"), following, strict=True):
@@ -427,7 +427,7 @@ def main() -> None:
         result = best_of(
             [measure(data, stream, keep / "film", Path(scratch) / str(i)) for i in range(max(given.rounds, 1))]
         )
-        words = ["run", data / "images", *files_of(data), "--out", Path(scratch) / "watched"]
+        words = ["run", "--no-strict", data / "images", *files_of(data), "--out", Path(scratch) / "watched"]
         memory = timed_program(words, Path(scratch) / "log", watched=True)[1:]
         result |= dict(zip(("peak_process_mib", "peak_together_mib"), memory, strict=True))
         if given.large:

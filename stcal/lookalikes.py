@@ -120,6 +120,40 @@ def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozen
     set of frozenset of int
         Places in ``xy``; each set has ``MIN_COMMON`` or more.
     """
+    fits, _ = _motions(xy, radius, other_xy, other_radius, same)
+    return {frozenset(np.flatnonzero(row).tolist()) for row in np.unique(fits, axis=0)}
+
+
+def mirrored_circles(xy, radius, other_xy, other_radius) -> list[np.ndarray]:
+    """Finds the circles of a pattern's mirror image that coincide with circles of another pattern, radii included.
+
+    Parameters
+    ----------
+    xy, other_xy : (n, 2) and (m, 2) centres, mm
+    radius, other_radius : (n,) and (m,) mm
+
+    Returns
+    -------
+    list of (c, 2) int
+        Places of the same circle in ``xy`` and in ``other_xy``, for each rigid motion under which ``MIN_COMMON`` or
+        more coincide, the most circles first. A part of another result is omitted.
+    """
+    fits, nearest = _motions(xy * [1, -1], radius, other_xy, other_radius, same=False)
+    found: list[np.ndarray] = []
+    known: list[set[tuple[int, int]]] = []
+    for row in np.argsort(-fits.sum(1), kind="stable"):
+        own = np.flatnonzero(fits[row])
+        pairs = np.column_stack([own, nearest[row][own]])
+        members = set(map(tuple, pairs.tolist()))
+        if len(np.unique(pairs[:, 1])) == len(pairs) and not any(members <= other for other in known):
+            found.append(pairs)
+            known.append(members)
+    return found
+
+
+def _motions(xy, radius, other_xy, other_radius, same: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the masks of circles that coincide and the nearest circles of the other pattern, both (motions, n), for
+    all motions that put two circles onto two and let ``MIN_COMMON`` coincide."""
     n, m = len(xy), len(other_xy)
     k, near = (g.ravel() for g in np.meshgrid(np.arange(n), np.arange(n)))
     p, q = (g.ravel() for g in np.meshgrid(np.arange(m), np.arange(m)))
@@ -129,18 +163,22 @@ def common_circles(xy, radius, other_xy, other_radius, same: bool) -> set[frozen
     slack = MAX_GAP * min(radius.min(), other_radius.min())
     like = alike(radius[k][:, None], other_radius[p]) & alike(radius[near][:, None], other_radius[q])
     a, b = np.nonzero((np.abs(length[:, None] - other_length) < slack) & like)
-    sets: set[frozenset[int]] = set()
+    masks, places = [np.zeros((0, n), bool)], [np.zeros((0, n), int)]
     for start in range(0, len(a), BLOCK):
         block = slice(start, start + BLOCK)
-        fits = _coincide(
+        fits, nearest = _coincide(
             xy, radius, other_xy, other_radius, (k[a[block]], p[b[block]]), step[a[block]], other_step[b[block]], same
         )
-        sets |= {frozenset(np.flatnonzero(row).tolist()) for row in np.unique(fits, axis=0) if row.sum() >= MIN_COMMON}
-    return sets
+        enough = fits.sum(1) >= MIN_COMMON
+        _, first = np.unique(np.where(fits, nearest, -1)[enough], axis=0, return_index=True)
+        masks.append(fits[enough][first])
+        places.append(nearest[enough][first])
+    return np.concatenate(masks), np.concatenate(places)
 
 
-def _coincide(xy, radius, other_xy, other_radius, origin, step, other_step, same: bool) -> np.ndarray:
-    """Returns the mask (motions, n) of circles that coincide, for motions that put two circles onto two."""
+def _coincide(xy, radius, other_xy, other_radius, origin, step, other_step, same: bool):
+    """Returns the circles that coincide and the nearest circles, both (motions, n), for motions that put two circles
+    onto two."""
     turn = np.arctan2(other_step[:, 1], other_step[:, 0]) - np.arctan2(step[:, 1], step[:, 0])
     c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
     x, y = np.moveaxis(xy - xy[origin[0]][:, None], 2, 0)
@@ -148,8 +186,9 @@ def _coincide(xy, radius, other_xy, other_radius, origin, step, other_step, same
     gap, nearest = KDTree(other_xy).query(moved)
     fits = (gap < MAX_GAP * np.minimum(radius, other_radius[nearest])) & alike(radius[None], other_radius[nearest])
     if same:  # the identity is excluded
-        fits = fits[~((nearest == np.arange(len(xy))) | ~fits).all(1)]
-    return fits
+        moved_away = ~((nearest == np.arange(len(xy))) | ~fits).all(1)
+        fits, nearest = fits[moved_away], nearest[moved_away]
+    return fits, nearest
 
 
 def alike(a, b):

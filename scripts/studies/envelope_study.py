@@ -504,6 +504,10 @@ def write_case(kind: Kind, case: Case, folder: Path) -> dict[str, Picture]:
     return pictures
 
 
+ANSWERED_NO = 4
+"""Exit code of a run that wrote results and says that they must not be used: it has not ended early."""
+
+
 def run_program(program: Path, case: Case, folder: Path, workers: int) -> tuple[int, str, float]:
     """(exit code, first line of the error, seconds) of a run on a degraded set."""
     words = [str(program / "stcal-sfm"), "run", str(folder / "images"), "--camera", str(folder / "cameras.txt")]
@@ -515,7 +519,7 @@ def run_program(program: Path, case: Case, folder: Path, workers: int) -> tuple[
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
     try:
         done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=LONGEST_S, env=environment)
-        code, said = done.returncode, done.stderr
+        code, said = 0 if done.returncode == ANSWERED_NO else done.returncode, done.stderr
     except subprocess.TimeoutExpired:
         code, said = -1, f"error: not done after {LONGEST_S:.0f} s"
     lines = [x for x in said.splitlines() if x.strip() and not re.fullmatch(r"[\w ]+: \d+ of \d+", x)]

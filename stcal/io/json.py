@@ -51,8 +51,20 @@ def first_mistake(error: ValidationError, where: str = "", missing: str = "key m
         shown = " ".join(repr(first["input"]).split())
         shown = shown if len(shown) <= LONGEST else shown[: LONGEST - 1] + "…"
         code, reason = "E-KEY-VALUE", f"{shown}: {first['msg'][0].lower()}{first['msg'][1:]}"
-    suffix = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    unknown = _unknown_beside(error) if code == "E-KEY-MISSING" else []
+    if unknown:
+        reason += f"; unknown key {', '.join(unknown)} in its place, perhaps misspelt"
+    more = error.error_count() - 1 - len(unknown)
+    suffix = f" (and {more} more)" if more else ""
     return InputError(code, ": ".join(part for part in (where, place, reason + suffix) if part))
+
+
+def _unknown_beside(error: ValidationError) -> list[str]:
+    """Returns the unknown keys of the table that lacks the key of the first mistake."""
+    first, *others = error.errors()
+    table = first["loc"][:-1]
+    unknown = [e["loc"][-1] for e in others if e["type"] == "extra_forbidden" and e["loc"][:-1] == table]
+    return [" ".join(str(key).split())[:LONGEST] for key in unknown]
 
 
 class Part(BaseModel):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from functools import cache
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from stcal.errors import InputError
 from stcal.report.text import cells, join, number
@@ -25,6 +25,7 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    env.filters["with_code"] = with_code
     env.filters |= {"number": number, "listed": join, "cells": lambda rows, spec: [cells(row, spec) for row in rows]}
     macros = vars(env.get_template(MACROS).module)
     env.globals |= {name: macro for name, macro in macros.items() if not name.startswith("_")}
@@ -43,6 +44,12 @@ def render(template: str, **values) -> str:
         return environment().get_template(template).render(values)
     except UndefinedError as error:
         raise LookupError(error.message) from error
+
+
+def with_code(text: str) -> Markup:
+    """Return a sentence in which what stands between backticks is code."""
+    parts = [escape(part) for part in text.split("`")]
+    return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else p for i, p in enumerate(parts))
 
 
 def swatch(name: str, colour: str) -> Markup:

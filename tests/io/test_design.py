@@ -216,6 +216,7 @@ WRONG_TARGETS = {
     "unknown key": (changed('x = "2"', 'x = "2"\ncolour = 1'), "E-KEY-UNKNOWN"),
     "key of two lines": (changed('x = "2"', 'x = "2"\n"a\\nb" = 1'), "E-KEY-UNKNOWN"),
     "misspelt key": (changed("polarity", "polarty"), "E-KEY-MISSING"),
+    "misspelt radius": (changed("radius_mm = 4", "radius = 4"), "E-KEY-MISSING … radius_mm … unknown key radius"),
     "polarity": (changed('"bright"', '"grey"'), "E-KEY-VALUE … 'grey' … 'bright' … 'dark'"),
     "long polarity": (changed('"bright"', f'"{"a" * 9999}"'), "E-KEY-VALUE … polarity"),
     "boolean face id": (changed('[[face]]\nid = "1"', "[[face]]\nid = true"), "E-KEY-VALUE … 1."),

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import MOST_SEED
-from stcal.cli.terminal import StageProgress, say
+from stcal.cli.terminal import StageProgress, print_each, say
 from stcal.errors import InputError
 from stcal.io.files import BOARD, TARGET, save
 
@@ -39,9 +39,13 @@ def draw(
     ] = False,
 ) -> None:
     """Draw a target or a board 1:1, with dimensions, cut marks and scale bars, to print, cut or mill."""
+    from stcal.design import TargetDesign
     from stcal.drawing.draw import draw as drawn
-    from stcal.drawing.draw import drawn_text
+    from stcal.drawing.draw import drawn_text, load_design
+    from stcal.sfm.detect.sightings import likeness_notes
 
+    if isinstance(target := load_design(design), TargetDesign):
+        print_each("note", likeness_notes(target))
     say(drawn_text(drawn(design, out, paper, margin, net)))
 
 
@@ -81,6 +85,7 @@ def design(
     """Make a target for a box: circles on five sides that name each face with any three hidden; and forecast its σ."""
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import board_toml, load_board, target_toml
+    from stcal.sfm.detect.sightings import likeness_notes
     from stcal.sfm.make.box import size_of
     from stcal.sfm.make.design import MakeOptions, made_text, make_target
     from stcal.sfm.planning.file import plan_text
@@ -100,6 +105,7 @@ def design(
     planned = PlanOptions(images=images, distance_mm=distance, width=width, camera=model, noise=noise, seed=seed)
     forecast = plan(planned, target, board or product.board, target.rough_poses())
     save(target_file, target_toml(target))
+    print_each("note", likeness_notes(target))
     say(f"{made_text(product)}\n{target_file}")
     if board is None:
         save(board_file, board_toml(product.board))

@@ -17,17 +17,15 @@ from stcal.cli.options import (
     Run,
     Scheduler,
     SendImages,
-    Strict,
     TargetFile,
     Workers,
     designs_told,
     ellipse_options,
     handed_over,
     load_ahead,
-    require_passed,
 )
 from stcal.cli.terminal import StageProgress, say, verbose, write
-from stcal.errors import InputError
+from stcal.errors import ChecksFailed, InputError
 from stcal.io.files import keep_apart
 
 app = typer.Typer()
@@ -134,7 +132,22 @@ def run(
         ),
     ] = None,
     exclude: Exclude = None,
-    strict: Strict = False,
+    expect_faces: Annotated[
+        str | None,
+        typer.Option(
+            "--expect-faces",
+            metavar="FACES",
+            help="Answer no where one of these faces, such as 1,2, is not in the result; those that the groups are "
+            "named after, such as 12, if not given.",
+        ),
+    ] = None,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict/--no-strict",
+            help="End with exit code 4 where the answer is no, or with 0 all the same; results are written.",
+        ),
+    ] = True,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
@@ -165,14 +178,19 @@ def run(
         ellipses=ellipse_options(min_diameter, max_diameter),
         workers=workers,
         exclude=tuple(exclude or ()),
+        expect_faces=tuple(face.strip() for face in (expect_faces or "").split(",") if face.strip()),
     )
     with designs_told(target, board), handed_over(scheduler, send_images), StageProgress() as progress:
         result = pipeline.run(images, camera, out, target, board, options, progress)
     if verbose():
         say("\n".join(found_lines(result.labelled)))
     say(run_text(result))
-    failed = [check.title for check in result.checks if check.verdict == "failed"]
-    require_passed(strict, failed, result.out / "report.html")
+    if strict and result.judgement is not None and result.judgement.verdict == "no":
+        raise ChecksFailed(
+            "E-CHECKS-FAILED",
+            f"may I use it? {result.judgement.use.removesuffix('.')}; results are written, do not use them, or end "
+            f"with 0 by --no-strict; see {result.out / 'report.html'}",
+        )
 
 
 @app.command()

@@ -129,8 +129,23 @@ def _row_lines(found: Findings) -> list[str]:
     return lines
 
 
-def field_sentence(field: Field) -> str:
+UNRELATED = 0.1
+"""Ratio of residuals to the spread of the points, both RMS, beyond which the transform explains no measurement: the
+coarsest instruments reach a hundredth of their range."""
+
+
+def field_sentence(found: Findings, field: Field) -> str:
     """Returns a sentence on whether residuals are more than noise."""
+    result = found.registration
+    own = result.inliers
+    xyz_b = (result.b_from_a @ found.xyz_a + result.residuals)[own]
+    share = float(np.sqrt((result.residuals[own] ** 2).sum() / ((xyz_b - xyz_b.mean(0)) ** 2).sum()))
+    if share > UNRELATED:
+        return (
+            f"residuals are {100 * share:.0f} % of the spread of the points, {100 * UNRELATED:.0f} % at most of points "
+            "that correspond: the rows are not the same points in both frames, or not in the same order or unit; do "
+            "not use this transform"
+        )
     if not field.seen:
         return (
             f"no systematic residuals seen: they look like noise of σ {field.noise_mm:.3g} mm "
@@ -147,7 +162,7 @@ def field_sentence(field: Field) -> str:
 
 
 def _field_lines(found: Findings) -> list[str]:
-    return [] if found.field is None else [field_sentence(found.field)]
+    return [] if found.field is None else [field_sentence(found, found.field)]
 
 
 def shells(reach: Cubes) -> list[str]:
@@ -199,7 +214,7 @@ def registration_page(found: Findings, more: Sections = ()) -> str:
         colours=COLOURS,
         space=uri(space),
         enlarged=enlarged,
-        systematic="" if found.field is None else field_sentence(found.field),
+        systematic="" if found.field is None else field_sentence(found, found.field),
         field=field and uri(field),
         cubes=found.cubes and _cubes(found, found.cubes),
         outliers=[_row(found, row, length) for row in result.outliers[:ROWS_ON_PAGE]],

@@ -11,9 +11,11 @@ from pydantic import Field
 import stcal
 from stcal.io.files import RUN_MARKER
 from stcal.io.json import ByName, Finite, Part, ResultFile
+from stcal.report.text import join
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row
 from stcal.sfm.budget.lengths import LengthTest
 from stcal.sfm.budget.sources import Source
+from stcal.sfm.report.judgement import invalidated
 from stcal.sfm.runs.saved import SavedRun
 from stcal.sfm.runs.verify import VerifyFile
 
@@ -214,8 +216,8 @@ def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, A
             if value is not None
         ],
         "correction_ppm": PPM * budget.correction,
-        "faces": _faces(budget),
-        "distances": [_distance(row, budget) for row in budget.of_kind("distance")],
+        "faces": {} if is_refused(run) else _faces(budget),
+        "distances": [] if is_refused(run) else [_distance(row, budget) for row in budget.of_kind("distance")],
         "notes": notes_of(budget, verified, run),
     }
 
@@ -265,6 +267,15 @@ def _uncertainty(row: Row, budget: Budget, unit: float) -> dict:
     }
 
 
+def _failed(run: SavedRun) -> list[dict]:
+    return [check for check in run.report.get("checks", ()) if check["verdict"] == "failed"]
+
+
+def is_refused(run: SavedRun) -> bool:
+    """Whether a run says that it must not be used, so that no uncertainty of it holds."""
+    return bool(_failed(run)) or (run.report.get("judgement") or {}).get("verdict") == "no"
+
+
 def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
     unknown = [source.title for source in budget.sources if source.origin == "not stated"]
@@ -279,12 +290,16 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
             f"for the stated expansion lengths of the run are to be changed by {PPM * budget.correction:+.1f} ppm; "
             "this is not done in faces.json, and the expanded uncertainties hold for corrected lengths"
         )
-    failed = [check["title"] for check in run.report.get("checks", ()) if check["verdict"] == "failed"]
+    failed = _failed(run)
     if failed:
-        notes.append(
-            f"failed checks of the run: {len(failed)}, first {failed[0]}; what they found is not among the inputs, and "
-            "this budget does not hold before it is put right"
+        invalid = join(invalidated(check["key"] for check in failed))
+        notes.insert(
+            0,
+            f"failed checks of the run: {len(failed)}, first {failed[0]['title']}; what they found is not among the "
+            f"inputs: {invalid} do not hold before it is put right, and no uncertainty of them is given",
         )
+    elif is_refused(run):
+        notes.insert(0, f"may the run be used? {run.report['judgement']['use']} No uncertainty of it is given")
     if faults := verified.faults():
         notes.append(f"the run's folder is not as the run left it: {'; '.join(faults)}")
     notes.append(

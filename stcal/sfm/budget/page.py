@@ -86,6 +86,8 @@ def _inputs(sources: Sequence[SourceRow]) -> list[str]:
 
 def _text_table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> list[str]:
     """Returns contributions by input, and combined and expanded uncertainty, with a column for each measurand."""
+    if not columns:
+        return [f"{title}: none is given, see the first note"]
     rows = [(f"<{title}", *columns)]
     for source in file.sources:
         if source.origin != "not stated" or any(u.contributions[source.key] for u in columns.values()):

@@ -257,8 +257,17 @@ def moved_check(networks: Sequence[Network]) -> Check:
     return _take_out(judge("moved", "Target against board, image by image", trials, "images", ""), remedy)
 
 
+NEARLY_ALL = 0.7
+"""Share of the images beyond which a check that names them names none."""
+
+
 def _take_out(check: Check, remedy: str) -> Check:
     """Returns the check with the remedy and the option that excludes the worst image, if it names one."""
+    if len(check.names) > max(NEARLY_ALL * check.tested, 1):
+        common = (
+            "nearly all images, so that none is to be taken out: look for what they have in common, first the camera"
+        )
+        return replace(check, names=(), remedy=common)
     return replace(check, remedy=f"{remedy}: {without_image(check.names[0])}") if check.names else check
 
 

@@ -16,6 +16,7 @@ from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.checks.board import board_checks, measure_radii, pitch_check, radius_checks, rim_check
+from stcal.sfm.checks.causes import whole_set_cause
 from stcal.sfm.checks.faces import (
     Again,
     agreement_check,
@@ -47,6 +48,8 @@ JOINT = (
 """Checks that need the joint result and its covariances."""
 CONTROL = "Uncorrected control"
 MICRO = 1e3
+IN_PAIRS = 2
+"""Number of functions that make two checks each: of the board, and of the radii."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +96,10 @@ def _rims(evidence: Evidence) -> tuple[dict[str, Rim], float | None, float | Non
 
 
 def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
-    """Returns all checks of a run in the order of the report; ``progress`` is called with (``check``, done, total)."""
+    """Returns all checks of a run in the order of the report, the cause of the whole set before them if one failed.
+
+    ``progress`` is called with (``check``, done, total).
+    """
     networks, calibration = evidence.networks(), evidence.calibration
     camera, board, target = calibration.camera, evidence.board, evidence.target
     radii = measure_radii(networks, evidence.images, target.radius_of() | board.radius_of(), camera)
@@ -114,13 +120,16 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: flatness_check(networks, evidence.options.flatness_mm),
         lambda: control_check(evidence, networks),
     )
-    step = counted(progress or (lambda *_: None), "check", len(makers))
+    step = counted(progress or (lambda *_: None), "check", len(makers) + IN_PAIRS)
     checks: list[Check] = []
     for make in makers:
         result = make()
-        checks += [result] if isinstance(result, Check) else result
-        step(None)
-    return tuple(checks)
+        for check in [result] if isinstance(result, Check) else result:
+            checks.append(check)
+            step(None)
+    failed = any(check.verdict == "failed" for check in checks)
+    cause = whole_set_cause(networks, camera) if failed else None
+    return (cause, *checks) if cause else tuple(checks)
 
 
 def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[[], Check]]:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from stcal.geometry.robust import ratio_limit
+from stcal.sfm.report.judgement import CAUSE
 from stcal.sfm.report.page import ORDER
 
 Verdict = Literal["passed", "suspicious", "failed", "not possible"]
@@ -132,9 +133,12 @@ def without_image(name: str) -> str:
 def ranked(checks: Sequence[Check], images: frozenset[str]) -> list[Check]:
     """Returns the checks in the order in which to read them, the worst first.
 
-    Among equal verdicts those that name an image come first: the image may be the reason why the others fail.
+    Among equal verdicts the cause of the whole set comes first, then those that name an image: it may be the reason why
+    the others fail.
     """
-    return sorted(checks, key=lambda check: (ORDER.index(check.verdict), images.isdisjoint(check.names)))
+    return sorted(
+        checks, key=lambda check: (ORDER.index(check.verdict), check.key != CAUSE, images.isdisjoint(check.names))
+    )
 
 
 def impossible(key: str, title: str, reason: str, remedy: str) -> Check:

@@ -15,7 +15,7 @@ from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.plane import homography_jacobian
 from stcal.labels import CircleLabel
 from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, grow_matches, singular_values
-from stcal.sfm.detect.sightings import is_named, mirror_images
+from stcal.sfm.detect.sightings import MIN_NAMING, is_named, mirror_images
 
 NEIGHBOURS_IN_DESIGN = 3
 NEIGHBOURS_IN_IMAGE = 12
@@ -33,8 +33,6 @@ AT_ONCE = 32
 """Number of hypotheses that are grown side by side, ahead of their turn."""
 MAX_CONTRAST_RATIO = 4.0
 """Largest ratio of contrasts of neighbouring circles of one face, which a shadow or a glare may cross."""
-MIN_CIRCLES = 6
-"""Smallest number of circles of a face. Four determine a homography; two more confirm it."""
 MAX_SIZE_RATIO = 1.25
 """Largest ratio of measured to designed size between two circles of a face, in addition to one pixel of diameter. It
 rejects printed grids of equal discs."""
@@ -202,7 +200,7 @@ class FaceFinder:
         The mirror image of a face may look like another face; only the group can tell.
         """
         readings: list[FaceReading] = []
-        if len(candidates) < MIN_CIRCLES or not self.target.faces:
+        if len(candidates) < MIN_NAMING or not self.target.faces:
             return _decide(readings, self.target)
         starts, tries = self._hypotheses(candidates), np.zeros(len(candidates), int)
         is_open = np.ones(len(starts.origin), bool)
@@ -328,7 +326,7 @@ def _of_one_size(candidates: Candidates, face: FaceDesign, index: np.ndarray, ho
 
 def needed_circles(face: FaceDesign) -> int:
     """Returns the smallest number of circles for a reading of the face."""
-    return min(MIN_CIRCLES, len(face.ids))
+    return min(MIN_NAMING, len(face.ids))
 
 
 def _decide(readings: list[FaceReading], target: TargetDesign) -> FaceFinding:

@@ -13,7 +13,7 @@ from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights
 from stcal.labels import BOARD
 from stcal.sfm.data.patterns import Pattern
-from stcal.sfm.detect.sightings import PlaneView, Readings, flipped_pose
+from stcal.sfm.detect.sightings import PlaneView, Readings, flipped_pose, mirrored_as
 
 HUBER_PX = 1.5
 """Residual beyond which an observation loses weight.
@@ -465,20 +465,37 @@ def _without_reflections(found: Arrangement, patterns: dict[str, Pattern], reach
 
 
 def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, image: str, reach_mm: float) -> bool:
-    if not {real, image} <= found.group_from_plane.keys() or len(patterns[real].labels) != len(patterns[image].labels):
+    """Whether a plane is another one's image in a mirror: in most images its circles are those of the mirrored design,
+    radii included; they stand where a mirror shows them; and most images are taken from the other plane's side."""
+    if not {real, image} <= found.group_from_plane.keys():
         return False
-    xyz_real, xyz_image = (found.group_from_plane[p] @ patterns[p].xyz_mm() for p in (real, image))
-    between = xyz_real.mean(0) - xyz_image.mean(0)
+    views = {i: v for i, own in found.views.items() for v in own if v.plane == image}
+    labels = list(patterns[image].labels)
+    seen = {i: {labels.index(label) for label in view.labels} for i, view in views.items()}
+    own, other = (found.group_from_plane[p] @ patterns[p].xyz_mm() for p in (real, image))
+    for pairs in mirrored_as(patterns[real], patterns[image]):
+        explained = [i for i, circles in seen.items() if circles <= set(pairs[:, 1].tolist())]
+        if 2 * len(explained) <= len(seen):
+            continue  # most images show circles, or radii, that the mirror image does not have
+        mirror = _mirror(own[pairs[:, 0]], other[pairs[:, 1]], reach_mm)
+        if mirror is None:
+            continue
+        normal, middle = mirror
+        sides = [(found.camera_from_group[i].inverse().translation - middle) @ normal > 0 for i in seen]
+        if np.mean(sides) > 0.5:
+            return True
+    return False
+
+
+def _mirror(own: np.ndarray, other: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Returns normal, towards ``own``, and a point of the mirror plane half way in which circles (n, 3) appear as the
+    others; None if they do not."""
+    between = own.mean(0) - other.mean(0)
     if np.linalg.norm(between) < reach_mm:
-        return False
-    normal, middle = between / np.linalg.norm(between), (xyz_real.mean(0) + xyz_image.mean(0)) / 2
-    mirrored = xyz_real - 2 * ((xyz_real - middle) @ normal)[:, None] * normal
-    apart, at = KDTree(xyz_image).query(mirrored)
-    if apart.max() > reach_mm or len(np.unique(at)) < len(xyz_image):
-        return False
-    seen_by = [i for i, views in found.views.items() if any(v.plane == image for v in views)]
-    sides = [(found.camera_from_group[i].inverse().translation - middle) @ normal > 0 for i in seen_by]
-    return bool(np.mean(sides) > 0.5) if sides else False
+        return None
+    normal, middle = between / np.linalg.norm(between), (own.mean(0) + other.mean(0)) / 2
+    turned = own - 2 * ((own - middle) @ normal)[:, None] * normal
+    return (normal, middle) if np.linalg.norm(turned - other, axis=1).max() < reach_mm else None
 
 
 def mirrored_images(

@@ -11,11 +11,14 @@ from stcal.errors import ConvergenceError, DegenerateError
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label
-from stcal.lookalikes import common_circles, whole_likeness
+from stcal.lookalikes import common_circles, mirrored_circles, whole_likeness
 from stcal.sfm.data.model import Centres
+from stcal.sfm.data.patterns import Pattern
 
 SECOND_BOARD_SHARE = 0.8
 """Smallest number of dots of a second board, as a share of the dots of the first."""
+MIN_NAMING = 6
+"""Smallest number of circles that can name a face: four determine a homography, two more confirm it."""
 MIN_POSE_CIRCLES = 5
 """Smallest number of circles for a pose. Four determine it, a fifth allows a check."""
 
@@ -252,9 +255,24 @@ def likeness_notes(target: TargetDesign) -> list[str]:
             f"another, or from itself turned (the least is {face}:{circle} against {rival}, {gap:.1f} mm); where it is "
             "hidden, the face has no name"
         )
-    if pairs := {tuple(sorted(pair)) for pair in mirror_images(target).items()}:
+    alike = mirror_images(target)
+    if pairs := {tuple(sorted((face, other))) for face, others in alike.items() for other in others}:
         listed = ", ".join(f"{a} of itself" if a == b else f"{a} and {b}" for a, b in sorted(pairs))
         notes.append(f"target {target.name}: faces are mirror images: {listed}; a reflection passes for a face")
+    partly = [
+        (len(pairs), face.id, other.id, len(other.ids))
+        for face in target.faces
+        for other in target.faces
+        if other.id not in alike.get(face.id, ())
+        for pairs in mirrored_as(face, other)
+        if len(pairs) >= MIN_NAMING and is_named(other, np.isin(np.arange(len(other.ids)), pairs[:, 1]), target)
+    ]
+    if partly:
+        common, face, other, count = max(partly)
+        notes.append(
+            f"target {target.name}: a reflection of face {face} shows {common} of the {count} circles of "
+            f"{'that face' if face == other else f'face {other}'} itself; where the others are hidden, it passes for it"
+        )
     return notes
 
 
@@ -274,19 +292,29 @@ def _telling(face: FaceDesign, other: FaceDesign) -> list[tuple[float, str, str,
     return telling
 
 
-def mirror_images(target: TargetDesign) -> dict[str, str]:
-    """Returns the faces whose mirror image looks like a face, and that face."""
-    key = tuple((f.id, f.xy_mm.tobytes(), f.radius_mm.tobytes()) for f in target.faces)
-    return _mirror_images(key)
+def mirror_images(target: TargetDesign) -> dict[str, tuple[str, ...]]:
+    """Returns by face the faces that its mirror image looks like, whole and with its radii; others have no entry."""
+    found = {
+        face.id: tuple(
+            other.id
+            for other in target.faces
+            if any(len(face.ids) == len(other.ids) == len(pairs) for pairs in mirrored_as(face, other))
+        )
+        for face in target.faces
+    }
+    return {face: others for face, others in found.items() if others}
 
 
-@lru_cache(maxsize=8)
-def _mirror_images(key) -> dict[str, str]:
-    faces = [(face_id, np.frombuffer(xy).reshape(-1, 2), np.frombuffer(radius)) for face_id, xy, radius in key]
-    found = {}
-    for face_id, xy, radius in faces:
-        for other_id, other_xy, other_radius in faces:
-            most = max(map(len, common_circles(xy * [1, -1], radius, other_xy, other_radius, same=False)), default=0)
-            if most == len(xy) == len(other_xy):
-                found[face_id] = other_id
-    return found
+def mirrored_as(face: FaceDesign | Pattern, other: FaceDesign | Pattern) -> tuple[np.ndarray, ...]:
+    """Returns the circles of a face's mirror image that pass for circles of another, see
+    :func:`~stcal.lookalikes.mirrored_circles`.
+
+    This is the only rule about mirror images: of a design before a photograph is taken, and of the faces of a group.
+    """
+    return _mirrored_as(*(a.tobytes() for a in (face.xy_mm, face.radius_mm, other.xy_mm, other.radius_mm)))
+
+
+@lru_cache(maxsize=256)
+def _mirrored_as(xy: bytes, radius: bytes, other_xy: bytes, other_radius: bytes) -> tuple[np.ndarray, ...]:
+    own, other = np.frombuffer(xy).reshape(-1, 2), np.frombuffer(other_xy).reshape(-1, 2)
+    return tuple(mirrored_circles(own, np.frombuffer(radius), other, np.frombuffer(other_radius)))

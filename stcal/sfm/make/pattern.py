@@ -14,14 +14,14 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.data.patterns import Pattern, images_px
 from stcal.sfm.detect.circles.candidates import Candidates, Ellipses
-from stcal.sfm.detect.faces import MIN_CIRCLES, FaceFinder
-from stcal.sfm.detect.sightings import in_common
+from stcal.sfm.detect.faces import FaceFinder
+from stcal.sfm.detect.sightings import MIN_NAMING, in_common
 from stcal.sfm.make.box import Side
 from stcal.synthetic.designs import face_of_drawing
 
 HIDDEN = 3
 """Number of circles of a face that may be hidden. Any set of the remaining circles identifies the face."""
-LEAST_CIRCLES = MIN_CIRCLES + HIDDEN
+LEAST_CIRCLES = MIN_NAMING + HIDDEN
 LARGE = 1.6
 """Radius of the larger circles as a multiple of the smaller radius. Detection takes radii up to a ratio of 1.3 for
 equal."""
@@ -56,7 +56,7 @@ def make_pattern(
     if circles < LEAST_CIRCLES:
         raise InputError(
             "E-MAKE-CIRCLES",
-            f"--circles {circles}: {LEAST_CIRCLES} needed, {MIN_CIRCLES} name a face and {HIDDEN} may be hidden",
+            f"--circles {circles}: {LEAST_CIRCLES} needed, {MIN_NAMING} name a face and {HIDDEN} may be hidden",
         )
     rng = np.random.default_rng(seed)
     faces: list[FaceDesign] = []

@@ -5,6 +5,7 @@ so that everyone can follow them.
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from statistics import median
 from typing import Literal
@@ -28,6 +29,37 @@ QUESTIONS = {
     "next": "What to do next?",
 }
 Use = Literal["yes", "with care", "no"]
+CAUSE = "cause"
+"""Key of the check that names what all images have in common and makes others fail."""
+OF_WHOLE_SET = "Cause of the whole set: "
+"""How the title of that check begins, before the cause."""
+LEFT_OUT_WHOLE = "left out whole: "
+"""How the note begins on a group that could not be solved."""
+EVERY_SIGMA = "every σ"
+DISTANCES = "all distances and the size"
+PLACES = "the places of all faces"
+CENTRES = "all centres of circles"
+INVALIDATES: dict[str, tuple[str, ...]] = {
+    CAUSE: (PLACES, DISTANCES, EVERY_SIGMA),
+    "camera": (PLACES, DISTANCES, EVERY_SIGMA),
+    "residual-field": (PLACES, DISTANCES, EVERY_SIGMA),
+    "centres": (EVERY_SIGMA,),
+    "agreement": (PLACES, EVERY_SIGMA),
+    "halves": (PLACES, EVERY_SIGMA),
+    "groups": (PLACES, EVERY_SIGMA),
+    "loops": (PLACES, EVERY_SIGMA),
+    "moved": (PLACES, EVERY_SIGMA),
+    "image-residuals": (PLACES, EVERY_SIGMA),
+    "labels": (PLACES, EVERY_SIGMA),
+    "board": (DISTANCES, EVERY_SIGMA),
+    "board-lines": (DISTANCES, EVERY_SIGMA),
+    "pitch": (DISTANCES,),
+    "radius": ("the centres of the circles that it names", EVERY_SIGMA),
+    "radius-design": (CENTRES, PLACES),
+    "flatness": ("the frames of the faces whose circles it names", EVERY_SIGMA),
+    "control": (CENTRES, PLACES),
+}
+"""What does not hold where a check has failed, by its key."""
 
 
 class Judgement(Part):
@@ -39,11 +71,14 @@ class Judgement(Part):
     limit: str = Field(description="what limits it")
     next: str = Field(description="what to do next")
     position_sigma_um: float | None = Field(
-        description="largest σ of a face's position along an axis; null without covariances, as the next three"
+        description="largest σ of a face's position along an axis; null without covariances and after *no*, as the "
+        "next three"
     )
     position_face: str | None = Field(description="face that it is of")
     rotation_sigma_mdeg: float | None = Field(description="largest σ of a face's rotation about an axis")
     rotation_face: str | None = Field(description="face that it is of")
+    invalid: list[str] = Field(default=[], description="what does not hold, as checks failed that it rests on")
+    missing: list[str] = Field(default=[], description="faces that were to be there, and groups, that are not in it")
 
     def answers(self) -> list[tuple[str, str]]:
         """Returns the questions with their answers, in order."""
@@ -71,33 +106,78 @@ def judgement_of(report: dict) -> Judgement:
     report : content of ``report.json``
     """
     verdict, use = _use(report)
-    cause = _control(report) or _by_checks(report) or _by_sigma(report)
-    position, rotation = (_largest(report, key) for key in ("translation_sigma_um", "rotation_sigma_mdeg"))
+    cause = _control(report) or _by_checks(report) or _by_gaps(report) or _by_sigma(report)
+    position, rotation = (
+        None if verdict == "no" else _largest(report, key) for key in ("translation_sigma_um", "rotation_sigma_mdeg")
+    )
+    invalid = _invalid(report)
     return Judgement(
         verdict=verdict,
         use=use,
-        quality=_quality(report, position, rotation),
+        quality=_unknown(report, invalid) if verdict == "no" else _quality(report, position, rotation),
         limit=cause.limit,
         next=" ".join([cause.remedy, *_more(report, verdict)]),
         position_sigma_um=position and position[0],
         position_face=position and position[1],
         rotation_sigma_mdeg=rotation and rotation[0],
         rotation_face=rotation and rotation[1],
+        invalid=invalid,
+        missing=[*_missing_faces(report), *_lost_groups(report)],
     )
+
+
+def _invalid(report: dict) -> list[str]:
+    """Returns what the failed checks do not let hold, each once."""
+    return invalidated(check["key"] for check in report.get("checks", []) if check["verdict"] == "failed")
+
+
+def invalidated(failed: Iterable[str]) -> list[str]:
+    """Returns what failed checks, by their keys, do not let hold, each once."""
+    return list(dict.fromkeys(what for key in failed for what in INVALIDATES.get(key, (EVERY_SIGMA,))))
+
+
+def without_sigma(report: dict) -> dict:
+    """Returns the content of ``report.json`` without σ and distances of chains, which a failed run must not show."""
+    none = {"translation_sigma_um": None, "rotation_sigma_mdeg": None}
+    return report | {
+        "faces": {name: face | none for name, face in report["faces"].items()},
+        "between_faces": [row | {"distance_sigma_um": None} for row in report["between_faces"]],
+        "summary": report["summary"] | {"scale_sigma_ppm": None},
+    }
 
 
 # --- may I use it -----------------------------------------------------------------------------------------------------
 
 
 def _use(report: dict) -> tuple[Use, str]:
-    checks = report.get("checks", [])
+    verdict, answer = _by_result(report)
+    gaps = _gaps(report)
+    if not gaps or not report["faces"]:
+        return verdict, answer
+    missing = _missing_faces(report)
+    if verdict != "no" and missing:
+        return "no", f"No: {'; '.join(gaps)}."
+    if verdict == "yes" and (_lost_groups(report) or any(_is_read(report, f) for f in _absent(report))):
+        verdict, answer = "with care", f"With care: {answer.removeprefix('Yes: ')}"
+    elif verdict == "yes" and _absent(report):
+        answer = f"Yes, for face {join(list(report['faces']))}: {answer.removeprefix('Yes: ')}"
+    return verdict, f"{answer.removesuffix('.')}; {'; '.join(gaps)}."
+
+
+def _by_result(report: dict) -> tuple[Use, str]:
+    """Returns verdict and answer by what is in the result."""
+    checks = [check for check in report.get("checks", []) if check["key"] != CAUSE]
     counts = {v: sum(c["verdict"] == v for c in checks) for v in ("failed", "suspicious", "passed", "not possible")}
     if not report["faces"]:
         return "no", "No: there is no face in it, λ and residuals of the board alone."
     if _control(report):
         return "no", "No: it was made for comparison, and its faces are biased by tens of µm."
     made = len(checks) - counts["not possible"]
-    if n := counts["failed"]:
+    n = counts["failed"]
+    if cause := [check for check in report.get("checks", []) if check["key"] == CAUSE]:
+        name = cause[0]["title"].removeprefix(OF_WHOLE_SET)
+        return "no", f"No: {name}; that is the likely cause of {n} of {made} checks that failed."
+    if n:
         return "no", f"No: {n} of {made} checks failed, the first: {_first(report, 'failed')['title']}."
     if different := report.get("crosscheck", {}).get("differences"):
         return "with care", f"With care: the native COLMAP comes to other faces ({different[0]})."
@@ -116,15 +196,88 @@ def _use(report: dict) -> tuple[Use, str]:
     return "yes", f"Yes: {passed}{open_}."
 
 
+def _absent(report: dict) -> list[str]:
+    """Returns the faces of the design, and of those expected, that are not in the result."""
+    return list(report["summary"]["faces_not_seen"])
+
+
+def _missing_faces(report: dict) -> list[str]:
+    """Returns the faces that the photographs were to show and that are not in the result."""
+    expected = report["summary"].get("faces_expected") or []
+    return [face for face in _absent(report) if face in expected]
+
+
+def lost_groups(notes: Iterable[str]) -> list[str]:
+    """Returns the names of the groups that could not be solved, of all notes of a run."""
+    begin = f"{LEFT_OUT_WHOLE}group "
+    return [note.removeprefix(begin).partition(":")[0] for note in notes if note.startswith(begin)]
+
+
+def _lost_groups(report: dict) -> list[str]:
+    return [f"group {name}" for name in lost_groups(report["notes"])]
+
+
+def images_left_out(face: str, notes: Iterable[tuple[str, str]]) -> list[str]:
+    """Returns the images in which a face was read but left out, of all notes (image, note)."""
+    begins = f"a pattern like face {face}:", f"face {face}: read in one image"
+    return list(dict.fromkeys(image for image, note in notes if note.startswith(begins)))
+
+
+def _left_out_in(report: dict, face: str) -> list[str]:
+    return images_left_out(face, ((note["image"], note["note"]) for note in report["left_out"]["notes"]))
+
+
+def _is_read(report: dict, face: str) -> bool:
+    """Whether a face that is not in the result was read in two images, or has circles that were mapped or left out."""
+    return len(_left_out_in(report, face)) > 1 or _has_circles(report, face)
+
+
+def _has_circles(report: dict, face: str) -> bool:
+    rows = [*report["residuals_by_label"], *report["left_out"]["circles"]]
+    return any(row["label"].startswith(f"{face}:") for row in rows)
+
+
+def _gaps(report: dict) -> list[str]:
+    """Returns in words what is missing: faces that are not in the result, or in one image alone, and lost groups."""
+    never, words = [], []
+    for face in _absent(report):
+        images = _left_out_in(report, face)
+        if images:
+            shown = "1 image" if len(images) == 1 else f"{len(images)} images"
+            words.append(f"face {face} was read in {shown} and left out")
+        elif _has_circles(report, face):
+            words.append(f"face {face} is not in it, though circles of it were seen: they do not hold its frame")
+        else:
+            never.append(face)
+    if never:
+        words.insert(0, f"face {join(never)} of the design was seen in no image")
+    single = [name for name, face in report["faces"].items() if face["images"] == 1]
+    if single:
+        words.append(f"face {join(single)} rests on one image")
+    words += [f"{group} was left out whole" for group in _lost_groups(report)]
+    return words
+
+
 def _first(report: dict, verdict: str) -> dict:
-    """Returns the first check with this verdict that names an image, which can be looked at, else the first one."""
+    """Returns the cause of the whole set, else the first check of this verdict that names an image, or the first."""
     images = {image["name"] for image in report["images"]}
     matching = [check for check in report.get("checks", []) if check["verdict"] == verdict]
     naming = [check for check in matching if any(name in images for name in check["names"])]
-    return [*naming, *matching][0]
+    return [*(check for check in matching if check["key"] == CAUSE), *naming, *matching][0]
 
 
 # --- how good ---------------------------------------------------------------------------------------------------------
+
+
+def _unknown(report: dict, invalid: list[str]) -> str:
+    """Returns the answer of a result that must not be used: no number, and what does not hold."""
+    if not report["faces"]:
+        return _quality(report, None, None)
+    if invalid:
+        return f"That cannot be told: {join(invalid)} do not hold before what failed is put right."
+    if _control(report):
+        return "That cannot be told: biased faces have no σ that holds."
+    return "That is not told of a part: what was to be measured is not all there."
 
 
 def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[float, str] | None) -> str:
@@ -147,8 +300,13 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
     return (
         f"Faces are known against face {report['reference_face']} to {number(position[0], 1)} µm (face {position[1]}) "
         f"and {number(rotation[0], 2)} mdeg (face {rotation[1]}) at worst, one σ along and about an axis{scale}; that "
-        "holds where the intrinsics and the board's pitch are as stated."
+        f"holds where {_premise(report)} as stated."
     )
+
+
+def _premise(report: dict) -> str:
+    refined = report["options"].get("refine_camera")
+    return "the board's pitch is" if refined else "the intrinsics and the board's pitch are"
 
 
 def _largest(report: dict, key: str) -> tuple[float, str] | None:
@@ -186,6 +344,16 @@ def _by_checks(report: dict) -> _Cause | None:
             return _Cause(f"{check['title']}: {check['reason']}.", f"{remedy[0].upper()}{remedy[1:]}.")
     if different := report.get("crosscheck", {}).get("differences"):
         return _Cause(f"The native COLMAP differs: {different[0]}.", "Look at the cross-check: which of both is right?")
+    return None
+
+
+def _by_gaps(report: dict) -> _Cause | None:
+    """Returns the cause where faces are missing that were to be there; None if all are."""
+    if missing := _missing_faces(report):
+        return _Cause(
+            f"Face {join(missing)} was to be photographed and is not in the result.",
+            "Look at the overlays and at what was left out, in the photographs that show it.",
+        )
     return None
 
 
@@ -227,7 +395,12 @@ def _more(report: dict, verdict: Use) -> list[str]:
     """Returns what to do beyond the limit: about missing faces, and about checks that could not be made."""
     advice = []
     if report["faces"] and (missing := report["summary"]["faces_not_seen"]):
-        advice.append(f"Photograph face {join(missing)} together with one of the others: not seen in any image.")
+        read = [face for face in missing if _is_read(report, face) or _left_out_in(report, face)]
+        unseen = [face for face in missing if face not in read]
+        if unseen:
+            advice.append(f"Photograph face {join(unseen)} together with one of the others: not seen in any image.")
+        if read:
+            advice.append(f"Read why face {join(read)} was left out, and photograph it again from other places.")
     open_ = [c for c in report.get("checks", []) if c["verdict"] == "not possible" and c["remedy"]]
     if verdict == "yes" and open_:
         remedy = open_[0]["remedy"].removeprefix("to be able to make it, ")

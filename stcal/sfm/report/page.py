@@ -10,7 +10,7 @@ from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report import figures
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, photographs, space_parts
-from stcal.sfm.report.judgement import CHANCE, Judgement, judgement_of
+from stcal.sfm.report.judgement import CHANCE, Judgement, judgement_of, without_sigma
 
 LIMITS = (
     ("mapped_sigma", "σ", "of faces and circles between the programs"),
@@ -146,6 +146,9 @@ def report_html(
     reload_s : seconds after which the page reloads itself; never if None
     gone : number of overlays that are no longer in the run's folder
     """
+    judgement = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
+    if judgement.verdict == "no":
+        report = without_sigma(report)
     colours = figures.group_colours([group["name"] for group in report["groups"]])
     boards, views, bars = _drawn(report, colours)
     return render(
@@ -154,7 +157,7 @@ def report_html(
         reload_s=reload_s,
         colours=colours,
         factor=_factor_in_words(report["summary"]["sigma_factor"]),
-        judgement=_judgement(report),
+        judgement=_judgement(judgement),
         headline=_headline(report),
         settings=_settings(report),
         worst_values=_worst_values(report),
@@ -233,23 +236,25 @@ def _worst_chain(report: dict, key: str) -> tuple[float, str] | None:
     )
 
 
-def _judgement(report: dict) -> dict:
-    """Returns colour and sentences; they are made anew if the report is of a version that had none."""
-    judgement = Judgement.model_validate(report.get("judgement") or judgement_of(report).model_dump())
-    return {"colour": COLOURS[VERDICTS[judgement.verdict]], "answers": judgement.answers()}
+def _judgement(judgement: Judgement) -> dict:
+    """Returns colour and sentences."""
+    return {
+        "colour": COLOURS[VERDICTS[judgement.verdict]],
+        "answers": judgement.answers(),
+        "refused": judgement.verdict == "no",
+    }
 
 
 def _headline(report: dict) -> list[tuple[str, str, str]]:
     """Returns (value, unit, description) of the tiles."""
     summary = report["summary"]
-    sigma, chain = _largest_sigma(report, "translation_sigma_um"), _worst_chain(report, "translation_um")
+    sigma = _largest_sigma(report, "translation_sigma_um")
     ppm = max((abs(group["scale"]["difference_ppm"]) for group in report["groups"]), default=None)
     return [
         (number(summary["residual_rms_px"], 4), "px", "residual, RMS per axis"),
         (number(summary["sigma0"], 2), "", "σ₀ of the joint adjustment"),
         (number(summary["sigma_factor"], 2), "×", _factor_in_words(summary["sigma_factor"])),
         (number(sigma and sigma[0], 1), "µm", "largest σ of a face's position"),
-        (number(chain and chain[0], 1), "µm", "largest disagreement of chains"),
         (number(ppm, 1), "ppm", "largest difference of λ by rows"),
     ]
 

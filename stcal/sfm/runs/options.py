@@ -1,5 +1,7 @@
 """Options of a run."""
 
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal, get_args
 
@@ -51,6 +53,9 @@ class RunOptions:
         Also solve the same photographs as published, and step by step from there, for the report.
     exclude : tuple of str
         Images that are not used, by their names in results, such as ``12/IMG_1003.jpg``.
+    expect_faces : tuple of str
+        Faces that the photographs were to show: the answer is "no" where one is not in the result. If empty, the names
+        of the groups tell, where all of them are made of ids of faces, such as ``12`` or ``front-right``.
 
     Raises
     ------
@@ -72,6 +77,7 @@ class RunOptions:
     board_only: bool = False
     compare: Compare | None = None
     exclude: tuple[str, ...] = ()
+    expect_faces: tuple[str, ...] = ()
 
     def __post_init__(self):
         if self.compare not in (None, *get_args(Compare)):
@@ -105,4 +111,25 @@ class RunOptions:
         InputError
             A choice that does not exist.
         """
+        for face in self.expect_faces:
+            target.face(face)
         return replace(self, **asdict(self.adjustment(target)))
+
+    def faces_expected(self, groups: Iterable[str], target: TargetDesign) -> list[str]:
+        """Returns the faces that the photographs were to show, in the order of the design.
+
+        ``groups`` : names of all groups, those included that could not be solved.
+        """
+        if self.board_only:
+            return []
+        ids = [face.id for face in target.faces]
+        named = [set(self.expect_faces)] if self.expect_faces else [_faces_in_name(name, ids) for name in groups]
+        return [face for face in ids if all(named) and any(face in faces for faces in named)]
+
+
+def _faces_in_name(group: str, ids: Sequence[str]) -> set[str]:
+    """Returns the faces of which the name of a group is made, two at least; empty if it is made of anything else."""
+    for parts in (re.split("[-_+ ]", group), list(group)):
+        if len(parts) > 1 and len(set(parts)) == len(parts) and set(parts) <= set(ids):
+            return set(parts)
+    return set()

@@ -10,6 +10,7 @@ from stcal.labels import DotLabel
 from stcal.sfm.data.model import MIN_POINTS, GroupModel, ImageObservations
 from stcal.sfm.detect.defocus import Focus
 from stcal.sfm.mapping.incremental import MIN_RAY_ANGLE_RAD
+from stcal.sfm.report.judgement import lost_groups
 from stcal.sfm.runs.report import ReportFile
 from stcal.sfm.runs.result import RunResult
 
@@ -31,6 +32,7 @@ def report_of(result: RunResult) -> ReportFile:
                 "solve": result.options.solve,
                 "frame": result.options.frame,
                 "eccentricity": result.options.eccentricity,
+                "refine_camera": result.options.refine_camera,
                 "max_pair_angle_deg": round(float(np.degrees(result.options.pairs.limit_rad())), 9),
             },
             "camera": {
@@ -49,6 +51,10 @@ def report_of(result: RunResult) -> ReportFile:
                 "faces_not_seen": [
                     f.id for f in result.target_design.faces if f.id not in result.target.target_from_face
                 ],
+                "faces_expected": result.options.faces_expected(
+                    {image.file.group for image in result.detection.images} | set(lost_groups(result.notes)),
+                    result.target_design,
+                ),
                 "observations": len(all_residuals),
                 "residual_rms_px": float(np.sqrt((all_residuals**2).mean())),
                 "centre_sigma_rms_px": float(

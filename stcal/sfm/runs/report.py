@@ -21,6 +21,7 @@ class ReportOptions(Part):
     solve: Solve
     frame: FrameKind
     eccentricity: bool
+    refine_camera: bool
     max_pair_angle_deg: float
 
 
@@ -39,6 +40,7 @@ class Summary(Part):
     groups: int
     faces: int
     faces_not_seen: list[str]
+    faces_expected: list[str]
     observations: int
     residual_rms_px: float
     centre_sigma_rms_px: float
@@ -230,14 +232,17 @@ class ReportFile(ResultFile):
     version: str = Field(description="of stcal")
     target: str = Field(description="name of the design")
     reference_face: str = Field(description="face id")
-    options: ReportOptions = Field(description="`solve`, `frame`, `eccentricity`, `max_pair_angle_deg`")
+    options: ReportOptions = Field(
+        description="`solve`, `frame`, `eccentricity`, `refine_camera`, `max_pair_angle_deg`"
+    )
     camera: ReportCamera = Field(
         description="COLMAP `model`, `size_px`, `focal_px`, `centre_px` (OpenCV pixel origin), `distortion` k1, k2, "
         "p1, p2, k3 … k6, and s1 … s4 of a lens with thin prisms"
     )
     summary: Summary = Field(
         description="counts: `files` (skipped ones included), `images`, `images_mapped`, `groups`, `faces`, "
-        "`faces_not_seen`, `observations`; `residual_rms_px` per coordinate; `centre_sigma_rms_px` of the σ used; "
+        "`faces_not_seen`, `faces_expected` (by `--expect-faces`, or by the names of groups, where all are made of "
+        "ids of faces), `observations`; `residual_rms_px` per coordinate; `centre_sigma_rms_px` of the σ used; "
         "`sigma_factor` by which the residuals of the single groups exceed the centres' own σ, `circle_sigma_factor` "
         "of the circles of the faces and `dot_sigma_factor` of the dots, which multiply these σ; `scale_sigma_ppm`: σ "
         "of the size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "

@@ -169,13 +169,16 @@ def load_run(folder: str | Path) -> SavedRun:
 def _options(stored: dict) -> RunOptions:
     for part in (stored, stored["pairs"], stored["ellipses"]):
         for name, value in part.items():
-            if isinstance(value, list | dict) and name not in ("pairs", "ellipses", "exclude"):
+            if isinstance(value, list | dict) and name not in ("pairs", "ellipses", "exclude", "expect_faces"):
                 raise ValueError(f"options: {name} {value}: a single value needed")
-    exclude = stored.get("exclude", [])
-    if not (isinstance(exclude, list) and all(isinstance(name, str) for name in exclude)):
-        raise ValueError(f"options: exclude {exclude}: a list of names needed")
+    lists = {key: stored.get(key, []) for key in ("exclude", "expect_faces")}
+    for key, names in lists.items():
+        if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+            raise ValueError(f"options: {key} {names}: a list of names needed")
     pairs, ellipses = PairOptions(**stored["pairs"]), EllipseOptions(**stored["ellipses"])
-    return RunOptions(**(stored | {"pairs": pairs, "ellipses": ellipses, "exclude": tuple(exclude)}))
+    return RunOptions(
+        **(stored | {"pairs": pairs, "ellipses": ellipses, **{key: tuple(names) for key, names in lists.items()}})
+    )
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from stcal.sfm.detect.labels import LabelledImage, leaves_a_board_out
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, rank_pairs
+from stcal.sfm.report.judgement import LEFT_OUT_WHOLE
 from stcal.sfm.runs.options import RunOptions
 
 CACHE_VERSION = 6
@@ -118,7 +119,7 @@ def _listed(names: Iterable[str], most: int = 4) -> str:
 
 
 def _left_out(error: StcalError) -> str:
-    return f"left out whole: {error}"
+    return f"{LEFT_OUT_WHOLE}{error}"
 
 
 def require_usable(group: list[ImageObservations], board_alone: bool = False) -> None:

@@ -14,6 +14,7 @@ from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.report.compare import comparison_cells
+from stcal.sfm.report.judgement import images_left_out
 from stcal.sfm.report.page import count_verdicts
 from stcal.sfm.runs.result import Comparison, RunResult
 from stcal.sfm.runs.solve import GroupSolution
@@ -108,7 +109,7 @@ def so_far_text(result: RunResult) -> str:
         if face != target.reference_face
     }
     faces = f"{len(target.target_from_face)} of {len(result.target_design.faces)} faces"
-    if sigma:
+    if sigma and (result.judgement is None or result.judgement.verdict != "no"):
         worst = max(sigma, key=lambda face: sigma[face])
         faces += f", worst is face {worst}: σ {1e3 * sigma[worst][0]:.1f} µm, {1e3 * sigma[worst][1]:.1f} mdeg"
     mapped = sum(len(solution.model.images) for solution in result.solutions)
@@ -145,12 +146,14 @@ def _group(solution: GroupSolution, board_rms_mm: float) -> Iterator[str]:
 
 def _faces(result: RunResult) -> Iterator[str]:
     target = result.target
-    sigma_heading = "   σ position µm      σ rotation mdeg" if target.face_covariance else ""
+    failed = result.judgement is not None and result.judgement.verdict == "no"
+    face_covariance = {} if failed else target.face_covariance
+    sigma_heading = "   σ position µm      σ rotation mdeg" if face_covariance else ""
     yield f"{'face':>6} {'x':>10} {'y':>10} {'z':>10} mm{sigma_heading}"
     for face_id, pose in target.target_from_face.items():
         x, y, z = pose.translation
         line = f"{face_id:>6} {x:10.4f} {y:10.4f} {z:10.4f}"
-        covariance = target.face_covariance.get(face_id)
+        covariance = face_covariance.get(face_id)
         if face_id == target.reference_face:
             line += "      reference"
         elif covariance is not None:
@@ -159,8 +162,16 @@ def _faces(result: RunResult) -> Iterator[str]:
             rotation = " ".join(f"{1e3 * np.degrees(s):5.2f}" for s in sigma[:3])
             line += f"    {position}   {rotation}"
         yield line
-    unseen = [f.id for f in result.target_design.faces if f.id not in target.target_from_face]
-    if unseen:
+    absent = [f.id for f in result.target_design.faces if f.id not in target.target_from_face]
+    notes = [(image.observations.name, note) for image in result.labelled for note in image.notes]
+    seen = {label.plane for image in result.labelled for label in image.observations.labels}
+    for face in absent:
+        images = images_left_out(face, notes)
+        if images:
+            yield f"read and left out, of {len(images)} images: face {face}"
+        elif face in seen:
+            yield f"seen, but not by enough circles for its frame: face {face}"
+    if unseen := [face for face in absent if face not in seen and not images_left_out(face, notes)]:
         yield f"not seen in any image: face {', '.join(unseen)}"
 
 

@@ -53,6 +53,15 @@ def test_every_row_of_a_few_is_listed():
     assert len(re.findall(r"line \d+ +(?:inlier|OUTLIER)", text)) == FEW_ROWS - 4
 
 
+def test_rows_that_do_not_correspond_are_no_noise():
+    rng = np.random.default_rng(1)
+    a = rng.uniform(-1000, 1000, (40, 3))
+    b = 0.5 * a + rng.normal(0, 200, a.shape)
+    text = registration_text(findings("x", range(40), a, b, register(a, b, model="rigid", method="least-squares")))
+    assert "no systematic residuals" not in text
+    assert "do not use this transform" in text
+
+
 def test_a_bent_frame_is_said():
     text = registration_text(found_of(n=90, bend=0.6, allow_ambiguous=True))
     assert "residuals are systematic" in text

@@ -10,6 +10,7 @@ from stcal.design import StatedSize
 from stcal.io.design import board_toml, load_board
 from stcal.sfm.budget.combine import budget_of_run, longest_of
 from stcal.sfm.budget.sources import FIELDS, correction, statement_of
+from stcal.sfm.report.judgement import INVALIDATES
 from stcal.sfm.runs.saved import load_run
 from tests.outcome import INPUT, assert_error
 from tests.shared import own_copy
@@ -168,6 +169,12 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     code, text, _ = stcal_sfm("budget", copy)
     assert code == 0
     assert f"note: failed checks of the run: 1, first {title}; what they found is not among the inputs" in text
+    assert f"{', '.join(INVALIDATES[report['checks'][1]['key']])} do not hold before it is put right" in text
+    assert "expanded uncertainty U" not in text
+    page, out = tmp_path / "budget.html", tmp_path / "budget.json"
+    assert stcal_sfm("budget", copy, "--report", page, "--json", out)[0] == 0
+    assert "do not hold before it is put right" in page.read_text()
+    assert json.loads(out.read_text())["faces"] == {}
 
 
 @pytest.mark.parametrize(

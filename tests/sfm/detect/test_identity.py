@@ -138,7 +138,7 @@ def test_a_face_in_view_twice_has_two_readings():
 
 def test_which_faces_a_mirror_makes_of_faces():
     """Swapping x and y turns the pattern of face 5 into that of face 3, and that of face 4 into that of face 2."""
-    assert mirror_images(TARGET) == {"2": "4", "4": "2", "3": "5", "5": "3"}
+    assert mirror_images(TARGET) == {"2": ("4",), "4": ("2",), "3": ("5",), "5": ("3",)}
 
 
 @pytest.mark.parametrize("face_id", ["1", "2"])

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DetectionError
 from stcal.geometry.rigid import Rigid
 from stcal.io.images import ImageFile
 from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.files import DetectedImage, require_upright
 from stcal.sfm.detect.labels import label_groups
-from stcal.sfm.detect.sightings import FaceSighting, ImageDetection
+from stcal.sfm.detect.sightings import FaceSighting, ImageDetection, likeness_notes, mirror_images
 from tests.sfm.detect.degraded import study
 from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen, plane_centres
 from tests.support import degrade
@@ -177,3 +178,71 @@ def test_a_phantom_in_one_image_goes_out_and_ends_nothing(bench):
     notes = found.images[FIRST].notes
     assert sum(note.startswith("face 3: read in one image of the group alone, 0 of 20 of its") for note in notes) == 1
     assert {label.plane for label in found.labels(FIRST)} == {"1", "2", "board"}
+
+
+def nine_circles(face_id: str, large: str, shifts: dict[int, tuple[float, float]]) -> FaceDesign:
+    """A face of 3 × 3 circles, 35 mm apart, those of ``large`` with 6 mm radius, some shifted."""
+    xy = np.array([(35.0 * (i % 3), 35.0 * (i // 3)) for i in range(9)])
+    for i, shift in shifts.items():
+        xy[i] += shift
+    radius = np.where([c == "o" for c in large], 6.0, 3.5)
+    return FaceDesign(face_id, tuple("123456789"), xy, radius, "1", "3", "7")
+
+
+GRIDS = {
+    "perturbed": (
+        nine_circles("front", "o.ooo..oo", {2: (6, 3), 4: (0, 5)}),
+        nine_circles("right", "ooo..ooo.", {0: (-3, 0), 5: (4, -6)}),
+    ),
+    "pure": (nine_circles("front", "ooooo.oo.", {}), nine_circles("right", "o..oo.o.o", {})),
+    "partly alike": (nine_circles("front", "o.o...ooo", {}), nine_circles("right", "o.o...oo.", {4: (0, 6)})),
+}
+"""Pairs of faces that only radii or small shifts distinguish from mirror images of each other."""
+TARGET_FROM_RIGHT = Rigid(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.array([100.0, 0, -30]))
+
+
+@pytest.mark.parametrize("kind", GRIDS)
+@pytest.mark.parametrize("turn", [-1.1, -0.8, -0.4])
+def test_a_face_that_stands_like_a_mirror_image_but_has_other_radii_stays(kind, turn):
+    """Both at right angles: seen from either side of the plane half way."""
+    target = TargetDesign("two", "dark", GRIDS[kind])
+    assert "right" not in mirror_images(target).get("front", ())
+    images = []
+    for i in range(4):
+        pose = Rigid.exp([3.1, 0.02 * i, 0, 0, 0, 0]) @ Rigid.exp([0, turn + 0.05 * i, 0, 0, 0, 0])
+        pose = Rigid(pose.rotation, np.array([0.0, 20 * i, 900]))
+        seen = Seen()
+        for face, own in zip(target.faces, (pose, pose @ TARGET_FROM_RIGHT), strict=True):
+            seen.face(face.id, plane_centres(own, face.xy_mm), range(9))
+        images.append((str(i), "a", seen.detection()))
+    ((labelled, _),) = label_groups([images], target, None, FOCAL_PX)
+    assert all(set(each.observations.face_ids()) == {"front", "right"} for each in labelled)
+    assert all(each.notes == () for each in labelled)
+
+
+@pytest.mark.parametrize("kind", GRIDS)
+def test_a_real_mirror_image_of_the_same_patterns_goes_out(kind):
+    """The second face is the first one's mirror image with its radii: the design says so, and the group leaves it out
+    where it stands as a mirror would show it."""
+    front = GRIDS[kind][0]
+    image = replace(front, id="right", xy_mm=front.xy_mm * [-1, 1] + [70, 0], origin="3", x="1", y="9")
+    target = TargetDesign("two", "dark", (front, image))
+    assert "right" in mirror_images(target)["front"]
+    assert any("mirror images: front" in note for note in likeness_notes(target))
+    mirrored_from_plane = Rigid(np.diag([1.0, -1, -1]), np.array([0.0, 0, 0]))
+    normal, offset = np.array([0.0, 0.96, 0.28]), -100.0  # a floor that the face leans over
+    reflection = np.eye(3) - 2 * np.outer(normal, normal)
+    images = []
+    for i in range(4):
+        pose = Rigid(Rigid.exp([-0.6, 0.05 * i, 0, 0, 0, 0]).rotation, np.array([0.0, 20 * i, 900]))
+        xyz = np.column_stack([front.xy_mm, np.zeros(9)])
+        world = xyz @ mirrored_from_plane.rotation.T
+        beyond = pose @ (world @ reflection.T + 2 * offset * normal)
+        direct = pose @ world
+        seen = Seen().face("front", direct[:, :2] / direct[:, 2:], range(9))
+        seen.face("right", beyond[:, :2] / beyond[:, 2:], range(9))
+        images.append((str(i), "a", seen.detection()))
+    ((labelled, _),) = label_groups([images], target, None, FOCAL_PX)
+    notes = [note for each in labelled for note in each.notes]
+    assert sum("the image of another face in a mirror" in note for note in notes) == 4
+    assert all(set(each.observations.face_ids()) == {"front"} for each in labelled)

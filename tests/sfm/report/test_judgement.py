@@ -1,14 +1,28 @@
 """The report in four sentences."""
 
 import copy
+import re
+from pathlib import Path
 
 import pytest
 
 from stcal.report.page import environment
+from stcal.sfm import checks
 from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS
-from stcal.sfm.report.judgement import CHANCE, TESTS_OF_CHANCE, judged, judgement_of
+from stcal.sfm.report.judgement import (
+    CAUSE,
+    CHANCE,
+    INVALIDATES,
+    LEFT_OUT_WHOLE,
+    OF_WHOLE_SET,
+    TESTS_OF_CHANCE,
+    judged,
+    judgement_of,
+)
 from stcal.sfm.report.page import report_html
 from tests.sfm.report.test_report import make
+
+KEYS = re.compile(r'(?:judge|impossible)\(\s*"([a-z-]+)"|key(?:, title)? = "([a-z-]+)"')
 
 
 def check(key: str, verdict: str, names: tuple[str, ...] = (), remedy: str = "") -> dict:
@@ -67,6 +81,14 @@ def test_the_check_that_names_an_image_comes_first():
     )
     assert found.use == "No: 2 of 2 checks failed, the first: Check b."
     assert found.next == "Look at it."
+
+
+def test_the_cause_of_the_whole_set_is_said_before_all():
+    cause = check(CAUSE, "failed", remedy="give the originals") | {"title": OF_WHOLE_SET + "they are undistorted"}
+    names_an_image = check("moved", "failed", ("a/1.jpg",), "look at it")
+    found = judgement_of(report(names_an_image, check("c", "passed"), cause))
+    assert found.use == "No: they are undistorted; that is the likely cause of 1 of 2 checks that failed."
+    assert found.next == "Give the originals."
 
 
 def test_a_suspicious_check_says_how_often_chance_makes_one():
@@ -135,9 +157,76 @@ def test_what_is_missing_is_said_too():
     own = report(*[check(key, "not possible", remedy="to be able to make it, add a group") for key in "ab"])
     own["summary"]["faces_not_seen"] = ["5", "6"]
     told = judgement_of(own)
-    assert told.use == "Yes: nothing was checked, 2 were not possible."
+    assert told.use == (
+        "Yes, for face 1, 2, 3, 4: nothing was checked, 2 were not possible; face 5, 6 of the design was seen in no "
+        "image."
+    )
     assert "Photograph face 5, 6 together with one of the others: not seen in any image." in told.next
     assert told.next.endswith("For 2 more checks: add a group.")
+
+
+def test_a_missing_face_that_was_expected_is_a_no():
+    own = report()
+    own["summary"] |= {"faces_not_seen": ["5", "6"], "faces_expected": ["1", "6"]}
+    told = judgement_of(own)
+    assert (told.verdict, told.missing) == ("no", ["6"])
+    assert told.use == "No: face 5, 6 of the design was seen in no image."
+    assert told.position_sigma_um is None
+    assert "µm" not in told.quality
+    own["checks"] = [check("a", "failed", remedy="x")]
+    assert judgement_of(own).use.endswith("the first: Check a; face 5, 6 of the design was seen in no image.")
+
+
+def test_a_face_that_was_read_and_left_out_and_a_lost_group_call_for_care():
+    own = report()
+    own["summary"]["faces_not_seen"] = ["5"]
+    note = "a pattern like face 5: the image of another face in a mirror; left out"
+    own["left_out"]["notes"] = [{"image": f"a/{i}.jpg", "note": note} for i in range(3)]
+    told = judgement_of(own)
+    assert told.verdict == "with care"
+    assert told.use == "With care: 17 checks passed; face 5 was read in 3 images and left out."
+    assert "Read why face 5 was left out" in told.next
+    own = report()
+    own["notes"] = [LEFT_OUT_WHOLE + "group 25: no board recognised in 4 images; keep it in view"]
+    told = judgement_of(own)
+    assert (told.verdict, told.missing) == ("with care", ["group 25"])
+    assert told.use.endswith("; group 25 was left out whole.")
+
+
+def test_a_face_of_one_image_is_in_the_sentence():
+    own = report()
+    own["faces"]["3"]["images"] = 1
+    told = judgement_of(own)
+    assert told.verdict == "yes"
+    assert told.use == "Yes: 17 checks passed; face 3 rests on one image."
+
+
+@pytest.mark.parametrize("key", INVALIDATES)
+def test_after_no_there_are_no_micrometres_but_what_does_not_hold(key):
+    failed = judged(report(check(key, "failed", remedy="x"), check("b", "passed")))
+    told = failed["judgement"]
+    assert told["invalid"] == list(INVALIDATES[key])
+    assert all(what in told["quality"] for what in told["invalid"])
+    assert "µm" not in told["quality"]
+    assert {told[k] for k in ("position_sigma_um", "rotation_sigma_mdeg", "position_face", "rotation_face")} == {None}
+    page = report_html(failed, {})
+    assert "No σ are shown" in page
+    assert "3.04" not in page.replace("-3.04", "")
+
+
+def test_every_check_that_can_fail_says_what_it_invalidates():
+    """Both others are suspicious at worst."""
+    sources = (Path(checks.__file__).parent / f"{name}.py" for name in ("board", "faces", "images", "suite"))
+    keys = {key for source in sources for found in KEYS.findall(source.read_text()) for key in found if key}
+    assert keys - {"sharpness", "evenness"} <= INVALIDATES.keys()
+    assert len(keys) > 15
+
+
+def test_the_intrinsics_are_no_premise_where_they_were_adjusted():
+    own = report()
+    assert judgement_of(own).quality.endswith("that holds where the intrinsics and the board's pitch are as stated.")
+    own["options"]["refine_camera"] = True
+    assert judgement_of(own).quality.endswith("that holds where the board's pitch is as stated.")
 
 
 @pytest.mark.parametrize("stored", [True, False])

@@ -50,7 +50,7 @@ def test_the_comparison_is_in_the_report(compared):
 @pytest.mark.slow
 def test_the_published_method_is_settled_whole(small_set, stcal_sfm):
     data = small_set("12", "14")
-    code, text, _ = stcal_sfm(*data.arguments("--solve", "paper"))
+    code, text, _ = stcal_sfm(*data.arguments("--solve", "paper", "--no-strict"))
     assert code == 0
     assert "as published, for comparison: centres of contours" in text
     faces = json.loads((data.out / "faces.json").read_text())

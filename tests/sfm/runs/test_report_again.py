@@ -7,9 +7,9 @@ import re
 import shutil
 
 import pytest
-from markupsafe import escape
 
 from stcal.io.files import RUN_MARKER
+from stcal.report.page import with_code
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs import folder
 from stcal.sfm.runs.text import run_text
@@ -102,7 +102,7 @@ def test_terminal_file_and_page_have_the_same_judgement(small_result, small_run)
     assert len(stored.answers()) == 4
     for question, answer in stored.answers():
         assert f"{question} {answer}" in terminal
-        assert f"<dt>{question}</dt><dd>{escape(answer)}</dd>" in page
+        assert f"<dt>{question}</dt><dd>{with_code(answer)}</dd>" in page
 
 
 def test_residuals_of_the_table_are_those_of_the_report_and_of_the_page(small_run):

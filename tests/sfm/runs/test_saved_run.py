@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal.design import reference_target
 from stcal.errors import InputError
 from stcal.sfm import run
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -17,7 +18,7 @@ from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import load_run
 from stcal.sfm.runs.transaction import MarkerFile, run_folder
-from tests.outcome import INPUT, assert_error
+from tests.outcome import INPUT, assert_error, fails_with
 from tests.shared import own_copy
 
 FRAME = ("id", "ids", "origin", "x", "y")
@@ -33,6 +34,7 @@ OTHER = RunOptions(
     workers=3,
     flatness_mm=0.3,
     exclude=("12/a.jpg", "b.jpg"),
+    expect_faces=("1", "2"),
 )
 SPECIAL = ("refine_camera", "compare", "board_only")
 """No value is a default but those that only the joint adjustment knows, and that of runs without faces."""
@@ -131,6 +133,28 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
     saved = load_run(own)
     assert saved.options == OTHER
     assert saved.images == tmp_path / "some images"
+
+
+@pytest.mark.parametrize(
+    ("groups", "given", "expected"),
+    [
+        (("12", "14"), (), ["1", "2", "4"]),
+        (("1-2", "4_1"), (), ["1", "2", "4"]),
+        (("12", "far"), (), []),
+        (("1", "2"), (), []),  # numbers of groups, most likely
+        (("12", "16"), (), []),
+        (("12",), ("5", "3"), ["3", "5"]),
+        ((".",), ("1",), ["1"]),
+    ],
+)
+def test_which_faces_the_photographs_were_to_show(groups, given, expected):
+    assert RunOptions(expect_faces=given).faces_expected(groups, reference_target()) == expected
+    assert RunOptions(expect_faces=given, board_only=True).faces_expected(groups, reference_target()) == []
+
+
+def test_an_expected_face_that_the_design_lacks():
+    with fails_with("E-TARGET-NO-FACE … 7"):
+        RunOptions(expect_faces=("7",)).settled(reference_target())
 
 
 # --- damaged, unfinished, of another version ---

@@ -1,0 +1,286 @@
+"""Causes of the whole set: each is fitted as a hypothesis, and the one that explains most with fewest parameters is
+named first.
+
+A cause that all images share makes many checks fail, which each name something else. A hypothesis is a set of further
+parameters of the free networks (score test). It explains what it takes from the squared residuals beyond chance.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri, fdtrc
+
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import skew
+from stcal.labels import CircleLabel
+from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
+from stcal.sfm.checks.images import summed
+from stcal.sfm.checks.verdict import FAILED, Check, Measured
+from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
+
+EXPLAINS = 0.8
+"""Least share, of what the best hypothesis explains, of one that is preferred for its fewer parameters."""
+MOST_IMAGES = 60
+"""Largest number of images of a group in which parameters of single images are fitted; more take minutes."""
+FIXED_WITHIN = 0.2
+"""Largest deviation from 1 of the share of a change that is as a whole or not at all, such as a distortion removed."""
+FEW = 0.25
+"""Share of the images that may not explain alone what is taken for a cause of the whole set."""
+ALONE = 0.93
+"""Share of what all images explain at which a few explain it alone; of random changes in all of them they have 0.5 to
+0.87."""
+LEAST_SHIFT_PX = 3.0
+"""Smallest change of the principal point at which photographs that were turned by 180° can be told."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Cause:
+    """A hypothesis.
+
+    ``name``, ``remedy`` in words; ``size`` : its size in words, from the estimates (q,) and their σ; ``columns`` : (n,
+    2, q) derivatives of the projections of a network over σ; ``scope`` : one set of parameters for all images, or one
+    for each group or image; ``whole`` : True if the parameter is 1 where the hypothesis is true.
+    """
+
+    name: str
+    remedy: str
+    size: Callable[[np.ndarray, np.ndarray], str]
+    columns: Callable[[Network], np.ndarray]
+    scope: str = "all"
+    whole: bool = False
+    nameable: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fitted:
+    cause: _Cause
+    test: ScoreTest
+    explained: float
+    probability: float
+    left: float
+
+
+def whole_set_cause(networks: Sequence[Network], camera: Camera) -> Check | None:
+    """Returns a failed check that names the cause of the whole set; None if none explains most of the residuals.
+
+    The residuals beyond chance are those that the most flexible hypothesis explains. Of all hypotheses that explain
+    ``EXPLAINS`` of it the one with fewest parameters is named.
+    """
+    fitted = [f for cause in _hypotheses(camera) if (f := _fit(cause, networks)) is not None]
+    most = max((f.explained for f in fitted), default=0.0)
+    named = [
+        f
+        for f in fitted
+        if f.cause.nameable
+        and f.probability * len(fitted) < FAILED
+        and f.explained > EXPLAINS * most
+        and _applies(f, networks)
+    ]
+    if not named:
+        return None
+    best = min(named, key=lambda f: (f.test.freedom, -f.explained))
+    if best.cause.scope == "image" and _explained_by_one(networks, best.left) > EXPLAINS * most:
+        return None  # its checks name that image
+    size = best.cause.size(best.test.estimate, np.sqrt(np.maximum(np.diag(best.test.covariance), 0)))
+    square = sum(float((n.residual**2).sum()) for n in networks)
+    after = float(np.sqrt(best.left * _redundancy(networks) / square))
+    reason = (
+        f"{best.cause.name}, {size}: {best.test.freedom} parameter{'s' * (best.test.freedom > 1)} explain"
+        f"{'s' * (best.test.freedom == 1)} {100 * best.explained / most:.0f} % of what any cause explains; residuals "
+        f"would be {after:.2f} times as large"
+    )
+    measured = tuple(
+        Measured(f.cause.name, 100 * f.explained / most, None, "% explained", f.probability)
+        for f in sorted(fitted, key=lambda f: (f is not best, f.test.freedom))
+    )
+    return Check(
+        CAUSE, f"{OF_WHOLE_SET}{best.cause.name}", "failed", reason, measured, len(fitted), (), best.cause.remedy
+    )
+
+
+def _redundancy(networks: Sequence[Network]) -> float:
+    return float(sum(n.redundancy.sum() for n in networks))
+
+
+def _fit(cause: _Cause, networks: Sequence[Network]) -> _Fitted | None:
+    """Returns the hypothesis fitted to all networks; None if it cannot be."""
+    if cause.scope == "all":
+        test = solve_score(*summed(networks, cause.columns))
+    else:
+        if cause.scope == "image" and max(len(n.model.images) for n in networks) > MOST_IMAGES:
+            return None
+        tests = [solve_score(*n.score(_apart(cause, n))) for n in networks]
+        test = _together(tests)
+    redundancy = _redundancy(networks)
+    square = sum(float((n.residual**2).sum()) for n in networks)
+    rest = redundancy - test.freedom
+    left = (square - test.statistic) / rest if rest > 0 else 0.0
+    if not test.freedom or left <= 0:
+        return None
+    probability = float(fdtrc(test.freedom, rest, test.statistic / test.freedom / left))
+    return _Fitted(cause, test, test.statistic - test.freedom * left, probability, left)
+
+
+def _apart(cause: _Cause, network: Network) -> np.ndarray:
+    """Returns the columns with parameters of each image, or of the group, for itself."""
+    columns = cause.columns(network)
+    if cause.scope == "group":
+        return columns
+    n, _, q = columns.shape
+    images = len(network.model.images)
+    apart = np.zeros((n, 2, images, q))
+    apart[np.arange(n), :, network.model.image_index] = columns
+    return apart.reshape(n, 2, images * q)
+
+
+def _together(tests: Sequence[ScoreTest]) -> ScoreTest:
+    sizes = [len(t.estimate) for t in tests]
+    covariance = np.zeros((sum(sizes), sum(sizes)))
+    for end, size, test in zip(np.cumsum(sizes), sizes, tests, strict=True):
+        covariance[end - size : end, end - size : end] = test.covariance
+    return ScoreTest(
+        np.concatenate([t.estimate for t in tests]),
+        covariance,
+        sum(t.statistic for t in tests),
+        sum(t.freedom for t in tests),
+    )
+
+
+def _applies(fitted: _Fitted, networks: Sequence[Network]) -> bool:
+    """Whether the estimates are those of a cause of the whole set: a change as a whole is 1, groups differ, and a few
+    images do not explain it alone."""
+    estimate = fitted.test.estimate
+    if fitted.cause.whole:
+        return bool(abs(estimate[0] - 1) < FIXED_WITHIN)
+    if fitted.cause.scope == "group":
+        away = (estimate - np.median(estimate)) ** 2 / np.maximum(np.diag(fitted.test.covariance), 1e-300)
+        return len(networks) > 1 and bool((away > fitted.left * chdtri(1, FAILED)).any())
+    if fitted.cause.scope == "image":
+        few = _explained_by_few(fitted, networks)
+        return few < ALONE * fitted.test.statistic
+    return True
+
+
+def _explained_by_few(fitted: _Fitted, networks: Sequence[Network]) -> float:
+    """Returns what the parameters of a quarter of the images explain, of those that explain most alone."""
+    equations = [network.score(_apart(fitted.cause, network)) for network in networks]
+    gains = []
+    for i, (network, (normal, right)) in enumerate(zip(networks, equations, strict=True)):
+        q = len(right) // len(network.model.images)
+        for k in range(len(network.model.images)):
+            own = slice(q * k, q * k + q)
+            gains.append((solve_score(normal[own, own], right[own]).statistic, i, np.arange(q * k, q * k + q)))
+    gains.sort(key=lambda gain: -gain[0])
+    few = gains[: max(round(FEW * len(gains)), 1)]
+    explained = 0.0
+    for i, (normal, right) in enumerate(equations):
+        if columns := [own for _, j, own in few if j == i]:
+            own = np.concatenate(columns)
+            explained += solve_score(normal[np.ix_(own, own)], right[own]).statistic
+    return explained
+
+
+def _explained_by_one(networks: Sequence[Network], left: float) -> float:
+    """Returns what any one image explains, if it is taken out.
+
+    ``left`` : squared residual per degree of freedom that is not explained.
+    """
+    most = 0.0
+    for network in networks:
+        for rows in network.model.rows_by_image():
+            columns = np.zeros((len(network.residual), 2, 2 * len(rows)))
+            columns[rows, 0, np.arange(len(rows))] = columns[rows, 1, len(rows) + np.arange(len(rows))] = 1
+            test = solve_score(*network.score(columns))
+            most = max(most, test.statistic - test.freedom * left)
+    return most
+
+
+def _percent(what: str) -> Callable[[np.ndarray, np.ndarray], str]:
+    return lambda value, sigma: f"{what} {100 * value[0]:+.3g} ± {100 * sigma[0]:.2g} %"
+
+
+def _spread(what: str) -> Callable[[np.ndarray, np.ndarray], str]:
+    return lambda value, _: f"{what} up to {100 * np.ptp(value):.3g} % apart"
+
+
+def _listed(names: Sequence[str]) -> Callable[[np.ndarray, np.ndarray], str]:
+    return lambda value, _: ", ".join(f"{name} {v:+.2g}" for name, v in zip(names, value, strict=True))
+
+
+ANEW = "calibrate the camera anew with this lens, zoom and focus, or run with --refine-camera"
+
+
+def _hypotheses(camera: Camera) -> list[_Cause]:
+    """Returns the causes that a set of photographs may have as a whole."""
+    fx, fy = camera.focal
+    cx, cy = camera.centre
+    unit = np.eye(len(camera.parameters()))
+    focal = fx * unit[:, [0]] + fy * unit[:, [1]]
+    scaled = focal + (cx + 0.5) * unit[:, [2]] + (cy + 0.5) * unit[:, [3]]
+    turned = (camera.width - 1 - 2 * cx) * unit[:, [2]] + (camera.height - 1 - 2 * cy) * unit[:, [3]]
+    removed = -camera.parameters()[:, None] * (np.arange(len(unit)) > 3)[:, None]
+
+    def by(direction: np.ndarray) -> Callable[[Network], np.ndarray]:
+        return lambda network: network.model.whiten(_by_parameters(network, camera) @ direction)
+
+    found = [
+        _Cause("the focal length is not that of the camera file", "zoom or focus is not as at the calibration, or the "
+               f"file is of another lens: {ANEW}", _percent("focal length"), by(focal)),
+        _Cause("the photographs are scaled against the camera file", "give the photographs in the size of the "
+               "calibration, or scale focal length and principal point in the camera file alike", _percent("size"),
+               by(scaled)),
+        _Cause("width and height are scaled unlike", "the photographs were resized without keeping their proportions, "
+               "or fx and fy of the camera file are wrong: give the original photographs", _percent("fx over fy"),
+               by(fx * unit[:, [0]])),
+        _Cause("the principal point is not that of the camera file", "the photographs are cropped, or of another "
+               f"sensor: give them whole, or correct cx and cy in the camera file; or {ANEW}",
+               _listed(("cx", "cy")), by(unit[:, 2:4])),
+        _Cause("the distortion is not that of the camera file", f"another lens or focus, or its signs or order are "
+               f"wrong in the file: {ANEW}", _listed(("k1", "k2", "p1", "p2")), by(unit[:, 4:8])),
+        _Cause("the intrinsics are not those of the camera file", f"the camera file is of another camera: {ANEW}",
+               _listed(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")), by(unit[:, :8])),
+        _Cause("zoom or focus changed between the groups", "the focal length differs from group to group: fix zoom and "
+               "focus, and take the photographs again; or run each group with a camera file of its own",
+               _spread("focal lengths"), by(focal), "group"),
+        _Cause("zoom or focus changed from image to image", "the focal length differs from image to image: turn "
+               "autofocus and stabiliser off, and take the photographs again", _spread("focal lengths"), by(focal),
+               "image"),
+        _Cause("the camera moved while its rows were read (rolling shutter)", "use a camera with a global shutter, or "
+               "stand still for each photograph", lambda value, _: "in most images", _by_row, "image"),
+        _Cause("the target moved against the board", "", lambda value, _: "", _by_motion, "image", nameable=False),
+    ]  # fmt: skip
+    if np.abs(removed).max() > 0:
+        found.append(
+            _Cause("the photographs are already undistorted", "the camera file has a distortion that they no longer "
+                   "have: give the original photographs, or set the distortion in the camera file to 0",
+                   lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
+                   "not in them", by(removed), whole=True)
+        )  # fmt: skip
+    if np.abs(turned).max() > LEAST_SHIFT_PX:
+        found.append(
+            _Cause("the photographs are turned by 180° against the camera file", "turn them back, as the sensor has "
+                   "them, without the rotation that a viewer or converter applied",
+                   lambda value, _: f"principal point {100 * value[0]:.0f} % of the way", by(turned), whole=True)
+        )  # fmt: skip
+    return found
+
+
+def _by_parameters(network: Network, camera: Camera) -> np.ndarray:
+    xyz = network.model.xyz_camera()
+    return camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:])
+
+
+def _by_row(network: Network) -> np.ndarray:
+    """Returns the columns of a motion that grows from the first to the last row of an image."""
+    row = network.model.measured_px[:, 1]
+    return network.by_pose * ((row - row.mean()) / max(float(np.ptp(row)), 1.0))[:, None, None]
+
+
+def _by_motion(network: Network) -> np.ndarray:
+    """Returns the columns of a motion of all faces against the board."""
+    model = network.model
+    on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])
+    arm = model.xyz_model[model.point_index] - model.xyz_model.mean(0)
+    motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
+    return network.by_point @ (motion * on_face[model.point_index][:, None, None])

@@ -1,0 +1,131 @@
+"""Causes of the whole set are named first, with their size; what only some images have is not taken for one."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.labels import CircleLabel
+from stcal.sfm.checks.verdict import ranked
+from stcal.sfm.report.judgement import CAUSE, OF_WHOLE_SET
+from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.sfm.checks.test_checks import Lab
+
+
+@pytest.fixture(scope="module")
+def few():
+    """Four images in each of three groups; the principal point is 3 to 18 px off the middle."""
+    options = SceneOptions(seed=4, images_per_group=4, width=2592, height=1728)
+    return make_scene(replace(options, groups=(("1", "2"), ("1", "4"), ("1", "5"))))
+
+
+@pytest.fixture(scope="module")
+def lab(labels_only):
+    return Lab(labels_only)
+
+
+def first(scene, lab, images, camera=None, board=None):
+    checks = lab.check(scene, images, camera=camera, board=board)
+    return ranked(list(checks.values()), frozenset(image.name for image in images))[0]
+
+
+def of_file(**change):
+    """A camera file that is wrong."""
+
+    def plant(scene, images):
+        camera = scene.camera
+        made = {key: make(np.asarray(getattr(camera, key)), camera) for key, make in change.items()}
+        return images, replace(camera, **made)
+
+    return plant
+
+
+def of_photographs(change):
+    """Photographs that are changed: new places, px, from an image and the camera."""
+
+    def plant(scene, images):
+        return [replace(image, centre_px=change(image, scene.camera, k)) for k, image in enumerate(images)], None
+
+    return plant
+
+
+def zoomed(by):
+    return of_photographs(lambda i, camera, k: camera.centre + (1 + by(i, k)) * (i.centre_px - camera.centre))
+
+
+RANDOM = np.random.default_rng(0).normal(size=(12, 2))
+PLANTED = {
+    "focal length long": (of_file(focal=lambda f, _: 1.01 * f), "the focal length is not"),
+    "focal length short": (of_file(focal=lambda f, _: 0.998 * f), "the focal length is not"),
+    "unlike": (of_file(focal=lambda f, _: f * [1.003, 1]), "width and height are scaled unlike"),
+    "principal point": (of_file(centre=lambda c, _: c + np.array([8, -5])), "the principal point is not"),
+    "undistorted": (
+        of_photographs(lambda i, camera, _: i.centre * camera.focal + camera.centre),
+        "already undistorted",
+    ),
+    "scaled": (of_photographs(lambda i, *_: 1.005 * (i.centre_px + 0.5) - 0.5), "scaled against the camera file"),
+    "turned": (
+        of_file(centre=lambda c, camera: np.array([camera.width - 1, camera.height - 1]) - c),
+        "turned by 180°",
+    ),
+    "zoom by group": (zoomed(lambda i, _: {"12": 0, "14": 0.003, "15": -0.004}[i.group]), "between the groups"),
+    "autofocus": (zoomed(lambda _, k: 0.003 * RANDOM[k, 0]), "from image to image"),
+    "rolling shutter": (
+        of_photographs(lambda i, camera, k: i.centre_px + RANDOM[k] * (i.centre_px[:, 1:] / camera.height - 0.5)),
+        "rolling shutter",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_the_planted_cause_is_named_first(few, lab, name):
+    plant, words = PLANTED[name]
+    images, camera = plant(few, lab.observe(few))
+    check = first(few, lab, images, camera)
+    assert (check.key, check.verdict, check.names) == (CAUSE, "failed", ())
+    assert check.title.startswith(OF_WHOLE_SET)
+    assert words in check.title
+    assert check.remedy
+
+
+def test_the_size_of_the_cause_is_said(few, lab):
+    images, camera = PLANTED["focal length long"][0](few, lab.observe(few))
+    assert re.search(r"focal length -(1|0\.99\d*) ", first(few, lab, images, camera).reason)
+    assert "1 parameter explains" in first(few, lab, images, camera).reason
+
+
+def shifted(image):
+    on_face = np.array([isinstance(label, CircleLabel) for label in image.labels])
+    return replace(image, centre_px=image.centre_px + on_face[:, None] * [0.4, 0])
+
+
+@pytest.mark.parametrize("places", [(3,), (0, 1)])
+def test_what_some_images_have_is_no_cause_of_the_whole_set(few, lab, places):
+    images = [shifted(image) if k in places else image for k, image in enumerate(lab.observe(few))]
+    check = first(few, lab, images)
+    assert check.key != CAUSE
+    assert check.names[0] in {images[k].name for k in places} or len(places) == 2  # 2 of 4: either half may be wrong
+
+
+@pytest.mark.parametrize("zoom", [0.001, 0.003, 0.01])
+@pytest.mark.parametrize("place", [2, 5])
+def test_one_image_of_another_focus_is_no_cause_of_the_whole_set(few, lab, place, zoom):
+    images, _ = zoomed(lambda _, k: zoom * (k == place))(few, lab.observe(few))
+    assert first(few, lab, images).key != CAUSE
+
+
+def test_a_wrong_pitch_is_named_by_its_own_check(few, lab):
+    board = replace(few.board, pitch_mm=1.01 * few.board.pitch_mm)
+    assert first(few, lab, lab.observe(few), board=board).key == "pitch"
+
+
+def test_a_check_that_names_nearly_all_images_names_none(few, lab):
+    images, camera = PLANTED["focal length long"][0](few, lab.observe(few))
+    moved = lab.check(few, images, camera=camera)["moved"]
+    assert moved.verdict == "failed"
+    assert len(moved.names) <= 0.7 * len(images)
+
+
+def test_a_sound_set_has_no_cause(few, lab):
+    assert CAUSE not in lab.check(few, lab.observe(few))
