@@ -115,3 +115,15 @@ def dot_cells(labels: Iterable[Label]) -> np.ndarray:
             raise InputError("E-LABEL-FORM", f"label {label}: {BOARD}:row:column needed")
         cells.append((label.row, label.column))
     return np.array(cells, int).reshape(-1, 2)
+
+
+def unseen_lines(labels: Iterable[Label], rows: int, columns: int) -> list[str]:
+    """Returns notes on rows and columns of the board of which ``labels`` have no dot: hidden in all images, or
+    nonexistent."""
+    cells = dot_cells(labels)
+    notes = []
+    for line, count, numbers in (("row", rows, cells[:, 0]), ("column", columns, cells[:, 1])):
+        missing = [str(i) for i in range(count) if i not in numbers]
+        if missing:
+            notes.append(f"board {line} {', '.join(missing)}: not seen in any image; check {line}s in the board file")
+    return notes

@@ -183,7 +183,7 @@ def _coincide(xy, radius, other_xy, other_radius, origin, step, other_step, same
     c, s = np.cos(turn)[:, None], np.sin(turn)[:, None]
     x, y = np.moveaxis(xy - xy[origin[0]][:, None], 2, 0)
     moved = np.stack([c * x - s * y, s * x + c * y], -1) + other_xy[origin[1]][:, None]
-    gap, nearest = KDTree(other_xy).query(moved)
+    gap, nearest = map(np.asarray, KDTree(other_xy).query(moved))
     fits = (gap < MAX_GAP * np.minimum(radius, other_radius[nearest])) & alike(radius[None], other_radius[nearest])
     if same:  # the identity is excluded
         moved_away = ~((nearest == np.arange(len(xy))) | ~fits).all(1)

@@ -1,4 +1,4 @@
-"""Detection of tags and of ChArUco boards (through ``cv2.aruco``), and corners of a tag from its four edges."""
+"""Detection of tags (through ``cv2.aruco``), and corners of a tag from its four edges."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from stcal.boards.design import BoardView, CharucoDesign, TagLayout, view_of
+from stcal.boards.design import BoardView, TagLayout, view_of
 from stcal.geometry.arrays import frozen
-from stcal.geometry.camera import Camera
 from stcal.geometry.robust import median_length
 from stcal.io.images import grey_8bit
 
@@ -193,7 +192,6 @@ def _meet(frame: _Frame, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
     return point, covariance
 
 
-REFINE_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-5)
 UNREFINED_PX = 0.5
 """σ of a corner whose edges cannot be measured."""
 SATURATED = 254
@@ -251,7 +249,7 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str], border_bits: int =
     grey = grey_8bit(image)
     places_of: dict[tuple[str, int], list[np.ndarray]] = {}
     for name in dict.fromkeys(dictionaries):
-        detector = cv2.aruco.ArucoDetector(dictionary_of(name), _parameters(name, border_bits))
+        detector = cv2.aruco.ArucoDetector(dictionary_of(name), detector_settings(name, border_bits))
         for look in _looks(grey, joined):
             corners, ids, _ = detector.detectMarkers(look.grey)
             places = look.in_image(np.array(corners, np.float32).reshape(-1, 4, 2))
@@ -316,7 +314,7 @@ def other_dictionaries(image: np.ndarray, known: Sequence[str]) -> list[tuple[st
     counts = []
     for name in names:
         dictionary = dictionary_of(name)
-        _, ids, _ = cv2.aruco.ArucoDetector(dictionary, _parameters(name)).detectMarkers(grey)
+        _, ids, _ = cv2.aruco.ArucoDetector(dictionary, detector_settings(name)).detectMarkers(grey)
         if ids is not None:
             counts.append((-len(ids), len(dictionary.bytesList), name))
     return [(name, -count) for count, _, name in sorted(counts)]
@@ -334,58 +332,12 @@ def view_of_tags(image: str, tags: Tags, layout: TagLayout) -> BoardView | None:
     return replace(view, unused=tuple(f"tag {tag[1]} is in view more than once" for tag in tags.repeated if tag in row))
 
 
-def find_charuco(image: np.ndarray, name: str, board: CharucoDesign, camera: Camera | None = None) -> BoardView | None:
-    """Return the inner corners of a ChArUco board; None if fewer than four are seen.
-
-    One visible neighbour tag is enough for a corner, and tags that the first pass missed are searched at their expected
-    places: OpenCV's default settings lose a quarter of the corners of real image sets.
-    """
-    grey = grey_8bit(image)
-    plain = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows),
-        board.square_mm,
-        board.marker_mm,
-        dictionary_of(board.dictionary),
-        np.array(board.tag_ids(), np.int32),
-    )
-    plain.setLegacyPattern(board.legacy)
-    settings = cv2.aruco.CharucoParameters()
-    settings.minMarkers, settings.tryRefineMarkers = 1, True
-    if camera is not None and not camera.fisheye:  # OpenCV projects corners with a perspective lens
-        settings.cameraMatrix = np.array(
-            [[camera.focal[0], 0, camera.centre[0]], [0, camera.focal[1], camera.centre[1]], [0, 0, 1]]
-        )
-        settings.distCoeffs = np.array(camera.distortion)
-    detector = cv2.aruco.CharucoDetector(plain, settings, _parameters(board.dictionary))
-    corners, ids, _, _ = detector.detectBoard(grey)
-    if ids is None or len(ids) < 4:
-        return None
-    return view_of(name, board, ids.ravel().astype(int), _refined_inner(grey, corners.reshape(-1, 2), board))
-
-
-def _refined_inner(grey: np.ndarray, corners: np.ndarray, board: CharucoDesign) -> np.ndarray:
-    """Return the inner corners (n, 2), refined in windows whose half diagonal just stays clear of the tags.
-
-    The detector's own windows depend on the tags that it read: they reach into tags, or are too small.
-    """
-    apart = np.linalg.norm(corners[:, None] - corners, axis=2)
-    np.fill_diagonal(apart, np.inf)
-    clear = (1 - board.marker_mm / board.square_mm) / 2 / np.sqrt(2)
-    half = np.rint(clear * apart.min(1)).astype(int).clip(2, 30)
-    start = corners.astype(np.float32).reshape(-1, 1, 1, 2)
-    refined = [
-        cv2.cornerSubPix(grey, xy.copy(), (h, h), (-1, -1), REFINE_STEPS)
-        for xy, h in zip(start, half.tolist(), strict=True)
-    ]
-    return np.array(refined).reshape(-1, 2).astype(float)
-
-
 def dictionary_of(name: str):
     """Return the dictionary of ``cv2.aruco`` with this name."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def _parameters(name: str, border_bits: int = 1):
+def detector_settings(name: str, border_bits: int = 1):
     """Return the settings of the detector.
 
     The default settings lose small tags: only the middle of a cell keeps its colour, blur mixes the rest with the

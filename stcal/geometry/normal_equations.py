@@ -3,11 +3,15 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri  # type: ignore[attr-defined]
 
 from stcal.geometry.rigid import skew
 
 SINGULAR = 1e-11
 """Eigenvalue of a normal matrix of unit diagonal below which a direction counts as undetermined."""
+
+LARGE = 100
+"""Number of unknowns of a block from which on its inverse is computed from Cholesky's factors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,13 +54,25 @@ def reduce(block: np.ndarray, right: np.ndarray, cross: np.ndarray) -> Reduction
         A block is singular.
     """
     m, a, k = cross.shape
-    inverse = np.linalg.inv(block)
+    inverse = _inverses(block)
     from_kept = inverse @ cross
     flat, weighted = cross.reshape(m * a, k), from_kept.reshape(m * a, k)
     step = np.einsum("mij,mj->mi", inverse, right)
     return Reduction(
         flat.T @ weighted, weighted.T @ right.ravel(), step, from_kept, inverse, float((right * step).sum())
     )
+
+
+def _inverses(block: np.ndarray) -> np.ndarray:
+    """Return the inverses of symmetric matrices (m, a, a); of large ones by Cholesky's factors, three times as fast."""
+    if block.shape[1] < LARGE:
+        return np.linalg.inv(block)
+    inverse = np.empty_like(block)
+    for i, matrix in enumerate(block):
+        factor, fault = dpotrf(matrix, lower=True)
+        lower, _ = dpotri(factor, lower=True)
+        inverse[i] = np.linalg.inv(matrix) if fault else np.tril(lower) + np.tril(lower, -1).T
+    return inverse
 
 
 def blocks_of(

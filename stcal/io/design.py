@@ -291,7 +291,9 @@ def _face(face: _FaceFile, where: str) -> FaceDesign:
         _require_inside(ids, xy, radius, np.array(face.outline_mm), where)
         outline = (np.array(face.outline_mm) - origin) @ face_from_drawing.T
     stated = [face.rim_mm if circle.rim_mm is None else circle.rim_mm for circle in face.circles]
-    rims = None if all(rim is None for rim in stated) else np.array([rim or 0.0 for rim in stated])
+    rims = None
+    if any(rim is not None for rim in stated):
+        rims = np.array([rim or 0.0 for rim in stated])
     return FaceDesign(face.id, tuple(ids), xy_face, radius, face.origin, face.x, face.y, rough, outline, rims)
 
 

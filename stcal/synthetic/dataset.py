@@ -79,7 +79,7 @@ class TruthFile(ResultFile):
             optics["lens"] = TrueLens(**asdict(options.lens))
         if options.rim_mm:
             optics["rim_mm"] = options.rim_mm
-        return cls(
+        truth = cls(
             unit="mm",
             reference_face=scene.reference_face,
             target_from_face={face: pose.matrix() for face, pose in scene.target_from_face.items()},
@@ -96,8 +96,8 @@ class TruthFile(ResultFile):
                 )
                 for name, group in scene.groups.items()
             },
-            **({"optics": TrueOptics(**optics)} if optics else {}),
         )
+        return truth.model_copy(update={"optics": TrueOptics(**optics)}) if optics else truth
 
 
 def image_name(group: str, image: int, image_format: str = "jpg") -> str:

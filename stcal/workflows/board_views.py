@@ -3,11 +3,13 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
 
 from stcal.boards.aprilgrid import find_aprilgrid
+from stcal.boards.charuco import find_charuco
 from stcal.boards.chessboard import find_chessboard, why_no_chessboard
 from stcal.boards.design import (
     AprilGridDesign,
@@ -20,7 +22,7 @@ from stcal.boards.design import (
     TagLayout,
     turns,
 )
-from stcal.boards.tags import Tags, find_charuco, find_tags, view_of_tags
+from stcal.boards.tags import Tags, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.camera import Camera
@@ -151,7 +153,7 @@ def _find_flat(
         view = find_chessboard(image, name, board)
         return view, "" if view else why_no_chessboard(image, board)
     if isinstance(board, CharucoDesign):
-        view = find_charuco(image, name, board, camera)
+        view = find_charuco(image, name, board)
         return view, "" if view else _without_charuco(image, board)
     if isinstance(board, AprilGridDesign):
         return find_aprilgrid(image, name, board, camera)
@@ -170,9 +172,16 @@ def _without_charuco(image: np.ndarray, board: CharucoDesign) -> str:
         return f"{few}: tag {max(foreign)} of {board.dictionary}, of {extent}" + (
             f" from {board_ids[0]}" if board_ids[0] else ""
         )
+    turned = replace(board, rows=board.columns, columns=board.rows)
+    others = [replace(own, legacy=legacy) for own in (board, turned) for legacy in (False, True)]
+    found = [(len(view), other) for other in others if (view := find_charuco(image, "", other)) is not None]
+    if not found:
+        return f"{few}, but {len(ids)} of its tags, not where rows and columns of its file put them; correct them"
+    _, fits = max(found, key=itemgetter(0))
+    legacy = f", legacy = {str(fits.legacy).lower()}" if fits.legacy != board.legacy else ""
     return (
-        f"{few}, but {len(ids)} of its tags: are rows and columns exchanged, or is it one that OpenCV drew before 4.6 "
-        "(legacy = true)?"
+        f"{few}, but {len(ids)} of its tags, as on a board of rows = {fits.rows}, columns = {fits.columns}{legacy}; "
+        "correct its file"
     )
 
 

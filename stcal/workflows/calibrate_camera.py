@@ -1,7 +1,7 @@
 """Calibration of a camera, or of the cameras of a rig, from photographs of a board."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -22,11 +22,12 @@ from stcal.errors import InputError, StcalError
 from stcal.io.cameras.forms import kalibr_chain
 from stcal.io.cameras.model import CalibratedCamera, CameraModel, cameras_txt
 from stcal.io.files import json_text
-from stcal.io.images import ImageFile, find_images, name_fault, require_common_size
+from stcal.io.images import ImageFile, Skipped, find_images, name_fault, require_common_size
 from stcal.io.json import ResultFile
-from stcal.labels import DotLabel
+from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress, one_thread
 from stcal.sfm.camera.calibrate import (
+    MAX_RESIDUAL_PX,
     CameraCalibration,
     calibrate_camera,
     judged,
@@ -35,15 +36,21 @@ from stcal.sfm.camera.calibrate import (
     require_model,
     require_views,
 )
-from stcal.sfm.camera.checks import AUTO
+from stcal.sfm.camera.checks import AUTO, foretold
 from stcal.sfm.camera.file import CalibrationFile, RigCalibrationFile
-from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera
+from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, closed_form, start_camera
 from stcal.sfm.camera.rig import RigCalibration, calibrate_rig
 from stcal.sfm.data.model import ImageObservations
 from stcal.workflows.board_views import detect_boards, kind_of
 
 CORNER_SIGMA_PX = 0.1
 """σ of corners whose detector states none. Only their equality matters, since the factor is estimated."""
+GROSS_SIGMAS = 10.0
+"""Smallest deviation of a gross error from camera and board, in σ; it is more than :data:`MAX_RESIDUAL_PX`, too."""
+LEAST_CORNERS = 6
+"""Smallest number of corners of a view of which others were left out: they still check one another."""
+LEAST_SHARE = 0.5
+"""Smallest share of the corners of a view that are no gross errors; with fewer of them the view is not used."""
 POINT_RADIUS_MM = 1e-6
 PLACE_DIGITS = 6
 """Decimals, mm, to which the places of points are the same row or column."""
@@ -99,17 +106,81 @@ def calibrate_camera_by_corners(
         detections = detect_boards(files, model, board, (), workers, partial(progress, f"detect {done}"))
         views = _observations(files, detections.views(), points, camera)
         skipped = (*skipped_files, *detections.skipped)
-        require_views(views, len(files), skipped)
-        start = camera if done > 1 else closed_form(views, grid, camera)
-        result = adjust_intrinsics(views, grid, start, colmap_model)
-        require_determined(result, views)
+        require_views(views, files, skipped)
+        result = adjust_intrinsics(views, grid, camera if done > 1 else closed_form(views, grid, camera), colmap_model)
         camera = result.camera
-    return judged(result, views, skipped, rounds, True, grid)
+    gated = _without_gross_errors(views, grid, result)
+    if gated.corners or gated.skipped:
+        views, skipped = gated.views, (*skipped, *gated.skipped)
+        require_views(views, files, skipped)
+        result = adjust_intrinsics(views, grid, result.camera, colmap_model)
+    require_determined(result, views)
+    calibration = judged(result, views, skipped, rounds, True, grid)
+    return replace(calibration, warnings=(*calibration.warnings, *gated.warnings()))
 
 
-ROUNDS = {CharucoDesign: 2, AprilGridDesign: 2, AsymmetricCirclesDesign: 3}
+@dataclass(frozen=True, slots=True, eq=False)
+class _Gated:
+    """``views`` : views without gross errors; ``skipped`` : views that consist of them, and why; ``corners`` : the
+    other gross errors, by image."""
+
+    views: list[ImageObservations]
+    skipped: tuple[Skipped, ...]
+    corners: dict[str, tuple[Label, ...]]
+
+    def warnings(self) -> list[str]:
+        """Returns a warning about gross errors, if there are any."""
+        if not self.corners:
+            return []
+        count, (image, labels) = sum(map(len, self.corners.values())), next(iter(self.corners.items()))
+        return [
+            f"{count} corners in {len(self.corners)} views are left out, first {image} {labels[0]}: they lie more than "
+            f"{GROSS_SIGMAS:g} σ and {MAX_RESIDUAL_PX:g} px from where the camera and all views put them; look whether "
+            "something hides the board there"
+        ]
+
+
+def _without_gross_errors(views: Sequence[ImageObservations], grid: BoardDesign, result: Intrinsics) -> _Gated:
+    """Returns the views without gross errors: their weights in the adjustment would be small, but not zero."""
+    lengths = [np.linalg.norm(m.residuals_px(result.camera), axis=1) for m in result.models]
+    suspects = {
+        model.images[image]
+        for model, length in zip(result.models, lengths, strict=True)
+        for image in model.image_index[length > MAX_RESIDUAL_PX].tolist()
+    }
+    kept, skipped, corners = [], [], {}
+    for view in views:
+        own = _gated(view, grid, result) if view.name in suspects else view
+        off = tuple(label for label in view.labels if label not in own.labels)
+        if len(own) < max(LEAST_CORNERS, LEAST_SHARE * len(view)):
+            reason = (
+                f"{len(off)} of {len(view)} corners lie more than {GROSS_SIGMAS:g} σ and {MAX_RESIDUAL_PX:g} px from "
+                "where the camera and the other views put them"
+            )
+            skipped.append(Skipped(view.name, reason, "corners", f"{len(own)}", f"{LEAST_SHARE * len(view):.0f}"))
+            continue
+        kept.append(own)
+        if off:
+            corners[view.name] = off
+    return _Gated(kept, tuple(skipped), corners)
+
+
+def _gated(view: ImageObservations, grid: BoardDesign, result: Intrinsics) -> ImageObservations:
+    """Returns a view without its gross errors, one by one, as each disturbs the pose and thereby the others."""
+    while len(view) > LEAST_CORNERS:
+        residual_px, in_sigma = foretold(view, grid, result)
+        length_px = np.linalg.norm(residual_px, axis=1)
+        in_sigmas = np.linalg.norm(in_sigma, axis=1) / result.factors.centres
+        worst = int(np.argmax(np.where(length_px > MAX_RESIDUAL_PX, in_sigmas, 0)))
+        if length_px[worst] <= MAX_RESIDUAL_PX or in_sigmas[worst] <= GROSS_SIGMAS:
+            break
+        view = view.select(np.delete(np.arange(len(view)), worst))
+    return view
+
+
+ROUNDS = {AprilGridDesign: 2, AsymmetricCirclesDesign: 3}
 """Rounds of detection where the camera helps to find the points, and for circles also moves them: an error of their
-eccentricity shrinks to less than a tenth with each round. Corners of a plain chessboard need one."""
+eccentricity shrinks to less than a tenth with each round. Corners of chessboards and ChArUco boards need one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

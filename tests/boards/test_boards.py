@@ -4,10 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal.boards.charuco import find_charuco
 from stcal.boards.chessboard import find_chessboard
 from stcal.boards.design import CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.file import load_flat_board
-from stcal.boards.tags import find_charuco, find_tags, view_of_tags
+from stcal.boards.tags import find_tags, view_of_tags
 from stcal.design import BoardDesign
 from stcal.errors import InputError
 from stcal.geometry.plane import apply_homography

@@ -187,7 +187,7 @@ def test_no_readable_image_is_said(tmp_path):
     [
         ({"dictionary": "DICT_4X4_50"}, "no tag of DICT_4X4_50"),
         ({"rows": 4, "columns": 5}, "of 10 on a board of 4×5"),
-        ({"legacy": True}, "of its tags: are rows and columns exchanged, or is it one that OpenCV drew before 4.6"),
+        ({"legacy": True}, "of its tags, as on a board of rows = 6, columns = 8, legacy = false; correct its file"),
     ],
 )
 def test_why_a_charuco_board_is_not_found(tmp_path, changed, reason):

@@ -103,7 +103,7 @@ def _region(stated: object, source: str) -> np.ndarray | None:
         region = np.full(1, np.nan)  # refused below
     if region is not None and not region.size:
         return None
-    if region is not None and (region.ndim != 2 or region.shape[1] != 2 or not np.isfinite(region).all()):
+    if region is not None and (region.ndim != 2 or region.shape[-1] != 2 or not np.isfinite(region).all()):
         raise InputError(
             "E-CAMERA-CONTENT", f"camera file {source}: valid_intrinsics_region is no list of pixels; remove it"
         )

@@ -13,7 +13,7 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import blocks_of, constrained_inverse, free_motions, reduce
 from stcal.sfm.adjust.refine import projection_jacobians
-from stcal.sfm.data.model import GroupModel, MetricModel
+from stcal.sfm.data.model import GroupModel
 
 MIN_SHARE = 1e-6
 """Smallest share of a parameter's information that poses and points leave to it. Below this share, the parameter cannot
@@ -31,7 +31,7 @@ class Network:
     (n,) of each observation, between 0 and 2.
     """
 
-    model: MetricModel
+    model: GroupModel
     residual: np.ndarray
     by_pose: np.ndarray
     by_point: np.ndarray

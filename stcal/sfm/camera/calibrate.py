@@ -11,7 +11,8 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import COLMAP_MODELS, CameraModel
-from stcal.io.images import Skipped, find_images, require_common_size
+from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
+from stcal.labels import unseen_lines
 from stcal.parallel import Progress, counted, one_thread
 from stcal.sfm.camera.checks import (
     AUTO,
@@ -47,7 +48,7 @@ SETTLED_SIGMAS = 0.1
 MAX_FOCAL_SIGMA = 0.01
 """Largest relative σ of the focal length. Beyond it the boards do not determine the focal length."""
 MAX_RESIDUAL_PX = 1.0
-"""Largest RMS residual. Beyond it the camera model or the board file does not fit the images."""
+"""Largest weighted RMS residual. Beyond it the camera model or the board file does not fit the images."""
 SUSPICIOUS_FACTOR = 3.0
 OUTLIER_WEIGHT = 0.5
 CORNERS = ("top left", "top right", "bottom left", "bottom right")
@@ -135,7 +136,7 @@ def calibrate_camera(
             )
             views = board_views(detection.images, board, camera)
             skipped = (*not_images, *detection.skipped, *_without_board(detection, views))
-            require_views(views, len(files), skipped)
+            require_views(views, files, skipped)
             start = camera if before else closed_form(views, board, camera)
             result = adjust_intrinsics(views, board, start, colmap_model)
             require_determined(result, views)
@@ -196,7 +197,8 @@ def judged(
     """
     projection = projection_sigma(result)
     split = split_half(result, views, board)
-    warnings = [*_of_rounds(result, settled), *_warnings(result, projection, split, board)]
+    unseen = unseen_lines((label for view in views for label in view.labels), board.rows, board.columns)
+    warnings = [*unseen, *_of_rounds(result, settled), *_warnings(result, projection, split, board)]
     try:
         of_held_out = held_out(views, board, result.camera, result.colmap_model)
     except StcalError as error:
@@ -238,7 +240,7 @@ def _without_board(detection: DetectionResult, views: Sequence[ImageObservations
     ]
 
 
-def require_views(views: Sequence[ImageObservations], files: int, skipped: Sequence[Skipped]) -> None:
+def require_views(views: Sequence[ImageObservations], files: Sequence[ImageFile], skipped: Sequence[Skipped]) -> None:
     """Checks that there are enough views of the board.
 
     Raises
@@ -250,16 +252,17 @@ def require_views(views: Sequence[ImageObservations], files: int, skipped: Seque
     """
     if len(views) >= MIN_VIEWS:
         return
-    why = "".join(f"; {s.name}: {s.reason}" for s in skipped[:1])
+    images = {file.name for file in files}  # other files are skipped too, and explain nothing
+    why = "".join(f"; {s.name}: {s.reason}" for s in [s for s in skipped if s.name in images][:1])
     if not views:
         raise DetectionError(
             "E-BOARD-NOT-FOUND",
-            f"camera: no board recognised in {files} images{why}; check the board file (rows, columns, polarity, "
+            f"camera: no board recognised in {len(files)} images{why}; check the board file (rows, columns, polarity, "
             "radius) and keep a third of the dots in view at least",
         )
     raise DegenerateError(
         "E-CALIBRATE-FEW-VIEWS",
-        f"camera: {len(views)} of {files} images show the board, {MIN_VIEWS} needed, 10 and more advised{why}; "
+        f"camera: {len(views)} of {len(files)} images show the board, {MIN_VIEWS} needed, 10 and more advised{why}; "
         "add views in which it is tilted by 20° to 40°",
     )
 
@@ -280,7 +283,7 @@ def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -
             f"{100 * MAX_FOCAL_SIGMA:.0f} % needed (largest angle between boards {_spread_deg(result):.0f}°); "
             "add views in which the board is tilted by 20° to 40°, about different axes",
         )
-    rms = residual_rms_px(result)
+    rms = weighted_rms_px(result)
     if rms > MAX_RESIDUAL_PX:
         raise DegenerateError(
             "E-CALIBRATE-MISFIT",
@@ -292,6 +295,13 @@ def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -
 def residual_rms_px(result: Intrinsics) -> float:
     """Returns the RMS of the residuals per coordinate, px."""
     return float(np.sqrt((result.residuals_px() ** 2).mean()))
+
+
+def weighted_rms_px(result: Intrinsics) -> float:
+    """Returns the RMS of the residuals per coordinate with the weights of the adjustment, px. A few gross errors, which
+    weigh little, do not change it."""
+    weight = np.concatenate(result.weights())
+    return float(np.sqrt(np.average((result.residuals_px() ** 2).mean(axis=1), weights=weight)))
 
 
 def _spread_deg(result: Intrinsics) -> float:

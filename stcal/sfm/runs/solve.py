@@ -16,7 +16,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cache import keep, kept
 from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
-from stcal.labels import DotLabel, dot_cells, parse_labels
+from stcal.labels import DotLabel, parse_labels, unseen_lines
 from stcal.parallel import Progress
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import find_scale
@@ -252,13 +252,8 @@ def _stored(stored, meta) -> GroupSolution:
 
 def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str]:
     """Returns notes on rows and columns of the board that no image shows: hidden everywhere, or nonexistent."""
-    cells = dot_cells(label for s in solutions for label in s.model.labels if isinstance(label, DotLabel))
-    notes = []
-    for line, count, numbers in (("row", board.rows, cells[:, 0]), ("column", board.columns, cells[:, 1])):
-        missing = [str(i) for i in range(count) if i not in numbers]
-        if missing:
-            notes.append(f"board {line} {', '.join(missing)}: not seen in any image; check {line}s in the board file")
-    return notes
+    dots = (label for s in solutions for label in s.model.labels if isinstance(label, DotLabel))
+    return unseen_lines(dots, board.rows, board.columns)
 
 
 def solve_groups(
