@@ -127,7 +127,7 @@ def _foretold(squares: np.ndarray, corners: np.ndarray) -> _Foretold:
     n = len(squares)
     if n < TESTED_FROM:
         return _Foretold(base, np.zeros(n), step)
-    near = KDTree(squares).query(squares, k=min(NEIGHBOURS, n - 1) + 1)[1][:, 1:]
+    near = np.asarray(KDTree(squares).query(squares, k=min(NEIGHBOURS, n - 1) + 1)[1])[:, 1:]
     design = np.concatenate([np.ones((*near.shape, 1)), squares[near] - squares[:, None]], axis=2)
     left = (corners - base)[near]
     weight = np.ones(near.shape)

@@ -1,7 +1,7 @@
 """Readers of ``target.toml`` and ``board.toml`` that name every mistake, and writers that add comments for editing."""
 
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -291,10 +291,10 @@ def _face(face: _FaceFile, where: str) -> FaceDesign:
         _require_inside(ids, xy, radius, np.array(face.outline_mm), where)
         outline = (np.array(face.outline_mm) - origin) @ face_from_drawing.T
     stated = [face.rim_mm if circle.rim_mm is None else circle.rim_mm for circle in face.circles]
-    rims = None
-    if any(rim is not None for rim in stated):
-        rims = np.array([rim or 0.0 for rim in stated])
-    return FaceDesign(face.id, tuple(ids), xy_face, radius, face.origin, face.x, face.y, rough, outline, rims)
+    design = FaceDesign(face.id, tuple(ids), xy_face, radius, face.origin, face.x, face.y, rough, outline)
+    if all(rim is None for rim in stated):
+        return design
+    return replace(design, rim_mm=np.array([rim or 0.0 for rim in stated]))
 
 
 def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline: np.ndarray, where: str) -> None:

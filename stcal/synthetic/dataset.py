@@ -68,7 +68,7 @@ class TruthFile(ResultFile):
     target_from_face: dict[ByFace, Pose] = Field(description="three-point frame of each face")
     circles: dict[ByLabel, Vector3] = Field(description="`face:circle` → centre, target frame, mm")
     groups: dict[ByGroup, TrueGroup] | None = Field(None, description="by folder of `images`")
-    optics: TrueOptics | None = Field(None, description="of simulated sets with a thin lens or rims")
+    optics: TrueOptics | None = Field(default=None, description="of simulated sets with a thin lens or rims")
 
     @classmethod
     def of(cls, scene: Scene, image_format: str = "jpg", options: RenderOptions | None = None) -> "TruthFile":
