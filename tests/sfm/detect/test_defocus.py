@@ -1,0 +1,69 @@
+"""Depth of field: the blur of an image as a function of depth, and the shifts of centres that follow."""
+
+import numpy as np
+import pytest
+
+from stcal.sfm.data.patterns import patterns_of
+from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.defocus import correct_defocus
+from stcal.sfm.detect.image import detect_image
+from stcal.sfm.detect.labels import label_single
+from stcal.synthetic.optics import ThinLens
+from stcal.synthetic.render import RenderOptions, render
+from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.levels import SLOW
+
+LENS = ThinLens(f_number=1.8, focal_mm=24.0, focus_mm=1150.0)
+GROUP = "12"
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(SceneOptions(seed=4, width=1944, height=1296, images_per_group=2, groups=(("1", "2"),)))
+
+
+def seen(scene, image, lens=None, noise=0.0):
+    """The labelled circles of the faces in one image."""
+    options = RenderOptions(seed=3, noise=noise, lens=lens, clutter=False)
+    picture = render(scene, GROUP, image, options)
+    detection = detect_image(picture, scene.camera, scene.target, None, EllipseOptions())
+    return label_single(f"{GROUP}/{image}", GROUP, detection, scene.target).observations
+
+
+@pytest.fixture(scope="module")
+def pairs(scene):
+    """Each image through a lens, and its pinhole twin."""
+    return [(seen(scene, i, LENS), seen(scene, i)) for i in range(2)]
+
+
+def shifts_px(blurred, sharp):
+    place = {label: i for i, label in enumerate(sharp.labels)}
+    own = [i for i, label in enumerate(blurred.labels) if label in place]
+    return blurred.centre_px[own] - sharp.centre_px[[place[blurred.labels[i]] for i in own]], own
+
+
+@pytest.mark.parametrize("image", [pytest.param(0, marks=SLOW), pytest.param(1, marks=SLOW)])
+def test_centres_through_a_lens_are_those_of_the_pinhole_twin(scene, pairs, image):
+    """Off by up to 0.03 px before; after it by what the correction's σ, 15 % of it, allows, and the pixels' squares."""
+    blurred, sharp = pairs[image]
+    patterns = patterns_of(scene.target, None)
+    (corrected,), (focus,) = correct_defocus([blurred], scene.camera, patterns)
+    before, own = shifts_px(blurred, sharp)
+    after, _ = shifts_px(corrected, sharp)
+    assert focus.shift_px > 0.008
+    assert focus.focused_mm == pytest.approx(LENS.focus_mm, rel=0.03)
+    assert (after**2).sum() < 0.15 * (before**2).sum()
+    added = corrected.covariance_px2[own] - blurred.covariance_px2[own]
+    sigma = np.sqrt(np.trace(added, axis1=1, axis2=2) / 2)
+    assert (np.linalg.norm(after, axis=1) < 4 * sigma + 0.002).all()
+
+
+@pytest.mark.slow
+def test_images_without_depth_of_field_are_left_alone(scene, pairs):
+    sharp = [twin for _, twin in pairs]
+    corrected, focus = correct_defocus(sharp, scene.camera, patterns_of(scene.target, None))
+    for before, after, own in zip(sharp, corrected, focus, strict=True):
+        assert own.shift_px == 0
+        assert own.focused_mm is None
+        np.testing.assert_array_equal(after.centre_px, before.centre_px)
+        np.testing.assert_array_equal(after.covariance_px2, before.covariance_px2)
