@@ -18,7 +18,7 @@ from stcal.handeye.data.views import Views, resect
 from stcal.handeye.methods.arm import ROUNDS, SETTLED_MM, ArmModel, LinearArm
 from stcal.handeye.methods.bundle import Bundle, Corners
 from stcal.handeye.methods.camera_error import CameraError, of_corners
-from stcal.handeye.methods.noise import LEAST, Noise, Problem, adjust
+from stcal.handeye.methods.noise import LEAST_SIGMA, Noise, Problem, adjust
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
 from stcal.io.cameras.model import PARAMETER_NAMES, CameraPrior, intrinsic_basis
 
@@ -253,7 +253,7 @@ def problem(
             free.append(name)
         sigma[name] = first[name] if value is None else value
     if sigma["robot_rad"] or sigma["robot_mm"] or arm is not None:  # exact in one of them only: tiny σ there
-        sigma |= {name: max(sigma[name], LEAST[name]) for name in ("robot_rad", "robot_mm")}
+        sigma |= {name: max(sigma[name], LEAST_SIGMA[name]) for name in ("robot_rad", "robot_mm")}
     robot = None
     if loop.robot_covariance is not None:
         robot = np.linalg.inv(np.linalg.cholesky(loop.robot_covariance))
