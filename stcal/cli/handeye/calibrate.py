@@ -1,6 +1,7 @@
 """``stcal handeye``: where the camera sits on the robot's flange, or beside the robot, and how well that is known."""
 
 import math
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -315,9 +316,11 @@ def handeye(
         if method is None and not (refine_camera or with_scale or four_dof):
             method = AUTO
         chosen, offset = setup_of(said, given.setup, given.where), None
+        if said.setup:
+            given = replace(given, setup=chosen)
         if time_offset:
             given, options, offset = at_offset(given, chosen, options)
-        outcome = with_offset(calibrate(given, chosen, method, options, validation, progress), offset)
+        outcome = with_offset(calibrate(given, chosen, method, options, validation, progress, time_offset), offset)
     result = outcome.result
     say(outcome_text(outcome))
     for option, given_, able in (("--with-scale", with_scale, SCALED), ("--refine-camera", refine_camera, SCALED[1:])):
