@@ -2,8 +2,8 @@
 
     .venv/bin/python scripts/studies/defocus_study.py [--pupil POINTS]
 
-Simulated circles without noise, tilted and out of focus: the mean of their sharp images through points of a round
-pupil, each an ellipse with an edge of 0.55 px. Printed for each tilt, radius and aperture: blur over the smaller radius;
+Simulated circles without noise, tilted and out of focus: the mean of their sharp images through points of a
+round pupil, each an ellipse with an edge of 0.55 px. Printed for each case: blur over the smaller radius;
 shift of the centre as a multiple of the gradient of the squared blur, measured, and as `stcal.sfm.detect.defocus` has
 it; loss of the radius over σ²/2R, which `stcal.sfm.adjust.rims` puts back.
 """
@@ -89,9 +89,8 @@ def main() -> None:
                 )
     heads = ["tilt °", "radius px", "pupil mm", "blur / radius", "response", "formula", "loss / (σ²/2R)"]
     print("\n".join(text_table([heads, *rows])))
-    print(
-        f"response over formula: median {np.median(ratios):.2f}, σ {1.4826 * np.median(np.abs(np.array(ratios) - 1)):.2f}"
-    )
+    spread = 1.4826 * np.median(np.abs(np.array(ratios) - 1))
+    print(f"response over formula: median {np.median(ratios):.2f}, σ {spread:.2f}")
     print(f"loss of radius over σ²/2R: median {np.median(losses):.2f}")
 
 

@@ -202,6 +202,8 @@ def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandE
     if options.symmetries:
         repaired = repair(pairs, setup, options.symmetries, views)
         pairs, views, notes = repaired.pairs, repaired.views, repaired.notes()
+    if options.arm is None:
+        pairs.require_moving_flange()
     loop, guess = Loop.of(pairs, setup), cache(partial(_guess, options, observability))
     notes += check_conventions(pairs, loop, setup, guess, options.with_scale, views is not None)
     return _Task(pairs, loop, setup, views, options, guess, observability, notes)

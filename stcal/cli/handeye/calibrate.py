@@ -323,9 +323,11 @@ def handeye(
         if method is None and not (refine_camera or with_scale or four_dof):
             method = AUTO
         chosen, offset = setup_of(statements, inputs.setup, inputs.where), None
+        if statements.setup:
+            inputs = replace(inputs, setup=chosen)
         if time_offset:
             inputs, options, offset = at_offset(inputs, chosen, options)
-        outcome = with_offset(calibrate(inputs, chosen, method, options, validation, progress), offset)
+        outcome = with_offset(calibrate(inputs, chosen, method, options, validation, progress, time_offset), offset)
     result = outcome.result
     say(outcome_text(outcome))
     for option, given_, able in (("--with-scale", with_scale, SCALED), ("--refine-camera", refine_camera, SCALED[1:])):

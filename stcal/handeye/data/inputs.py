@@ -13,7 +13,7 @@ from stcal.handeye.data.formats.numeric import read_columns, todays
 from stcal.handeye.data.formats.recognise import read_content
 from stcal.handeye.data.formats.record import FRAMES, Content, Frames, Role, Said, Side
 from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance
-from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
+from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.join import keys_of
 from stcal.io.poses.columns import read_mapped
 from stcal.io.quaternions import Order
@@ -159,11 +159,25 @@ def read_two(
     notes = () if not how else (f"rows joined {how}",)
     a, b = [i for i, _ in rows], [j for _, j in rows]
     names = tuple(robot.called(i) for i in a)
-    left_out = [(robot.called(i), f"in {first.name} alone") for i in sorted(set(range(len(robot))) - set(a))]
+    stamped = _stamped(robot, camera, b)
+    alone = sorted(set(range(len(robot))) - set(a)) if stamped is None else ()  # samples between images are no mistake
+    left_out = [(robot.called(i), f"in {first.name} alone") for i in alone]
     left_out += [(camera.called(j), f"in {second.name} alone") for j in sorted(set(range(len(camera))) - set(b))]
     where = f"{first.name} with {second.name}"
     pairs = _pairs(robot, camera, a, b, names, where)
-    return Told(pairs, (*_both(robot, camera), *notes), setup, camera.scaled, tuple(left_out))
+    return Told(pairs, (*_both(robot, camera), *notes), setup, camera.scaled, tuple(left_out), stamped)
+
+
+def _stamped(robot: Posed, camera: Posed, rows: Sequence[int]) -> Timed | None:
+    """Returns the robot's stream and the times of these rows of the camera; None where names are no times, or where
+    the robot has no samples beside those of the images, or none between which its pose is known."""
+    times = [stamps_of(side.names) if side.names else None for side in (robot, camera)]
+    if times[0] is None or times[1] is None or len(set(times[0])) < max(len(times[0]), len(rows) + 1):
+        return None
+    stream = Stream.of(times[0], robot.poses, Path(robot.where).name)
+    if stream.spacing_s() > LONGEST_S:
+        return None
+    return Timed(stream, stream.after_origin([times[1][j] for j in rows]))
 
 
 def read_robot(path: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:

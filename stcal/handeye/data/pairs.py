@@ -119,6 +119,49 @@ class HandEyePoses:
                 f"{np.degrees(turned):.3g}°; give each its own pose of the board",
             )
 
+    def require_moving_flange(self):
+        """Refuse poses of the flange that are equal to the last digit while the board moved about it.
+
+        Commanded poses may be equal, and images at one of them differ by noise and by wrong numberings or flips of the
+        board; so the board must have turned and moved, each by more than :data:`STALE` of what poses usually do.
+
+        Raises
+        ------
+        InputError
+            The poses of the flange were not read anew.
+        """
+        flange, board = self.base_from_flange, self.camera_from_board
+        rows: dict[bytes, list[int]] = {}
+        for i in range(len(self)):
+            rows.setdefault(flange.rotation[i].tobytes() + flange.translation[i].tobytes(), []).append(i)
+        copies = [same for same in rows.values() if len(same) > 1]
+        if not copies:
+            return
+        usual = np.median(_apart(board, np.arange(len(self))), axis=0)
+        stale = [same for same in copies if (_apart(board, np.array(same)) > STALE * usual).all(1).any()]
+        if stale:
+            same = max(stale, key=len)
+            named = ", ".join(self.names[i] for i in same[:3]) + (" …" if len(same) > 3 else "")
+            turn, shift = _apart(board, np.array(same)).max(0)
+            raise InputError(
+                "E-POSES-IDENTICAL",
+                f"{self.where}: {named}: the flange's pose is the same to the last digit in {len(same)} rows, while "
+                f"the board moved by up to {shift:.3g} mm and {np.degrees(turn):.3g}°; read the robot's pose anew with "
+                "each image",
+            )
+
+
+STALE = 0.2
+"""Share of the median turn, and of the median way, of the board between two poses, beyond both of which the board moved
+although the flange's pose is a copy. Noise of usable poses is some hundredths."""
+
+
+def _apart(poses: Poses, rows: np.ndarray) -> np.ndarray:
+    """Returns angle (rad) and distance (mm) between each two of these rows, (k, 2)."""
+    first, second = (rows[k] for k in np.triu_indices(len(rows), 1))
+    turns = Rotation.from_matrix(np.swapaxes(poses.rotation[first], 1, 2) @ poses.rotation[second]).magnitude()
+    return np.column_stack([turns, np.linalg.norm(poses.translation[first] - poses.translation[second], axis=1)])
+
 
 def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEyePoses:
     """Read a CSV file of pose pairs.

@@ -26,6 +26,12 @@ class Aside(str):
     __slots__ = ()
 
 
+class SizeDoubt(Grave):
+    """A note that the board is of another size than stated, which a clock's lag can feign."""
+
+    __slots__ = ()
+
+
 SIZE_SIGMAS, SIZE_SHARE = 4.0, 1e-3
 """Number of σ, and relative deviation, beyond which a board's size is doubted; the latter is 0.5 mm at half a metre."""
 HINTED = 2.0
@@ -92,7 +98,7 @@ def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, .
     if not (_is_other(scale, sigma, SIZE_SIGMAS) and scale_is_seen(scale, sigma, len(loop))):
         return ()
     return (
-        Grave(
+        SizeDoubt(
             f"by the robot's motion the board is {scale:.4f} ± {sigma:.2g} times as large as stated{unit_of(scale)}: "
             "check its size and the camera file, or solve with the scale"
         ),

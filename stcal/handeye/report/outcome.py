@@ -136,6 +136,9 @@ HALF, MOST = 0.5, 0.9
 robot or camera would; beyond nine tenths, the error of a prediction is three times that of a pose."""
 AS_ONE, AS_THREE = 1.0, 3.0
 """Limits of σ in the worst direction, in σ of one pose. They are the same two limits if there is no covariance."""
+WRONG_RAD, WRONG_SHARE = float(np.radians(4.0)), 0.04
+"""Residuals (RMS), as an angle and as a share of the board's distance, beyond which poses do not belong together. Arms
+that were never calibrated and poses of single tags stay below half of these."""
 NOTHING_MM = 1e-6
 """Smallest RMS residual that is tested, in mm. Poses with smaller residuals have no errors."""
 
@@ -179,8 +182,35 @@ class Verdict:
 
 def judged(outcome: Outcome) -> Verdict:
     """Returns the verdict on a calibration."""
-    tests = [_of_prediction(outcome), _of_share(outcome), _of_motions(outcome), _of_outliers(outcome)]
+    tests = [
+        _of_residuals(outcome),
+        _of_prediction(outcome),
+        _of_share(outcome),
+        _of_motions(outcome),
+        _of_outliers(outcome),
+    ]
     return Verdict(tuple(each for each in (*tests, *of_notes(outcome.all_notes())) if each is not None))
+
+
+def _of_residuals(outcome: Outcome) -> Finding | None:
+    """Refuses residuals that no robot and no camera in order leave, however well they predict one another."""
+    if outcome.pairs is None or not (used := ~outcome.result.outliers).any():
+        return None
+    turn, shift = outcome.result.rms()
+    scale = outcome.result.scale
+    away = scale * float(np.median(np.linalg.norm(outcome.pairs.camera_from_board.translation[used], axis=1)))
+    if turn <= WRONG_RAD and shift <= WRONG_SHARE * away:
+        return None
+    return Finding(
+        "Residuals",
+        BAD,
+        f"the poses miss one another by {np.degrees(turn):.2g}° and {shift:.3g} mm (RMS), {shift / away:.0%} of the "
+        f"board's distance of {away:.0f} mm",
+        f"{np.degrees(turn):.2g}°, {shift:.3g} mm",
+        f"{np.degrees(WRONG_RAD):.0f}°, {WRONG_SHARE * away:.3g} mm",
+        "pair each pose of the board with that of the flange at the same moment, and check units, directions and the "
+        "camera file",
+    )
 
 
 def _of_prediction(outcome: Outcome) -> Finding | None:

@@ -3,6 +3,7 @@ made."""
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations, product
 from typing import Literal
 
 import numpy as np
@@ -19,7 +20,7 @@ from stcal.robot.kinematics.dh import FITS, require_convention
 from stcal.robot.kinematics.forward import carried_poses
 from stcal.robot.kinematics.inverse import reach_mm
 from stcal.robot.kinematics.measurements import Measurements
-from stcal.robot.kinematics.model import Robot
+from stcal.robot.kinematics.model import DHRow, Robot
 
 Fit = frozenset[Literal["base", "tool"]]
 BOTH: Fit = frozenset(("base", "tool"))
@@ -31,6 +32,12 @@ NEARLY = 1e-3
 """Share of the squared misfit that the next step may still be predicted to remove. Where the robot file does not belong
 to the data, the valley is flat, and the misfit shows it."""
 STILL_MM = 0.01
+QUARTERS_DEG = (90, -90, 180)
+"""Errors of a joint's zero that conventions of a robot's home position cause."""
+GUESS_ROWS = 60
+"""Largest number of rows by which mistakes in the rows are tried: far more than the nine numbers of base and tool."""
+MOST_JOINTS = 8
+"""Largest number of joints of which two or three at a time are tried; their number grows with the third power."""
 AROUND = 0.1
 """Distance from the given tool point at which distances are fitted from other starts too, as a share of the arm's
 reach."""
@@ -265,20 +272,85 @@ def _points_of_distances(
 
 def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: float, extent: float) -> None:
     """Raises an error that says what is wrong with the data, or with the robot file."""
-    misfits = {}
-    for reason, variant, guess in _guesses(robot, data, tools):
-        try:
-            misfits[reason] = _placed(variant, guess, tools)[1] / _extent(guess)
-        except (DegenerateError, ConvergenceError):  # this guess leaves too few data, or explains nothing
-            continue
     says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
     says += f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; "
-    reason = min(misfits, key=lambda guess: misfits[guess])
-    if misfits[reason] < min(EXPLAINS * misfit / extent, FITS):
-        raise InputError("E-IDENTIFY-MISFIT", f"{says}it would fit if {reason}")
+    thinned = data if data.positions is None else data[np.unique(np.linspace(0, len(data) - 1, GUESS_ROWS).astype(int))]
+    for guesses in (_guesses(robot, data, tools), _arms(robot, thinned), _pairs_of_mistakes(robot, thinned)):
+        misfits = {}
+        for reason, variant, guess in guesses:
+            try:
+                misfits[reason] = _placed(variant, guess, tools)[1] / _extent(guess)
+            except (DegenerateError, ConvergenceError):  # this guess leaves too few data, or explains nothing
+                continue
+        reason = min(misfits, key=lambda guess: misfits[guess], default="")
+        if reason and misfits[reason] < min(EXPLAINS * misfit / extent, FITS):
+            raise InputError("E-IDENTIFY-MISFIT", f"{says}it would fit if {reason}")
     raise InputError(
         "E-IDENTIFY-MISFIT", f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units"
     )
+
+
+def _arms(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
+    """Yields frequent mistakes in the rows: convention, zeros of joints, order of joints and of rows."""
+    n = len(robot.rows)
+    other = "standard" if robot.convention == "modified" else "modified"
+    reason = f'rows were of the {other} convention; give convention = "{other}" in the robot file'
+    yield reason, replace(robot, convention=other), data
+    for i in _inner(robot):
+        for turn in QUARTERS_DEG:
+            rows = _turned(robot.rows, {i: turn})
+            yield (
+                f"theta of joint {i + 1} were larger by {turn:+d}°; correct theta_deg",
+                replace(robot, rows=rows),
+                data,
+            )
+    for i, k in combinations(range(n), 2):
+        if n > MOST_JOINTS or robot.joints[i].type != robot.joints[k].type:
+            continue
+        order = _exchanged(n, i, k)
+        reason = f"columns q{i + 1} and q{k + 1} were exchanged; correct the order of the joint values"
+        yield reason, robot, replace(data, q=data.q[:, order])
+        if robot.tree is None:
+            rows = tuple(robot.rows[r] for r in order)
+            yield f"rows {i + 1} and {k + 1} were exchanged; correct the robot file", replace(robot, rows=rows), data
+    if len({joint.type for joint in robot.joints}) == 1:
+        reason = "joint values were in the opposite order, the last joint first; correct the columns"
+        yield reason, robot, replace(data, q=data.q[:, ::-1])
+
+
+def _pairs_of_mistakes(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
+    """Yields zeros of two joints that are off, and signs of several joints."""
+    n, inner = len(robot.rows), _inner(robot)
+    if n > MOST_JOINTS:
+        return
+    for i, k in combinations(inner, 2):
+        for turns in product(QUARTERS_DEG, repeat=2):
+            rows = _turned(robot.rows, {i: turns[0], k: turns[1]})
+            reason = f"theta of joints {i + 1} and {k + 1} were larger by {turns[0]:+d}° and {turns[1]:+d}°"
+            yield f"{reason}; correct theta_deg", replace(robot, rows=rows), data
+    turning = np.flatnonzero(~robot.prismatic).tolist()
+    for count in (2, 3):
+        for group in combinations(turning, count):
+            named = ", ".join(str(i + 1) for i in group)
+            reason = f"joints {named} had the opposite sign; check their directions in the rows, or the signs of q"
+            yield reason, robot, replace(data, q=data.q * np.where(np.isin(np.arange(n), group), -1, 1))
+
+
+def _inner(robot: Robot) -> list[int]:
+    """Returns revolute joints whose zeros neither base nor tool takes up: all but the first and the last."""
+    return [i for i in range(1, len(robot.rows) - 1) if robot.joints[i].type == "revolute"]
+
+
+def _turned(rows: tuple[DHRow, ...], turns_deg: dict[int, int]) -> tuple[DHRow, ...]:
+    """Returns the rows with θ larger by these angles."""
+    return tuple(replace(row, theta=row.theta + np.radians(turns_deg.get(i, 0))) for i, row in enumerate(rows))
+
+
+def _exchanged(n: int, i: int, k: int) -> list[int]:
+    """Returns the order of n things with two exchanged."""
+    order = list(range(n))
+    order[i], order[k] = k, i
+    return order
 
 
 def _guesses(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[tuple[str, Robot, Measurements]]:
@@ -298,10 +370,11 @@ def _guesses(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Itera
     if (robot.coupling != np.eye(n)).any():
         yield "the joints were not coupled; take coupling out of the robot file", replace(robot, coupling=None), data
     elif n >= 3:
-        coupling = np.eye(n)
-        coupling[2, 1] = 1.0
-        reason = "joint 3 were coupled to joint 2, as Fanuc's are; give coupling in the robot file"
-        yield reason, replace(robot, coupling=coupling), data
+        for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
+            coupling = np.eye(n)
+            coupling[2, 1] = sign
+            reason = f"joint 3 were coupled to joint 2 by {sign:+.0f}, {makers}; give coupling in the robot file"
+            yield reason, replace(robot, coupling=coupling), data
     if data.positions is None:
         return
     mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)

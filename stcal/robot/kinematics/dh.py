@@ -91,24 +91,34 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
         elasticity=None,
         tree=tree,
     )
-    return replace(robot, elasticity=_elasticity(robot, chain, nominal))
+    if chain.elasticity is None:
+        return robot
+    loaded = len(chain) - 1 if tree is None else tree.carrier("", len(chain) - 1)
+    return replace(robot, elasticity=_elasticity(robot, chain, chain.elasticity, end(loaded)))
 
 
-def _elasticity(robot: Robot, chain: Chain, nominal: Robot) -> Elasticity | None:
-    """Returns the elasticity of ``chain`` in the joint frames of ``robot``.
+def _elasticity(robot: Robot, chain: Chain, elasticity: Elasticity, flange_from_loaded: Rigid) -> Elasticity:
+    """Returns the elasticity of ``chain`` in the joint frames of the rigid ``robot``.
 
-    Those frames are turned about the joints' axes and slid along them. The motions are so small, or the arm so stiff,
-    that deflections do not change. The payload centre is that of ``nominal``."""
-    elasticity = chain.elasticity
-    if elasticity is None:
-        return None
+    Those frames are turned about the joints' axes and slid along them: moments turn with them, and pivots keep the
+    places about which links give way, as a frame may be far from them (that of a joint that the next one crosses
+    elsewhere than its nominal row says). ``flange_from_loaded``: frame of the joint of ``chain`` that carries the load.
+    """
     zero = np.zeros((1, len(chain)))
-    rigid = replace(chain, elasticity=None)
-    turn = np.swapaxes(joint_frames(robot.chain(), zero)[0], 2, 3) @ joint_frames(rigid, zero)[0]
-    gravity = robot.world_from_base.rotation.T @ chain.rotation[0] @ elasticity.gravity
-    moment = (turn[:, 0] @ elasticity.moment[:, :, None])[:, :, 0]
-    centre = np.zeros(3) if nominal.elasticity is None else nominal.elasticity.payload_centre
-    return replace(elasticity, moment=moment, gravity=gravity, payload_centre=centre)
+    of_rows, rows_at = joint_frames(robot.chain(), zero)
+    of_chain, chain_at = joint_frames(replace(chain, elasticity=None), zero)
+    back = np.swapaxes(of_rows, 2, 3)[:, 0]
+    turn = back @ of_chain[:, 0]
+    moment = (turn @ elasticity.moment[:, :, None])[:, :, 0]
+    pivot = (back @ (chain_at - rows_at)[:, 0, :, None])[:, :, 0]
+    pivot[~chain.prismatic, :2] = 0.0  # rounding: the frames share their axes
+    return replace(
+        elasticity,
+        moment=moment,
+        pivot=np.where(np.abs(pivot) < ROUNDING_MM, 0.0, pivot),
+        gravity=robot.world_from_base.rotation.T @ chain.rotation[0] @ elasticity.gravity,
+        payload_centre=flange_from_loaded @ elasticity.payload_centre,
+    )
 
 
 def _row_between(gap: Rigid, nominal: DHRow, to_prismatic: bool) -> DHRow:

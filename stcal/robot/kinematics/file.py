@@ -68,6 +68,7 @@ class _ElasticityFile(Strict):
     moment_Nm: list[tuple[Finite, Finite, Finite]] | None = None
     periodic_rad: list[tuple[Finite, Finite, Finite, Finite]] | None = None
     hysteresis_rad: list[Finite] | None = None
+    pivot_mm: list[tuple[Finite, Finite, Finite]] | None = None
     payload_kg: Finite = 0.0
     payload_centre_mm: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
 
@@ -87,7 +88,8 @@ class _ElasticityFile(Strict):
         centre = np.array(self.payload_centre_mm)
         load = self.payload_kg, centre
         hysteresis = np.array(self.hysteresis_rad or none)
-        return Elasticity(compliance, moment, periodic, np.array(self.gravity), *load, hysteresis)
+        pivot = np.array(self.pivot_mm or np.zeros((count, 3)))
+        return Elasticity(compliance, moment, periodic, np.array(self.gravity), *load, hysteresis, pivot)
 
 
 class _RobotFile(Sized):
@@ -270,6 +272,9 @@ def _elasticity_lines(elasticity: Elasticity) -> list[str]:
     load = []
     if elasticity.hysteresis.any():
         load.append(f"hysteresis_rad = {_numbers(elasticity.hysteresis)}  # half of it: farther if it came from below")
+    if elasticity.pivot.any():
+        rows = ", ".join(_numbers(row) for row in elasticity.pivot)
+        load.append(f"pivot_mm = [{rows}]  # in the joints' frames: where the links turn when they give way")
     if elasticity.payload_kg or elasticity.payload_centre.any():
         load += [
             f"payload_kg = {_number(elasticity.payload_kg)}",

@@ -91,6 +91,9 @@ class Elasticity:
         Its direction, of length 1: in the base of a robot, in the first joint's frame of a :class:`Chain`.
     hysteresis : (n,) array
         rad: what revolute joints are turned farther by that came from below, and less by that came from above.
+    pivot : (n, 3) array
+        Place about which each link turns when it gives way, mm, in its joint's frame: on the joint's axis for a
+        revolute joint. The origin of that frame if not given; always so of a :class:`Chain`.
     payload_kg : float
         Mass that is carried where nothing else is said of joint vectors.
     payload_centre : (3,) array
@@ -110,13 +113,16 @@ class Elasticity:
     payload_kg: float = 0.0
     payload_centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
     hysteresis: np.ndarray = None  # pyright: ignore[reportAssignmentType]  # made below: its size is that of the joints
+    pivot: np.ndarray = None  # pyright: ignore[reportAssignmentType]  # likewise
 
     def __post_init__(self):
         n = len(self.compliance)
+        if self.pivot is None:  # not given
+            object.__setattr__(self, "pivot", np.zeros((n, 3)))
         if self.hysteresis is None:  # not given
             object.__setattr__(self, "hysteresis", np.zeros(n))
         shapes = {"compliance": (n, 2), "moment": (n, 3), "periodic": (n, 4), "gravity": (3,), "payload_centre": (3,)}
-        shapes["hysteresis"] = (n,)
+        shapes |= {"hysteresis": (n,), "pivot": (n, 3)}
         loaded(self.payload_kg, 1)
         for name, shape in shapes.items():
             object.__setattr__(self, name, frozen(getattr(self, name), shape, f"elasticity: {name}"))
@@ -268,14 +274,17 @@ class Robot:
         return replace(self, elasticity=replace(self.elasticity, payload_kg=float(payload_kg)))
 
     def chain(self) -> "Chain":
-        """The fixed transforms in order."""
+        """The fixed transforms in order. Frames of joints stand at the pivots of the elasticity; a shift along the axis
+        of a joint, or of a sliding joint in any direction, leaves the rigid arm as it is."""
         gaps, ends = [], []
+        pivots = np.zeros((len(self.rows), 3)) if self.elasticity is None else self.elasticity.pivot
         for i, row in enumerate(self.rows):
             modified = self.convention == "modified"
             after, mount = self.carrier(i)
             before = self.world_from_base if after < 0 else ends[after]
-            gaps.append(before @ mount @ across(row) if modified else before @ mount)
-            ends.append(along(row) if modified else along(row) @ across(row))
+            pivot = Rigid(np.eye(3), pivots[i])
+            gaps.append((before @ mount @ across(row) if modified else before @ mount) @ pivot)
+            ends.append(pivot.inverse() @ (along(row) if modified else along(row) @ across(row)))
         rotation, translation = np.array([g.rotation for g in gaps]), np.array([g.translation for g in gaps])
         elasticity = self.elasticity
         if elasticity is not None:
@@ -283,7 +292,8 @@ class Robot:
             last = len(ends) - 1
             end = last if self.tree is None else self.tree.carrier("", last)
             centre = ends[end] @ elasticity.payload_centre
-            elasticity = replace(elasticity, gravity=first.rotation.T @ elasticity.gravity, payload_centre=centre)
+            gravity = first.rotation.T @ elasticity.gravity
+            elasticity = replace(elasticity, gravity=gravity, payload_centre=centre, pivot=np.zeros_like(pivots))
         grown = None if self.tree is None else Grown(self.tree, tuple(ends))
         return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, grown)
 

@@ -10,8 +10,10 @@ from stcal.errors import DegenerateError, StcalError
 from stcal.handeye import HandEyeOptions, handeye
 from stcal.handeye.choose import choose
 from stcal.handeye.data.pairs import Setup
+from stcal.handeye.judge.remarks import Grave
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.report.outcome import Outcome
+from stcal.handeye.result import HandEye
 from stcal.handeye.validate import (
     LEAST_LEFT,
     better_setup,
@@ -24,6 +26,7 @@ from stcal.handeye.validate import (
 from stcal.parallel import Progress
 from stcal.workflows.handeye.arm import with_arm
 from stcal.workflows.handeye.inputs import HandEyeInput
+from stcal.workflows.handeye.offset import lag_tried
 
 ALL, AUTO = "all", "auto"
 """Words in place of a method's name: all methods, compared; the way of solving that predicts best."""
@@ -48,8 +51,11 @@ def calibrate(
     options: HandEyeOptions,
     validation: Splits,
     progress: Progress = lambda *_: None,
+    offset_known: bool = False,
 ) -> Outcome:
     """Returns the result and its errors on poses held out.
+
+    Clocks that differ are tried as a cause of residuals, unless poses of ``given`` are at a known offset already.
 
     All methods are compared where ``method`` is :data:`ALL`;
     the way of solving that predicts best is used where it is :data:`AUTO`.
@@ -60,13 +66,31 @@ def calibrate(
         For the reasons given in :func:`stcal.handeye.handeye`; the message also names what was left out before.
     """
     try:
-        return _outcome(given, setup, method, options, validation, progress)
+        return _outcome(given, setup, method, options, validation, progress, offset_known)
     except StcalError as error:
         if not given.left_out:
             raise
         name, reason = given.left_out[0]
         error.append(f"; {len(given.left_out)} left out before, first {name}: {reason}")
         raise
+
+
+FAR_MM, TOO_FAR_MM = 600.0, 1000.0
+"""Distances of a camera from the flange that carries it that are doubted, and that are called wrong unless the setup is
+stated; brackets are shorter."""
+
+
+def _of_setup(given: HandEyeInput, setup: Setup, result: HandEye) -> tuple[str, ...]:
+    """Returns a note if a setup that nobody stated puts the camera where no flange carries it. Poses of the other setup
+    that were inverted before fit as well, so that no residual tells."""
+    away = float(np.linalg.norm(result.mount_from_camera.translation))
+    if setup != "eye-in-hand" or given.setup is not None or away < FAR_MM:
+        return ()
+    said = (
+        f"the camera is {away:.0f} mm off the flange, farther than brackets reach, and no residual tells the setup: "
+        "give --setup eye-to-hand if the camera stood beside the robot, --setup eye-in-hand if the flange carried it"
+    )
+    return (Grave(said) if away > TOO_FAR_MM else said,)
 
 
 def _outcome(
@@ -76,6 +100,7 @@ def _outcome(
     options: HandEyeOptions,
     validation: Splits,
     progress: Progress,
+    offset_known: bool,
 ) -> Outcome:
     pairs, views = given.pairs, given.views
     if options.camera is None:
@@ -110,6 +135,10 @@ def _outcome(
         result = widened_by_scatter(result, held_out)
     if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
         notes = (*notes, meant)
+    notes = (*notes, *_of_setup(given, setup, result))
+    if not offset_known:
+        result, lagging = lag_tried(given, setup, options, result)
+        notes = (*notes, *lagging)
     motions = None
     if validation.motions is not None:
         motions = predict_motions(pairs, setup, result.method, views, options, validation.motions)

@@ -1,17 +1,37 @@
-"""The offset between the clocks of robot and camera, found before X and Z and carried through them."""
+"""The offset between the clocks of robot and camera: found before X and Z and carried through them, or tried as the
+cause of residuals."""
 
 from dataclasses import replace
+from decimal import Decimal
 
 import numpy as np
 
-from stcal.errors import InputError
-from stcal.handeye import HandEyeOptions
-from stcal.handeye.data.pairs import Setup
+from stcal.errors import InputError, StcalError
+from stcal.geometry.normal_equations import generalised_inverse
+from stcal.handeye import HandEyeOptions, handeye
+from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
+from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
+from stcal.handeye.judge.remarks import Grave, SizeDoubt
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.report.outcome import Outcome
+from stcal.handeye.result import HandEye
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from stcal.parallel import one_thread
 from stcal.workflows.handeye.inputs import HandEyeInput
+
+HINT_T, SURE_SIGMAS = 3.0, 4.0
+"""Student's t of a first test from which an offset is solved for, and number of its σ from which it is told: one sound
+set in 16,000 is beyond the latter."""
+FALLS = 0.98
+"""Largest ratio of the mean squares of residuals with and without an offset that is told."""
+HARMFUL = 1.0
+"""Change of the transform by the offset, in σ of the transform, from which the transform is called wrong."""
+ROW_S = 0.05
+"""Time that stands for one row where poses have no times but follow one another smoothly: a scan of 1 s about 0 is one
+of 20 rows."""
+SMOOTH, LEAST_ROWS = 0.2, 20
+"""Largest deviation of poses from a cubic through their neighbours, as a share of the steps between them, with which
+their order counts as that of a motion; and least number of such poses."""
 
 
 @one_thread()
@@ -68,3 +88,96 @@ def with_offset(outcome: Outcome, offset: TimeOffset | None) -> Outcome:
     if offset is None:
         return outcome
     return replace(outcome, result=offset.carried(outcome.result), time_offset=offset)
+
+
+@one_thread()
+def lag_tried(
+    given: HandEyeInput, setup: Setup, options: HandEyeOptions, result: HandEye
+) -> tuple[HandEye, tuple[str, ...]]:
+    """Returns the result and a note if clocks that differ explain its residuals; a doubt of the board's size that ends
+    with the lag is then taken from the result's notes.
+
+    The poses are those of ``given`` and ``result``, with no offset applied. Where poses have no times, their order
+    gives velocities if they follow one another smoothly.
+    """
+    pairs = given.pairs
+    timed = given.timed if given.timed is not None else _by_order(pairs)
+    if timed is None or options.four_dof or len(result.outliers) != len(pairs) or not _close(timed):
+        return result, ()
+    try:
+        if abs(_lag_t(pairs, timed, setup, result)) < HINT_T:
+            return result, ()
+        plain = replace(options, arm=None, intrinsics=None, camera=None, symmetries=())
+        lag = estimate_offset(pairs, timed.stream, timed.seconds, setup, options.noise, options.with_scale)
+        shifted = replace(pairs[np.flatnonzero(lag.kept)], base_from_flange=lag.base_from_flange)
+        before, after = (handeye(each, setup, "pose", None, plain) for each in (pairs[lag.kept], shifted))
+    except StcalError:  # the motions tell no offset
+        return result, ()
+    fits = [float((_lengths(each) ** 2).mean()) for each in (before, after)]
+    if abs(lag.seconds) < SURE_SIGMAS * lag.sigma_s or fits[1] > FALLS * fits[0]:
+        return result, ()
+    old, new = (f"{np.degrees(each.rms()[0]):.2g}° and {each.rms()[1]:.3g} mm" for each in (before, after))
+    if given.timed is not None:
+        order = "ahead of" if lag.seconds > 0 else "behind"
+        said = (
+            f"by the motions the robot's clock is {1e3 * abs(lag.seconds):.3g} ± {1e3 * lag.sigma_s:.2g} ms {order} "
+            f"the camera's, with which residuals fall from {old} to {new}: solve with --time-offset"
+        )
+    else:
+        order = "later" if lag.seconds > 0 else "earlier"
+        said = (
+            f"by the motions the board's poses are {abs(lag.seconds) / ROW_S:.2g} ± {lag.sigma_s / ROW_S:.1g} rows "
+            f"{order} than the robot's, with which residuals fall from {old} to {new}: give both with times, and "
+            "--time-offset"
+        )
+    if not any(isinstance(note, SizeDoubt) for note in after.notes):
+        result = replace(result, notes=tuple(note for note in result.notes if not isinstance(note, SizeDoubt)))
+    return result, (Grave(said) if _shift(result, lag) > HARMFUL else said,)
+
+
+def _by_order(pairs: HandEyePoses) -> Timed | None:
+    """Returns the robot's poses as a stream of equal steps, where they follow one another smoothly; else None."""
+    if len(pairs) < LEAST_ROWS:
+        return None
+    seconds = ROW_S * np.arange(len(pairs))
+    stream = Stream(seconds, pairs.base_from_flange, Decimal(0), pairs.where)
+    steps = pairs.base_from_flange[1:].difference(pairs.base_from_flange[:-1]).reshape(-1, 2, 3)
+    steps_rms = np.sqrt((steps**2).sum(2).mean(0))
+    smooth = all(own < SMOOTH * step for own, step in zip(stream.rest(), steps_rms, strict=True))
+    return Timed(stream, seconds) if smooth else None
+
+
+def _close(timed: Timed) -> bool:
+    """Returns True if samples of the stream are so close about most images that poses between them are known."""
+    samples = timed.stream.seconds
+    after = np.clip(np.searchsorted(samples, timed.seconds, side="right"), 1, len(samples) - 1)
+    return float(np.median(samples[after] - samples[after - 1])) <= LONGEST_S
+
+
+def _lag_t(pairs: HandEyePoses, timed: Timed, setup: Setup, result: HandEye) -> float:
+    """Returns Student's t of an offset beside X and Z, to first order, by the poses that are no outliers."""
+    good = np.flatnonzero(~result.outliers)
+    loop, x = Loop.of(pairs[good], setup), result.mount_from_camera
+    residuals = loop.residuals(x, result.stand_from_board, result.scale)
+    by_time = loop.by_robot(x, result.scale) @ timed.stream.velocity(timed.seconds[good])[:, :, None]
+    columns = 12 + (result.sigma_scale is not None)
+    jacobian = np.concatenate([loop.jacobian(x, result.scale)[:, :, :columns], by_time], axis=2)
+    size = np.sqrt((residuals.reshape(-1, 2, 3) ** 2).mean((0, 2)))
+    weight = 1 / np.repeat(np.maximum(size, 1e-12), 3)
+    flat, left = (jacobian * weight[:, None]).reshape(-1, columns + 1), (residuals * weight).ravel()
+    covariance = generalised_inverse(flat.T @ flat)
+    step = -covariance @ (flat.T @ left)
+    variance = float(((left + flat @ step) ** 2).sum()) / max(len(left) - columns - 1, 1)
+    return float(step[-1] / np.sqrt(max(variance * covariance[-1, -1], 1e-300)))
+
+
+def _lengths(result: HandEye) -> np.ndarray:
+    """Returns the translation residuals (m,) of the poses that are no outliers, mm."""
+    return np.linalg.norm(result.residuals[~result.outliers, 3:], axis=1)
+
+
+def _shift(result: HandEye, lag: TimeOffset) -> float:
+    """Returns the largest change of X by the offset, in σ of X; infinite where X has no σ."""
+    if result.covariance is None:
+        return float("inf")
+    return float((np.abs(lag.seconds * lag.slope[:6]) / np.sqrt(np.diag(result.covariance))).max())

@@ -63,7 +63,11 @@ def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | No
         return AtImages(robot)
     if not timing.offset and all(time in samples for time in images.values()):
         rows = {name: samples.index(time) for name, time in images.items()}
-        return AtImages(_of_rows(robot, rows))
+        if not len(images) < len(samples) == len(set(samples)):
+            return AtImages(_of_rows(robot, rows))
+        stream = Stream.of([time for time in samples if time is not None], robot.base_from_flange, robot.file)
+        seconds = stream.after_origin(list(images.values())).tolist()
+        return AtImages(_of_rows(robot, rows), (), stream, dict(zip(images, seconds, strict=True)))
     times = [time for time in samples if time is not None]
     stream = Stream.of(times, robot.base_from_flange, robot.file)
     image_names = list(images)

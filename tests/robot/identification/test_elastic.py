@@ -9,9 +9,10 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot import forward, read_measurements
 from stcal.robot.identification.prior import DOWN, HEAVIER, MOMENT, usual
 from stcal.robot.identification.report import identified_file, identified_text
-from stcal.robot.identification.result import Identified, IdentifyOptions
+from stcal.robot.identification.result import Identified, IdentifyOptions, require_written
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import USUAL, Conditions
+from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.model import Elasticity, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import evaluate
@@ -102,6 +103,18 @@ def test_wrong_rows_are_named_beside_elasticity():
     found = identify(mh80(), replace(data, positions=positions), IdentifyOptions(model="elastic", folds=0))
     assert [row for row, _ in found.outliers()] == [5, 20, 40]
     assert elsewhere(found, true) < 0.1
+
+
+def test_a_written_file_that_predicts_otherwise_is_an_error(tmp_path):
+    _, data = drawn(60, 12)
+    found = identify(mh80(), data, IdentifyOptions(folds=0, model="elastic"))
+    path = tmp_path / "robot.toml"
+    path.write_text(robot_toml(found.robot))
+    require_written(path, found)
+    rows = (replace(found.robot.rows[0], d=found.robot.rows[0].d + 0.001), *found.robot.rows[1:])
+    path.write_text(robot_toml(replace(found.robot, rows=rows)))
+    with fails_with("E-WRITTEN-DIFFERS … robot.toml"):
+        require_written(path, found)
 
 
 def test_without_folds_nothing_can_be_chosen():

@@ -65,6 +65,59 @@ def test_orientations_that_no_convention_mends_are_left_to_the_adjustment():
     start(mh80(), replace(data, rotations=still))
 
 
+def as_modified(robot):
+    return replace(robot, convention="modified")
+
+
+def with_zero(robot):
+    rows = list(robot.rows)
+    rows[3] = replace(rows[3], theta=rows[3].theta - np.pi / 2)
+    return replace(robot, rows=tuple(rows))
+
+
+def with_two_zeros(robot):
+    rows = list(robot.rows)
+    rows[1] = replace(rows[1], theta=rows[1].theta + np.pi / 2)
+    rows[4] = replace(rows[4], theta=rows[4].theta - np.pi / 2)
+    return replace(robot, rows=tuple(rows))
+
+
+def with_rows_exchanged(robot):
+    rows = list(robot.rows)
+    rows[1], rows[2] = rows[2], rows[1]
+    return replace(robot, rows=tuple(rows))
+
+
+@pytest.mark.parametrize(
+    ("mistaken", "named"),
+    [
+        (as_modified, "standard convention"),
+        (with_zero, "theta of joint 4 … +90°"),
+        (with_two_zeros, "theta of joints 2 and 5 … -90° … +90°"),
+        (with_rows_exchanged, "rows 2 and 3 were exchanged"),
+    ],
+)
+def test_mistakes_in_the_rows_are_named(mistaken, named):
+    with fails_with(f"E-IDENTIFY-MISFIT … {named}"):
+        start(mistaken(mh80()), replace(seen(5, 40), rotations=None))
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda q: q[:, [0, 2, 1, 3, 4, 5]], "columns q2 and q3 were exchanged"),
+        (lambda q: q[:, ::-1], "opposite order"),
+        (lambda q: q * [1, -1, 1, -1, 1, 1], "joints 2, 4 had the opposite sign"),
+        (lambda q: q + q[:, [1]] * [0, 0, 1, 0, 0, 0], "joint 3 were coupled to joint 2 by -1"),
+        (lambda q: q - q[:, [1]] * [0, 0, 1, 0, 0, 0], "joint 3 were coupled to joint 2 by +1"),
+    ],
+)
+def test_mistakes_in_the_joint_values_are_named(change, named):
+    data = replace(seen(6, 40), rotations=None)
+    with fails_with(f"E-IDENTIFY-MISFIT … {named}"):
+        start(mh80(), replace(data, q=change(data.q)))
+
+
 def test_the_order_of_quaternions_is_an_option(tmp_path, monkeypatch, capsys):
     data = seen(2, 30)
     (tmp_path / "robot.toml").write_text(robot_toml(mh80()))

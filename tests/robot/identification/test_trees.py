@@ -272,3 +272,27 @@ def test_a_hand_is_brought_to_a_pose(share):
     found = inverse(robot, wanted, q + rng.normal(0, 0.02, q.shape), "right")
     assert found.usable.all()
     assert np.abs(forward(robot, found.q, "right").difference(wanted)).max() < 1e-6
+
+
+def test_rows_of_an_elastic_tree_keep_the_place_about_which_a_link_gives_way(tmp_path):
+    """Joint 1 stands 700 mm below where the next axis crosses it: its row takes the crossing, and links give way by a
+    fifth of a degree across it, about where they did."""
+    robot, rng = elastic(two_arms(), np.random.default_rng(5)), np.random.default_rng(6)
+    chain = robot.chain()
+    place = chain.translation.copy()
+    place[0] -= 700 * chain.rotation[0][:, 2]
+    place[1] += [0, 0, 700]
+    compliance = chain.elasticity.compliance.copy()
+    compliance[0] = 1e-5
+    bent = replace(chain, translation=place, elasticity=replace(chain.elasticity, compliance=compliance))
+    file = tmp_path / "robot.toml"
+    file.write_text(robot_toml(robot_from_chain(bent, robot.tools, robot)))
+    again = load_robot(file)
+    q, targets = joint_vectors(robot, 8, rng), MARKERS * 2
+    q, targets = q[: len(targets)], targets[: len(q)]
+    wanted = tips(State(bent, dict(robot.tools)), q, targets)
+    found = tips(State(again.chain(), dict(again.tools)), q, targets)
+    assert np.abs(found.difference(wanted)).max() < 1e-8
+    slid = replace(again, elasticity=replace(again.elasticity, pivot=np.zeros_like(again.elasticity.pivot)))
+    assert np.abs(tips(State(slid.chain(), dict(slid.tools)), q, targets).difference(wanted)).max() > 1e-3
+    assert again.elasticity.pivot[0] == pytest.approx([0, 0, -700], abs=1.0)

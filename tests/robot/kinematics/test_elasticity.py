@@ -180,11 +180,11 @@ def test_a_payload_is_in_the_file_and_in_rows_made_of_a_chain(tmp_path):
     step = np.random.default_rng(3).normal(0, 1e-3, len(chain_parameters(robot.chain())))
     moved = moved_chain(robot.chain(), step)
     found = robot_from_chain(moved, {"": TOOL}, robot)
-    assert (found.elasticity.payload_centre == np.ones(3)).all()
+    assert found.elasticity.payload_centre == pytest.approx(np.ones(3), abs=1.0)  # rows put the flange elsewhere
     heavy = loaded(60.0, len(q))
     sag = flange_poses(moved, q, heavy).translation - flange_poses(moved, q).translation
     again = flange_poses(found.chain(), q, heavy).translation - flange_poses(found.chain(), q).translation
-    assert np.abs(again - sag).max() < 0.01 * np.abs(sag).max()
+    assert np.abs(again - sag).max() < 1e-9
 
 
 @pytest.mark.parametrize("mass", [-1.0, np.nan, 2e4, [1.0, 2.0]])

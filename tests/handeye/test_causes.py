@@ -1,0 +1,103 @@
+"""Causes that the data can test are tried: a clock's lag before the board's size, stale poses, a setup not stated."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.geometry.rigid import Poses
+from stcal.handeye import HandEyeOptions, handeye
+from stcal.handeye.data.pairs import HandEyePoses
+from stcal.handeye.data.stream import Timed
+from stcal.handeye.judge.remarks import Grave, SizeDoubt
+from stcal.handeye.report.outcome import judged
+from stcal.workflows.handeye.calibrate import Splits, calibrate
+from stcal.workflows.handeye.inputs import HandEyeInput
+from stcal.workflows.handeye.offset import lag_tried
+from tests.outcome import fails_with
+from tests.support.handeye_stream import simulated_stream
+
+
+def given_of(seed: int, offset_s: float, count: int = 25) -> HandEyeInput:
+    """Poses taken as if both clocks were one."""
+    truth = simulated_stream(np.random.default_rng(seed), count, offset_s=offset_s)
+    pairs = replace(truth.pairs, base_from_flange=truth.stream.at(truth.seconds))
+    return HandEyeInput("poses", pairs, timed=Timed(truth.stream, truth.seconds))
+
+
+def told(given: HandEyeInput) -> tuple[str, ...]:
+    return lag_tried(given, "eye-in-hand", HandEyeOptions(), handeye(given.pairs))[1]
+
+
+@pytest.mark.parametrize("offset_s", [0.004, -0.02, 0.1])
+def test_a_lag_is_told_with_what_it_explains(offset_s):
+    given = given_of(11, offset_s)
+    (note,) = told(given)
+    assert f"{'ahead of' if offset_s > 0 else 'behind'} the camera's" in note
+    found = float(note.split("clock is ")[1].split(" ±")[0])
+    assert found == pytest.approx(1e3 * abs(offset_s), abs=1.0)
+    assert isinstance(note, Grave) or abs(offset_s) < 0.01
+
+
+@pytest.mark.parametrize("seed", range(12, 18))
+def test_clocks_that_agree_are_not_blamed(seed):
+    assert told(given_of(seed, 0.0)) == ()
+
+
+def test_a_doubt_of_the_size_ends_with_the_lag():
+    given = given_of(19, 0.05)
+    doubted = replace(result := handeye(given.pairs), notes=(*result.notes, SizeDoubt("the board is larger")))
+    again, notes = lag_tried(given, "eye-in-hand", HandEyeOptions(), doubted)
+    assert not any(isinstance(note, SizeDoubt) for note in again.notes)
+    assert len(notes) == 1
+
+
+def stale(pairs: HandEyePoses, rows: slice) -> HandEyePoses:
+    """The flange's pose of the first of these rows in all of them."""
+    rotation, place = np.array(pairs.base_from_flange.rotation), np.array(pairs.base_from_flange.translation)
+    rotation[rows], place[rows] = rotation[rows][0], place[rows][0]
+    return replace(pairs, base_from_flange=Poses(rotation, place))
+
+
+def test_poses_of_the_flange_that_were_not_read_anew_are_refused():
+    pairs = stale(given_of(20, 0.0).pairs, slice(6, 12))
+    with fails_with("E-POSES-IDENTICAL … pose 7, pose 8, pose 9 … 6 rows"):
+        handeye(pairs)
+
+
+def test_images_at_one_commanded_pose_are_used():
+    """Twice each pose, with noise of the board between the two."""
+    pairs = given_of(21, 0.0).pairs
+    rows, rng = np.repeat(np.arange(len(pairs)), 2), np.random.default_rng(0)
+    board = pairs.camera_from_board[rows]
+    jitter = Poses(board.rotation, board.translation + rng.normal(0, 0.3, (len(rows), 3)))
+    assert len(handeye(HandEyePoses(pairs.base_from_flange[rows], jitter)).names) == len(rows)
+
+
+def test_residuals_that_no_arm_leaves_are_not_to_be_used():
+    given = given_of(22, 0.0)
+    rng = np.random.default_rng(1)
+    board = given.pairs.camera_from_board
+    far = Poses(board.rotation, board.translation + rng.normal(0, 40, (len(board), 3)))
+    outcome = calibrate(
+        replace(given, pairs=replace(given.pairs, camera_from_board=far), timed=None),
+        "eye-in-hand",
+        "pose",
+        HandEyeOptions(),
+        Splits(0),
+    )
+    assert judged(outcome).word == "do not use"
+    assert any(finding.title == "Residuals" for finding in judged(outcome).reasons())
+
+
+def test_a_camera_far_off_the_flange_needs_its_setup_stated():
+    """Robot's poses inverted, as of a camera beside the robot: nothing else tells."""
+    truth = simulated_stream(np.random.default_rng(23), 20, "eye-to-hand", 0.0)
+    flange = truth.stream.at(truth.seconds).inverse()
+    far = Poses(flange.rotation, flange.translation)
+    given = HandEyeInput("poses", replace(truth.pairs, base_from_flange=far))
+    outcome = calibrate(given, "eye-in-hand", "pose", HandEyeOptions(), Splits(0))
+    assert np.linalg.norm(outcome.result.mount_from_camera.translation) > 1000
+    assert any("--setup eye-to-hand" in note and isinstance(note, Grave) for note in outcome.notes)
+    stated = calibrate(replace(given, setup="eye-in-hand"), "eye-in-hand", "pose", HandEyeOptions(), Splits(0))
+    assert not any("--setup" in note for note in stated.notes)
