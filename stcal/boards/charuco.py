@@ -168,7 +168,7 @@ def _gradient(smooth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Corners:
-    """Measured corners ``xy_px`` (n, 2) with ``covariance_px2`` (n, 2, 2). ``seen`` : (n,) False if there is
+    """Corners as measured, ``xy_px`` (n, 2) with ``covariance_px2`` (n, 2, 2). ``seen`` : (n,) False if there is
     none in its window."""
 
     xy_px: np.ndarray

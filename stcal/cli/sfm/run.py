@@ -112,7 +112,7 @@ def run(
     ] = False,
     rim: Annotated[
         bool,
-        typer.Option("--rim", help="Estimate the rim in front of circles, and give faces of the surface behind it."),
+        typer.Option("--rim", help="Compute the rim in front of circles, and give faces of the surface behind it."),
     ] = False,
     board_only: Annotated[
         bool,
