@@ -72,12 +72,17 @@ def simulate(
     focal: Annotated[
         float | None,
         typer.Option(
-            "--focal-mm", min=0.5, max=5000, help="Focal length of the thin lens; that on a 22.3 mm sensor if none."
+            "--focal-mm",
+            min=0.5,
+            max=5000,
+            help="Set the focal length of the thin lens; that on a 22.3 mm sensor if none.",
         ),
     ] = None,
     rim: Annotated[
         float,
-        typer.Option("--rim-mm", min=-20, max=20, help="Put the faces' circles behind rims so high; raised if < 0."),
+        typer.Option(
+            "--rim-mm", min=-20, max=20, help="Set the height of rims before the faces' circles; raised if < 0."
+        ),
     ] = 0.0,
     clutter: Annotated[bool, typer.Option("--clutter/--clean", help="Add lamps, discs and a checkered wall.")] = False,
     target: TargetFile = None,
