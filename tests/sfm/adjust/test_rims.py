@@ -1,0 +1,72 @@
+"""Rims in front of circles, from the change of their radii with tilt, and faces of the surface behind them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stcal.io.design import load_target, target_toml
+from stcal.sfm.adjust.rims import Rim, find_rims
+from stcal.sfm.checks.board import rim_check
+from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.image import detect_image
+from stcal.sfm.detect.labels import label_single
+from stcal.sfm.planning.nominal import true_models
+from stcal.synthetic.render import RenderOptions, render
+from stcal.synthetic.scene import SceneOptions, make_scene
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(SceneOptions(seed=6, width=1944, height=1296, images_per_group=6, groups=(("1", "2"),)))
+
+
+def rims_of(scene, rim_mm):
+    images = []
+    for i in range(6):
+        picture = render(scene, "12", i, RenderOptions(seed=5, rim_mm=rim_mm, clutter=False))
+        found = detect_image(picture, scene.camera, scene.target, None, EllipseOptions())
+        images.append(label_single(f"12/{i:04d}", "12", found, scene.target).observations)
+    radius = scene.target.radius_of() | scene.board.radius_of()
+    return find_rims(true_models(scene, images), images, radius, scene.camera)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rim_mm", [0.3, 0.15])
+def test_the_height_of_a_rim_is_found(scene, rim_mm):
+    """Within 10 %, as the area of the lens-shaped image is that of an ellipse to second order alone, and within 3 σ."""
+    rim = rims_of(scene, rim_mm)["circles"]
+    assert rim.height_mm == pytest.approx(rim_mm, abs=0.1 * rim_mm + 3 * rim.sigma_mm)
+    assert rim.height_mm > 4 * rim.sigma_mm
+    check = rim_check({"circles": rim}, 0.002)
+    assert check.verdict == "suspicious"
+    assert "in front of the luminous surface" in check.reason
+    assert rim_check({"circles": rim}, 0.002, rim_mm).verdict == "passed"
+
+
+@pytest.mark.slow
+def test_no_rim_is_found_where_there_is_none(scene):
+    rims = rims_of(scene, 0.0)
+    assert abs(rims["circles"].height_mm) < 3 * rims["circles"].sigma_mm
+    assert rim_check(rims, 0.002).verdict == "passed"
+
+
+def test_without_tilts_nothing_is_said():
+    assert rim_check({}, 0.002).verdict == "not possible"
+
+
+def test_a_rim_that_harms_nothing_is_no_fault():
+    """It is seen with certainty, and moves faces by less than their σ."""
+    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.02).verdict == "passed"
+    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.002).verdict == "suspicious"
+
+
+def test_a_design_states_its_rims(scene, tmp_path):
+    face = scene.target.faces[0]
+    heights = np.where(np.arange(len(face.ids)) == 2, -0.1, 0.25)
+    target = replace(scene.target, faces=(replace(face, rim_mm=heights), *scene.target.faces[1:]))
+    (tmp_path / "target.toml").write_text(target_toml(target), encoding="utf-8")
+    read = load_target(tmp_path / "target.toml")
+    np.testing.assert_array_equal(read.faces[0].rim_mm, heights)
+    assert read.faces[1].rim_mm is None
+    assert read.rim_of() == dict(zip(face.labels(), heights.tolist(), strict=True))
