@@ -171,7 +171,8 @@ def test_rows_with_two_payloads_tell_how_compliant_the_arm_is():
     assert found.weighting.sigma_mm == pytest.approx(0.05, rel=0.25)
     own, sigma = (each.compliance[:3, 0] for each in (found.robot.elasticity, found.elasticity_sigma))
     assert np.abs((own - true.elasticity.compliance[:3, 0]) / sigma).max() < 3.5
-    assert (found.robot.elasticity.payload_centre == CENTRE).all()
+    # the same place, in a flange frame that rows of another arm put elsewhere by their own errors, about 1 mm
+    assert np.abs(found.robot.elasticity.payload_centre - CENTRE).max() < 3.0
     assert found.robot.elasticity.payload_kg == 0.0
     without = identify(nominal, replace(data, conditions=USUAL), IdentifyOptions(model="elastic", folds=0))
     assert sag_error(without.robot, true, 100.0) > 0.4
