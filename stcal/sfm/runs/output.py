@@ -67,6 +67,7 @@ def report_of(result: RunResult) -> ReportFile:
                 "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
                 "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
                 "last_move_px": result.calibration.joint.last_move_px if result.calibration.joint else None,
+                "rim_mm": float(np.mean(rims)) if (rims := list(result.calibration.rim_mm.values())) else None,
             },
             "faces": {face: _face(result, face) for face in result.target.target_from_face},
             "between_faces": _between(result),

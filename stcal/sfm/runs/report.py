@@ -51,6 +51,7 @@ class Summary(Part):
     sigma0: float | None
     redundancy: int | None
     last_move_px: float | None
+    rim_mm: float | None = None
 
 
 class FaceRow(Part):
@@ -246,7 +247,8 @@ class ReportFile(ResultFile):
         "`sigma_factor` by which the residuals of the single groups exceed the centres' own σ, `circle_sigma_factor` "
         "of the circles of the faces and `dot_sigma_factor` of the dots, which multiply these σ; `scale_sigma_ppm`: σ "
         "of the size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
-        "moved a projection at most (settled: less than 1e-6); these four are null with `chain` and `paper`"
+        "moved a projection at most (settled: less than 1e-6); these four are null with `chain` and `paper`; "
+        "`rim_mm` mean height of the rims behind which the faces lie, null where they are as seen"
     )
     faces: dict[ByFace, FaceRow] = Field(
         description="`target_from_face`, `translation_mm`, `angle_to_reference_deg`, `translation_sigma_um` and "
