@@ -29,7 +29,7 @@ from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.model import CalibratedCamera, CameraPrior, intrinsic_basis
 from stcal.labels import CircleLabel
 from stcal.parallel import one_thread
-from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.calibration import SigmaFactors, calibrate, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import JointResult, adjusted
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
@@ -157,19 +157,19 @@ def drawn(case: Case, which: str, single: np.ndarray, rng: np.random.Generator, 
     return Draw(models, circles)
 
 
-def whole(case: Case, draw: Draw) -> tuple[JointResult, list[MetricModel], float, CalibratedTarget]:
-    """``calibrate`` as in a run: joint adjustment, its models, the factor on σ of the centres, the start."""
+def whole(case: Case, draw: Draw) -> tuple[JointResult, list[MetricModel], SigmaFactors, CalibratedTarget]:
+    """``calibrate`` as in a run: joint adjustment, its models, the factors on σ of the centres, the start."""
     models = [adjust(m, case.camera).in_world(Similarity(1.0, Rigid())) for m in draw.models]
     options = RunOptions(refine_camera=case.refined).adjustment(case.scene.target)
     result = calibrate(models, case.camera, case.scene.target, case.board, options, case.prior)
-    return result.joint, list(result.models), result.sigma_factor, result.target
+    return result.joint, list(result.models), result.sigma_factors, result.target
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stated:
-    """What one calibration states: ``factor`` on σ of the centres, the board's ``common`` share, and the ``budget``."""
+    """Statements of one calibration: ``factors`` on σ of the centres, the board's ``common`` share, ``budget``."""
 
-    factor: float
+    factors: SigmaFactors
     common: float
     budget: Budget
 
@@ -177,7 +177,7 @@ class Stated:
 def stated_by(case: Case) -> Stated:
     """Of one simulated calibration in which all inputs err."""
     draw = drawn(case, ALL, single_inputs(99, 40)[7], np.random.default_rng(99))
-    _, models, factor, start = whole(case, draw)
+    _, models, factors, start = whole(case, draw)
     start = replace(start, target_from_group=dict.fromkeys(start.target_from_group, Rigid()))
     state = adjusted(models, case.board, case.camera, case.flatness_mm, case.prior)
     found = contributions_of(state)
@@ -185,7 +185,7 @@ def stated_by(case: Case) -> Stated:
     rows = budget(
         found, own, case.camera, case.board, case.flatness_mm, case.refined, case.statement, start.reference_face
     )
-    return Stated(factor, found.joint.board_common, rows)
+    return Stated(factors, found.joint.board_common, rows)
 
 
 def errors(
@@ -197,7 +197,7 @@ def errors(
     if which == ALL:
         joint = whole(case, draw)[0]
     else:
-        weighed = [replace(m, covariance_px2=stated.factor**2 * m.covariance_px2) for m in draw.models]
+        weighed = [with_sigma(m, stated.factors) for m in draw.models]
         camera: Camera = case.camera
         joint = adjusted(weighed, case.board, camera, case.flatness_mm, case.prior, common=stated.common).result()
     true = np.array([draw.circles[label] for label in joint.labels])
