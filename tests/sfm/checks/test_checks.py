@@ -268,7 +268,7 @@ def test_a_run_reports_a_blurred_photograph(small_set, small_scene):
 def test_a_run_of_photographs_passes(small_run):
     checks = json.loads((small_run / "report.json").read_text(encoding="utf-8"))["checks"]
     assert {check["verdict"] for check in checks} <= {"passed", "not possible"}
-    assert len({check["key"] for check in checks}) == len(checks) == 19
+    assert len({check["key"] for check in checks}) == len(checks) == 20
     assert all(set(check) == set(checks[0]) for check in checks)
     assert "19 " not in count_verdicts([check["verdict"] for check in checks])
     assert "not possible" in checks_values(checks)["verdicts"]
