@@ -113,7 +113,14 @@ class RunOptions:
         """
         for face in self.expect_faces:
             target.face(face)
-        return replace(self, **asdict(self.adjustment(target)))
+        settled = replace(self, **asdict(self.adjustment(target)))
+        if settled.solve != "joint" and (self.rim or any(target.rim_of().values())):
+            raise InputError(
+                "E-RIM-SOLVE",
+                f"--solve {settled.solve} with {'--rim' if self.rim else 'rim_mm of the target'}: rims are corrected by the "
+                "joint adjustment alone; use --solve joint, or leave the rims out",
+            )
+        return settled
 
     def faces_expected(self, groups: Iterable[str], target: TargetDesign) -> list[str]:
         """Returns the faces that the photographs were to show, in the order of the design.

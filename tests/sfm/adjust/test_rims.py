@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.errors import InputError
 from stcal.io.design import load_target, target_toml
 from stcal.sfm.adjust.rims import Rim, find_rims
 from stcal.sfm.checks.board import rim_check
@@ -12,6 +13,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import label_single
 from stcal.sfm.planning.nominal import true_models
+from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene
 
@@ -59,6 +61,14 @@ def test_a_rim_that_harms_nothing_is_no_fault():
     """It is seen with certainty, and moves faces by less than their σ."""
     assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.02).verdict == "passed"
     assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.002).verdict == "suspicious"
+
+
+@pytest.mark.parametrize("solve", ["chain", "paper"])
+def test_rims_need_the_joint_adjustment(scene, solve):
+    with pytest.raises(InputError, match="--solve joint") as error:
+        RunOptions(solve=solve, rim=True).settled(scene.target)
+    assert error.value.code == "E-RIM-SOLVE"
+    assert RunOptions(rim=True).settled(scene.target).rim
 
 
 def test_a_design_states_its_rims(scene, tmp_path):

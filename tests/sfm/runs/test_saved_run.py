@@ -36,7 +36,7 @@ OTHER = RunOptions(
     exclude=("12/a.jpg", "b.jpg"),
     expect_faces=("1", "2"),
 )
-SPECIAL = ("refine_camera", "compare", "board_only")
+SPECIAL = ("refine_camera", "rim", "compare", "board_only")
 """No value is a default but those that only the joint adjustment knows, and that of runs without faces."""
 
 
