@@ -117,8 +117,8 @@ class RunOptions:
         if settled.solve != "joint" and (self.rim or any(target.rim_of().values())):
             raise InputError(
                 "E-RIM-SOLVE",
-                f"--solve {settled.solve} with {'--rim' if self.rim else 'rim_mm of the target'}: rims are corrected by "
-                "the joint adjustment alone; use --solve joint, or leave the rims out",
+                f"--solve {settled.solve} with {'--rim' if self.rim else 'rim_mm of the target'}: only the joint "
+                "adjustment corrects rims; use --solve joint, or leave the rims out",
             )
         return settled
 
