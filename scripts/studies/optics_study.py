@@ -5,7 +5,8 @@
 For each set of `../shared/data/stereo_target`, JPEG and PNG where both exist, `stcal-sfm run` with its default options.
 Columns: largest error of a face's place (µm) and rotation (mdeg); largest normalised error √(eᵀC⁻¹e/6) of a face; χ² of
 all circles of the faces with their joint covariance, after the best rigid motion, per degree of freedom; largest
-correction for defocus, px; wrong labels; verdict, and the checks that did not pass. `--rim` : runs that estimate rims.
+correction for defocus, px; wrong labels; verdict, and the checks that did not pass.
+`--rim` : runs that estimate rims, and their height.
 """
 
 import argparse
@@ -72,8 +73,14 @@ def row_of(name: str, images: Path, folder: Path, run: Path, options: list[str])
         f"{chi2 / freedom:.2f}",
         f"{max((row['shift_px'] for row in report['focus']), default=0.0):.4f}",
         str(wrong),
+        *([_rim(report)] if "--rim" in options else []),
         f"{report['judgement']['verdict']}{': ' if bad else ''}{', '.join(bad)}",
     ]
+
+
+def _rim(report: dict) -> str:
+    """Height of the rim that the run found in front of the circles of the faces, mm."""
+    return f"{report['summary']['rim_mm'] or 0.0:.3f}"
 
 
 def main() -> None:
@@ -94,7 +101,17 @@ def main() -> None:
                 form = " PNG" if images.name.endswith("png") else ""
                 run = runs / f"{name}{form.strip().lower()}"
                 rows.append(row_of(name + form, images, args.data / name, run, ["--rim"] if args.rim else []))
-    heads = ["<set", "faces µm", "mdeg", "worst σ", "χ²/dof", "defocus px", "wrong", "<verdict"]
+    heads = [
+        "<set",
+        "faces µm",
+        "mdeg",
+        "worst σ",
+        "χ²/dof",
+        "defocus px",
+        "wrong",
+        *(["rim mm"] if args.rim else []),
+        "<verdict",
+    ]
     print("\n".join(text_table([heads, *rows])))
 
 

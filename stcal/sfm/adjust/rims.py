@@ -58,7 +58,7 @@ def radius_views(
 
     The areas of the circles' images follow from the dual conic r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3),
     with the estimated planes of the faces. A blur of σ takes σ²/2R off the radius R of a disc's image, and the fit
-    follows by 0.9 to 1.2 of it; this is put back.
+    follows by about as much (``scripts/studies/defocus_study.py``); this is put back.
     """
     focal = float(np.sqrt(camera.focal.prod()))
     rows = model.rows_by_image()
