@@ -89,6 +89,7 @@ def test_tests_have_one_thread():
     assert threads() == {1}
 
 
+@pytest.mark.slow
 def test_the_limit_ends_with_the_outermost_call(said):
     assert said[OUTERMOST] == [CORES, "1", "1", "1", CORES]
 
@@ -119,6 +120,7 @@ def process(_) -> int:
     return os.getpid()
 
 
+@pytest.mark.slow
 def test_processes_are_kept_from_call_to_call():
     with kept_processes(2):
         first = {found for _, found in run_parallel(process, [(i,) for i in range(6)])}
@@ -158,6 +160,7 @@ def test_brief_work_goes_on_here_when_a_process_is_ended():
         load_in_processes("json")
 
 
+@pytest.mark.slow
 def test_files_beside_the_user_are_no_modules(tmp_path):
     """A folder with files named like libraries, where a program works in several processes."""
     for name in ("numpy", "scipy", "stcal"):

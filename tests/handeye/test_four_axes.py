@@ -23,7 +23,7 @@ def scara(rng, count=12, setup="eye-to-hand", sigma=(5e-4, 0.1)):
 def test_four_axes_give_all_but_one_number():
     """BASE_FROM_CAMERA but for its height, which is said; the chain still closes."""
     pairs = scara(np.random.default_rng(10))
-    with fails_with("E-HANDEYE-AXES … 0 … 0 … 1 … 1 … 0 … 1 … 0 … four_dof"):
+    with fails_with("E-HANDEYE-AXES … (0, 0, 1) … four_dof"):
         handeye(pairs, "eye-to-hand")
     found = handeye(pairs, "eye-to-hand", options=HandEyeOptions(four_dof=True))
     away = BASE_FROM_CAMERA.inverse() @ found.base_from_camera

@@ -114,6 +114,7 @@ def test_board_arrays():
     assert board.radius_of() == dict(zip(board.labels(), [2.0, 2, 2, 2, 2, 3], strict=True))
 
 
+@pytest.mark.slow
 @given(st.floats(-np.pi, np.pi), st.floats(-500, 500), st.floats(-500, 500))
 def test_any_right_handed_drawing_frame_gives_the_same_face(tmp_path_factory, angle, x, y):
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -134,6 +135,7 @@ identifiers = st.text(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(identifiers, min_size=4, max_size=4, unique=True), st.text(st.characters(codec="utf-8")))
 def test_any_allowed_id_and_any_name_survive(tmp_path_factory, ids, name):
     xy = [[0, 0], [40, 0], [0, 40], [40, 40]]

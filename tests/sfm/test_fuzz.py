@@ -41,6 +41,7 @@ def shortest_first() -> list[tuple[int, str]]:
     return [(n, calls[n].command) for n in sorted(range(CASES), key=lambda n: calls[n].seconds)]
 
 
+@pytest.mark.slow
 def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, tmp_path):
     cases = shortest_first()
     first = {command: n for n, command in reversed(cases)}
@@ -75,6 +76,7 @@ QUICK = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_a_mistake_is_told(stock, tmp_path, name):
     assert name in MISTAKES

@@ -105,6 +105,7 @@ def test_wrong_rows_are_named_beside_elasticity():
     assert elsewhere(found, true) < 0.1
 
 
+@pytest.mark.slow
 def test_a_written_file_that_predicts_otherwise_is_an_error(tmp_path):
     _, data = drawn(60, 12)
     found = identify(mh80(), data, IdentifyOptions(folds=0, model="elastic"))

@@ -88,6 +88,7 @@ def with_rows_exchanged(robot):
     return replace(robot, rows=tuple(rows))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mistaken", "named"),
     [
@@ -102,6 +103,7 @@ def test_mistakes_in_the_rows_are_named(mistaken, named):
         start(mistaken(mh80()), replace(seen(5, 40), rotations=None))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "named"),
     [

@@ -78,6 +78,7 @@ PLANTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLANTED)
 def test_the_planted_cause_is_named_first(few, lab, name):
     plant, words = PLANTED[name]
@@ -108,6 +109,7 @@ def test_what_some_images_have_is_no_cause_of_the_whole_set(few, lab, places):
     assert check.names[0] in {images[k].name for k in places} or len(places) == 2  # 2 of 4: either half may be wrong
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zoom", [0.001, 0.003, 0.01])
 @pytest.mark.parametrize("place", [2, 5])
 def test_one_image_of_another_focus_is_no_cause_of_the_whole_set(few, lab, place, zoom):

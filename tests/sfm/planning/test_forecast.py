@@ -397,6 +397,7 @@ def test_advise_without_the_final_model(stcal_sfm, small_run, tmp_path):
     assert "target_model: damaged or incomplete" in error
 
 
+@pytest.mark.slow
 def test_plan_command(stcal_sfm, tmp_path):
     code, text, _ = stcal_sfm("plan", "--width", 2592, "--images", 2, "--json", tmp_path / "plan.json")
     content = json.loads((tmp_path / "plan.json").read_text())
