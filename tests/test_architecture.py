@@ -17,7 +17,7 @@ MOST_ENTRIES = 16
 """Of ``sfm/``, folders and files."""
 
 LAYERS = (
-    ("errors", "parallel", "cross_validation"),
+    ("errors", "parallel", "cross_validation", "row_order"),
     ("geometry",),
     ("design", "labels", "lookalikes"),
     ("io",),
@@ -41,7 +41,7 @@ INSIDE = {
         ("interop", "diagnose", "planning", "budget", "make"),
         (".",),
     ),
-    "robot": (("kinematics",), ("identification", "axes", "urdf"), ("use",), ("export",), (".",)),
+    "robot": (("kinematics",), ("identification", "urdf"), ("axes",), ("use",), ("export",), (".",)),
     "register": (("core",), ("judge", "workspace"), (".",), ("report",)),
     "handeye": (("data",), ("methods",), ("judge",), (".",), ("rig",), ("report",)),
     "locate": (("data",), ("pose", "calibration"), (".",), ("report",)),

@@ -108,7 +108,7 @@ def register(
     from stcal.register import register as registered
     from stcal.register.core.liu2017 import Liu2017Options, sample_sizes
     from stcal.register.core.pairs import read_pairs
-    from stcal.register.report.file import RegistrationFile
+    from stcal.register.report.file import RegistrationFile, require_registration_written
     from stcal.register.report.page import registration_page, registration_text, sample_size_section
     from stcal.register.workspace.findings import findings
 
@@ -143,6 +143,7 @@ def register(
     print_each(f"warning: {pairs.where}", result.notes)
     content, sections, failed = RegistrationFile.of(registration), [], None
     if robot_file:
+        from stcal.robot.identification.result import require_identified_written
         from stcal.robot.kinematics.file import robot_toml
         from stcal.workflows.register_robot import compared, comparison_section, comparison_text, robot_part
 
@@ -154,10 +155,12 @@ def register(
             if identified:
                 comments = [f"Identified from {name_of(source)}: {beside.identified.rank} parameters."]
                 write(identified, robot_toml(beside.identified.robot, comments))
+                require_identified_written(identified, beside.identified)
         except (DegenerateError, ConvergenceError) as error:  # the transform is valid without it
             failed = error
     if out:
         write(out, content)
+        require_registration_written(out, registration)
     if report:
         if liu2017:
             limits = liu2017 if threshold is None else replace(liu2017, limit_mm=threshold)

@@ -165,6 +165,10 @@ def write(path: Path, content, said: str = "written") -> None:
         taker.flush()
         return
     files.save(path, content if isinstance(content, str | bytes) else files.json_text(content))
+    if not isinstance(content, str | bytes | dict):
+        from stcal.io.json import require_result_written
+
+        require_result_written(path, content)
     say(f"{said}: {path}")
 
 

@@ -276,7 +276,7 @@ def _by_poses(task: _Task) -> HandEye:
         require_scale(state.scale, sigma_scale, task.loop, task.pairs.where)
     if options.four_dof:
         x, z, covariance, notes = _without_slide(task, x, z, normal)
-    notes += _remarks(task, solution.outliers, solution.residuals, solution.scale_hint)
+    notes += _remarks(task, x, solution.outliers, solution.residuals, solution.scale_hint)
     if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
         notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
     if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
@@ -327,7 +327,7 @@ def _by_views(task: _Task, views: Views) -> HandEye:
         covariance = solution.camera_error.covariance(covariance)
     adjusted = replace(solution.loop, camera_from_board=resected(names, views, solution.found))
     residuals = adjusted.residuals(x, z)
-    notes += _remarks(task, solution.outliers, residuals, solution.scale_hint)
+    notes += _remarks(task, x, solution.outliers, residuals, solution.scale_hint)
     notes += of_camera_file(solution.camera_gain, solution.sigma)
     return HandEye(
         method="reprojection",
@@ -405,11 +405,14 @@ def _contradicted(
     return any(found) and worse > REST_WORSE
 
 
-def _remarks(task: _Task, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]) -> tuple[str, ...]:
-    """Returns notes on outliers, groups of poses, the board's size, and distances."""
+def _remarks(
+    task: _Task, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]
+) -> tuple[str, ...]:
+    """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
     names = tuple(name for name, bad in zip(task.pairs.names, outliers, strict=True) if not bad)
     notes = remarks.of_outliers(task.pairs.names, outliers, residuals)
-    notes += remarks.of_groups(names, residuals[~outliers])
+    moved = remarks.of_order(task.pairs.names, residuals, task.loop.jacobian(x)[:, :, :12])
+    notes += moved or remarks.of_groups(names, residuals[~outliers])
     if not (task.options.with_scale or task.options.four_dof):
         notes += remarks.of_size(task.loop[~outliers], hint, task.options.noise)
     return notes + remarks.of_distance(task.loop)

@@ -19,7 +19,7 @@ from stcal.design import (
 )
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save
 from stcal.io.toml import (
     Finite,
     Length,
@@ -464,3 +464,11 @@ def board_toml(board: BoardDesign) -> str:
 
 def _number(value: float) -> str:
     return repr(round(float(value), 9) + 0.0)
+
+
+def save_design(path: str | Path, design: TargetDesign | BoardDesign) -> None:
+    """Write the file of a target or a board, and require that it is read as the same design."""
+    target = isinstance(design, TargetDesign)
+    text = target_toml(design) if target else board_toml(design)
+    save(Path(path), text)
+    require_same(path, lambda: target_toml(load_target(path)) if target else board_toml(load_board(path)), text)

@@ -6,6 +6,7 @@ that was given as None is null. Arrays and poses are lists of numbers in the fil
 
 import json
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -17,7 +18,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
 from stcal.io.covariance import OF_POINT, OF_POSE, Rows, require_covariance
-from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.files import TABLE_BYTES, json_text, read_bytes, require_same
 
 LONGEST = 80
 """Largest number of characters of a value that a message shows."""
@@ -222,3 +223,9 @@ def read_result(path: str | Path, model: type[F], what: str, remedy: str) -> F:
         return checked(content, model)
     except InputError as error:
         raise InputError(error.code, f"{what} {path}: {error}; {remedy}") from error
+
+
+def require_result_written(path: str | Path, content: ResultFile) -> None:
+    """Read a written result file again, and require the same content."""
+    again = partial(read_result, path, type(content), "result file", "report this with its data")
+    require_same(path, lambda: json.loads(json_text(again())), json.loads(json_text(content)))

@@ -3,7 +3,7 @@
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
-from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.files import TABLE_BYTES, read_bytes, require_written
 from stcal.io.quaternions import COLUMNS as QUATERNION
 from stcal.io.quaternions import Order, require_unit
 
@@ -494,3 +494,26 @@ def _number(text: str) -> float:
 
 def _is_number(text: str) -> bool:
     return np.isfinite(_number(text))
+
+
+LEVER_MM = 1000.0
+"""Distance at which an error of rotation is compared as one of position, mm."""
+POSE_MM = 1e-6
+"""Largest difference of a written pose, mm at :data:`LEVER_MM`. Decimals of degrees and quaternions cause less."""
+
+
+def pose_values(poses: Poses | Mapping[str, Rigid]) -> np.ndarray:
+    """Returns poses as lengths (m, 3, 4), mm: rotations at :data:`LEVER_MM`, and translations."""
+    matrices = [pose.matrix() for pose in poses.values()] if isinstance(poses, Mapping) else poses.matrix()
+    return np.reshape(matrices, (-1, 4, 4))[:, :3] * np.array([LEVER_MM] * 3 + [1.0])
+
+
+def require_poses_written(path: str | Path, read: Callable[[], Poses | Mapping[str, Rigid]], poses) -> None:
+    """Read a written file again, and require that its poses are ``poses``, of the type that ``read`` returns."""
+    require_written(path, lambda: pose_values(read()), pose_values(poses), POSE_MM, "mm")
+
+
+def require_pose_table_written(path: str | Path, poses: Mapping[str, Poses]) -> None:
+    """Read a written table again, and require that its poses are ``poses``, by the prefix of their columns."""
+    for prefix, own in poses.items():
+        require_poses_written(path, lambda prefix=prefix: read_table(path, "poses").poses(prefix), own)

@@ -21,9 +21,10 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.forms import kalibr_chain
 from stcal.io.cameras.model import CalibratedCamera, CameraModel, cameras_txt
+from stcal.io.cameras.write import require_camera_written
 from stcal.io.files import json_text
 from stcal.io.images import ImageFile, Skipped, find_images, name_fault, require_common_size
-from stcal.io.json import ResultFile
+from stcal.io.json import ResultFile, require_result_written
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress, one_thread
 from stcal.sfm.camera.calibrate import (
@@ -393,3 +394,12 @@ def files_of(rig: RigCalibration) -> tuple[dict[str, str], list[str]]:
     except InputError as error:
         missing.append(f"no {CHAIN_FILE}: {error}")
     return files, missing
+
+
+def require_rig_written(out: Path, files: Mapping[str, str], rig: RigCalibration) -> None:
+    """Read the camera files among ``files`` of :func:`files_of` in folder ``out`` again, and require the cameras."""
+    for number, (name, calibration) in enumerate(zip(rig.names, rig.cameras, strict=True)):
+        require_camera_written(out / f"{name}.txt", calibration.intrinsics.camera)
+        if CHAIN_FILE in files:
+            require_camera_written(out / CHAIN_FILE, calibration.intrinsics.camera, f"cam{number}")
+    require_result_written(out / RIG_FILE, RigCalibrationFile.of(rig))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from stcal.cli.main import MESSAGE_CHARACTERS
+from stcal.io.files import require_written
 from tests.commands import CALLS, COMMANDS, options_of
 from tests.fuzzing.cases import BRIEF_S, Judged, chosen, judged
 from tests.fuzzing.judged import EARLIER, OUT, Outcome, failures, hashes, in_process, lay_out
@@ -95,6 +96,22 @@ FIRST = [n for n, call in enumerate(CALLS) if call.command not in {before.comman
 )
 def test_calls_go_through(stock, tmp_path, number):
     assert went_through(stock, tmp_path / "case", number).failures == ()
+
+
+INIT = next(n for n, call in enumerate(CALLS) if call.command == "robot init")
+
+
+@pytest.mark.parametrize(
+    ("kind", "instead"),
+    [
+        ("not read again", lambda path, robot: None),
+        ("check is blind", lambda path, robot: require_written(path, lambda: 0.0, 0.0, 0.0, "mm")),
+    ],
+)
+def test_a_writer_without_a_check_is_found(stock, tmp_path, monkeypatch, kind, instead):
+    """Every file that a call writes is read again (`test_calls_go_through`), and its check sees another number."""
+    monkeypatch.setattr("stcal.robot.kinematics.file.require_robot_written", instead)
+    assert went_through(stock, tmp_path / "case", INIT).failures == ((kind, "robot.toml"),)
 
 
 @pytest.fixture

@@ -253,10 +253,18 @@ def handeye(
     """Find where a camera sits on a robot's flange, or in its base, and how well that is known."""
     from stcal.handeye import HandEyeOptions, Noise
     from stcal.handeye.data.formats.record import Said
-    from stcal.handeye.report.export import exported, opencv_yaml, require_form, ros_yaml, urdf_joint
+    from stcal.handeye.report.export import (
+        exported,
+        opencv_yaml,
+        require_export_written,
+        require_form,
+        ros_yaml,
+        urdf_joint,
+    )
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.outcome import judged
     from stcal.handeye.report.page import outcome_page, outcome_text
+    from stcal.io.files import require_same
     from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye.calibrate import AUTO, Splits, calibrate
     from stcal.workflows.handeye.inputs import dry_run as understood
@@ -345,8 +353,12 @@ def handeye(
     ):
         if path:
             write(path, content())
+    for path, kind in ((out, "json"), (ros, "ros"), (urdf, "urdf"), (opencv, "opencv")):
+        if path:
+            require_export_written(path, kind, result, parent, child, camera_frame.value)
     for form, path in exports:
-        write(path, exported(result, form, path.stem, parent, child, camera_frame.value))
+        write(path, text := exported(result, form, path.stem, parent, child, camera_frame.value))
+        require_same(path, path.read_text, text)  # which gave the transform back
     if camera_out:
         _save_camera(camera_out, outcome)
     if robot_out and inputs.arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
@@ -449,7 +461,8 @@ def _evolution(method: str | None, **given) -> "EvolutionOptions":
 
 
 def _save_camera(path: Path, outcome: "Outcome") -> None:
-    from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+    from stcal.io.cameras.model import CalibratedCamera
+    from stcal.io.cameras.write import save_camera
 
     reprojection = outcome.result.reprojection
     if reprojection is None:
@@ -457,9 +470,7 @@ def _save_camera(path: Path, outcome: "Outcome") -> None:
             "E-OPTION-METHOD", f"--camera-out: {outcome.result.method} does not adjust the camera; leave --method out"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_cameras_txt(
-        path, CalibratedCamera.of(reprojection.camera, outcome.colmap_model, reprojection.camera_covariance)
-    )
+    save_camera(path, CalibratedCamera.of(reprojection.camera, outcome.colmap_model, reprojection.camera_covariance))
     say(f"written: {path}")
 
 

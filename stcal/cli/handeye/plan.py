@@ -65,6 +65,7 @@ def plan(
     """Name the robot poses that would lower the worst σ at the board most, after those of a hand-eye calibration."""
     from stcal.handeye.data.formats.record import Said
     from stcal.handeye.report.planned import planned_csv, planned_file, planned_text
+    from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
     from stcal.workflows.handeye.inputs import read_input, setup_of
     from stcal.workflows.handeye.plan import plan_next
@@ -84,5 +85,7 @@ def plan(
     print_each("note", planned.notes)
     if out:
         write(out, planned_csv(planned.poses, planned.joints))
+        frames = ("base_from_flange", "camera_from_board")
+        require_pose_table_written(out, {f"{name}_": getattr(planned.poses, name) for name in frames})
     if json_file:
         write(json_file, planned_file(planned.result, planned.poses, planned.joints))

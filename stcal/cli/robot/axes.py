@@ -60,7 +60,7 @@ def axes(
     from stcal.robot.axes.model import robot_from_sweeps
     from stcal.robot.axes.report import axes_file, axes_page, axes_text
     from stcal.robot.axes.sweeps import ring
-    from stcal.robot.kinematics.file import load_robot, robot_toml
+    from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
@@ -81,6 +81,7 @@ def axes(
     print_each(f"warning: {data.where}", result.notes)
     if out:
         write(out, robot_toml(result.robot, [f"Identified by the axis method from {name_of(source)}."]))
+        require_robot_written(out, result.robot, result.chain)
     if json_file:
         write(json_file, axes_file(result))
     if report:

@@ -84,6 +84,7 @@ def compensate(
     report: ReportFile = None,
 ) -> None:
     """Compute joint values that really reach commanded poses, beside the nominal ones."""
+    from stcal.io.files import require_same
     from stcal.robot.export import exported, require_form
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import compensation as stage
@@ -110,6 +111,7 @@ def compensate(
     print_each(f"warning: {wanted.where}", result.notes())
     if out:
         write(out, stage.compensated_csv(result, identified))
+        stage.require_compensated_written(out, result, identified)
     if json_file:
         write(json_file, stage.compensation_file(result, identified))
     if report:
@@ -119,6 +121,7 @@ def compensate(
     for form, path in exports if result.found.usable.any() else ():
         exported_file = exported(result, identified, form, path, export_as.value, pulses)
         write(path, exported_file.text)
+        require_same(path, path.read_text, exported_file.text)  # which gave the points back
         print_each("note", exported_file.notes)
     if not result.found.usable.any():
         raise DegenerateError(

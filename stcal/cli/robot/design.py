@@ -56,6 +56,7 @@ def design(
     say(f"for an instrument whose {observe.value}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
     if out:
         write(out, stage.design_csv(result, robot))
+        stage.require_design_written(out, result, robot, target)
     if json_file:
         write(json_file, stage.design_file(result))
     if report:

@@ -76,6 +76,7 @@ def evaluate(
     print_each("note", data[0].notes)
     if out:
         write(out, shown.evaluated_csv(result))
+        shown.require_evaluated_written(out, result)
     if json_file:
         write(json_file, shown.evaluation_file(result))
     if report:

@@ -152,6 +152,7 @@ def measure(
     say(output.measure_text(result))
     print_each("not joined", apart)
     write(out, text, "poses")
+    output.require_table_written(out, result, table)
     if json_file:
         write(json_file, output.poses_file(result), "as JSON")
     if report:

@@ -25,15 +25,15 @@ app = typer.Typer()
 def init(folder: Annotated[Path, typer.Argument(help="Write the two files to this folder.")]) -> None:
     """Write target.toml and board.toml of the reference design, commented, to edit."""
     from stcal.design import reference_board, reference_target
-    from stcal.io.design import board_toml, target_toml
+    from stcal.io.design import save_design
 
     folder.mkdir(parents=True, exist_ok=True)
-    texts = {"target.toml": target_toml(reference_target()), "board.toml": board_toml(reference_board())}
-    for name in texts:
+    designs = {"target.toml": reference_target(), "board.toml": reference_board()}
+    for name in designs:
         if (folder / name).exists():
             raise InputError("E-OUTPUT-EXISTS", f"{folder / name}: exists; move it away, or give another folder")
-    for name, text in texts.items():
-        save(folder / name, text)
+    for name, design in designs.items():
+        save_design(folder / name, design)
         say(folder / name)
 
 

@@ -15,7 +15,7 @@ from stcal.errors import InputError
 from stcal.io.device import DARK, SATURATED, Source, checked_name, png
 from stcal.io.files import IMAGE_BYTES, json_text, read_bytes, real_place, save
 from stcal.io.images import SUFFIXES, TOP_GROUP, ImageFile, decode, find_images, grey_8bit
-from stcal.io.json import Part, ResultFile
+from stcal.io.json import Part, ResultFile, require_result_written
 from stcal.locate.data.layout import TargetLayout
 
 
@@ -265,4 +265,5 @@ def capture(
     for row, image in zip(rows, images, strict=True):
         save(folder / row.image, png(image))
     save(folder / CAPTURED, json_text(content.content()))
+    require_result_written(folder / CAPTURED, content)
     return content

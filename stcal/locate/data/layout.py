@@ -9,9 +9,12 @@ import numpy as np
 from stcal.boards.file import TagsFile, load_tags, require_sizes
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
+from stcal.io.files import require_written
 from stcal.io.toml import side, stated_unusual, toml_string
 
 WHAT = "layout file"
+WRITTEN_MM = 1e-6
+"""Largest difference of a written corner, mm: its last decimal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,6 +161,11 @@ def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
         lines += ["", "[[tag]]", f'dictionary = "{dictionary}"', f"id = {tag}", f"corners_mm = [{places}]"]
         lines.append(f"# sigma of the corners in the plane: {errors} um")
     return "\n".join(lines) + "\n"
+
+
+def require_layout_written(path: str | Path, layout: TargetLayout) -> None:
+    """Read a written layout again, and require the corners that were reported."""
+    require_written(path, lambda: load_layout(path).corners_mm, layout.corners_mm, WRITTEN_MM, "mm")
 
 
 def square(size_mm: float) -> np.ndarray:

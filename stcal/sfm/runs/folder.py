@@ -14,13 +14,14 @@ import numpy as np
 
 from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
-from stcal.io.design import board_toml, target_toml
+from stcal.io.cameras.model import CalibratedCamera
+from stcal.io.cameras.write import save_camera
+from stcal.io.design import save_design
 from stcal.io.files import BOARD, CAMERA, REFINED_CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, json_text, read_bytes, save
 from stcal.io.json import checked, read_json
 from stcal.parallel import Progress
 from stcal.report.page import pdf_of, require_pdf
-from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.adjust.file import FacesFile, require_faces_written
 from stcal.sfm.data.model import GroupModel, ImageObservations
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
@@ -105,16 +106,17 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
         write_model(folder, [model], observations, ids, result.camera)
     adjusted = CalibratedCamera.of(result.calibration.camera, result.camera.colmap_model)
     write_model(out / "target_model", result.calibration.models, observations, ids, adjusted)
-    write_cameras_txt(out / CAMERA, result.camera)
+    save_camera(out / CAMERA, result.camera)
     if (refined := result.refined_camera) is not None:
-        write_cameras_txt(out / REFINED_CAMERA, refined)
-    save(out / TARGET, target_toml(result.target_design))
-    save(out / BOARD, board_toml(result.board_design))
+        save_camera(out / REFINED_CAMERA, refined)
+    save_design(out / TARGET, result.target_design)
+    save_design(out / BOARD, result.board_design)
     report = judged(report_of(result).content())
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.circles
         faces = FacesFile.of(result.target, result.target_design, options, factor, result.calibration.rim_mm)
         save(out / "faces.json", json_text(faces.content()))
+        require_faces_written(out / "faces.json", result.target)
     write_report(out, report, out, reload_s)
     progress("report", 1, 1)
     return Judgement.model_validate(report["judgement"])
