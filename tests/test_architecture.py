@@ -56,7 +56,7 @@ LIBRARIES = {
     "pycolmap": ("sfm/mapping", "sfm/interop"),
     "sqlite3": ("sfm/mapping", "sfm/interop", "io/cameras/foreign.py"),
     "cv2": (
-        *("io/images.py", "boards", "sfm/detect", "sfm/diagnose", "synthetic"),
+        *("io/images.py", "io/photographs", "boards", "sfm/detect", "sfm/diagnose", "synthetic"),
         *("io/device.py", "io/cameras/foreign.py", "handeye/methods/closed_form.py", "sfm/mapping/pairs.py"),
     ),
 }

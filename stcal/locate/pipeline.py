@@ -7,7 +7,6 @@ from typing import Literal
 from stcal.boards.tags import other_dictionaries
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.model import CameraModel, CameraPrior
-from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode
 from stcal.locate.data.exposures import SceneFiles, SceneTags, read_scenes
 from stcal.locate.data.layout import TargetLayout
@@ -233,7 +232,7 @@ def _why_no_tag(tags: SceneTags, merged: Merged, files: SceneFiles, layout: Targ
     dictionaries = layout.dictionaries()
     used = {exposure.name for exposure in tags.readable()}
     file = next(file for file in files.files if file.name in used)
-    other_tags = other_dictionaries(decode(read_bytes(file.path, IMAGE_BYTES), file.name), dictionaries)
+    other_tags = other_dictionaries(decode(file.read(), file.name), dictionaries)
     if merged.unknown:
         names = ", ".join(str(tag) for _, tag in merged.unknown[:5])
         return f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"

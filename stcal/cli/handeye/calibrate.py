@@ -152,6 +152,10 @@ def handeye(
             help="Read the times of the images from this file: image, time_s (CSV); their names if not given.",
         ),
     ] = None,
+    times_columns: Annotated[
+        Path | None,
+        typer.Option("--times-columns", help="Read --image-times with the columns, delimiter … of this file (TOML)."),
+    ] = None,
     time_tolerance: TimeTolerance = 0.02,
     motions_held_out: Annotated[
         int | None,
@@ -275,7 +279,9 @@ def handeye(
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
     statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
-    timing = Timing(time_tolerance, image_times, time_offset)
+    if times_columns is not None and image_times is None:
+        raise InputError("E-OPTION-NEEDS", f"--times-columns {times_columns}: of times of images; give --image-times")
+    timing = Timing(time_tolerance, image_times, time_offset, times_columns)
     pairs = source_of(source, first, second, key, statements, quaternions.value, timing, columns, columns_a)
     folder = isinstance(pairs, Path) and pairs.is_dir()
     statements = replace(statements, columns=columns) if folder else statements
@@ -287,7 +293,7 @@ def handeye(
     written |= {"--robot-out": robot_out}
     written |= {"--json": json_file, "--report": report}
     read = {"source": source, "--poses": poses, "--camera": camera, "--board": board, "--a": first, "--b": second}
-    read |= {"--with-kinematics": with_kinematics, "--image-times": image_times}
+    read |= {"--with-kinematics": with_kinematics, "--image-times": image_times, "--times-columns": times_columns}
     keep_apart(
         [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
         [(name, path) for name, path in read.items() if path],

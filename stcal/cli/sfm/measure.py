@@ -58,6 +58,10 @@ def measure(
             help="Add to the table the columns of this file, joint values say; it needs a column image (CSV).",
         ),
     ] = None,
+    columns: Annotated[
+        Path | None,
+        typer.Option("--columns", help="Read --joints with the columns, delimiter … of this file (TOML)."),
+    ] = None,
     board: Annotated[
         Path | None,
         typer.Option("--board", help="Tell the dots of the board of this board.toml apart, if it is in view."),
@@ -107,7 +111,7 @@ def measure(
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
     if serve:
-        alone = {"IMAGES": images, "--json": json_file, "--report": report, "--joints": joints}
+        alone = {"IMAGES": images, "--json": json_file, "--report": report, "--joints": joints, "--columns": columns}
         alone |= {
             "--previous": previous,
             "--sequence": sequence,
@@ -125,10 +129,12 @@ def measure(
         return
     if images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, or --serve")
+    if columns is not None and joints is None:
+        raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of joint values; give it with --joints")
     load_ahead(workers)
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, target_of
-    from stcal.io.table import read_table
+    from stcal.io.join import table_of
     from stcal.sfm.measurement import images as work
     from stcal.sfm.measurement import report as output
     from stcal.sfm.measurement.pose import PoseOptions, fit_verdict
@@ -139,7 +145,7 @@ def measure(
             raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
     design = target_of(target)
     circles = read_target(faces, design)
-    table = read_table(joints, "joints") if joints else None
+    table = table_of(joints, columns, "joints") if joints else None
     options = work.MeasureOptions(
         PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipse_options(min_diameter, max_diameter), workers
     )

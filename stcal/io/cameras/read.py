@@ -15,7 +15,7 @@ import yaml
 from stcal.errors import InputError
 from stcal.io.cameras import forms, matlab, metashape
 from stcal.io.cameras.foreign import ForeignLens, numbered, of_colmap, of_database, one_of
-from stcal.io.cameras.keyed import from_keys, values_of
+from stcal.io.cameras.keyed import from_keys
 from stcal.io.cameras.model import (
     COLMAP_MODELS,
     CORRELATION,
@@ -25,11 +25,15 @@ from stcal.io.cameras.model import (
     CameraModel,
     parameter_names,
 )
+from stcal.io.cameras.photograph import is_photograph
+from stcal.io.cameras.texts import values_of, values_of_archive
 from stcal.io.covariance import Rows, require_covariance
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 
 SQLITE = b"SQLite format 3\0"
 """First bytes of an SQLite database."""
+ARCHIVE, PICKLE = b"PK\x03\x04", (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
+"""First bytes of NumPy's archives, and of Python's pickles."""
 
 
 _chosen: ContextVar[str] = ContextVar("_chosen", default="")
@@ -90,10 +94,18 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
     if forms.is_colmap_binary(content):
         return forms.from_colmap_binary(content, name, str(path))
     try:
+        if content.startswith(ARCHIVE):
+            return from_keys(values_of_archive(content), name, str(path))
         return _of_text(text_of(content), name, path)
     except InputError:
         raise
     except UnicodeDecodeError as error:
+        if content.startswith(PICKLE):
+            raise InputError(
+                "E-CAMERA-UNREADABLE",
+                f"camera file {path}: a pickle, which may hold a program and is not opened; write its arrays by "
+                "numpy.savez, or as JSON",
+            ) from error
         raise _no_text(path) from error
     except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:150]
@@ -143,6 +155,12 @@ def text_of(content: bytes) -> str:
 
 
 def _no_text(path: Path) -> InputError:
+    if is_photograph(path):
+        return InputError(
+            "E-CAMERA-UNREADABLE",
+            f"camera file {path}: a photograph; `stcal camera convert {path.name} cameras.txt` makes a start for "
+            "--refine-camera of its EXIF",
+        )
     return InputError(
         "E-CAMERA-UNREADABLE", f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML"
     )
