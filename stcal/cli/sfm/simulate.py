@@ -85,6 +85,12 @@ def simulate(
         ),
     ] = 0.0,
     clutter: Annotated[bool, typer.Option("--clutter/--clean", help="Add lamps, discs and a checkered wall.")] = False,
+    reflectance: Annotated[
+        float | None,
+        typer.Option(
+            "--table-reflectance", min=0, max=1, help="Add a table below that mirrors all of target and board."
+        ),
+    ] = None,
     target: TargetFile = None,
     board: BoardFile = None,
     groups: Annotated[
@@ -125,6 +131,7 @@ def simulate(
         noise=noise,
         blur_px=blur,
         clutter=clutter,
+        reflectance=reflectance,
         bit_depth=16 if sixteen_bit else 8,
         seed=seed,
         lens=_lens(scene, f_number, focus, focal, distance, camera),

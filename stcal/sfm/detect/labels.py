@@ -336,6 +336,8 @@ def _open(views: Readings) -> str:
 
 
 def _reflection(view: PlaneView) -> str:
+    if view.plane == BOARD:
+        return f"a board of {len(view.rows)} dots: the image of the board in a mirror; left out"
     return f"a pattern like face {view.plane}: the image of another face in a mirror; left out"
 
 

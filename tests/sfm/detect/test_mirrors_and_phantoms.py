@@ -17,9 +17,13 @@ from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.files import DetectedImage, require_upright
 from stcal.sfm.detect.labels import label_groups
 from stcal.sfm.detect.sightings import FaceSighting, ImageDetection, likeness_notes, mirror_images
-from tests.sfm.detect.degraded import study
+from stcal.synthetic.dataset import write_dataset
+from stcal.synthetic.render import RenderOptions
+from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.sfm.detect.degraded import Bench, study
 from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen, plane_centres
 from tests.support import degrade
+from tests.support.photograph import read_set
 
 FIRST = "12/IMG_1000"
 ALL = ("12", "14", "15", "23")
@@ -67,6 +71,41 @@ def two_groups(scene, labels_only):
     """Exact observations of groups 12 and 23."""
     seen = labels_only.observations(scene, 0.003, np.random.default_rng(0))
     return [[o for o in seen if o.group == group] for group in scene.groups if "2" in group]
+
+
+def test_a_table_that_mirrors_board_and_target_is_a_second_world(scene, two_groups):
+    """It moves with the real one in all images, and a face in it reads as face 3. What lies behind it goes out."""
+    own = two_groups[0]
+    group = scene.groups["12"]
+    up = group.axes[1]
+    points = np.vstack([*(scene.face_outline(face) for face in "12345"), scene.board_outline("12")])
+    turn = np.eye(3) - 2 * np.outer(up, up)
+    shift = 2 * ((points @ up).min() - OFF_MM) * up
+    left_handed = np.diag([-1.0, 1.0, 1.0])
+    pose = scene.target_from_face["2"]
+    target_from_image = Rigid(turn @ pose.rotation @ left_handed, turn @ pose.translation + shift)
+    seen = [Seen(o) for o in own]
+    for each, camera_from_target in zip(seen, group.camera_from_target, strict=True):
+        xyz = camera_from_target @ (group.board_circles_target @ turn + shift)
+        each.board(xyz[:, :2] / xyz[:, 2:], [[row, 8 - column] for row in range(7) for column in range(9)])
+        each.face("3", plane_centres(camera_from_target @ target_from_image, TARGET.face("3").xy_mm))
+    named = [(o.name, o.group, s.detection()) for o, s in zip(own, seen, strict=True)]
+    (alone,) = label_groups([named], scene.target, scene.board, FOCAL_PX)
+    for result, o in zip(alone[0], own, strict=True):
+        assert set(result.observations.labels) == set(o.labels)
+        assert sorted(result.notes) == [
+            "a board of 63 dots: the image of the board in a mirror; left out",
+            "a pattern like face 3: the image of another face in a mirror; left out",
+        ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reflectance", [0.3, 0.9])
+def test_a_shiny_table_gives_no_wrong_label(reflectance, tmp_path):
+    options = SceneOptions(seed=3, width=1300, height=867, images_per_group=3, distance_mm=1400, groups=(("1", "2"),))
+    scene = make_scene(options)
+    write_dataset(tmp_path / "set", scene, RenderOptions(clutter=True, reflectance=reflectance, seed=3), workers=1)
+    Bench(read_set(tmp_path / "set"), tmp_path / "bench").label("plain").assert_all_found()
 
 
 def test_a_face_that_another_group_has_elsewhere_goes_out(scene, two_groups):
