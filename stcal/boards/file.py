@@ -24,7 +24,7 @@ from stcal.design import BoardDesign, Polarity
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
 from stcal.io.design import BoardEntry, Count, Squares, board_design, load_board
-from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 from stcal.io.json import mistake
 from stcal.io.plain_yaml import load_yaml
 from stcal.io.toml import (
@@ -216,7 +216,7 @@ def load_tags(path: str | Path, what: str) -> TagsFile:
         The file is unreadable or invalid; the message begins with ``what``, and names file, place and reason.
     """
     try:
-        content = bundle_content(read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig"))
+        content = bundle_content(text_of(read_bytes(path, SETTINGS_BYTES)))
     except (OSError, UnicodeDecodeError):
         content = None  # the error of the reader of TOML says why
     if content is None:
@@ -282,7 +282,7 @@ def board_content(path: str | Path) -> dict[str, Any] | None:
         The file is unreadable.
     """
     try:
-        text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")
+        text = text_of(read_bytes(path, SETTINGS_BYTES))
         return tomllib.loads(text)
     except OSError as error:
         raise InputError("E-BOARD-UNREADABLE", f"board file {path}: {error.strerror or error}; {REMEDY}") from error

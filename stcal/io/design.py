@@ -19,7 +19,7 @@ from stcal.design import (
 )
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save
+from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.toml import (
     Finite,
     Length,
@@ -178,7 +178,7 @@ def load_board(path: str | Path) -> BoardDesign:
 def _require_dots(path: str | Path) -> None:
     """Refuse a file that names another kind of board; one that cannot be read is left to the reader."""
     try:
-        text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")
+        text = text_of(read_bytes(path, SETTINGS_BYTES))
     except (OSError, ValueError):
         return
     named = re.search(r"(?m)^\s*(?:type\s*=|target_type\s*:)\s*[\"']?([\w-]+)", text.split("[[")[0])

@@ -1,5 +1,6 @@
 """Reading of files within a size limit, and writing: completely or not at all, never over an input, and read again."""
 
+import codecs
 import errno
 import json
 import os
@@ -43,6 +44,19 @@ def read_bytes(path: str | Path, most: int) -> bytes:
         if not remaining:
             raise _too_large(path, most)
     return b"".join(chunks)
+
+
+def text_of(content: bytes) -> str:
+    """Return the text of a file in UTF-8, or in UTF-16 with a byte-order mark; each line ends in a line feed.
+
+    Raises
+    ------
+    UnicodeDecodeError
+        It is neither.
+    """
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = content.decode("utf-16" if wide else "utf-8-sig")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def require_size(path: str | Path, most: int) -> None:

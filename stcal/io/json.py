@@ -18,7 +18,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
 from stcal.io.covariance import OF_POINT, OF_POSE, Rows, require_covariance
-from stcal.io.files import TABLE_BYTES, json_text, read_bytes, require_same
+from stcal.io.files import TABLE_BYTES, json_text, read_bytes, require_same, text_of
 
 LONGEST = 80
 """Largest number of characters of a value that a message shows."""
@@ -187,7 +187,7 @@ def read_json(path: str | Path, what: str, remedy: str) -> dict[str, Any]:
     """
     where = f"{what} {path}".lstrip()
     try:
-        content = json.loads(read_bytes(path, TABLE_BYTES).decode("utf-8-sig"))  # Windows puts a byte-order mark first
+        content = json.loads(text_of(read_bytes(path, TABLE_BYTES)))
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; {remedy}") from error
     except (ValueError, RecursionError) as error:  # not UTF-8, a NUL in the name, a number of 5000 digits, deep nesting

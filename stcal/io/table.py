@@ -12,7 +12,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
-from stcal.io.files import TABLE_BYTES, read_bytes, require_written
+from stcal.io.files import TABLE_BYTES, read_bytes, require_written, text_of
 from stcal.io.quaternions import COLUMNS as QUATERNION
 from stcal.io.quaternions import Order, require_unit
 
@@ -253,7 +253,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
         return path
     where = f"{what} {path}"
     try:
-        text = read_bytes(path, TABLE_BYTES).decode("utf-8-sig")
+        text = text_of(read_bytes(path, TABLE_BYTES))
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
     except UnicodeDecodeError as error:

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
-from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 from stcal.io.json import first_mistake
 
 M = TypeVar("M", bound=BaseModel)
@@ -84,7 +84,7 @@ def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
         The file is unreadable, not TOML, or does not fit ``model``; the message names file, place and reason.
     """
     try:
-        text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")  # Windows editors put a byte-order mark first
+        text = text_of(read_bytes(path, SETTINGS_BYTES))
         content = tomllib.loads(text)
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{what} {path}: {error.strerror or error}; {remedy}") from error

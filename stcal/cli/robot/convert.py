@@ -109,12 +109,12 @@ def convert(
 
 def _of_universal(source: Path, nominal: Path | None, convention: "Convention") -> "tuple[Robot, list[str]] | None":
     """The arm of a file of Universal Robots, with notes; None for any other file."""
-    from stcal.io.files import SETTINGS_BYTES, read_bytes
+    from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.urdf.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
 
     try:
-        text = read_bytes(source, SETTINGS_BYTES).decode("utf-8-sig")
+        text = text_of(read_bytes(source, SETTINGS_BYTES))
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{source}: {error.strerror or error}; check the path") from error
     except UnicodeDecodeError:

@@ -1,6 +1,5 @@
 """Reading of camera files of any kind, which is recognised by the content."""
 
-import codecs
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -28,7 +27,7 @@ from stcal.io.cameras.model import (
 from stcal.io.cameras.photograph import is_photograph
 from stcal.io.cameras.texts import values_of, values_of_archive
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 
 SQLITE = b"SQLite format 3\0"
 """First bytes of an SQLite database."""
@@ -139,19 +138,6 @@ def _of_text(text: str, name: str, path: Path) -> CameraModel | ForeignLens:
     if matlab.STRUCTURE in values or "MappingCoefficients" in values:
         return matlab.from_structure(values, str(path))
     return from_keys(values, name, str(path))
-
-
-def text_of(content: bytes) -> str:
-    """Return the text of a file in UTF-8, or in UTF-16 with a byte-order mark; each line ends in a line feed.
-
-    Raises
-    ------
-    UnicodeDecodeError
-        It is neither.
-    """
-    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    text = content.decode("utf-16" if wide else "utf-8-sig")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _no_text(path: Path) -> InputError:
