@@ -37,7 +37,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
-CACHE_VERSION = 7
+CACHE_VERSION = 8
 """Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
 LOSSY = (".jpg", ".jpeg")

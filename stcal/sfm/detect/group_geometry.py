@@ -161,7 +161,8 @@ def across_groups(groups: Sequence[Arrangement], patterns: dict[str, Pattern], r
 
     A face is removed from a group in which its place differs from that in most groups. A face is added to a group if
     its place is known from other groups, even if no image of the group has a reading of it: the second look decides.
-    The places of all faces then also identify the mirror image of a face that a group does not show.
+    The places of all faces then also identify the mirror image of a face that a group does not show. A group that
+    contradicts the others, and whose faces may all be mirror images of other faces, has mirrored images and loses them.
     """
     faces = [_as_faces(group) for group in groups]
     best: Arrangement = Arrangement({}, {}, {})
@@ -175,9 +176,15 @@ def across_groups(groups: Sequence[Arrangement], patterns: dict[str, Pattern], r
             settled.append(group)
             continue
         agreed = {view.plane for view in best.views[i]}
-        reduced, foreign = group.without({p for p in group.group_from_plane if p != BOARD} - agreed)
+        faces = {p for p in group.group_from_plane if p != BOARD}
+        if faces - agreed and all(_may_be_mirrored(group, patterns, face) for face in faces):
+            reduced, foreign = group.without(faces)
+            others = [replace(reduced, foreign=foreign) if each is group else each for each in groups]
+            return across_groups(others, patterns, reach_mm)
+        reduced, foreign = group.without(faces - agreed)
         pose = best.camera_from_group[i]
         known = {p: pose @ target_from_face for p, target_from_face in best.group_from_plane.items()}
+        foreign = {k: group.foreign.get(k, ()) + foreign.get(k, ()) for k in {*group.foreign, *foreign}}
         settled.append(replace(reduced, group_from_plane=known | reduced.group_from_plane, foreign=foreign))
     cleared = [_without_reflections(group, patterns, reach_mm) for group in settled]
     reflections = [s.group_from_plane.keys() - c.group_from_plane.keys() for s, c in zip(settled, cleared, strict=True)]
@@ -432,13 +439,10 @@ def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, imag
     radii included; they stand where a mirror shows them; and most images are taken from the other plane's side."""
     if not {real, image} <= found.group_from_plane.keys():
         return False
-    views = {i: v for i, own in found.views.items() for v in own if v.plane == image}
-    labels = list(patterns[image].labels)
-    seen = {i: {labels.index(label) for label in view.labels} for i, view in views.items()}
+    seen = _circles_seen(found, patterns, image)
     own, other = (found.group_from_plane[p] @ patterns[p].xyz_mm() for p in (real, image))
     for pairs in mirrored_as(patterns[real], patterns[image]):
-        explained = [i for i, circles in seen.items() if circles <= set(pairs[:, 1].tolist())]
-        if 2 * len(explained) <= len(seen):
+        if not _in_most(seen, pairs):
             continue  # most images show circles, or radii, that the mirror image does not have
         mirror = _mirror(own[pairs[:, 0]], other[pairs[:, 1]], reach_mm)
         if mirror is None:
@@ -448,6 +452,25 @@ def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, imag
         if np.mean(sides) > 0.5:
             return True
     return False
+
+
+def _circles_seen(found: Arrangement, patterns: dict[str, Pattern], face: str) -> dict[int, set[int]]:
+    """Returns the circles of a face, as places in its pattern, by image."""
+    labels = list(patterns[face].labels)
+    views = {i: view for i, own in found.views.items() for view in own if view.plane == face}
+    return {i: {labels.index(label) for label in view.labels} for i, view in views.items()}
+
+
+def _in_most(seen: dict[int, set[int]], pairs: np.ndarray) -> bool:
+    """Whether most images show no circles but those of ``pairs``, the second places."""
+    return 2 * sum(circles <= set(pairs[:, 1].tolist()) for circles in seen.values()) > len(seen)
+
+
+def _may_be_mirrored(found: Arrangement, patterns: dict[str, Pattern], face: str) -> bool:
+    """Whether what a group shows of a face may be the mirror image of any face, itself included."""
+    seen = _circles_seen(found, patterns, face)
+    reals = [pattern for plane, pattern in patterns.items() if plane != BOARD]
+    return any(_in_most(seen, pairs) for real in reals for pairs in mirrored_as(real, patterns[face]))
 
 
 def _mirror(own: np.ndarray, other: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray] | None:

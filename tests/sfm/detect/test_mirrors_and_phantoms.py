@@ -154,6 +154,22 @@ def test_a_mirrored_image_of_which_every_face_passes_for_another_is_told_by_its_
     assert found.counts["must"] == 2 * 20
 
 
+@pytest.mark.slow
+def test_a_mirrored_group_whose_faces_pass_for_others_is_told_by_the_other_groups(bench):
+    """Faces 2, 3 and 5 of all images of group 23 pass for 4, 5 and 3, and nothing in that group contradicts."""
+    found = bench.label("mirrored", "a group", *ALL)
+    found.assert_all_found()
+    assert all(not found.labels(name, face) for name in found.images for face in "12345" if name.startswith("23/"))
+    assert "or the image is mirrored" in found.notes()
+
+
+@pytest.mark.slow
+def test_circles_blurred_beyond_their_size_give_no_wrong_label(bench):
+    """Circles of a third face at 75°, half as wide as their blur: not searched for, but seen by the first look."""
+    found = bench.label("defocus", 5.0, *ALL)
+    found.assert_all_found(0.9)
+
+
 def detected(name, faces=(), mirrored=()):
     """An image that shows these faces, or these as a mirror does."""
     nothing = Centres(*(np.zeros((0, *shape)) for shape in ((2,), (2,), (2, 2), (2, 2), *[()] * 4, (2,), ())))
