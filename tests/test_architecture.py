@@ -16,9 +16,9 @@ MOST_ENTRIES = 16
 """Of ``sfm/``, folders and files."""
 
 LAYERS = (
-    ("errors", "parallel", "cross_validation"),
+    ("errors", "parallel", "one_thread", "cross_validation"),
     ("geometry",),
-    ("design", "labels", "lookalikes"),
+    ("design", "labels", "lookalikes", "lengths"),
     ("io",),
     ("boards", "report"),
     ("synthetic", "drawing"),

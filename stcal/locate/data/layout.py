@@ -9,7 +9,8 @@ import numpy as np
 from stcal.boards.file import TagsFile, load_tags, require_sizes
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
-from stcal.io.toml import side, stated_unusual, toml_string
+from stcal.io.toml import toml_string
+from stcal.lengths import side, stated_unusual
 
 WHAT = "layout file"
 
