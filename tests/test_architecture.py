@@ -17,9 +17,9 @@ MOST_ENTRIES = 16
 """Of ``sfm/``, folders and files."""
 
 LAYERS = (
-    ("errors", "parallel", "cross_validation", "row_order"),
+    ("errors", "parallel", "one_thread", "cross_validation", "row_order"),
     ("geometry",),
-    ("design", "labels", "lookalikes"),
+    ("design", "labels", "lookalikes", "lengths"),
     ("io",),
     ("boards", "report"),
     ("synthetic", "drawing"),

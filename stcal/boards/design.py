@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, Polarity
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import frozen, require_choices
 from stcal.geometry.rigid import Rigid
 from stcal.labels import Label, dot_cells
 
@@ -194,6 +194,9 @@ class AsymmetricCirclesDesign:
     radius_mm: float | None
     polarity: Polarity
     sigma_mm: float = 0.005
+
+    def __post_init__(self):
+        require_choices(self, "asymmetric circles")
 
     def _steps(self) -> np.ndarray:
         row, place = np.divmod(np.arange(self.rows * self.columns), self.columns)

@@ -27,20 +27,8 @@ from stcal.io.design import BoardEntry, Count, Squares, board_design, load_board
 from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 from stcal.io.json import mistake
 from stcal.io.plain_yaml import load_yaml
-from stcal.io.toml import (
-    LEAST_SIDE_MM,
-    MOST_SIDE_MM,
-    Finite,
-    Length,
-    Positive,
-    Sized,
-    Strict,
-    load_toml,
-    radius,
-    require_millimetres,
-    side,
-    validated,
-)
+from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, validated
+from stcal.lengths import LEAST_SIDE_MM, MOST_SIDE_MM, Length, radius, require_millimetres, side
 
 KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles")
 """Types of flat boards."""

@@ -16,6 +16,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
+from stcal.errors import InputError
 from stcal.io import files
 
 if TYPE_CHECKING:
@@ -161,6 +162,8 @@ def said_apart() -> Iterator[None]:
 def write(path: Path, content, said: str = "written") -> None:
     """Saves text, bytes, or a dict or result file as JSON, and prints the path; ``-`` is standard output."""
     if path == STANDARD_OUTPUT and (taker := _taker.get()) is not None:
+        if getattr(taker, "name", "") == os.devnull:  # see ``entry.py``
+            raise InputError("E-OUTPUT-UNWRITABLE", "--json -: standard output is closed; give the name of a file")
         taker.write(_escaped(files.json_text(content), taker.encoding or "ascii"))
         taker.flush()
         return

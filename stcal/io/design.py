@@ -14,35 +14,23 @@ from stcal.design import (
     Polarity,
     StatedSize,
     TargetDesign,
+    board_lengths,
     reference_board,
     reference_target,
+    require_board,
+    require_distinct,
+    require_face,
+    require_ids,
 )
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
-from stcal.io.toml import (
-    Finite,
-    Length,
-    Positive,
-    Sized,
-    Strict,
-    load_toml,
-    radius,
-    require_millimetres,
-    side,
-    stated_unusual,
-    toml_string,
-)
-from stcal.labels import BOARD
-from stcal.lookalikes import MAX_GAP, MAX_RADIUS_RATIO, whole_likeness
+from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_string
+from stcal.lengths import radius, require_millimetres, stated_unusual
 
 REMEDY = "`stcal-sfm init DIR` writes one"
 ROUGH_KEYS = "rough_pose = { origin_mm, x, normal }"
 """Form of the entry in which a face of a target file may state its rough pose."""
-MIN_SINE = 0.02
-"""Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
-
-
 MIN_DIRECTION = 1e-6
 MAX_SKEW_DEG = 5.0
 """Largest deviation from a right angle between X and normal of a rough pose."""
@@ -160,13 +148,10 @@ def load_target(path: str | Path) -> TargetDesign:
         data.unusual_size,
         where,
     )
-    _no_duplicates([face.id for face in data.face], f"{where}: face id")
-    for face in data.face:
-        if face.id == BOARD:
-            raise InputError("E-TARGET-ID", f"{where}: face id {BOARD} is taken by the board; choose another")
+    require_ids([face.id for face in data.face], where)
     faces = tuple(_face(face, f"{where}: face {face.id}") for face in data.face)
-    _require_distinct(faces, where)
-    return TargetDesign(data.name, data.polarity, faces)
+    require_distinct(faces, where)
+    return TargetDesign(data.name, data.polarity, faces, data.unusual_size)
 
 
 def load_board(path: str | Path) -> BoardDesign:
@@ -192,25 +177,10 @@ def _require_dots(path: str | Path) -> None:
 
 def board_design(data: BoardEntry, where: str) -> BoardDesign:
     """Return the board of an entry; the message of an InputError begins with ``where``."""
-    require_millimetres(_board_lengths(data.pitch_mm, data.radius_mm), data.unusual_size, where)
-    if 2 * data.radius_mm >= data.pitch_mm:
-        raise InputError(
-            "E-BOARD-RADIUS", f"{where}: radius {data.radius_mm:g} mm, under half the pitch {data.pitch_mm:g} mm needed"
-        )
-    corner = None
-    if data.corner is not None:
-        corner = (data.corner.row, data.corner.column)
-        if corner[0] not in (0, data.rows - 1) or corner[1] not in (0, data.columns - 1):
-            raise InputError(
-                "E-BOARD-CORNER",
-                f"{where}: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed",
-            )
-        if not 1.15 * data.radius_mm <= data.corner.radius_mm < data.pitch_mm - data.radius_mm:
-            raise InputError(
-                "E-BOARD-CORNER",
-                f"{where}: corner radius {data.corner.radius_mm:g} mm; at least {1.15 * data.radius_mm:g} mm "
-                f"and under {data.pitch_mm - data.radius_mm:g} mm needed",
-            )
+    require_millimetres(board_lengths(data.pitch_mm, data.radius_mm), data.unusual_size, where)
+    corner = None if data.corner is None else (data.corner.row, data.corner.column)
+    corner_mm = None if data.corner is None else data.corner.radius_mm
+    require_board(data.rows, data.columns, data.pitch_mm, data.radius_mm, corner, corner_mm, where)
     return BoardDesign(
         data.rows,
         data.columns,
@@ -219,13 +189,10 @@ def board_design(data: BoardEntry, where: str) -> BoardDesign:
         data.polarity,
         data.sigma_mm,
         corner,
-        data.corner.radius_mm if data.corner else None,
+        corner_mm,
         data.stated(),
+        data.unusual_size,
     )
-
-
-def _board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:
-    return [side("pitch_mm", pitch_mm), radius("radius_mm", radius_mm)]
 
 
 def target_of(given: str | Path | TargetDesign | None) -> TargetDesign:
@@ -238,47 +205,13 @@ def board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
     return reference_board() if given is None else given if isinstance(given, BoardDesign) else load_board(given)
 
 
-def _no_duplicates(ids: list[str], what: str) -> None:
-    for i, value in enumerate(ids):
-        if value in ids[:i]:
-            raise InputError("E-TARGET-ID", f"{what} {value} occurs twice; ids must differ")
-
-
 def _face(face: _FaceFile, where: str) -> FaceDesign:
     ids = [circle.id for circle in face.circles]
-    _no_duplicates(ids, f"{where}: circle id")
-    for key in ("origin", "x", "y"):
-        if getattr(face, key) not in ids:
-            raise InputError(
-                "E-TARGET-FRAME",
-                f"{where}: {key} circle {getattr(face, key)} is not among the circles {', '.join(ids)}",
-            )
     xy = np.array([[circle.x_mm, circle.y_mm] for circle in face.circles])
     radius = np.array([circle.radius_mm for circle in face.circles])
-    gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
-    np.fill_diagonal(gap, np.inf)
-    if gap.min() <= 0:
-        i, j = np.unravel_index(gap.argmin(), gap.shape)
-        raise InputError("E-TARGET-OVERLAP", f"{where}: circles {ids[i]} and {ids[j]} overlap; move them apart")
-    origin, x, y = (xy[ids.index(getattr(face, key))] for key in ("origin", "x", "y"))
-    length_x, length_y = np.linalg.norm(x - origin), np.linalg.norm(y - origin)
-    if min(length_x, length_y) == 0:
-        raise InputError(
-            "E-TARGET-FRAME", f"{where}: frame circles {face.origin}, {face.x}, {face.y}; three different ones needed"
-        )
-    axis = (x - origin) / length_x
-    sine = float(axis[0] * (y - origin)[1] - axis[1] * (y - origin)[0]) / length_y
-    if abs(sine) < MIN_SINE:
-        raise InputError(
-            "E-TARGET-FRAME",
-            f"{where}: frame circles {face.origin}, {face.x}, {face.y} are collinear; choose three off one line",
-        )
-    if sine < 0:
-        raise InputError(
-            "E-TARGET-FRAME",
-            f"{where}: X to Y through {face.x} and {face.y} turns clockwise seen from outside; swap x and y, or "
-            "give positions as seen from outside with y up",
-        )
+    require_face(ids, xy, radius, (face.origin, face.x, face.y), where)
+    origin, x = (xy[ids.index(key)] for key in (face.origin, face.x))
+    axis = (x - origin) / np.linalg.norm(x - origin)
     face_from_drawing = np.array([axis, [-axis[1], axis[0]]])
     rough = None
     if face.rough_pose is not None:
@@ -319,32 +252,6 @@ def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline:
             "E-TARGET-OUTLINE",
             f"{where}: circle {name} reaches over outline_mm; corners in order around all circles needed",
         )
-
-
-def _require_distinct(faces: tuple[FaceDesign, ...], where: str) -> None:
-    """Refuse faces that look alike in photographs, and a face that looks the same after a rotation."""
-    for i, face in enumerate(faces):
-        for second in faces[i:]:
-            few, many = (face, second) if len(face.ids) <= len(second.ids) else (second, face)
-            like = whole_likeness(
-                few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm, np.arange(len(few.ids)) if few is many else None
-            )
-            if like is None:
-                continue
-            size = "" if abs(like.scale - 1) < 0.005 else f" at {like.scale:.2f} times the size"
-            deviation = f"places differ by up to {round(like.gap_mm, 3):g} mm, radii by {round(like.radius_mm, 3):g} mm"
-            if few is many:
-                finding = f"face {face.id} looks the same after a turn by {abs(np.degrees(like.turn_rad)):.0f}°"
-            elif len(few.ids) == len(many.ids):
-                finding = f"faces {face.id} and {second.id} have the same pattern{size}"
-            else:
-                finding = f"the {len(few.ids)} circles of face {few.id} are all on face {many.id} too{size}"
-            raise InputError(
-                "E-TARGET-LIKENESS",
-                f"{where}: {finding} ({deviation}); "
-                f"change a circle on {'it' if few is many else 'one of them'}, its place by more than "
-                f"{MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}",
-            )
 
 
 def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
@@ -448,7 +355,7 @@ def board_toml(board: BoardDesign) -> str:
                 f'polarity = "{board.polarity}"  # dots are "bright" or "dark" against the board',
                 f"sigma_mm = {_number(board.sigma_mm)}  # standard deviation of the dots' positions, per axis",
                 *(f"{key} = {_number(value)}" for key, value in sizes if value is not None),
-                *stated_unusual(_board_lengths(board.pitch_mm, board.radius_mm)),
+                *stated_unusual(board_lengths(board.pitch_mm, board.radius_mm)),
                 "",
                 "# One larger dot in a corner of the grid tells the orientation; without it the board looks the",
                 "# same after half a turn, which a run settles by comparing the images of a group.",

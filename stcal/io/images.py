@@ -86,19 +86,25 @@ class ImageFile:
 
         Raises
         ------
+        InputError
+            The file is gone. A result without it would be another one than was asked for.
         OSError
             The file cannot be read, or is too large for an image.
         """
         if self.content is not None:
             return self.content
-        data = read_bytes(self.path, IMAGE_BYTES)
+        try:
+            data = read_bytes(self.path, IMAGE_BYTES)
+        except FileNotFoundError as error:
+            reason = "was there when the work began, and is gone; put it back, or begin again without it"
+            raise InputError("E-IMAGES-GONE", f"{self.path}: {reason}") from error
         return _without_mosaic(data, self.name, self.bayer) if self.bayer else data
 
     def carried(self) -> "ImageFile":
         """Return the file with its content. An unreadable file is unchanged: its later read reports the error."""
         try:
             return replace(self, content=self.read())
-        except OSError:
+        except (OSError, InputError):
             return self
 
 
@@ -450,6 +456,27 @@ def grey_8bit(image: np.ndarray) -> np.ndarray:
 def grey_fine(image: np.ndarray) -> np.ndarray:
     """Return the image in the grey values of :func:`grey_8bit`, but without rounding."""
     return image if image.dtype == np.uint8 else image * np.float32(255.0 / _bright_end(image))
+
+
+def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "image") -> None:
+    """Refuse an array that is no grey image of 8 or 16 bits, or not of the camera's ``size``, (width, height) px.
+
+    Raises
+    ------
+    InputError
+        The message begins with ``name``.
+    """
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        remedy = "; of colours, give one: image[:, :, 1] is green" if image.ndim == 3 else ""
+        raise InputError(
+            "E-IMAGE-TYPE", f"{name}: {image.dtype} of shape {image.shape}; a grey image of 8 or 16 bits needed{remedy}"
+        )
+    if size is not None and image.shape[::-1] != size:
+        raise InputError(
+            "E-IMAGE-SIZE",
+            f"{name}: {image.shape[1]}×{image.shape[0]} px, camera {size[0]}×{size[1]} px; "
+            "give images as the camera took them",
+        )
 
 
 def same_photograph(image: np.ndarray, other: np.ndarray) -> bool:

@@ -9,7 +9,7 @@ from stcal.io.cameras.model import CameraModel, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_of, target_of
 from stcal.io.files import save
-from stcal.io.images import chosen_images
+from stcal.io.images import ImageFile, Skipped, chosen_images
 from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
@@ -28,6 +28,8 @@ from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.solve import solve_groups, ungrouped, unseen_board, usable_groups
 from stcal.sfm.runs.transaction import MarkerFile, RunFolder, run_folder
 
+ImageFiles = tuple[list[ImageFile], list[Skipped]]
+"""Files to use and files that are left out, as they were when the work began."""
 DRAWN_WITH = "matplotlib.backends.backend_svg", "mpl_toolkits.mplot3d.axes3d"
 """Modules that draw the figures of the report. They take half a second to load."""
 
@@ -76,15 +78,15 @@ def run(
     model = camera if isinstance(camera, CameraModel) else read_camera(camera)
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
     options = options or RunOptions()
-    chosen_images(images, options.exclude)
+    files = chosen_images(images, options.exclude)
     designs = target_of(target), board_of(board)
     options = options.settled(designs[0])
     if options.compare:
         require_comparable(options.adjustment(designs[0]))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
-        result = _calibrated(images, model, folder, *designs, options, progress)
+        result = _calibrated(files, model, folder, *designs, options, progress)
         if options.compare and result.target.target_from_face:
-            published = _published(images, model, folder, *designs, options, progress)
+            published = _published(files, model, folder, *designs, options, progress)
             result = replace(result, comparison=compare_with_paper(result, published))
         result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera)), progress))
         result = replace(result, calibration=_on_surface(result))
@@ -92,7 +94,7 @@ def run(
 
 
 def _calibrated(
-    images: str | Path,
+    files: ImageFiles,
     model: CameraModel,
     folder: RunFolder,
     target: TargetDesign,
@@ -100,7 +102,7 @@ def _calibrated(
     options: RunOptions,
     progress: Progress,
 ) -> RunResult:
-    detection, labelled = labelled_images(images, model, folder, target, board, options, progress)
+    detection, labelled = labelled_images(files, model, folder, target, board, options, progress)
     with overlays_beside(detection, labelled, target, folder.stage, progress):
         return _solved(detection, labelled, model, folder, target, board, options, progress)
 
@@ -126,7 +128,7 @@ def _on_surface(result: RunResult) -> Calibration:
 
 
 def _published(
-    images: str | Path,
+    files: ImageFiles,
     model: CameraModel,
     folder: RunFolder,
     target: TargetDesign,
@@ -143,7 +145,7 @@ def _published(
         progress(f"{stage}, as published", done, total)
 
     try:
-        detection, labelled = _labelled(images, model, folder, target, board, published_options, told)
+        detection, labelled = _labelled(files, model, folder, target, board, published_options, told)
         return _solved(detection, labelled, model, folder, target, board, published_options, told)
     except StcalError as error:
         return error
@@ -206,7 +208,7 @@ def _solved(
 
 
 def detect(
-    images: str | Path,
+    files: ImageFiles,
     camera: CameraModel,
     folder: RunFolder,
     target: TargetDesign,
@@ -215,13 +217,13 @@ def detect(
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detects and labels the images, and writes ``detections.csv`` and overlays into a claimed folder."""
-    detection, labelled = labelled_images(images, camera, folder, target, board, options, progress)
+    detection, labelled = labelled_images(files, camera, folder, target, board, options, progress)
     with overlays_beside(detection, labelled, target, folder.stage, progress):
         return detection, labelled
 
 
 def labelled_images(
-    images: str | Path,
+    files: ImageFiles,
     camera: CameraModel,
     folder: RunFolder,
     target: TargetDesign,
@@ -230,13 +232,13 @@ def labelled_images(
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detects and labels the images, and writes ``detections.csv`` into a claimed folder."""
-    detection, labelled = _labelled(images, camera, folder, target, board, options, progress)
+    detection, labelled = _labelled(files, camera, folder, target, board, options, progress)
     save(folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
     return detection, labelled
 
 
 def _labelled(
-    images: str | Path,
+    files: ImageFiles,
     camera: CameraModel,
     folder: RunFolder,
     target: TargetDesign,
@@ -245,14 +247,14 @@ def _labelled(
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detects and labels the images by the rules that the options ask for."""
-    files, skipped = chosen_images(images, options.exclude)
-    step = counted(progress, "detect", len(files))
+    chosen, skipped = files
+    step = counted(progress, "detect", len(chosen))
     published = options.solve == "paper"
     if published:
         PublishedPattern.of(target)
     detector = detect_published if published else None
     detection = detect_files(
-        files, camera, target, board, options.ellipses, folder.cache, options.workers, step, detector
+        chosen, camera, target, board, options.ellipses, folder.cache, options.workers, step, detector
     )
     detection = replace(detection, skipped=(*skipped, *detection.skipped))
     require_upright(detection.images)

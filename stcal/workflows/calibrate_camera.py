@@ -212,13 +212,13 @@ def point_grid(board: FlatBoard) -> PointGrid:
     xy = np.round(board.xy_mm(), PLACE_DIGITS)
     (x, column), (y, row) = (np.unique(values, return_inverse=True) for values in xy.T)
     cells = np.column_stack([row, column])
-    common = POINT_RADIUS_MM, "bright", board.sigma_mm
+    common = {"radius_mm": POINT_RADIUS_MM, "polarity": "bright", "sigma_mm": board.sigma_mm, "unusual_size": True}
     if isinstance(board, AprilGridDesign):
         pitch = float(np.ptp(x) / (len(x) - 1))
-        return PointGrid(UnevenGrid(len(y), len(x), pitch, *common, y_mm=tuple(y), x_mm=tuple(x)), cells)
+        return PointGrid(UnevenGrid(len(y), len(x), pitch, **common, y_mm=tuple(y), x_mm=tuple(x)), cells)
     if isinstance(board, AsymmetricCirclesDesign):
-        return PointGrid(LatticePart(len(y), len(x), board.spacing_mm, *common, taken=cells), cells)
-    return PointGrid(BoardDesign(len(y), len(x), board.square_mm, *common), cells)
+        return PointGrid(LatticePart(len(y), len(x), board.spacing_mm, **common, taken=cells), cells)
+    return PointGrid(BoardDesign(len(y), len(x), board.square_mm, **common), cells)
 
 
 def corner_grid(board: FlatBoard) -> BoardDesign:

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
-from stcal.io.design import MIN_SINE, board_toml, load_board, load_target, target_toml
+from stcal.design import MIN_SINE, BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
+from stcal.io.design import board_toml, load_board, load_target, target_toml
 from tests.outcome import fails_with
 
 ROUNDED_MM = 1e-9
@@ -199,7 +199,9 @@ def test_mirror_images_and_small_likenesses_are_taken(tmp_path):
 
 
 def test_no_negative_zero_is_written():
-    face = FaceDesign("f", ("1", "2", "3", "4"), [[-0.0, 0], [40, -1e-12], [0, 40], [40, 40]], [5.0] * 4, "1", "2", "3")
+    face = FaceDesign(
+        "f", ("1", "2", "3", "4"), [[-0.0, 0], [40, -1e-12], [0, 40], [40, 40]], [5.0, 5, 5, 8], "1", "2", "3"
+    )
     assert "-0.0" not in target_toml(TargetDesign("t", "dark", (face,)))
 
 

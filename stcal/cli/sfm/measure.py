@@ -108,6 +108,12 @@ def measure(
         float,
         typer.Option("--max-megabytes", min=0.01, max=2000, help="Accept image files up to this size with --serve."),
     ] = 64.0,
+    token: Annotated[
+        str,
+        typer.Option(
+            envvar="STCAL_TOKEN", help="Answer with --serve only requests with `Authorization: Bearer` and this word."
+        ),
+    ] = "",
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
     if serve:
@@ -125,7 +131,7 @@ def measure(
                 f"--serve and {conflicting[0]}: images come over HTTP, one answer each; leave {conflicting[0]} out",
             )
         ellipses = ellipse_options(min_diameter, max_diameter)
-        _serve(camera, faces, target, board, sigma_factor, ellipses, (host, port, max_megabytes, workers))
+        _serve(camera, faces, target, board, sigma_factor, ellipses, (host, port, max_megabytes, token), workers)
         return
     if images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, or --serve")
@@ -169,14 +175,14 @@ def measure(
     require_passed(strict, [f"χ² of {name}" for name in failed], report)
 
 
-def _serve(camera, faces, target, board, sigma_factor, ellipses, listen) -> None:
+def _serve(camera, faces, target, board, sigma_factor, ellipses, listen, workers) -> None:
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, target_of
     from stcal.sfm.measurement.pose import PoseOptions
     from stcal.sfm.measurement.serve import MeasureServer, MeasureService, ServeOptions, Setting, counts_text, serve
     from stcal.sfm.measurement.target import read_target
 
-    host, port, max_megabytes, workers = listen
+    options = ServeOptions(*listen)
     workers = workers or os.cpu_count() or 1
     circles = replace(read_target(faces, design := target_of(target)), design=design)
     setting = Setting(
@@ -191,12 +197,14 @@ def _serve(camera, faces, target, board, sigma_factor, ellipses, listen) -> None
     def ready(server: MeasureServer) -> None:
         servers.append(server)
         if not server.local:
-            say(f"warning: every machine that reaches {host} can send images; nothing is encrypted")
-        say(f"answering POST {server.url}/measure, {workers} processes, files up to {max_megabytes:g} MB")
+            who = "that knows the token" if options.token else f"that reaches {options.host}"
+            remedy = "" if options.token else "; give a --token"
+            print_each("warning", [f"every machine {who} can send images; nothing is encrypted{remedy}"])
+        say(f"answering POST {server.url}/measure, {workers} processes, files up to {options.max_megabytes:g} MB")
         sys.stdout.flush()
 
     try:
-        serve(MeasureService(setting, workers), ServeOptions(host, port, max_megabytes), ready)
+        serve(MeasureService(setting, workers), options, ready)
     finally:
         for server in servers:
             say(counts_text(server.counts))

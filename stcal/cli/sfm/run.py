@@ -236,7 +236,7 @@ def detect(
         raise InputError(
             "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
         )
-    chosen_images(images, options.exclude)
+    files = chosen_images(images, options.exclude)
     inputs = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with (
         designs_told(target, board),
@@ -244,7 +244,7 @@ def detect(
         run_folder(out, MarkerFile.of(images, None), inputs) as folder,
         StageProgress() as progress,
     ):
-        detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
+        detection, labelled = pipeline.detect(files, model, folder, target_design, board_design, options, progress)
     say(detection_text(detection, labelled))
     say(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
 

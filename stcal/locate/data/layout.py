@@ -10,7 +10,8 @@ from stcal.boards.file import TagsFile, load_tags, require_sizes
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.io.files import require_written
-from stcal.io.toml import side, stated_unusual, toml_string
+from stcal.io.toml import toml_string
+from stcal.lengths import side, stated_unusual
 
 WHAT = "layout file"
 WRITTEN_MM = 1e-6

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, freeze
+from stcal.geometry.arrays import Array, freeze, require_choices
 from stcal.io.files import require_written
 from stcal.robot.identification.adjustment import (
     Solution,
@@ -68,7 +68,8 @@ class IdentifyOptions:
     Raises
     ------
     InputError
-        A σ that is not positive, or beyond 1 m or 1 rad; ``auto`` with fewer than two folds.
+        A choice that does not exist; a σ that is not positive, or beyond 1 m or 1 rad; ``auto`` with fewer than two
+        folds.
     """
 
     observe: Kind | None = None
@@ -83,6 +84,7 @@ class IdentifyOptions:
     adjust: Adjusted = "all"
 
     def __post_init__(self):
+        require_choices(self, "identification")
         for name, value, most in (("sigma_mm", self.sigma_mm, 1e3), ("sigma_rad", self.sigma_rad, 1.0)):
             if value is not None and not 1e-12 <= value <= most:
                 raise InputError("E-OPTION-RANGE", f"{name} is {value:g}; a number above 0, up to {most:g}, needed")

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Array, freeze
+from stcal.geometry.arrays import Array, freeze, require_choices
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.table import POSE, pose_cells, pose_values, read_table, require_pose_table_written
@@ -108,7 +108,7 @@ class DesignOptions:
     Raises
     ------
     InputError
-        No more candidates than poses, a σ that is not positive, or a box that is empty.
+        A choice that does not exist, no more candidates than poses, a σ that is not positive, or a box that is empty.
     """
 
     count: int = 40
@@ -121,6 +121,7 @@ class DesignOptions:
     tool: str = ""
 
     def __post_init__(self):
+        require_choices(self, "design")
         if self.count < 1 or self.candidates <= self.count:
             raise InputError(
                 "E-DESIGN-OPTIONS",

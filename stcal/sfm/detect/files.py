@@ -10,14 +10,14 @@ from dataclasses import asdict, dataclass, fields
 from itertools import combinations
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cache import keep, kept, packed
+from stcal.io.cache import keep, keep_packed, kept, made_by, packed
 from stcal.io.cameras.model import CameraModel
-from stcal.io.files import save
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import (
     MAJORITY,
@@ -98,7 +98,7 @@ def detect_files(
     Raises
     ------
     InputError
-        No file is usable; the message names the first one and its reason.
+        No file is usable; the message names the first one and its reason. Or a file is gone meanwhile.
     DetectionError
         A process that worked on an image was ended from outside.
     """
@@ -144,7 +144,15 @@ def _fingerprint(
         return value.tolist() if isinstance(value, np.ndarray) else str(value)
 
     dots = {key: value for key, value in asdict(board).items() if key != "stated"} if board else None
-    parts = [CACHE_VERSION, asdict(camera), asdict(target.patterns_alone()), dots, asdict(options)]
+    parts = [
+        CACHE_VERSION,
+        made_by(),
+        cv2.__version__,
+        asdict(camera),
+        asdict(target.patterns_alone()),
+        dots,
+        asdict(options),
+    ]
     parts += [detector.__name__] if detector else []
     return hashlib.sha256(json.dumps(parts, default=plain, sort_keys=True).encode()).hexdigest()
 
@@ -160,7 +168,7 @@ def _kept(file: ImageFile, settings: str, cache: Path) -> DetectedImage | None:
         path = cache / f"{_key(file.read(), settings)[1]}.npz"
     except OSError:
         return None
-    return _load(file, path, reused=True) if path.exists() else None
+    return _load(file, path, reused=True)
 
 
 def _detect_file(
@@ -183,13 +191,13 @@ def _detect_file(
     except ConvergenceError as error:
         return Skipped(file.name, str(error), "distortion")
     digest, key = _key(data, settings)
-    return key, _packed(detection, digest, image)
+    return key, _packed(detection, key, digest, image)
 
 
 def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedImage:
     """Saves a result in the cache and loads it from there."""
     path = cache / f"{key}.npz"
-    save(path, content)
+    keep_packed(path, content)
     found = _load(file, path, reused=False)
     if found is None:
         raise InputError("E-OUTPUT-READ-BACK", f"{path}: written, and cannot be read again; check the disk")
@@ -197,7 +205,13 @@ def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedI
 
 
 def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, np.ndarray] | Skipped:
-    """Content of a file and the grey image in it, or why it cannot be used; ``size_from`` : what the size is from."""
+    """Content of a file and the grey image in it, or why it cannot be used; ``size_from`` : what the size is from.
+
+    Raises
+    ------
+    InputError
+        The file is gone.
+    """
     try:
         data = file.read()
     except OSError as error:
@@ -212,7 +226,7 @@ def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, 
     return data, image
 
 
-def _packed(detection: ImageDetection, digest: str, image: np.ndarray) -> bytes:
+def _packed(detection: ImageDetection, key: str, digest: str, image: np.ndarray) -> bytes:
     jpeg, scale = thumbnail(grey_8bit(image))
     meta = {
         "digest": digest,
@@ -232,11 +246,11 @@ def _packed(detection: ImageDetection, digest: str, image: np.ndarray) -> bytes:
             arrays |= {f"open_rows_{i}_{k}": face.rows, f"open_circles_{i}_{k}": face.circles}
     for i, each in enumerate(detection.boards):
         arrays |= {f"board_{f.name}_{i}": getattr(each, f.name) for f in fields(BoardSighting)}
-    return packed({"thumbnail": jpeg, **arrays}, meta)
+    return packed(key, {"thumbnail": jpeg, **arrays}, meta)
 
 
 def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
-    """Loads a cached result; None if the file is damaged."""
+    """Loads a cached result; None if there is none, or the file is not as it was saved."""
 
     def make(stored, meta) -> DetectedImage:
         faces = [
@@ -285,7 +299,7 @@ def look_again(
 ) -> dict[str, SecondLook]:
     """Measures the circles that are predicted in images; returns results by name, cached ones included.
 
-    An image that can no longer be read is left as it was after the first look.
+    An image that can no longer be read is left as it was after the first look; one that is gone is an error.
     """
     found: dict[str, SecondLook] = {}
     pending: list[tuple[ImageFile, Camera, PredictedCircles, EllipseOptions]] = []
@@ -306,7 +320,8 @@ def look_again(
 
 
 def _predicted_key(digest: str, predicted: PredictedCircles, camera: Camera, options: EllipseOptions) -> str:
-    hasher = hashlib.sha256(f"{CACHE_VERSION}\0{digest}\0{predicted.labels}\0{predicted.polarity}\0{options}".encode())
+    stated = (CACHE_VERSION, made_by(), cv2.__version__, digest, predicted.labels, predicted.polarity, options)
+    hasher = hashlib.sha256("\0".join(map(str, stated)).encode())
     for values in (predicted.centre_px, predicted.shape_px, predicted.wanted, camera.parameters()):
         hasher.update(values.tobytes())
     return hasher.hexdigest()[:40]
@@ -316,8 +331,12 @@ def _look_again(
     file: ImageFile, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
 ) -> SecondLook | None:
     try:
-        image = decode(file.read(), file.name, (camera.width, camera.height))
-    except (InputError, OSError):
+        data = file.read()
+    except OSError:
+        return None
+    try:
+        image = decode(data, file.name, (camera.width, camera.height))
+    except InputError:
         return None
     return measure_predicted(image, camera, predicted, options)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
-from stcal.io.images import grey_8bit, grey_fine
+from stcal.io.images import grey_8bit, grey_fine, require_grey
 from stcal.labels import Label
 from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.board import BoardReading, find_boards
@@ -89,7 +89,15 @@ def _read_once(
 def detect_image(
     image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> ImageDetection:
-    """Finds and measures all circles of the target and the board in one grey image of the camera's size."""
+    """Finds and measures all circles of the target and the board in one grey image of the camera's size.
+
+    Raises
+    ------
+    InputError
+        The image is not grey, not of 8 or 16 bits, or not of the camera's size.
+    """
+    require_grey(image, (camera.width, camera.height))
+    image = np.ascontiguousarray(image)
     reading = read_image(grey_8bit(image), camera, target, board, options)
     grey = grey_fine(image)
     named, refused, boards = reading.faces.faces, reading.faces.refused, reading.boards

@@ -13,7 +13,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cache import keep, kept
+from stcal.io.cache import keep, kept, made_by
 from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, parse_labels, unseen_lines
@@ -200,6 +200,7 @@ def _key(
         hasher.update(image.centre_px.tobytes() + image.covariance_px2.tobytes())
     plain = [
         CACHE_VERSION,
+        made_by(),
         list(skeleton),
         [camera.width, camera.height, camera.parameters()],
         asdict(target.patterns_alone()),

@@ -7,7 +7,7 @@ import shutil
 import socket
 import stat
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -295,7 +295,8 @@ def _locked(out: Path) -> Iterator[None]:
     except OSError as error:
         raise _unwritable(out, error) from error
     try:
-        save(cache / HOLDER, _me())
+        with suppress(StcalError):  # it only says to others who writes here
+            save(cache / HOLDER, _me())
         yield
     finally:
         lock.release()
