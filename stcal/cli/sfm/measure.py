@@ -126,8 +126,9 @@ def measure(
     if images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, or --serve")
     load_ahead(workers)
+    from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import load_board, target_of
+    from stcal.io.design import load_board
     from stcal.io.table import read_table
     from stcal.sfm.measurement import images as work
     from stcal.sfm.measurement import report as output
@@ -137,7 +138,7 @@ def measure(
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
             raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
-    design = target_of(target)
+    design = body_of(target)
     circles = read_target(faces, design)
     table = read_table(joints, "joints") if joints else None
     options = work.MeasureOptions(
@@ -163,15 +164,16 @@ def measure(
 
 
 def _serve(camera, faces, target, board, sigma_factor, ellipses, listen) -> None:
+    from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import load_board, target_of
+    from stcal.io.design import load_board
     from stcal.sfm.measurement.pose import PoseOptions
     from stcal.sfm.measurement.serve import MeasureServer, MeasureService, ServeOptions, Setting, counts_text, serve
     from stcal.sfm.measurement.target import read_target
 
     host, port, max_megabytes, workers = listen
     workers = workers or os.cpu_count() or 1
-    circles = replace(read_target(faces, design := target_of(target)), design=design)
+    circles = replace(read_target(faces, design := body_of(target)), design=design)
     setting = Setting(
         circles,
         read_camera(camera),

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -37,7 +37,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
-CACHE_VERSION = 7
+CACHE_VERSION = 8
 """Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
 LOSSY = (".jpg", ".jpeg")
@@ -124,6 +124,16 @@ def detect_files(
         first = skipped[0]
         raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {first.name}: {first.reason}")
     return DetectionResult(tuple(images), tuple(skipped), camera)
+
+
+def seen_by(detection: DetectionResult, camera: Camera) -> DetectionResult:
+    """Returns the detections of corners alone for another camera, which moves none of them."""
+    images = []
+    for image in detection.images:
+        centres = image.detection.centres
+        seen = replace(centres, centre=camera.normalised_from_pixel(centres.centre_px))
+        images.append(replace(image, detection=replace(image.detection, centres=seen)))
+    return replace(detection, images=tuple(images), camera=camera)
 
 
 def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera, str]:
@@ -218,6 +228,7 @@ def _packed(detection: ImageDetection, digest: str, image: np.ndarray) -> bytes:
         "digest": digest,
         "scale": scale,
         "faces": [each.face for each in detection.faces],
+        "printed": [each.face for each in detection.printed],
         "boards": len(detection.boards),
         "open_faces": [[each.face for each in faces] for faces in detection.open_faces],
         "mirrored": detection.mirrored,
@@ -227,6 +238,8 @@ def _packed(detection: ImageDetection, digest: str, image: np.ndarray) -> bytes:
     arrays = _centre_arrays(detection.centres)
     for i, face in enumerate(detection.faces):
         arrays |= {f"face_rows_{i}": face.rows, f"face_circles_{i}": face.circles}
+    for i, face in enumerate(detection.printed):
+        arrays |= {f"printed_rows_{i}": face.rows, f"printed_corners_{i}": face.circles}
     for i, faces in enumerate(detection.open_faces):
         for k, face in enumerate(faces):
             arrays |= {f"open_rows_{i}_{k}": face.rows, f"open_circles_{i}_{k}": face.circles}
@@ -262,6 +275,10 @@ def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
             tuple(meta["notes"]),
             meta["candidates"],
             tuple(open_faces),
+            tuple(
+                FaceSighting(face, stored[f"printed_rows_{i}"], stored[f"printed_corners_{i}"])
+                for i, face in enumerate(meta["printed"])
+            ),
         )
         return DetectedImage(file, detection, meta["digest"], stored["thumbnail"].tobytes(), meta["scale"], reused)
 
