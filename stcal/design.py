@@ -1,9 +1,9 @@
 """Designs of the hardware: the target's faces and circles, and the dot board. Their files: ``io/design.py``."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -15,6 +15,16 @@ from stcal.lengths import Length, radius, require_millimetres, side
 from stcal.lookalikes import MAX_GAP, MAX_RADIUS_RATIO, Likeness, whole_likeness
 
 Polarity = Literal["bright", "dark"]
+POINT_RADIUS_MM = 1e-6
+"""Radius of a corner as a circle: it has no extent and therefore no eccentricity."""
+
+
+class Printed(Protocol):
+    """A board or tags printed on a face: what :mod:`stcal.boards` finds in images."""
+
+    def xy_mm(self) -> np.ndarray:
+        """Returns the corners, (n, 2) mm, in the frame of the board."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +37,12 @@ class FaceDesign:
     states none. Plans and simulations use it, a calibration does not;
     ``outline_mm`` : (k, 2) corners of its plate in order, face frame, for drawings, or None if the design states none;
     ``rim_mm`` : (n,) heights of the rims in front of the circles, negative for discs that stand out, or None if the
-    circles lie in the surface of the plate.
+    circles lie in the surface of the plate;
+    ``printed`` : the board or tags on the face, whose corners are the face's points (radii are then nearly zero), and
+    whose frame is the face frame, Z into the body; None for a face of circles;
+    ``sigma_mm`` : σ of a point's place in the plane about the design if the design is what the face was made by, as
+    print is; None if the design only names the points; ``size_sigma`` : relative σ of the printed size; ``of_tags`` :
+    whether the corners are those of tags, four by four, whose edges light and ink move.
     """
 
     id: str
@@ -40,6 +55,10 @@ class FaceDesign:
     rough_target_from_face: Rigid | None = None
     outline_mm: Array | None = None
     rim_mm: Array | None = None
+    printed: Printed | None = None
+    sigma_mm: float | None = None
+    size_sigma: float = 0.0
+    of_tags: bool = False
 
     def __post_init__(self):
         freeze(self, "xy_mm", (len(self.ids), 2), f"face {self.id}: circles")
@@ -54,26 +73,59 @@ class FaceDesign:
         """Returns the label ``face:circle`` of every circle, in order."""
         return [CircleLabel(self.id, circle) for circle in self.ids]
 
+    def places_mm(self, circles: Iterable[str]) -> np.ndarray:
+        """Returns the places of these circles, (n, 3), face frame."""
+        row = {circle: i for i, circle in enumerate(self.ids)}
+        return np.pad(self.xy_mm[[row[circle] for circle in circles]].reshape(-1, 2), ((0, 0), (0, 1)))
+
+    @property
+    def outward(self) -> Literal[1, -1]:
+        """1 if the face's Z points out of the body, −1 if it points into it, as the Z of boards and tags does."""
+        return 1 if self.printed is None else -1
+
+
+@dataclass(frozen=True, slots=True)
+class KnownDistance:
+    """A measured distance between two points of the target, mm, with its σ: a scale bar."""
+
+    first: CircleLabel
+    second: CircleLabel
+    mm: float
+    sigma_mm: float
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetDesign:
     """Target: its faces, and whether its circles are brighter or darker than their surroundings.
 
-    ``unusual_size`` : whether radii that no hardware has in mm are meant as they stand.
+    ``unusual_size`` : whether radii that no hardware has in mm are meant as they stand;
+    ``distances`` : known distances between its points.
     """
 
     name: str
     polarity: Polarity
     faces: tuple[FaceDesign, ...]
     unusual_size: bool = False
+    distances: tuple[KnownDistance, ...] = ()
 
     def __post_init__(self):
         where = f"target {self.name}"
         require_choices(self, where)
         require_ids([face.id for face in self.faces], where)
-        radii = [radius(f"radius_mm of circle {label}", mm) for label, mm in self.radius_of().items()]
+        circles = [face for face in self.faces if face.printed is None]
+        sizes = [(label, mm) for face in circles for label, mm in zip(face.labels(), face.radius_mm, strict=True)]
+        radii = [radius(f"radius_mm of circle {label}", float(mm)) for label, mm in sizes]
         require_millimetres(radii, self.unusual_size, where)
-        require_distinct(self.faces, where)
+        require_distinct(circles, where)
+
+    @property
+    def has_scale(self) -> bool:
+        """True if the target itself tells its size: by printed faces, or by known distances."""
+        return bool(self.distances) or any(face.printed is not None for face in self.faces)
+
+    def with_faces(self, printed: bool) -> "TargetDesign":
+        """Returns the design with only the printed faces, or only the faces of circles."""
+        return replace(self, faces=tuple(face for face in self.faces if (face.printed is not None) == printed))
 
     def face(self, face_id: str) -> FaceDesign:
         """Returns the face with this id; raises InputError if there is none."""
@@ -330,6 +382,41 @@ def require_board(
             f"{where}: corner radius {corner_radius_mm} mm; at least {1.15 * radius_mm:g} mm and under "
             f"{pitch_mm - radius_mm:g} mm needed",
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaleReference(BoardDesign):
+    """All that a run takes its scale from: the board if there is one, faces of known shape, known distances.
+
+    Without a board it has no dots: ``rows`` and ``columns`` are 0.
+    """
+
+    faces: tuple[FaceDesign, ...] = ()
+    distances: tuple[KnownDistance, ...] = ()
+
+    def __post_init__(self):
+        if self.rows:
+            BoardDesign.__post_init__(self)
+
+
+def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDesign:
+    """Returns the board, with the faces and distances of the target that tell its size if there are any."""
+    faces = tuple(face for face in target.faces if face.sigma_mm is not None)
+    if board is not None and not faces and not target.distances:
+        return board
+    known = {} if board is None else {entry.name: getattr(board, entry.name) for entry in fields(BoardDesign)}
+    none = {"rows": 0, "columns": 0, "pitch_mm": 1.0, "radius_mm": 0.25, "polarity": "bright", "sigma_mm": 1.0}
+    return ScaleReference(**(known or none), faces=faces, distances=target.distances)
+
+
+def faces_of_known_shape(board: BoardDesign) -> tuple[FaceDesign, ...]:
+    """Returns the faces of known shape among what the scale is taken from."""
+    return board.faces if isinstance(board, ScaleReference) else ()
+
+
+def known_distances(board: BoardDesign) -> tuple[KnownDistance, ...]:
+    """Returns the known distances among what the scale is taken from."""
+    return board.distances if isinstance(board, ScaleReference) else ()
 
 
 @lru_cache(maxsize=4)

@@ -32,6 +32,14 @@ CameraFile = Annotated[
         "--camera", help="Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB."
     ),
 ]
+OptionalCamera = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        help="Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB; found from "
+        "the target's printed faces if not given.",
+    ),
+]
 CAMERA = "--camera"
 CameraName = Annotated[
     str,
@@ -435,11 +443,13 @@ def designs_told(
     with_target, with_board : bool
         Whether the reference design replaces a file that was not given.
     """
-    from stcal.io.design import target_of
+    from stcal.boards.target import body_of
     from stcal.sfm.detect.sightings import likeness_notes
 
     if target is not None:
-        print_each("note", likeness_notes(target_of(target)))
+        design = body_of(target)
+        print_each("note", likeness_notes(design.with_faces(printed=False)))
+        with_board = with_board and not design.has_scale
     assumed = assumed_designs(target is None and with_target, board is None and with_board)
     for design in assumed:
         say(f"assumed: {design}")

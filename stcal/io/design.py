@@ -1,16 +1,18 @@
 """Readers of ``target.toml`` and ``board.toml`` that name every mistake, and writers that add comments for editing."""
 
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from stcal.design import (
     BoardDesign,
     FaceDesign,
+    KnownDistance,
     Polarity,
     StatedSize,
     TargetDesign,
@@ -34,6 +36,9 @@ ROUGH_KEYS = "rough_pose = { origin_mm, x, normal }"
 MIN_DIRECTION = 1e-6
 MAX_SKEW_DEG = 5.0
 """Largest deviation from a right angle between X and normal of a rough pose."""
+
+INWARDS = Rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+"""Turns a frame whose Z points out of a body into that of a board or tag, whose Z points into it."""
 
 Vector = tuple[Finite, Finite, Finite]
 Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
@@ -79,10 +84,54 @@ class _FaceFile(Strict):
     circles: list[_CircleFile] = Field(min_length=4)
 
 
+class PrintedFaceFile(Strict):
+    """A face with a board or tags; their keys are those of a board file, and of a tag in a layout."""
+
+    id: Name
+    rough_pose: _RoughPoseFile | None = None
+    outline_mm: list[tuple[Finite, Finite]] | None = Field(default=None, min_length=3, max_length=1000)
+    board: dict[str, Any] | None = None
+    tags: list[dict[str, Any]] | None = Field(default=None, min_length=1)
+    sigma_mm: Positive | None = None
+    size_sigma_mm: Positive | None = None
+
+    def rough(self, where: str) -> Rigid | None:
+        """Return the rough pose, None if none is stated: its normal points out of the body, the face's Z into it."""
+        return None if self.rough_pose is None else _rough_pose(self.rough_pose, where) @ INWARDS
+
+
+def _kind_of_face(face: Any) -> str:
+    return "<printed>" if isinstance(face, dict) and ("board" in face or "tags" in face) else "<circles>"
+
+
+class _ScaleFile(Strict):
+    """A known distance between two points."""
+
+    first: str = Field(alias="from")
+    second: str = Field(alias="to")
+    mm: Positive
+    sigma_mm: Positive
+
+
 class _TargetFile(Sized):
     name: Annotated[str, AfterValidator(lambda v: " ".join(v.split()))] = "target"
     polarity: Polarity
-    face: list[_FaceFile] = Field(min_length=1)
+    face: list[
+        Annotated[
+            Annotated[_FaceFile, Tag("<circles>")] | Annotated[PrintedFaceFile, Tag("<printed>")],
+            Discriminator(_kind_of_face),
+        ]
+    ] = Field(min_length=1)
+    scale: list[_ScaleFile] = Field(default=[])
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_circles(cls, content: Any) -> Any:
+        """Adds a polarity where no face has circles that could have one."""
+        faces = content.get("face") if isinstance(content, dict) else None
+        if isinstance(faces, list) and faces and all(_kind_of_face(face) == "<printed>" for face in faces):
+            return {"polarity": "bright"} | content
+        return content
 
 
 class _CornerFile(Strict):
@@ -132,8 +181,15 @@ class BoardEntry(BoardSizeEntry):
     unusual_size: bool = False
 
 
-def load_target(path: str | Path) -> TargetDesign:
+PrintedReader = Callable[[PrintedFaceFile, bool, str], FaceDesign]
+"""Makes a face from its entry; ``True`` if the file states an unusual size; and the beginning of messages."""
+
+
+def load_target(path: str | Path, printed: PrintedReader | None = None) -> TargetDesign:
     """Read ``target.toml`` (form: ``data_layout.md``).
+
+    ``printed`` : reads faces with a board or tags, which :func:`stcal.boards.target.load_body` does; they are refused
+    if it is None.
 
     Raises
     ------
@@ -143,15 +199,44 @@ def load_target(path: str | Path) -> TargetDesign:
     """
     data = load_toml(path, _TargetFile, "target file", REMEDY)
     where = f"target file {path}"
+    of_circles = [face for face in data.face if isinstance(face, _FaceFile)]
     require_millimetres(
-        [radius(f"radius_mm of circle {face.id}:{c.id}", c.radius_mm) for face in data.face for c in face.circles],
+        [radius(f"radius_mm of circle {face.id}:{c.id}", c.radius_mm) for face in of_circles for c in face.circles],
         data.unusual_size,
         where,
     )
     require_ids([face.id for face in data.face], where)
-    faces = tuple(_face(face, f"{where}: face {face.id}") for face in data.face)
-    require_distinct(faces, where)
-    return TargetDesign(data.name, data.polarity, faces, data.unusual_size)
+    faces = []
+    for face in data.face:
+        of_face = f"{where}: face {face.id}"
+        if isinstance(face, _FaceFile):
+            faces.append(_face(face, of_face))
+        elif printed is None:
+            raise InputError(
+                "E-TARGET-PRINTED",
+                f"{of_face}: a board or tags, which this command does not take yet; `stcal-sfm run`, `detect` and "
+                "`measure` do",
+            )
+        else:
+            faces.append(printed(face, data.unusual_size, of_face))
+    require_distinct([face for face in faces if face.printed is None], where)
+    distances = tuple(_distance(entry, faces, where) for entry in data.scale)
+    return TargetDesign(data.name, data.polarity, tuple(faces), data.unusual_size, distances)
+
+
+def _distance(entry: _ScaleFile, faces: Sequence[FaceDesign], where: str) -> KnownDistance:
+    """Return the known distance of an entry, of whose points the target has both."""
+    known = {str(label): label for face in faces for label in face.labels()}
+    for name in (entry.first, entry.second):
+        if name not in known:
+            raise InputError(
+                "E-TARGET-SCALE",
+                f"{where}: scale from {entry.first} to {entry.second}: no point {name} on the target; points are "
+                f"{faces[0].labels()[0]}, …",
+            )
+    if entry.first == entry.second:
+        raise InputError("E-TARGET-SCALE", f"{where}: scale from {entry.first} to itself; two points needed")
+    return KnownDistance(known[entry.first], known[entry.second], entry.mm, entry.sigma_mm)
 
 
 def load_board(path: str | Path) -> BoardDesign:
@@ -279,16 +364,30 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
     return Rigid(np.column_stack([x, np.cross(z, x), z]), pose.origin_mm)
 
 
-def target_toml(target: TargetDesign) -> str:
-    """Return the text of a ``target.toml`` for ``target``, with comments."""
+def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]] | None = None) -> str:
+    """Return the text of a ``target.toml`` for ``target``, with comments.
+
+    ``printed`` : returns the lines of the board or tags of a face, needed if the target has such faces.
+    """
     lines = [
         "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
         "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
         f"name = {toml_string(target.name)}",
         f'polarity = "{target.polarity}"  # circles are "bright" or "dark" against what surrounds them',
-        *stated_unusual(radius("", float(r)) for face in target.faces for r in face.radius_mm),
+        *stated_unusual(radius("", float(r)) for face in target.with_faces(False).faces for r in face.radius_mm),
     ]
+    scales: list[str] = []
+    for known in target.distances:
+        ends = f"from = {toml_string(known.first)}, to = {toml_string(known.second)}"
+        scales.append(f"  {{ {ends}, mm = {_number(known.mm)}, sigma_mm = {_number(known.sigma_mm)} }},")
+    lines += ["scale = [", *scales, "]"] if scales else []
     for face in target.faces:
+        if face.printed is not None:
+            assert printed is not None, "faces with a board or tags are written by stcal.boards.target"
+            pose = _rough_lines(face.rough_target_from_face @ INWARDS) if face.rough_target_from_face else []
+            outline = _outline_lines(face.outline_mm)
+            lines += ["", "[[face]]", f"id = {toml_string(face.id)}", *pose, *outline, *printed(face)]
+            continue
         lines += [
             "",
             "[[face]]",

@@ -37,7 +37,8 @@ def first_mistake(error: ValidationError, where: str = "", missing: str = "key m
     ``missing`` : reason for a key that is missing.
     """
     first = error.errors()[0]
-    place = ".".join(str(part + 1 if isinstance(part, int) else part) for part in first["loc"])
+    keys = [part for part in first["loc"] if not str(part).startswith("<")]  # not which kind of entry it was taken for
+    place = ".".join(str(part + 1 if isinstance(part, int) else part) for part in keys)
     place = " ".join(place.split())  # a quoted TOML key may hold a line break
     if first["type"] == "extra_forbidden":
         code, reason = "E-KEY-UNKNOWN", "unknown key; remove it or correct its spelling"

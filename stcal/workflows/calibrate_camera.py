@@ -17,7 +17,7 @@ from stcal.boards.design import (
     TagLayout,
     UnevenGrid,
 )
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.forms import kalibr_chain
 from stcal.io.cameras.model import CalibratedCamera, CameraModel, cameras_txt
@@ -52,10 +52,8 @@ LEAST_CORNERS = 6
 """Smallest number of corners of a view of which others were left out: they still check one another."""
 LEAST_SHARE = 0.5
 """Smallest share of the corners of a view that are no gross errors; with fewer of them the view is not used."""
-POINT_RADIUS_MM = 1e-6
 PLACE_DIGITS = 6
 """Decimals, mm, to which the places of points are the same row or column."""
-"""Radius of a corner as a circle: it has no extent and therefore no eccentricity."""
 
 
 @one_thread()

@@ -138,8 +138,9 @@ def measure(
     if columns is not None and joints is None:
         raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of joint values; give it with --joints")
     load_ahead(workers)
+    from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import load_board, target_of
+    from stcal.io.design import load_board
     from stcal.io.join import table_of
     from stcal.sfm.measurement import images as work
     from stcal.sfm.measurement import report as output
@@ -149,7 +150,7 @@ def measure(
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
             raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
-    design = target_of(target)
+    design = body_of(target)
     circles = read_target(faces, design)
     table = table_of(joints, columns, "joints") if joints else None
     options = work.MeasureOptions(
@@ -176,15 +177,16 @@ def measure(
 
 
 def _serve(camera, faces, target, board, sigma_factor, ellipses, listen, workers) -> None:
+    from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import load_board, target_of
+    from stcal.io.design import load_board
     from stcal.sfm.measurement.pose import PoseOptions
     from stcal.sfm.measurement.serve import MeasureServer, MeasureService, ServeOptions, Setting, counts_text, serve
     from stcal.sfm.measurement.target import read_target
 
     options = ServeOptions(*listen)
     workers = workers or os.cpu_count() or 1
-    circles = replace(read_target(faces, design := target_of(target)), design=design)
+    circles = replace(read_target(faces, design := body_of(target)), design=design)
     setting = Setting(
         circles,
         read_camera(camera),

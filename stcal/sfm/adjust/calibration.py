@@ -263,12 +263,13 @@ def _adjust_all(
     covariances = [m.covariance_px2 for m in models]
     rounds = _joint_rounds(options, prior)
     prior = prior if options.refine_camera else None
-    current = camera
+    current, shape_factors = camera, (1.0, 1.0)
     for _ in range(rounds):
         if options.eccentricity:
             models = [replace(m, shift_px=eccentricity_px(m, current, radius, 1.0)) for m in models]
         models = [with_sigma(replace(m, covariance_px2=c), factors) for m, c in zip(models, covariances, strict=True)]
-        result = adjust_jointly(models, board, camera, options.flatness_mm, prior, current)
+        result = adjust_jointly(models, board, camera, options.flatness_mm, prior, current, shape_factors)
+        shape_factors = result.print_factor, result.bend_factor
         models, current = list(result.models), result.camera
         step(None)
         if prior is not None:

@@ -67,7 +67,7 @@ def radius_views(
     shape = np.concatenate([image.shape[keypoint] for image, keypoint in seen])
     blur = np.concatenate([image.blur_px[keypoint] for image, keypoint in seen])
     point = model.point_index[order]
-    radius = np.array([design_mm[label] for label in model.labels])[point]
+    radius = np.array([design_mm.get(label, np.nan) for label in model.labels])[point]  # corners have none
     normal = np.zeros((len(model.labels), 3))
     for members in model.points_by_face().values():
         normal[members] = fit_plane(model.xyz_model[members]).normal
@@ -108,7 +108,7 @@ def find_rims(
         views = radius_views(model, by_name, design_mm, camera)
         is_dot = np.array([isinstance(label, DotLabel) for label in model.labels])[views.point_index]
         short = (views.ratio - 1) * views.design_mm
-        near = (views.tan_tilt < MAX_TAN) & (views.ratio > 0)
+        near = (views.tan_tilt < MAX_TAN) & (views.ratio > 0)  # not of corners, whose ratio is not a number
         for kind, own in (("circles", ~is_dot & near), ("dots", is_dot & near)):
             parts[kind].append((short[own], views.tan_tilt[own], views.design_mm[own], views.blur_mm[own]))
     rims = {}

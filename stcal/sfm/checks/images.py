@@ -101,7 +101,8 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
 
     def columns(network: Network) -> np.ndarray:
         size = np.array([camera.width, camera.height])
-        x, y = (2 * network.model.measured_px / size - 1).T
+        # Not at the measured places: a field that poses and points absorb would leave the residuals themselves.
+        x, y = (2 * camera.project(network.model.xyz_camera()) / size - 1).T
         terms = np.stack([x**i * y**j for i in range(FIELD_DEGREE + 1) for j in range(FIELD_DEGREE + 1 - i)], axis=1)
         zeros = np.zeros_like(terms)
         field = np.stack([np.hstack([terms, zeros]), np.hstack([zeros, terms])], axis=1)

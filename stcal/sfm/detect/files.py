@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import combinations
 from pathlib import Path
 
@@ -126,6 +126,16 @@ def detect_files(
     return DetectionResult(tuple(images), tuple(skipped), camera)
 
 
+def seen_by(detection: DetectionResult, camera: Camera) -> DetectionResult:
+    """Returns the detections of corners alone for another camera, which moves none of them."""
+    images = []
+    for image in detection.images:
+        centres = image.detection.centres
+        seen = replace(centres, centre=camera.normalised_from_pixel(centres.centre_px))
+        images.append(replace(image, detection=replace(image.detection, centres=seen)))
+    return replace(detection, images=tuple(images), camera=camera)
+
+
 def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera, str]:
     """The camera, and what its size is from: a file of OpenCV may not say it, then most of the images do."""
     if camera_model.width and camera_model.height:
@@ -232,6 +242,7 @@ def _packed(detection: ImageDetection, key: str, digest: str, image: np.ndarray)
         "digest": digest,
         "scale": scale,
         "faces": [each.face for each in detection.faces],
+        "printed": [each.face for each in detection.printed],
         "boards": len(detection.boards),
         "open_faces": [[each.face for each in faces] for faces in detection.open_faces],
         "mirrored": detection.mirrored,
@@ -241,6 +252,8 @@ def _packed(detection: ImageDetection, key: str, digest: str, image: np.ndarray)
     arrays = _centre_arrays(detection.centres)
     for i, face in enumerate(detection.faces):
         arrays |= {f"face_rows_{i}": face.rows, f"face_circles_{i}": face.circles}
+    for i, face in enumerate(detection.printed):
+        arrays |= {f"printed_rows_{i}": face.rows, f"printed_corners_{i}": face.circles}
     for i, faces in enumerate(detection.open_faces):
         for k, face in enumerate(faces):
             arrays |= {f"open_rows_{i}_{k}": face.rows, f"open_circles_{i}_{k}": face.circles}
@@ -276,6 +289,10 @@ def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
             tuple(meta["notes"]),
             meta["candidates"],
             tuple(open_faces),
+            tuple(
+                FaceSighting(face, stored[f"printed_rows_{i}"], stored[f"printed_corners_{i}"])
+                for i, face in enumerate(meta["printed"])
+            ),
         )
         return DetectedImage(file, detection, meta["digest"], stored["thumbnail"].tobytes(), meta["scale"], reused)
 

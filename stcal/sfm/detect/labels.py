@@ -123,8 +123,40 @@ def label_images(
 ) -> list[LabelledImage]:
     """Returns the labelled circles of all images, in the order of their groups.
 
-    ``cache`` : folder for what the second look measures.
+    Corners of printed faces name themselves; circles are named by image and group. ``cache`` : folder for what the
+    second look measures.
     """
+    circles = target.with_faces(printed=False)
+    if len(circles.faces) == len(target.faces):
+        return _label_circles(detection, target, board, options, cache, workers)
+    if circles.faces or board is not None:
+        labelled = _label_circles(detection, circles, board, options, cache, workers)
+    else:
+        labelled = [
+            labelled_image(name, group, (), found.centres.select(np.zeros(0, int)), found.notes)
+            for _, images in _groups(detection)
+            for name, group, found in images
+        ]
+    by_name = {image.file.name: image.detection for image in detection.images}
+    return [_with_corners(image, by_name[image.observations.name], target) for image in labelled]
+
+
+def _with_corners(image: LabelledImage, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
+    """Returns the image with the corners of its printed faces."""
+    labels = [label for each in detection.printed for label in each.labels(target.face(each.face))]
+    rows = [each.rows for each in detection.printed]
+    return image.plus(labels, detection.centres.select(np.concatenate(rows)), ()) if rows else image
+
+
+def _label_circles(
+    detection: DetectionResult,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: EllipseOptions,
+    cache: Path,
+    workers: int | None = None,
+) -> list[LabelledImage]:
+    """Returns the labelled circles of all images, in the order of their groups."""
     camera = detection.camera
     groups = _groups(detection)
     patterns = patterns_of(target, board)

@@ -306,7 +306,11 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
 
 def _premise(report: dict) -> str:
     refined = report["options"].get("refine_camera")
-    return "the board's pitch is" if refined else "the intrinsics and the board's pitch are"
+    sizes = {"board": "the board's pitch", "faces": "the printed size of the faces", "distances": "the known distances"}
+    premises = [sizes[source] for source in report["summary"].get("scale_from", ["board"])]
+    premises = premises if refined else ["the intrinsics", *premises]
+    single = len(premises) == 1 and not premises[0].endswith("distances")
+    return f"{' and '.join(premises)} {'is' if single else 'are'}"
 
 
 def _largest(report: dict, key: str) -> tuple[float, str] | None:
@@ -372,6 +376,12 @@ def _by_sigma(report: dict) -> _Cause:
     face = report["faces"][worst]
     size = 1e-3 * (report["summary"]["scale_sigma_ppm"] or 0.0) * math.hypot(*face["translation_mm"])
     if size**2 > SHARE_OF_SCALE * spread[worst] ** 2:
+        if "board" not in report["summary"].get("scale_from", ["board"]):
+            return _Cause(
+                f"The scale: σ of the size make {number(size, 1)} of the {number(spread[worst], 1)} µm of face "
+                f"{worst}.",
+                "More photographs hardly help: measure the print, and state size_sigma_mm, or a known distance.",
+            )
         return _Cause(
             f"The board: σ of the size make {number(size, 1)} of the {number(spread[worst], 1)} µm of face {worst}.",
             "More photographs hardly help: measure the board's dots, or take a better plate, and state its σ.",

@@ -124,6 +124,7 @@ SOLVES = {
     "chain": "chain: group by group, then combined",
     "paper": "paper: as published by Zhang & Wei (2017), for comparison",
 }
+SCALES = {"board": "the board", "faces": "printed size of the faces", "distances": "known distances"}
 VERDICTS = {"yes": "passed", "with care": "suspicious", "no": "failed"}
 """Verdict of a check that has the colour of each judgement."""
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
@@ -277,7 +278,11 @@ def _settings(report: dict) -> list[list[str]]:
             "Left out",
             f"{len(left_out['files'])} files, {len(left_out['images'])} images, {len(left_out['circles'])} circles",
         ],
-        ["Camera, as given", f"{camera['model']}, {sizes} px"],
+        ["Scale", join([SCALES[source] for source in summary.get("scale_from", ["board"])])],
+        [
+            "Camera, as given" if summary.get("camera_given", True) else "Camera, found from the photographs",
+            f"{camera['model']}, {sizes} px",
+        ],
         ["Focal lengths (px)", ", ".join(number(v, 4) for v in camera["focal_px"])],
         ["Principal point (px)", ", ".join(number(v, 4) for v in camera["centre_px"]) + " (pixel centres integer)"],
         ["Distortion", ", ".join(f"{v:.8g}" for v in camera["distortion"])],
@@ -357,7 +362,11 @@ def _scales(report: dict) -> list[list]:
 
 def _boards(report: dict) -> dict[str, tuple]:
     """Returns the input of the plots of the boards' residuals, by group."""
-    residuals = {group["name"]: group["scale"]["board_residuals_um"] for group in report["groups"]}
+    residuals = {
+        group["name"]: group["scale"]["board_residuals_um"]
+        for group in report["groups"]
+        if group["scale"].get("source", "board") == "board"
+    }
     vectors = [vector for board_residuals in residuals.values() for vector in board_residuals.values()]
     reach = max((math.hypot(*vector[:2]) for vector in vectors), default=0.0)
     height = max((abs(vector[2]) for vector in vectors), default=0.0)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.target import save_body
 from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.model import CalibratedCamera
@@ -109,8 +110,9 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
     save_camera(out / CAMERA, result.camera)
     if (refined := result.refined_camera) is not None:
         save_camera(out / REFINED_CAMERA, refined)
-    save_design(out / TARGET, result.target_design)
-    save_design(out / BOARD, result.board_design)
+    save_body(out / TARGET, result.target_design)
+    if result.board_design.rows:
+        save_design(out / BOARD, result.board_design)
     report = judged(report_of(result).content())
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.circles

@@ -3,15 +3,17 @@
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from pydantic import Field
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, known_distances
 from stcal.io.cameras.model import CalibratedCamera, CameraPrior
 from stcal.io.json import ByFace, Part
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
+from stcal.sfm.adjust.scale import ScaleSource
 from stcal.sfm.checks.suite import Evidence
 from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import ImageObservations
@@ -93,6 +95,8 @@ class RunResult:
         Comparison with the published method, if requested.
     judgement : Judgement, optional
         The report in words, once it is made.
+    camera_given : bool
+        False if the camera was found from the photographs; ``camera`` is then the start of its adjustment.
     """
 
     out: Path
@@ -110,6 +114,13 @@ class RunResult:
     checks: tuple[Check, ...] = ()
     comparison: Comparison | None = None
     judgement: Judgement | None = None
+    camera_given: bool = True
+
+    def scale_from(self) -> list[ScaleSource]:
+        """Returns what the size of the result rests on."""
+        board = self.board_design
+        known = {"board": board.rows, "faces": faces_of_known_shape(board), "distances": known_distances(board)}
+        return [source for source in get_args(ScaleSource) if known[source]]
 
     @property
     def target(self) -> CalibratedTarget:
