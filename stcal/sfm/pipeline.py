@@ -190,8 +190,8 @@ def require_printed(target: TargetDesign) -> None:
     if not target.with_faces(printed=True).faces:
         raise InputError(
             "E-CAMERA-NEEDED",
-            "--camera: none given, and circles need one: only faces with a board or tags tell the camera; give a "
-            "camera file, which `stcal-sfm calibrate-camera` makes",
+            "missing option '--camera': circles need a camera file, which `stcal-sfm calibrate-camera` makes; only "
+            "faces with a board or tags tell the camera (see `stcal-sfm run --help`)",
         )
 
 

@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign, faces_of_known_shape
+from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign, faces_of_known_shape
 from stcal.errors import StcalError
 from stcal.io.cameras.model import CalibratedCamera, CameraPrior
 from stcal.labels import Label
@@ -37,6 +37,7 @@ from stcal.sfm.checks.images import (
     sigma_check,
     summed,
 )
+from stcal.sfm.checks.scales import scales_check
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
 
@@ -131,6 +132,10 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: flatness_check(networks, evidence.options.flatness_mm, *_bend(evidence)),
         lambda: control_check(evidence, networks),
     )
+    if isinstance(board, ScaleReference):  # the target tells its size itself
+        joint = calibration.joint
+        factor = 1.0 if joint is None else joint.print_factor
+        makers += (lambda: scales_check(networks, board, factor),)
     step = counted(progress or (lambda *_: None), "check", len(makers) + IN_PAIRS)
     checks: list[Check] = []
     for make in makers:

@@ -26,9 +26,12 @@ MIN_CORNERS = 4
 SAME_TURN_RAD, SAME_PLACE = np.radians(10.0), 0.25
 """Largest differences of two poses of one face relative to another that agree: rotation, and translation as a share of
 the distance of the faces."""
-OUTLIER_SIGMAS = 12.0
-"""Limit of a residual, in σ, beyond which it counts no more where poses are chosen."""
+MOST_VOTES = 250
+"""Most images that vote on how two faces lie; time and memory grow with their square."""
 LEAST_SIGMA_PX = 0.05
+"""σ that print, lens and detector leave to any corner."""
+BETTER = 0.2
+"""Share by which another pose of a face must fit its corners better."""
 PASSES, ROBUST_ROUNDS = 3, 3
 MAX_STEPS = 100
 FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)
@@ -216,6 +219,7 @@ def _edges(views: _Views, faces: int) -> list[_Edge]:
 
 
 def _edge(a: int, b: int, pairs: list[tuple[int, int]], views: _Views) -> _Edge:
+    pairs = pairs[:: 1 + len(pairs) // MOST_VOTES]
     rotation, translation, cost, of_pair = [], [], [], []
     for p, (v, w) in enumerate(pairs):
         for i in range(2):
@@ -283,7 +287,7 @@ def _images(
                 turn = views.poses.rotation[k] @ back
                 shift = views.poses.translation[k] - turn @ f.translation[views.face[v]]
                 length = _lengths(body[own] @ turn.T + shift, part, camera)
-                cost = float((np.minimum(length, 1e3) ** 0.5).sum())
+                cost = _robust(length)
                 if cost < least:
                     least, rotation[image], translation[image], placed[image] = cost, turn, shift, True
     return PoseStack(rotation, translation), placed
@@ -403,14 +407,46 @@ def _minimum(body: Body, used: Corners, basis, prior, given: Camera, huber: floa
     return minimise(body, linearise, moved, cost=cost, settled=1e-7, max_steps=MAX_STEPS).state
 
 
+def _faces_again(views: _Views, corners: Corners, body: Body) -> PoseStack:
+    """Returns body_from_face, each as that view of the face in a placed image has it which fits all of its corners
+    best, or as it was where none fits better."""
+    rotation, translation = body.body_from_face.rotation.copy(), body.body_from_face.translation.copy()
+    i = body.camera_from_body
+    for face in np.flatnonzero(body.placed_faces)[1:]:
+        own = np.flatnonzero((corners.face == face) & body.placed_images[corners.image])
+        part, xyz = corners.select(own), corners.xyz_face()[own]
+
+        def cost(turn: np.ndarray, shift: np.ndarray, part: Corners = part, xyz: np.ndarray = xyz) -> float:
+            in_body = xyz @ turn.T + shift
+            seen = np.einsum("nij,nj->ni", i.rotation[part.image], in_body) + i.translation[part.image]
+            return _robust(_lengths(seen, part, body.camera))
+
+        least = (1 - BETTER) * cost(rotation[face], translation[face])
+        for v in np.flatnonzero((views.face == face) & body.placed_images[views.image]):
+            back = i.rotation[views.image[v]].T
+            for k in (2 * v, 2 * v + 1):
+                turn = back @ views.poses.rotation[k]
+                shift = back @ (views.poses.translation[k] - i.translation[views.image[v]])
+                if (of_view := cost(turn, shift)) < least:
+                    least, rotation[face], translation[face] = of_view, turn, shift
+    return PoseStack(rotation, translation)
+
+
 def settled_body(body: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera) -> Body:
-    """Returns the adjusted body, with the images placed again where another of their poses fits it better."""
+    """Returns the adjusted body, with faces and images placed again where another of their poses fits better."""
     body = adjust_body(body, corners, basis, prior, given)
     for _ in range(PASSES - 1):
         views = _Views.of(corners, body.camera)
-        poses, placed = _images(views, corners, body.body_from_face, body.placed_faces, body.camera)
-        again = adjust_body(replace(body, camera_from_body=poses, placed_images=placed), corners, basis, prior, given)
+        faces = _faces_again(views, corners, body)
+        poses, placed = _images(views, corners, faces, body.placed_faces, body.camera)
+        start = replace(body, body_from_face=faces, camera_from_body=poses, placed_images=placed)
+        again = adjust_body(start, corners, basis, prior, given)
         if again.placed_images.sum() <= body.placed_images.sum() and again.cost >= (1 - 1e-3) * body.cost:
             break
         body = again
     return body
+
+
+def _robust(length: np.ndarray) -> float:
+    """Returns the cost of residuals of these lengths, in σ, that hardly grows with gross ones."""
+    return float((np.minimum(length, 1e3) ** 0.5).sum())
