@@ -3,11 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
+from stcal.boards.file import run_board_of as board_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.model import CameraModel, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import board_of, target_of
+from stcal.io.design import target_of
 from stcal.io.files import save
 from stcal.io.images import chosen_images
 from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread

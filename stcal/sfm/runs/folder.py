@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.file import run_board_toml
 from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
-from stcal.io.design import board_toml, target_toml
+from stcal.io.design import target_toml
 from stcal.io.files import BOARD, CAMERA, REFINED_CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, json_text, read_bytes, save
 from stcal.io.json import checked, read_json
 from stcal.parallel import Progress
@@ -109,7 +110,7 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
     if (refined := result.refined_camera) is not None:
         write_cameras_txt(out / REFINED_CAMERA, refined)
     save(out / TARGET, target_toml(result.target_design))
-    save(out / BOARD, board_toml(result.board_design))
+    save(out / BOARD, run_board_toml(result.board_design))
     report = judged(report_of(result).content())
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.circles

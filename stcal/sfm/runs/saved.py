@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from stcal.boards.file import load_run_board
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import frozen
@@ -18,7 +19,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CalibratedCamera, CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.io.covariance import OF_PIXEL, first_fault
-from stcal.io.design import load_board, load_target
+from stcal.io.design import load_target
 from stcal.io.files import BOARD, CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, read_bytes
 from stcal.io.json import Part, checked, read_json
 from stcal.labels import circle_labels
@@ -140,7 +141,7 @@ def load_run(folder: str | Path) -> SavedRun:
         )
     marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
     camera = read_camera(folder / CAMERA).calibrated(0, 0)
-    target, board = load_target(folder / TARGET), load_board(folder / BOARD)
+    target, board = load_target(folder / TARGET), load_run_board(folder / BOARD)
     with _as_written(folder / RUN_MARKER):
         marker_file = checked(marker, MarkerFile)
         options, images = _options(marker_file.options or {}).settled(target), Path(marker_file.images)
