@@ -404,6 +404,11 @@ def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDes
     faces = tuple(face for face in target.faces if face.sigma_mm is not None)
     if board is not None and not faces and not target.distances:
         return board
+    if board is not None and type(board) is not BoardDesign:
+        raise InputError(
+            "E-BOARD-TYPE",
+            "--board: asymmetric circles beside a target that tells its own size; a board of dots needed, or none",
+        )
     known = {} if board is None else {entry.name: getattr(board, entry.name) for entry in fields(BoardDesign)}
     none = {"rows": 0, "columns": 0, "pitch_mm": 1.0, "radius_mm": 0.25, "polarity": "bright", "sigma_mm": 1.0}
     return ScaleReference(**(known or none), faces=faces, distances=target.distances)

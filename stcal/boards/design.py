@@ -9,7 +9,7 @@ from stcal.design import BoardDesign, Polarity
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen, require_choices
 from stcal.geometry.rigid import Rigid
-from stcal.labels import Label, dot_cells
+from stcal.labels import DotLabel, Label, dot_cells
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,13 +148,25 @@ class AprilGridDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatticePart(BoardDesign):
-    """A grid of dots in which only some places have a dot. ``taken`` : (n, 2) rows and columns of these places."""
+    """A grid of dots in which only some places have a dot.
+
+    ``taken`` : (n, 2) rows and columns of these places; ``circles`` : the asymmetric circles that these are, if any.
+    """
 
     taken: np.ndarray | None = None
+    circles: "AsymmetricCirclesDesign | None" = None
 
     def cells(self) -> np.ndarray:
         """Return row and column of every dot, (n, 2)."""
         return BoardDesign.cells(self) if self.taken is None else self.taken
+
+    def radii_mm(self) -> np.ndarray:
+        """Return the radius of every dot, (n,), mm."""
+        return np.full(len(self.cells()), self.radius_mm)
+
+    def labels(self) -> list[DotLabel]:
+        """Return the labels of the dots."""
+        return [DotLabel(row, column) for row, column in self.cells().tolist()]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,7 +241,9 @@ class AsymmetricCirclesDesign:
         cells = cells - cells.min(0)
         rows, columns = (cells.max(0) + 1).tolist()
         pitch = float(np.sqrt(2) * self.spacing_mm)
-        return LatticePart(rows, columns, pitch, self.radii_mm()[0], self.polarity, self.sigma_mm, taken=cells)
+        return LatticePart(
+            rows, columns, pitch, self.radii_mm()[0], self.polarity, self.sigma_mm, taken=cells, circles=self
+        )
 
 
 FlatBoard = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign | AsymmetricCirclesDesign

@@ -18,17 +18,18 @@ from stcal.boards.design import (
     CharucoDesign,
     ChessboardDesign,
     FlatBoard,
+    LatticePart,
     TagLayout,
 )
-from stcal.design import BoardDesign, Polarity
+from stcal.design import BoardDesign, Polarity, reference_board
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.design import BoardEntry, Count, Squares, board_design, load_board
-from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
+from stcal.io.design import BoardEntry, Count, Squares, board_design, board_toml, load_board
+from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.json import mistake
 from stcal.io.plain_yaml import load_yaml
 from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, validated
-from stcal.lengths import LEAST_SIDE_MM, MOST_SIDE_MM, Length, radius, require_millimetres, side
+from stcal.lengths import LEAST_SIDE_MM, MOST_SIDE_MM, Length, radius, require_millimetres, side, stated_unusual
 
 KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles")
 """Types of flat boards."""
@@ -211,6 +212,57 @@ def load_tags(path: str | Path, what: str) -> TagsFile:
         return load_toml(path, TagsFile, what, REMEDY)
     where = f"{what} {path}"
     return validated(tags_of_bundle(content, where), TagsFile, where)
+
+
+def load_run_board(path: str | Path) -> BoardDesign:
+    """Read the file of a board beside a target: dots, or asymmetric circles as places of a lattice.
+
+    Raises
+    ------
+    InputError
+        As :func:`load_flat_board`; or it is another board, or its circles have no radius.
+    """
+    board = load_flat_board(path)
+    if isinstance(board, BoardDesign):
+        return board
+    if not isinstance(board, AsymmetricCirclesDesign):
+        raise InputError(
+            "E-BOARD-TYPE",
+            f"board file {path}: a board of dots or of asymmetric circles needed here: `calibrate-camera`, `handeye` "
+            "and `locate` take others",
+        )
+    if board.radius_mm is None:
+        raise InputError(
+            "E-BOARD-RADIUS",
+            f"board file {path}: circles without a radius, which their eccentricity needs here; write a file with "
+            'type = "asymmetric-circles" and radius_mm',
+        )
+    return board.lattice()
+
+
+def run_board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
+    """Return the given board, or the board of a file; the reference board if ``given`` is None."""
+    return reference_board() if given is None else given if isinstance(given, BoardDesign) else load_run_board(given)
+
+
+def run_board_toml(board: BoardDesign) -> str:
+    """Return the text of a board file that :func:`load_run_board` reads."""
+    circles = board.circles if isinstance(board, LatticePart) else None
+    if circles is None:
+        return board_toml(board)
+    return (
+        f'type = "asymmetric-circles"\nrows = {circles.rows}\ncolumns = {circles.columns}\n'
+        f"spacing_mm = {circles.spacing_mm!r}\nradius_mm = {circles.radius_mm!r}\n"
+        f'polarity = "{circles.polarity}"\nsigma_mm = {circles.sigma_mm!r}\n'
+        + "".join(f"{line}\n" for line in stated_unusual([side("", circles.spacing_mm), radius("", board.radius_mm)]))
+    )
+
+
+def save_run_board(path: str | Path, board: BoardDesign) -> None:
+    """Write the file of a board beside a target, and require that it is read as the same board."""
+    text = run_board_toml(board)
+    save(Path(path), text)
+    require_same(path, lambda: run_board_toml(load_run_board(path)), text)
 
 
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.model import CalibratedCamera, CameraModel, camera_prior, refinable
 from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import board_of
 from stcal.io.files import save
 from stcal.io.images import TOP_GROUP, ImageFile, Skipped, chosen_images, require_common_size
 from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread

@@ -9,9 +9,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from stcal.boards.file import run_board_toml
 from stcal.errors import InputError
 from stcal.io.cameras.model import write_cameras_txt
-from stcal.io.design import board_toml, target_toml
+from stcal.io.design import target_toml
 from stcal.io.json import ByFace, ByGroup, ByImage, ByLabel, Pair, Part, Points, Pose, ResultFile, Vector3
 from stcal.labels import BOARD, Label
 from stcal.parallel import run_parallel
@@ -175,7 +176,7 @@ def write_dataset(
             (folder / "images" / group).mkdir(parents=True, exist_ok=True)
         write_cameras_txt(folder / "cameras.txt", scene.camera)
         (folder / "target.toml").write_text(target_toml(scene.target), encoding="utf-8")
-        (folder / "board.toml").write_text(board_toml(scene.board), encoding="utf-8")
+        (folder / "board.toml").write_text(run_board_toml(scene.board), encoding="utf-8")
         (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(

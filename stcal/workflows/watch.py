@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.file import run_board_of as board_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import board_of, target_of
+from stcal.io.design import target_of
 from stcal.io.files import CACHE
 from stcal.io.images import ImageFile, Skipped, find_images
 from stcal.parallel import Progress

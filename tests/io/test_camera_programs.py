@@ -32,6 +32,7 @@ from tests.io.camera_files import (
     SIZE,
     VINS,
     XML,
+    matrix,
     perspective,
 )
 from tests.outcome import fails_with
@@ -183,6 +184,16 @@ REFUSED = {
     ),
     "two matrices": (OST.format(model=f"K: {EYE}", values=D4), "E-CAMERA-REPEATED … K"),
     "size of a shape": (f"K: {FLAT}\nimage_size: [720, 1280]\n", "E-CAMERA-SIZE … 720×1280 px … width first"),
+    "RealityCapture": (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/" xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"/>',
+        "E-CAMERA-MODEL … RealityCapture … export … COLMAP",
+    ),
+    "PhotoScan of old": (
+        METASHAPE.replace("<f>910.25</f>", "<fx>910.25</fx><fy>910</fy>"),
+        "E-CAMERA-MODEL … fx and fy … export … anew",
+    ),
+    "a pickle": (b"\x80\x04\x95\x10\xff", "E-CAMERA-UNREADABLE … a pickle … numpy.savez"),
+    "a matrix transposed": (f"K: {matrix().T.ravel().tolist()}\n", "E-CAMERA-MATRIX … transposed"),
     "YAML key twice": (f"K: {FLAT}\nD: {D4}\nD: {D5}\n", "E-CAMERA-UNREADABLE … D twice"),
     "JSON key twice": ('{"K": [1, 0, 1, 0, 1, 1, 0, 0, 1], "K": 5}', "E-CAMERA-UNREADABLE … K twice"),
     "documents that differ": (
@@ -200,6 +211,44 @@ def test_what_cannot_be_told_is_named_in_one_line(tmp_path, name):
     with fails_with(said) as caught:
         read(tmp_path, text)
     assert "\n" not in str(caught.value)
+
+
+def test_an_archive_of_numpy_is_read(tmp_path):
+    path = tmp_path / "camera.npz"
+    np.savez(path, mtx=matrix(), dist=np.array([D5]), rvecs=np.zeros((3, 3, 1)), odd=np.array([{}], object))
+    with pytest.warns(InputNote, match="odd"):
+        lens = read_lens(path)
+    np.testing.assert_allclose(project(lens), perspective(D5), atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [3, 4])
+def test_a_matrix_alone_has_no_distortion(tmp_path, size):
+    whole = np.eye(4)
+    whole[:3, :3] = matrix()
+    np.savetxt(tmp_path / "K.txt", whole[:size, :size])
+    with pytest.warns(InputNote, match="no distortion"):
+        lens = read_lens(tmp_path / "K.txt")
+    np.testing.assert_allclose(project(lens), perspective([0.0] * 4), atol=1e-9)
+
+
+def test_the_essential_matrices_of_a_pair_are_no_cameras(tmp_path):
+    path = tmp_path / "stereo.yml"
+    path.write_text(f"K1: {FLAT}\nD1: {D5}\nK2: {EYE}\nD2: {D4}\nR: {EYE}\nE: {FLAT}\nF: {FLAT}\n")
+    with fails_with("E-CAMERA-SEVERAL … 2 cameras … 1, 2"):
+        read_lens(path)
+    np.testing.assert_allclose(project(read_lens(path, "1")), perspective(D5), atol=1e-9)
+
+
+def test_both_cameras_of_orb_slam_have_their_distortion(tmp_path):
+    distortion = "Camera.k1: -0.2\nCamera.k2: 0.05\nCamera.p1: 0.001\nCamera.p2: -0.0005\n"
+    text = ORB.format(kind="PinHole", distortion=distortion)
+    lens = re.findall(r"Camera\.(?:[fc][xy]|[kp]\d): .*\n", text)
+    rest = "".join(line for line in text.splitlines(keepends=True) if line not in lens)
+    pair = "".join(line.replace("Camera.", f"Camera{i}.").replace("911.5", f"91{i}.5") for i in (1, 2) for line in lens)
+    (tmp_path / "pair.yaml").write_text(rest + pair)
+    for i in (1, 2):
+        wanted = perspective(D4, (910.5 + i, 910.25, 639.0, 359.0))
+        np.testing.assert_allclose(project(read_lens(tmp_path / "pair.yaml", str(i))), wanted, atol=1e-9)
 
 
 def test_an_inverse_model_of_zeros_has_no_distortion(tmp_path):

@@ -215,9 +215,9 @@ def detect(
 ) -> None:
     """Detect circles alone: detections.csv and an overlay picture of every image."""
     load_ahead(workers)
+    from stcal.boards.file import run_board_of as board_of
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import board_of
     from stcal.io.images import chosen_images
     from stcal.sfm import pipeline
     from stcal.sfm.runs.options import RunOptions

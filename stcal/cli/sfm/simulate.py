@@ -220,7 +220,8 @@ def _lens(
 
 def _designs(target: Path | None, board: Path | None, second_design: bool) -> "tuple[TargetDesign, BoardDesign]":
     """Returns the designs of the files, the reference designs, or the second designs."""
-    from stcal.io.design import board_of, target_of
+    from stcal.boards.file import run_board_of as board_of
+    from stcal.io.design import target_of
     from stcal.synthetic.scene import second_design as other
 
     return other()[:2] if second_design else (target_of(target), board_of(board))

@@ -114,7 +114,17 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
         ) from error
 
 
+REALITY_CAPTURE = ("capturingreality.com", "#name,x,y,alt,heading,pitch,roll,f,px,py")
+"""What tells the XMP and the table of RealityCapture."""
+
+
 def _of_text(text: str, name: str, path: Path) -> CameraModel | ForeignLens:
+    if any(word in text for word in REALITY_CAPTURE):
+        raise InputError(
+            "E-CAMERA-MODEL",
+            f"camera file {path}: of RealityCapture, relative to an image whose size it does not state; export the "
+            "registration as COLMAP, and give its cameras.txt",
+        )
     if text.lstrip().startswith("<"):
         root = ElementTree.fromstring(text)
         if root.tag == "calibration":

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.file import save_run_board
 from stcal.boards.target import save_body
 from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.cameras.write import save_camera
-from stcal.io.design import save_design
 from stcal.io.files import BOARD, CAMERA, REFINED_CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, json_text, read_bytes, save
 from stcal.io.json import checked, read_json
 from stcal.parallel import Progress
@@ -112,7 +112,7 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
         save_camera(out / REFINED_CAMERA, refined)
     save_body(out / TARGET, result.target_design)
     if result.board_design.rows:
-        save_design(out / BOARD, result.board_design)
+        save_run_board(out / BOARD, result.board_design)
     report = judged(report_of(result).content())
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.circles

@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from stcal.boards.file import load_run_board
 from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign, scale_reference
 from stcal.errors import InputError, StcalError
@@ -19,7 +20,6 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CalibratedCamera, CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.io.covariance import OF_PIXEL, first_fault
-from stcal.io.design import load_board
 from stcal.io.files import BOARD, CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, read_bytes
 from stcal.io.json import Part, checked, read_json
 from stcal.labels import circle_labels
@@ -154,7 +154,7 @@ def load_run(folder: str | Path) -> SavedRun:
     assert target is not None
     marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
     camera = read_camera(folder / CAMERA).calibrated(0, 0)
-    board = scale_reference(None if without_board else load_board(folder / BOARD), target)
+    board = scale_reference(None if without_board else load_run_board(folder / BOARD), target)
     with _as_written(folder / RUN_MARKER):
         marker_file = checked(marker, MarkerFile)
         options, images = _options(marker_file.options or {}).settled(target), Path(marker_file.images)
