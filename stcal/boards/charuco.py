@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from stcal.boards.design import BoardView, CharucoDesign, view_of
-from stcal.boards.tags import detector_settings, dictionary_of
+from stcal.boards.dictionaries import dictionary_of
+from stcal.boards.tags import detector_settings
 from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian
 from stcal.geometry.robust import median_length, robust_sigma
 from stcal.io.images import grey_8bit

@@ -1,6 +1,5 @@
 """Readers of board files: dots (``stcal.io.design``), chessboards, ChArUco boards, AprilGrids, and Kalibr's YAML."""
 
-import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -13,6 +12,7 @@ from pydantic import AfterValidator, Field, model_validator
 from stcal.boards.bundle import KEYS as BUNDLE_KEYS
 from stcal.boards.bundle import bundle_content, tags_of_bundle
 from stcal.boards.design import (
+    UNIT_SQUARE,
     AprilGridDesign,
     AsymmetricCirclesDesign,
     CharucoDesign,
@@ -21,6 +21,7 @@ from stcal.boards.design import (
     LatticePart,
     TagLayout,
 )
+from stcal.boards.dictionaries import count_of, known_dictionary
 from stcal.design import BoardDesign, Polarity, reference_board
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
@@ -46,37 +47,6 @@ NESTED = 0.5
 """Largest ratio of the sides of two tags of which one may be inside the other, as in nested markers."""
 OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_mm", "board"}
 """Keys that occur only in files of other boards than dots."""
-
-
-OF_OPENCV = ("tag36h11", "tag36h10", "tag25h9", "tag16h5")
-"""Families of AprilTag that OpenCV detects."""
-_APRILTAG = re.compile(r"(?:april)?[_ -]?t(?:ag)?[_ -]?(standard|circle|custom)?[_ -]?(\d{2}h\d{1,2})", re.I)
-
-
-def known_dictionary(name: str) -> str:
-    """Return the full name of a dictionary of ``cv2.aruco``; ``name`` may lack ``DICT_``, and be in any case.
-
-    Families of AprilTag have their own names, too: ``tag36h11``, ``t36h11``.
-
-    Raises
-    ------
-    ValueError
-        The name is unknown; the message lists similar names. Or OpenCV lacks the family.
-    """
-    family = _APRILTAG.fullmatch(name.strip())
-    if family is not None:
-        if family[1] is not None or f"DICT_APRILTAG_{family[2].lower()}" not in dir(cv2.aruco):
-            raise ValueError(
-                f"OpenCV does not detect this family of AprilTag; print tags of {', '.join(OF_OPENCV)} for the target"
-            )
-        name = f"APRILTAG_{family[2]}"
-    plain = name.strip().upper()
-    plain = plain if plain.startswith("DICT_") else f"DICT_{plain}"
-    dictionaries = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
-    if plain not in dictionaries:
-        alike = sorted(k for k in dictionaries if k[5:9] == plain[5:9]) or sorted(dictionaries)
-        raise ValueError(f"unknown dictionary; one of {', '.join(alike)} needed")
-    return dictionaries[plain]
 
 
 Dictionary = Annotated[str, AfterValidator(known_dictionary)]
@@ -155,7 +125,7 @@ class TagEntry(Strict):
             raise InputError(
                 "E-TAG-PLACE", f"{where}: tag {self.id}: x_mm, y_mm and size_mm needed together, or corners_mm"
             )
-        square = self.size_mm / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+        square = self.size_mm * UNIT_SQUARE
         cosine, sine = np.cos(np.radians(self.angle_deg)), np.sin(np.radians(self.angle_deg))
         return square @ np.array([[cosine, sine], [-sine, cosine]]) + [self.x_mm, self.y_mm]
 
@@ -370,7 +340,7 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
         place_of_tag = f"{where}: tag {tag.id}"
         if place is None:
             raise InputError("E-TAG-PLACE", f"{place_of_tag}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
-        if tag.id >= (count := _tags_of(tag.dictionary)):
+        if tag.id >= (count := count_of(tag.dictionary)):
             raise InputError(
                 "E-TAG-ID-RANGE", f"{place_of_tag}: {tag.dictionary} has 0 … {count - 1}; correct id or dictionary"
             )
@@ -454,17 +424,12 @@ def _aprilgrid(data: _AprilGrid, where: str) -> AprilGridDesign:
 def _require_tags(board: CharucoDesign | AprilGridDesign, where: str) -> None:
     """Refuse a board that needs more tags than its dictionary has."""
     ids = board.tag_ids()
-    if ids.stop > (count := _tags_of(board.dictionary)):
+    if ids.stop > (count := count_of(board.dictionary)):
         raise InputError(
             "E-TAG-ID-RANGE",
             f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {count - 1}; correct rows, "
             "columns, first_id or dictionary",
         )
-
-
-def _tags_of(dictionary: str) -> int:
-    """Return the number of tags in a dictionary."""
-    return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)).bytesList)
 
 
 def _asymmetric(data: _AsymmetricCircles, where: str) -> AsymmetricCirclesDesign:

@@ -446,6 +446,27 @@ def stated_size(data: bytes, name: str) -> tuple[int, int]:
         ) from error
 
 
+def grey_of(image: np.ndarray, name: str) -> np.ndarray:
+    """Return the grey image (height, width) of an array, grey or with three channels RGB.
+
+    Raises
+    ------
+    InputError
+        The array has another shape, or its values are not of 8 or 16 bit.
+    """
+    image = np.asarray(image)
+    if not image.size or image.shape[2:] not in ((), (1,), (3,)) or image.ndim < 2:
+        raise InputError(
+            "E-ARRAY-SHAPE",
+            f"{name}: array of shape {image.shape}; (height, width) or (height, width, 3) needed, grey or RGB",
+        )
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
+    if image.ndim == 2:
+        return image
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.shape[2] == 3 else image[:, :, 0]
+
+
 def grey_8bit(image: np.ndarray) -> np.ndarray:
     """Return the image in 8 bit; deeper images are scaled so that their bright end just fits."""
     if image.dtype == np.uint8:

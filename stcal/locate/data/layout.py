@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.design import UNIT_SQUARE, TagLayout
+from stcal.boards.dictionaries import known_tags
 from stcal.boards.file import TagsFile, load_tags, require_sizes
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
@@ -76,8 +78,15 @@ class TargetLayout:
 
     def __post_init__(self):
         n = len(self.tags)
+        object.__setattr__(self, "tags", known_tags(self.tags, "target layout"))
         object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (n, 4, 2), "tags' corners"))
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (8 * n, 8 * n), "corners' covariance"))
+
+    @classmethod
+    def of(cls, layout: TagLayout, name: str = "") -> "TargetLayout":
+        """Returns tags with known places as a target. The middle of the first tag is the origin of {obj}."""
+        corners = _in_obj(layout.corners_mm, 0)
+        return cls(name, layout.tags, corners, layout.sigma_mm**2 * np.eye(corners.size), 0)
 
     def dictionaries(self) -> tuple[str, ...]:
         """Returns each dictionary of the tags once."""
@@ -171,7 +180,7 @@ def require_layout_written(path: str | Path, layout: TargetLayout) -> None:
 
 def square(size_mm: float) -> np.ndarray:
     """Returns the corners (4, 2) of a tag about its middle."""
-    return size_mm / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+    return size_mm * UNIT_SQUARE
 
 
 def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
