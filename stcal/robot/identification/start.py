@@ -369,6 +369,8 @@ def _guesses(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Itera
         yield reason, robot, replace(data, q=q * np.where(np.arange(n) == i, -1, 1))
     if (robot.coupling != np.eye(n)).any():
         yield "the joints were not coupled; take coupling out of the robot file", replace(robot, coupling=None), data
+        reason = "the joints were coupled with the other sign; change the signs of coupling off its diagonal"
+        yield reason, replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling), data
     elif n >= 3:
         for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
             coupling = np.eye(n)
