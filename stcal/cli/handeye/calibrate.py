@@ -128,8 +128,8 @@ def handeye(
         bool,
         typer.Option(
             "--undo-flips",
-            help="Replace poses of a flat target by the second pose of its plane, tilted the other way, where only that "
-            "agrees with the others; not with images.",
+            help="Replace poses of a flat target by the second pose of its plane, tilted the other way, where only "
+            "that agrees with the others; not with images.",
         ),
     ] = False,
     four_dof: Annotated[
