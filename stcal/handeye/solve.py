@@ -13,7 +13,7 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log
 from stcal.handeye.data.views import Views
-from stcal.handeye.judge import remarks
+from stcal.handeye.judge import flips, remarks
 from stcal.handeye.judge.conventions import Guess, check_conventions
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
 from stcal.handeye.judge.remarks import Aside
@@ -411,6 +411,9 @@ def _remarks(
     """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
     names = tuple(name for name, bad in zip(task.pairs.names, outliers, strict=True) if not bad)
     notes = remarks.of_outliers(task.pairs.names, outliers, residuals)
+    if outliers.any():
+        z = closed_form.mean_pose(task.loop[~outliers].chain(x))
+        notes += flips.note_of(task.pairs.names, flips.flipped(task.loop, x, z, outliers))
     moved = remarks.of_order(task.pairs.names, residuals, task.loop.jacobian(x)[:, :, :12])
     notes += moved or remarks.of_groups(names, residuals[~outliers])
     if not (task.options.with_scale or task.options.four_dof):

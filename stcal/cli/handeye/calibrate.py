@@ -124,6 +124,14 @@ def handeye(
             "--robot-out", writable=True, help="Write the robot of --with-kinematics to this file, as adjusted (TOML)."
         ),
     ] = None,
+    undo_flips: Annotated[
+        bool,
+        typer.Option(
+            "--undo-flips",
+            help="Replace poses of a flat target by the second pose of its plane, tilted the other way, where only "
+            "that agrees with the others; not with images.",
+        ),
+    ] = False,
     four_dof: Annotated[
         bool,
         typer.Option("--four-dof", help="Solve for what a flange that turns about one axis only (SCARA) tells."),
@@ -272,7 +280,7 @@ def handeye(
     from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye.calibrate import AUTO, Splits, calibrate
     from stcal.workflows.handeye.inputs import dry_run as understood
-    from stcal.workflows.handeye.inputs import read_input, setup_of
+    from stcal.workflows.handeye.inputs import read_input, setup_of, without_flips
     from stcal.workflows.handeye.offset import at_offset, with_offset
     from stcal.workflows.handeye.times import Timing
 
@@ -339,6 +347,9 @@ def handeye(
         chosen, offset = setup_of(statements, inputs.setup, inputs.where), None
         if statements.setup:
             inputs = replace(inputs, setup=chosen)
+        if undo_flips:
+            inputs, undone = without_flips(inputs, chosen, options)
+            say(undone)
         if time_offset:
             inputs, options, offset = at_offset(inputs, chosen, options)
         outcome = with_offset(calibrate(inputs, chosen, method, options, validation, progress, time_offset), offset)
