@@ -375,14 +375,14 @@ CAUSES: dict[str, tuple[tuple[float, float, float], Plant, tuple[str, ...]]] = {
     "fx over fy": ((0.001, 0.004, 0.02), lambda c, v: c.file(focal=c.camera.focal * [1 + v, 1]), ("width and height",)),
     "cropped": (
         (5, 20, 80),
-        lambda c, v: c.file(centre=c.camera.centre + [v, -0.6 * v]),
+        lambda c, v: c.file(centre=c.camera.centre + np.array([v, -0.6 * v])),
         ("the principal point", "turned by 180°"),
     ),
     "another camera": (
         (0.3, 1, 3),
         lambda c, v: c.file(
             focal=c.camera.focal * [1 + 0.01 * v, 1 + 0.007 * v],
-            centre=c.camera.centre + [9 * v, 5 * v],
+            centre=c.camera.centre + np.array([9 * v, 5 * v]),
             distortion=c.camera.distortion + 0.02 * v * np.eye(12)[0],
         ),
         ("the intrinsics", "the focal length", "scaled", "the principal point", "width and height"),
@@ -460,7 +460,7 @@ CAUSES: dict[str, tuple[tuple[float, float, float], Plant, tuple[str, ...]]] = {
 def turned_by_180(case: Case, value: float) -> Case:
     """A camera whose principal point is ``value`` px off the middle, its photographs turned."""
     middle = (np.array([case.camera.width, case.camera.height]) - 1) / 2
-    by = middle + [value / 2, -value / 3] - case.camera.centre
+    by = middle + np.array([value / 2, -value / 3]) - case.camera.centre
     own = case.centres(lambda i, _: i.centre_px + by)  # as the lens would have them behind a shifted sensor
     at = 2 * middle - (case.camera.centre + by)
     return own.file(centre=at)
