@@ -52,6 +52,7 @@ class Summary(Part):
     redundancy: int | None
     last_move_px: float | None
     rim_mm: float | None = None
+    rim_sigma_mm: float | None = None
 
 
 class FaceRow(Part):
@@ -248,7 +249,8 @@ class ReportFile(ResultFile):
         "of the circles of the faces and `dot_sigma_factor` of the dots, which multiply these σ; `scale_sigma_ppm`: σ "
         "of the size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
         "moved a projection at most (settled: less than 1e-6); these four are null with `chain` and `paper`; "
-        "`rim_mm` mean height of the rims behind which the faces lie, null where they are as seen"
+        "`rim_mm` mean height of the rims behind which the faces lie, `rim_sigma_mm` its σ (0 where stated), null "
+        "where they are as seen"
     )
     faces: dict[ByFace, FaceRow] = Field(
         description="`target_from_face`, `translation_mm`, `angle_to_reference_deg`, `translation_sigma_um` and "
