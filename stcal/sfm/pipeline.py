@@ -8,7 +8,7 @@ from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference
 from stcal.errors import InputError, StcalError
-from stcal.io.cameras.model import CalibratedCamera, CameraModel, camera_prior, refinable
+from stcal.io.cameras.model import CalibratedCamera, CameraModel, camera_prior, model_of, refinable
 from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.cameras.read import read_camera
 from stcal.io.files import save
@@ -35,6 +35,8 @@ from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.solve import solve_body, solve_groups, ungrouped, unseen_board, usable_groups
 from stcal.sfm.runs.transaction import MarkerFile, RunFolder, run_folder
 
+PHOTOGRAPHS = "the photographs"
+"""Where a camera that was found is from, for messages."""
 ImageFiles = tuple[list[ImageFile], list[Skipped]]
 """Files to use and files that are left out, as they were when the work began."""
 DRAWN_WITH = "matplotlib.backends.backend_svg", "mpl_toolkits.mplot3d.axes3d"
@@ -135,21 +137,17 @@ def _with_found_camera(
     """Finds the camera by the printed faces of the target, and labels the images with it."""
     printed = target.with_faces(printed=True)
     guesses = guessed_cameras(files[0])
-    detection, labelled = _labelled(files, model_of(guesses[0]), folder, printed, None, options, progress)
+    detection, labelled = _labelled(files, model_of(guesses[0], PHOTOGRAPHS), folder, printed, None, options, progress)
     observations = [image.observations for image in labelled]
     found = place_and_find_camera(observations, printed.faces, guesses).camera
     if board.rows or len(printed.faces) < len(target.faces):
-        return *labelled_images(files, model_of(found), folder, target, board, options, progress), model_of(found)
+        return *labelled_images(
+            files, model_of(found, PHOTOGRAPHS), folder, target, board, options, progress
+        ), model_of(found, PHOTOGRAPHS)
     detection = seen_by(detection, found)
     labelled = label_images(detection, target, None, options.ellipses, folder.cache, options.workers)
     save(folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
-    return detection, labelled, model_of(found)
-
-
-def model_of(camera: CalibratedCamera) -> CameraModel:
-    """Returns a camera in the form of one that is read from a file."""
-    lens = camera.focal, camera.centre, camera.distortion, camera.colmap_model
-    return CameraModel(*lens, camera.width, camera.height, "the photographs", camera.covariance)
+    return detection, labelled, model_of(found, PHOTOGRAPHS)
 
 
 def guessed_cameras(files: Sequence[ImageFile]) -> list[CalibratedCamera]:
@@ -176,7 +174,7 @@ def assumed_camera(files: Sequence[ImageFile], target: TargetDesign) -> CameraMo
     """
     if len(target.with_faces(printed=True).faces) < len(target.faces):
         require_printed(target.with_faces(printed=False))
-    return model_of(guessed_cameras(files)[0])
+    return model_of(guessed_cameras(files)[0], PHOTOGRAPHS)
 
 
 def require_printed(target: TargetDesign) -> None:

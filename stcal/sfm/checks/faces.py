@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
+from scipy.special import fdtrc
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, StcalError
@@ -19,7 +20,8 @@ from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.uncertainty import calibrated_target
-from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
+from stcal.sfm.checks.culprits import Guilt
+from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import MetricModel
 
 MIN_HALF = 2
@@ -119,10 +121,11 @@ def _face_trial(name: str, apart: np.ndarray, covariance: np.ndarray, redundancy
     return Trial(name, MICRO * float(np.linalg.norm(apart[3:])), "µm", statistic, 6, redundancy)
 
 
-def groups_check(again: Again) -> Check:
+def groups_check(again: Again, networks: Sequence[Network]) -> Check:
     """Compares the result without one group with the whole result, for each group that all faces can spare.
 
-    The covariance of the change is the difference of the two covariances, as of a nested adjustment.
+    The covariance of the change is the difference of the two covariances, as of a nested adjustment. A group is named
+    only if the others agree without it, and do not if another one is left out instead.
     """
     key, title = "groups", "The result without each group"
     calibration = again.calibration
@@ -135,8 +138,12 @@ def groups_check(again: Again) -> Check:
         for g in members
         if len(members) > 1 and _linked([s for other, s in members.items() if other != g], reference) >= set(faces)
     ]
-    trials = []
+    trials: list[Trial] = []
     joints = again.adjust([[m for m in models if m.group != group] for group in removable])
+    cures = [
+        not isinstance(joint, StcalError) and _agree(joint, [n for n in networks if n.model.group != group])
+        for group, joint in zip(removable, joints, strict=True)
+    ]
     for group, adjustment in zip(removable, joints, strict=True):
         try:
             without, joint = again.posed(adjustment, faces)
@@ -151,8 +158,33 @@ def groups_check(again: Again) -> Check:
     if not trials:
         reason = "every group holds a face that no other links"
         return impossible(key, title, reason, "to be able to make it, add a group that closes a loop of faces")
-    remedy = "one group contradicts the others: was the target or the board moved in it, or the focus changed?"
-    return judge(key, title, [t for t in trials if t.freedom], "faces", remedy)
+    check = judge(key, title, [t for t in trials if t.freedom], "faces", "")
+    if not check.names:
+        return check
+    curing = [group for group, cured in zip(removable, cures, strict=True) if cured]
+    guilt = Guilt("groups", tuple(curing) if len(curing) == 1 else (), tuple(curing))
+    if guilt.culprits:
+        remedy = f"group {curing[0]} contradicts the others: was target or board moved in it, or the focus changed?"
+        return replace(check, names=(f"group {curing[0]}",), remedy=f"{remedy} Take it again, or leave it out")
+    remedy = (
+        "groups contradict one another: target, board or a face moved in one of them, or the focus changed; photograph "
+        "the faces in further groups, which tell the one that is wrong"
+    )
+    return replace(check, reason=f"{check.reason}; {guilt.words()}", names=(), remedy=remedy)
+
+
+def _agree(joint: JointResult, networks: Sequence[Network]) -> bool:
+    """Whether a joint adjustment adds no more to the squared residuals of its groups than chance does."""
+    extra, freedom, free = _added(joint, networks)
+    return float(fdtrc(freedom, free, extra / freedom)) >= SUSPICIOUS
+
+
+def _added(joint: JointResult, networks: Sequence[Network]) -> tuple[float, int, float]:
+    """Returns what a joint adjustment adds to the squared residuals of its groups, the degrees of freedom of that, and
+    those of the groups."""
+    free = float(sum(n.redundancy.sum() for n in networks))
+    square = float(sum((n.residual**2).sum() for n in networks))
+    return max(joint.sigma0**2 * joint.redundancy - square, 0.0), round(joint.redundancy - free), free
 
 
 def _nested_trial(name: str, change, larger: np.ndarray, smaller: np.ndarray, redundancy: float) -> Trial:
@@ -230,10 +262,7 @@ def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
     its last steps slow.
     """
     key, title = "agreement", "Groups, board and faces against one another (σ₀)"
-    free = float(sum(n.redundancy.sum() for n in networks))
-    square = float(sum((n.residual**2).sum() for n in networks))
-    extra = max(joint.sigma0**2 * joint.redundancy - square, 0.0)
-    freedom = round(joint.redundancy - free)
+    extra, freedom, free = _added(joint, networks)
     value = float(np.sqrt(extra / freedom))
     remedy = "look at the checks of board, groups and flatness: one of their σ is too small, or something moved"
     trial = Trial("all groups", value, "σ", extra, freedom, free)

@@ -144,7 +144,8 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
             checks.append(check)
             step(None)
     failed = any(check.verdict == "failed" for check in checks)
-    cause = whole_set_cause(networks, camera) if failed else None
+    moved = any(check.key == "moved" and check.verdict == "failed" and not check.names for check in checks)
+    cause = whole_set_cause(networks, camera, moved) if failed else None
     return (cause, *checks) if cause else tuple(checks)
 
 
@@ -161,7 +162,7 @@ def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[
     return [
         partial(agreement_check, joint, linked_networks),
         partial(halves_check, again),
-        partial(groups_check, again),
+        partial(groups_check, again, linked_networks),
         partial(loops_check, again),
     ]
 
