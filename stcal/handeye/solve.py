@@ -113,6 +113,11 @@ class _Task:
     seen: Observability
     notes: tuple[str, ...]
 
+    def only(self, rows: np.ndarray) -> "_Task":
+        """Returns the task with these poses alone."""
+        views = None if self.views is None else self.views[rows]
+        return replace(self, pairs=self.pairs[rows], loop=self.loop[rows], views=views)
+
 
 def _guess(options: HandEyeOptions, seen: Observability, loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
     """Returns the first X, Z and scale."""
@@ -166,6 +171,17 @@ def handeye(
     >>> found = handeye(pairs, "eye-in-hand")  # doctest: +SKIP
     >>> found.flange_from_camera @ [0, 0, 500]  # a point half a metre before the camera  # doctest: +SKIP
     """
+    return solved(pairs, setup, method, views, options).result
+
+
+def solved(
+    pairs: HandEyePoses,
+    setup: Setup,
+    method: str | None,
+    views: Views | None,
+    options: HandEyeOptions | None,
+) -> "Solved":
+    """Returns the result of :func:`handeye` with what solutions without some poses start from."""
     method = method or ("pose" if views is None else "reprojection")
     if method not in METHODS:
         raise InputError(
@@ -187,7 +203,45 @@ def handeye(
         return _by_poses(task)
     if method == "reprojection" and task.views is not None:
         return _by_views(task, task.views)
-    return _by_equations(task, method)
+    return Solved(task, _by_equations(task, method))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """``result`` of a ``task``, and the ``solution`` behind it where the method adjusts poses or corners."""
+
+    task: _Task
+    result: HandEye
+    solution: PoseSolution | AdjustedViews | None = None
+
+    def without(self, out: np.ndarray) -> HandEye:
+        """Returns the result without the poses ``out``, (k,) rows: X, Z, scale, camera and board. All else, σ and
+        outliers among them, is that of all poses.
+
+        Adjustments move from the solution of all poses by its equations; other methods are solved again.
+
+        Raises
+        ------
+        StcalError
+            The method fails without these poses.
+        """
+        task, solution = self.task, self.solution
+        if solution is None:
+            again = _by_equations(task.only(np.setdiff1d(np.arange(len(task.loop)), out)), self.result.method)
+            return replace(
+                self.result, mount_from_camera=again.mount_from_camera, stand_from_board=again.stand_from_board
+            )
+        board = None
+        if isinstance(solution, AdjustedViews):
+            state = solution.without(out)
+            found, corners = solution.found, state.scale * state.corners
+            board = replace(found, camera=state.camera, corners=corners)
+        else:
+            state = solution.without(task.loop, out)
+        x, z = state.mount_from_camera, state.stand_from_board
+        if task.options.four_dof:
+            x, z = closed_form.slid(x, z, task.seen.mount_axis, task.loop)
+        return replace(self.result, mount_from_camera=x, stand_from_board=z, scale=state.scale, reprojection=board)
 
 
 def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions) -> _Task:
@@ -261,7 +315,7 @@ def _by_motions(loop: Loop, method: str, unit_mm: float, options: EvolutionOptio
     return polish(objective, x) if method == "de-polished" else x
 
 
-def _by_poses(task: _Task) -> HandEye:
+def _by_poses(task: _Task) -> Solved:
     options = task.options
     first = LoopState(*task.guess(task.loop, options.with_scale))
     solution, contradicted = _by_true_robot(
@@ -288,7 +342,7 @@ def _by_poses(task: _Task) -> HandEye:
         error = of_poses(task.loop, solution, task.views, options.camera)
         covariance = error.covariance(covariance[:12, :12])
     stated = {name: getattr(noise, name) for name in ("robot_rad", "robot_mm", "camera_rad", "camera_mm")}
-    return HandEye(
+    result = HandEye(
         method="pose",
         setup=task.setup,
         mount_from_camera=x,
@@ -305,18 +359,19 @@ def _by_poses(task: _Task) -> HandEye:
         observability=task.seen,
         notes=notes + remarks.of_rounds(solution.settled),
     )
+    return Solved(task, result, solution)
 
 
-def _by_views(task: _Task, views: Views) -> HandEye:
+def _by_views(task: _Task, views: Views) -> Solved:
     options, names = task.options, task.pairs.names
     first = task.guess(task.loop, options.with_scale)
 
-    def solved(loop: Loop, noise: Noise) -> AdjustedViews:
+    def adjusted_by(loop: Loop, noise: Noise) -> AdjustedViews:
         flange = task.pairs.base_from_flange
         intrinsics, camera = options.intrinsics, options.camera
         return adjust_views(loop, flange, views, first, noise, intrinsics, options.with_scale, camera, options.arm)
 
-    solution, contradicted = _by_true_robot(task, solved)
+    solution, contradicted = _by_true_robot(task, adjusted_by)
     if solution.sigma_scale is not None:
         require_scale(solution.state.scale, solution.sigma_scale, task.loop, task.pairs.where)
     x, z = solution.state.mount_from_camera, solution.state.stand_from_board
@@ -329,7 +384,7 @@ def _by_views(task: _Task, views: Views) -> HandEye:
     residuals = adjusted.residuals(x, z)
     notes += _remarks(task, x, solution.outliers, residuals, solution.scale_hint)
     notes += of_camera_file(solution.camera_gain, solution.sigma)
-    return HandEye(
+    result = HandEye(
         method="reprojection",
         setup=task.setup,
         mount_from_camera=x,
@@ -347,6 +402,7 @@ def _by_views(task: _Task, views: Views) -> HandEye:
         observability=task.seen,
         notes=notes + remarks.of_rounds(solution.settled),
     )
+    return Solved(task, result, solution)
 
 
 def of_camera_file(camera_gain: float, sigma: dict[str, float]) -> tuple[str, ...]:

@@ -20,7 +20,6 @@ from stcal.handeye.report.figures import (
     turns_between,
     turns_figure,
 )
-from stcal.handeye.report.file import why_out
 from stcal.handeye.report.outcome import ArmFound, Outcome, RigOutcome, Verdict, asides, judged, rig_judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
@@ -200,7 +199,7 @@ def _choice_cells(outcome: Outcome) -> list[list[str]]:
         return []
     rows = [["<solved by", "held out mm", "splits", "<"]]
     for each in choice.tried:
-        outcome_of_way = "taken" if each.candidate == choice.chosen else why_out(each)
+        outcome_of_way = "taken" if each.candidate == choice.chosen else each.reason
         rows.append([each.candidate.name, number(each.mean_mm(), 3), str(len(each.error_mm)), outcome_of_way])
     return rows
 
