@@ -74,11 +74,27 @@ def run(
     StcalError
         A subclass of it, with a one-line message that says what to do.
     """
+    options = options or RunOptions()
+    files = chosen_images(images, options.exclude)
+    return run_on_files(files, images, camera, out, target, board, options, progress, reload_s)
+
+
+@one_thread()
+def run_on_files(
+    files: ImageFiles,
+    images: str | Path,
+    camera: str | Path | CameraModel,
+    out: str | Path,
+    target: str | Path | TargetDesign | None,
+    board: str | Path | BoardDesign | None,
+    options: RunOptions,
+    progress: Progress | None = None,
+    reload_s: int | None = None,
+) -> RunResult:
+    """Calibrates a target from some of the photographs in the folder ``images``; see :func:`run`."""
     progress = progress or (lambda *_: None)
     model = camera if isinstance(camera, CameraModel) else read_camera(camera)
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
-    options = options or RunOptions()
-    files = chosen_images(images, options.exclude)
     designs = target_of(target), board_of(board)
     options = options.settled(designs[0])
     if options.compare:
