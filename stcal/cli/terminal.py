@@ -138,7 +138,7 @@ def _instead(character: str) -> str:
 def say(*values: object, sep: str = " ", end: str = "\n") -> None:
     """Prints the values, unless the command is quiet. Names from files may contain any characters."""
     if not _quiet.get():
-        print(_coloured(printable(sep.join(map(str, values)))), end=end)
+        print(_coloured(printable(sep.join(map(str, values)))) + end, end="")  # at once: threads may say something too
 
 
 def _coloured(text: str) -> str:

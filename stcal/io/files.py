@@ -123,7 +123,8 @@ def save(path: Path, content: str | bytes) -> None:
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        # names of files that are not UTF-8 hold surrogates: written as \udcff, which JSON reads back
+        partial.write_bytes(content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content)
         os.replace(partial, path)
     except OSError as error:
         raise InputError(

@@ -84,14 +84,30 @@ def run(
     StcalError
         A subclass of it, with a one-line message that says what to do.
     """
+    options = options or RunOptions()
+    files = chosen_images(images, options.exclude)
+    return run_on_files(files, images, camera, out, target, board, options, progress, reload_s)
+
+
+@one_thread()
+def run_on_files(
+    files: ImageFiles,
+    images: str | Path,
+    camera: str | Path | CameraModel | None,
+    out: str | Path,
+    target: str | Path | TargetDesign | None,
+    board: str | Path | BoardDesign | None,
+    options: RunOptions,
+    progress: Progress | None = None,
+    reload_s: int | None = None,
+) -> RunResult:
+    """Calibrates a target from some of the photographs in the folder ``images``; see :func:`run`."""
     progress = progress or (lambda *_: None)
     model = read_camera(camera) if isinstance(camera, str | Path) else camera
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
-    options = options or RunOptions()
     if model is None:
         require_printed(body_of(target))
         options = replace(options, refine_camera=True)
-    files = chosen_images(images, options.exclude)
     target_design = body_of(target)
     known = None if board is None and target_design.has_scale else board_of(board)
     designs = target_design, scale_reference(known, target_design)
@@ -140,14 +156,13 @@ def _with_found_camera(
     detection, labelled = _labelled(files, model_of(guesses[0], PHOTOGRAPHS), folder, printed, None, options, progress)
     observations = [image.observations for image in labelled]
     found = place_and_find_camera(observations, printed.faces, guesses).camera
+    model = model_of(found, PHOTOGRAPHS)
     if board.rows or len(printed.faces) < len(target.faces):
-        return *labelled_images(
-            files, model_of(found, PHOTOGRAPHS), folder, target, board, options, progress
-        ), model_of(found, PHOTOGRAPHS)
+        return *labelled_images(files, model, folder, target, board, options, progress), model
     detection = seen_by(detection, found)
     labelled = label_images(detection, target, None, options.ellipses, folder.cache, options.workers)
     save(folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
-    return detection, labelled, model_of(found, PHOTOGRAPHS)
+    return detection, labelled, model
 
 
 def guessed_cameras(files: Sequence[ImageFile]) -> list[CalibratedCamera]:

@@ -85,9 +85,9 @@ def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):
 def overlay_path(out: Path, name: str) -> Path:
     """Returns the path of an image's overlay; a long name is cut, and ends in its hash."""
     group, slash, file_name = name.rpartition("/")
-    if len(file_name.encode()) > LONGEST_NAME:
-        cut = file_name.encode()[: LONGEST_NAME - HASH_DIGITS - 1].decode(errors="ignore")
-        file_name = f"{cut}-{hashlib.sha256(name.encode()).hexdigest()[:HASH_DIGITS]}"
+    if len(os.fsencode(file_name)) > LONGEST_NAME:
+        cut = os.fsencode(file_name)[: LONGEST_NAME - HASH_DIGITS - 1].decode(errors="ignore")
+        file_name = f"{cut}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:HASH_DIGITS]}"
     return out / "overlays" / f"{group}{slash}{file_name}.jpg"
 
 
@@ -198,7 +198,7 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
     gone, residuals = len(shown) - len(overlays), _residuals(run, list(overlays))
     with _as_written(path):
         page = report_html(report, overlays, residuals, gone=gone)
-    outputs: list[tuple[Path, bytes]] = [(out, page.encode())]
+    outputs: list[tuple[Path, bytes]] = [(out, page.encode("utf-8", "backslashreplace"))]
     if pdf:
         outputs.append((out.with_suffix(".pdf"), pdf_of(page)))
     for file, content in outputs:
@@ -208,7 +208,7 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
 
 def _report_page(run: Path, report: dict, reload_s: int | None = None) -> bytes:
     overlays = {name: overlay_path(run, name).read_bytes() for name in shown_overlays(report)}
-    return report_html(report, overlays, _residuals(run, list(overlays)), reload_s).encode()
+    return report_html(report, overlays, _residuals(run, list(overlays)), reload_s).encode("utf-8", "backslashreplace")
 
 
 def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:
