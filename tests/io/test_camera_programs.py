@@ -339,3 +339,9 @@ def test_a_database_without_its_log_is_named(tmp_path):
     with fails_with("E-CAMERA-UNREADABLE … copy.db-wal … copy both"):
         read_lens(copy)
     assert sorted(each.name for each in tmp_path.iterdir() if each.name.startswith("copy")) == ["copy.db"]
+
+
+def test_a_key_that_is_a_number_is_named(tmp_path):
+    with pytest.warns(InputNote, match="42"):
+        lens = read(tmp_path, f"K: {FLAT}\nD: {D5}\n42: 7\n")
+    np.testing.assert_allclose(project(lens), perspective(D5), atol=1e-9)

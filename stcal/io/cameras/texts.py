@@ -43,9 +43,10 @@ def values_of(text: str) -> dict:
         values, *more = documents
         if any(_without_header(each) != _without_header(values) for each in more):
             raise ValueError(f"{len(documents)} documents that differ; leave one in")
-    if not isinstance(values, dict):
+    made = _with_data(values) if isinstance(values, dict) else None
+    if not isinstance(made, dict):
         raise ValueError("no keys")
-    return _with_data(values)
+    return made
 
 
 def values_of_archive(content: bytes) -> dict:
@@ -102,11 +103,11 @@ def _without_header(document: object) -> object:
 
 
 def _with_data(values):
-    """Return values with the content of OpenCV's and ROS's matrices in place of their rows, columns and type."""
+    """Return values with the content of matrices in place of their rows, columns and type, and with keys as texts."""
     if isinstance(values, dict):
         if "data" in values and values.keys() & {"rows", "cols"}:
             return values["data"]
-        return {key: _with_data(value) for key, value in values.items()}
+        return {str(key): _with_data(value) for key, value in values.items()}
     if isinstance(values, list) and any(isinstance(value, dict) for value in values):
         return [_with_data(value) for value in values]
     return values
