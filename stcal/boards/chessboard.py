@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
+from stcal.boards.crossings import crossings
 from stcal.boards.design import BoardView, ChessboardDesign, view_of
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit
@@ -19,7 +20,8 @@ WINDOW_SHARE = 0.4
 """Half the side of the window in which a corner is refined, as a share of the smallest square's side."""
 REFINE_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-5)
 LEAST_WINDOW, MOST_WINDOW, MOST_AT_FIRST = 2.0, 20.0, 100.0
-"""Limits of half that window's side, px: smallest, largest, and largest in the first pass."""
+MOST_BY_AREA = 10.0
+"""Limits of half that window's side, px: smallest, largest, largest in the first pass, and largest for areas."""
 SMOOTHED_SHARE, LEAST_SMOOTHING = 0.05, 0.3
 """σ of the smoothing before refinement, as a share of half the window's side, and its lower limit in px. Smoothing does
 not move a saddle, but removes noise of the gradients, which would hold a corner at its start."""
@@ -107,7 +109,16 @@ def _refined(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
         grid = cv2.cornerSubPix(smooth, places, (half, half), (-1, -1), REFINE_STEPS).reshape(grid.shape).astype(float)
         if window <= MOST_WINDOW:
             break
-    return grid + first
+    return _by_area(grey, grid, int(min(window, MOST_BY_AREA))) + first
+
+
+def _by_area(grey: np.ndarray, grid: np.ndarray, half: int) -> np.ndarray:
+    """Return the corners by the areas of black and white in their windows, or unchanged where these do not fit.
+
+    Where edges lie along the pixel rows, gradients place all corners by up to 0.02 px to one side.
+    """
+    along = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=2).reshape(-1, 2, 2)
+    return crossings(grey, grid.reshape(-1, 2), along, np.full(len(along), half)).xy_px.reshape(grid.shape)
 
 
 def _first_is_black(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> bool:

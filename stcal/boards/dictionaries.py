@@ -41,7 +41,18 @@ def known_dictionary(name: str) -> str:
 
 
 def dictionary_of(name: str):
-    """Return the dictionary of ``cv2.aruco`` with this name."""
+    """Return the dictionary of ``cv2.aruco`` with this name, full or as of :func:`known_dictionary`.
+
+    Raises
+    ------
+    InputError
+        The name is unknown.
+    """
+    if not hasattr(cv2.aruco, name):
+        try:
+            name = known_dictionary(name)
+        except ValueError as error:
+            raise InputError("E-TAG-DICTIONARY", f"dictionary {name!r}: {error}") from None
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 

@@ -273,11 +273,11 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Lines:
         step, slope, widening, skew = integrated_step(distance, normal, value[:, 2])
         levels = np.stack([np.ones_like(t), relative, step, step * relative], axis=-1)
         if not k:  # the levels follow linearly
-            value[:, 3:] = _solved(levels, weight, pixels.level)[0]
+            value[:, 3:] = solved(levels, weight, pixels.level)[0]
         rise = value[:, 5, None, None] + value[:, 6, None, None] * relative
         residual = pixels.level - np.einsum("mpsi,mi->mps", levels, value[:, 3:])
         design = np.concatenate([(rise * np.stack([-slope, -slope * t, widening])).transpose(1, 2, 3, 0), levels], -1)
-        change, inverse = _solved(design, weight, residual)
+        change, inverse = solved(design, weight, residual)
         if k < STEPS:
             value += change
             value[:, 2] = value[:, 2].clip(MIN_VARIANCE, most)
@@ -320,7 +320,7 @@ def _covariance(residual, design, skew, distance, weight, inverse, shape) -> np.
     offset = design[..., 0]  # by a displacement of 1 px
     pull = np.stack([summed(offset * design[..., i]) for i in range(q)], axis=-1)
     # The skew that the parameters leave: what noise makes of it, and what displacements of 1 px make of it.
-    skew = skew - (design @ _solved(design, weight, skew)[0][:, None, :, None])[..., 0]
+    skew = skew - (design @ solved(design, weight, skew)[0][:, None, :, None])[..., 0]
     by_noise = (weight * skew**2).sum((1, 2))
     by_displacement = np.maximum((summed(skew * offset) ** 2).sum(1), 1e-12)
     square = ((weight * skew * residual).sum((1, 2)) ** 2 - noise * by_noise) / by_displacement
@@ -341,7 +341,7 @@ def _covariance(residual, design, skew, distance, weight, inverse, shape) -> np.
     return covariance[:, :2, :2].reshape(*shape, 2, 2)
 
 
-def _solved(design: np.ndarray, weight: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def solved(design: np.ndarray, weight: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the least-squares solutions (m, q) and inverse normal matrices (m, q, q)."""
     m, q = len(design), design.shape[-1]
     rows, w = design.reshape(m, -1, q), weight.reshape(m, -1, 1)

@@ -1,10 +1,12 @@
-"""Edges measured by area: the integrated step, and σ of tags' corners along the pixel rows and across them."""
+"""Edges measured by area: the integrated step, corners and their σ along the pixel rows and across them."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.design import TagLayout
+from stcal.boards.charuco import find_charuco
+from stcal.boards.chessboard import find_chessboard
+from stcal.boards.design import CharucoDesign, ChessboardDesign, TagLayout
 from stcal.boards.edges import integrated_step
 from stcal.boards.tags import corner_blocks, find_tags
 from tests.support.areas import homography, rendered, squares_nees
@@ -47,3 +49,22 @@ def test_sigma_of_a_tags_corners_holds_at_every_angle(degrees):
         squares.append(squares_nees(error.ravel()[None], tags.joint_px2))
         assert np.allclose(corner_blocks(tags.joint_px2), tags.covariance_px2)
     assert 0.4 < np.mean(squares) < 1.4
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0])
+@pytest.mark.parametrize("kind", ["charuco", "chessboard"])
+def test_corners_of_boards_lie_where_their_areas_meet(kind, degrees):
+    """Squares of whole pixels, so that along the rows all corners have one phase, and would be off to one side."""
+    rng, square = np.random.default_rng(4), 30.0
+    board = CharucoDesign(5, 7, square, 22.0, "DICT_4X4_50") if kind == "charuco" else ChessboardDesign(4, 5, square)
+    turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    middle = turn[:2, :2] @ board.xy_mm().mean(0)
+    place = homography(np.eye(3), turn, [*(np.array([159.7, 149.6]) - middle), 1.0])
+    image = rendered(board, place, (320, 300), rng)
+    view = (find_charuco if kind == "charuco" else find_chessboard)(image, "", board)
+    error = view.xy_px - (view.xyz_board[:, :2] @ place[:2, :2].T + place[:2, 2])
+    assert len(view) == len(board.xy_mm())
+    assert np.abs(error.mean(0)).max() < 0.006
+    assert np.sqrt((error**2).mean()) < 0.015
+    if view.covariance_px2 is not None:
+        assert 0.4 < squares_nees(error, view.covariance_px2).mean() < 1.6

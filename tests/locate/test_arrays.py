@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.boards.design import TagLayout
+from stcal.boards.charuco import find_charuco
+from stcal.boards.design import CharucoDesign, TagLayout
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CameraModel
@@ -77,3 +78,11 @@ def test_tags_that_no_dictionary_has():
         TagLayout.from_tags("4x4_50", [1], [[0.0, 0.0]], -1.0)
     with fails_with("E-ARRAY-SHAPE"):
         TagLayout.from_tags("4x4_50", [1, 2], [[0.0, 0.0]], 30.0)
+    with fails_with("E-TAG-DICTIONARY … 4x4_51"):
+        find_charuco(np.zeros((9, 9), np.uint8), "", CharucoDesign(5, 7, 30.0, 20.0, "4x4_51"))
+
+
+def test_a_board_of_a_dictionary_by_its_short_name():
+    board = CharucoDesign(5, 7, 30.0, 22.0, "4x4_50")
+    image = rendered(board, np.diag([1.2, 1.2, 1.0]), (300, 280), np.random.default_rng(1))
+    assert len(find_charuco(image, "", board)) == 24

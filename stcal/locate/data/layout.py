@@ -44,6 +44,9 @@ class LayoutPlan:
     origin: int
     corners_mm: np.ndarray
 
+    def __post_init__(self):
+        object.__setattr__(self, "tags", known_tags(self.tags, "target layout"))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetLayout:

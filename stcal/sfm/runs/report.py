@@ -257,9 +257,9 @@ class ReportFile(ResultFile):
         "of the size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
         "moved a projection at most (settled: less than 1e-6); these four are null with `chain` and `paper`; "
         "`rim_mm` mean height of the rims behind which the faces lie, `rim_sigma_mm` its σ (0 where stated), null "
-        "where they are as seen; `scale_from` what the size rests on; `print_factor`, `bend_factor` by which corners of "
-        "printed faces are off their design over their σ, in the plane and off it (null without such faces); `camera_given` false where the camera was found "
-        "from the photographs"
+        "where they are as seen; `scale_from` what the size rests on; `print_factor`, `bend_factor` by which corners "
+        "of printed faces are off their design over their σ, in the plane and off it (null without such faces); "
+        "`camera_given` false where the camera was found from the photographs"
     )
     faces: dict[ByFace, FaceRow] = Field(
         description="`target_from_face`, `translation_mm`, `angle_to_reference_deg`, `translation_sigma_um` and "
