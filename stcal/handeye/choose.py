@@ -35,6 +35,8 @@ WITHOUT_WEIGHTS = 0.7
 """The same for closed forms against adjustments: they are many, so that one of them is more often ahead by chance."""
 TINY_MM = 1e-9
 """Least standard error of a difference: differences of exact data are rounding."""
+MANY_PERCENT = 99.5
+"""Change of the board's size from which on a factor is clearer than per cent."""
 CONTRADICT = 0.01
 """Significance level: σ are widened if two answers differ so much that their σ explain it more rarely than this."""
 
@@ -310,8 +312,10 @@ def _sentence(tried: tuple[Tried, ...], chosen: Candidate, result: HandEye, meas
         parts.append(f"the camera file costs {min(filed_mm) - chosen_mm:.2g} mm")
     if chosen.scale and result.sigma_scale is not None:
         percent = 100 * (result.scale - 1)
-        size = "larger" if percent > 0 else "smaller"
-        parts.append(f"the board is {abs(percent):.2g} ± {100 * result.sigma_scale:.1g} % {size} than stated")
+        size = f"{abs(percent):.2g} ± {100 * result.sigma_scale:.1g} % {'larger' if percent > 0 else 'smaller'} than"
+        if abs(percent) >= MANY_PERCENT:
+            size = f"{result.scale:.3g} ± {result.sigma_scale:.1g} times as large as"
+        parts.append(f"the board is {size} stated")
     rad, mm = (result.sigma.get(name) for name in ("robot_rad", "robot_mm"))
     if rad is not None and mm is not None and {"robot_rad", "robot_mm"} & set(result.estimated):
         parts.append(f"the robot's poses err by {np.degrees(rad):.2g}° and {mm:.2g} mm an axis")

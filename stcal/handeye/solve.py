@@ -267,7 +267,7 @@ def _by_equations(task: _Task, method: str) -> HandEye:
     """Solves AX = XB or AX = ZB by the named method."""
     if task.options.four_dof:
         raise DegenerateError(
-            "E-HANDEYE-AXES", f"hand-eye: {method} needs rotations about two axes; with four_dof use method pose"
+            "E-HANDEYE-AXES", f"hand-eye: {method} needs rotations about two axes; with --four-dof use method pose"
         )
     loop, notes, noise = task.loop, task.notes, task.options.noise
     unit_mm = noise.camera_mm / noise.camera_rad if noise.camera_mm and noise.camera_rad else UNIT_MM

@@ -145,3 +145,12 @@ def test_steps_from_the_solution_of_all_are_solutions_of_the_others():
         moved = Poses.of([near.mount_from_camera]).difference(Poses.of([exact.mount_from_camera]))[0]
         size = [1e-9] * 6 if exact.covariance is None else np.sqrt(np.diag(exact.covariance))
         assert (np.abs(moved) < 0.1 * np.array(size)).all(), method
+
+
+def test_a_board_of_another_unit_is_told_by_a_factor():
+    truth = simulated(np.random.default_rng(7), 12, "eye-in-hand", ROBOT, (5e-4, 0.2))
+    eye = truth.pairs.camera_from_board
+    pairs = replace(truth.pairs, camera_from_board=replace(eye, translation=eye.translation / 2.7))
+    found = choose(pairs, truth.setup, None, HandEyeOptions(), None, splits(12, None, 4))
+    assert "the board is 2.7 ± " in found.sentence
+    assert " times as large as stated" in found.sentence
