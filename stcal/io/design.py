@@ -214,8 +214,8 @@ def load_target(path: str | Path, printed: PrintedReader | None = None) -> Targe
         elif printed is None:
             raise InputError(
                 "E-TARGET-PRINTED",
-                f"{of_face}: a board or tags, which this command does not take yet; `stcal-sfm run`, `detect` and "
-                "`measure` do",
+                f"{of_face}: a board or tags, which this command does not take yet; `stcal-sfm run`, `detect`, "
+                "`measure` and `simulate` do",
             )
         else:
             faces.append(printed(face, data.unusual_size, of_face))

@@ -520,7 +520,12 @@ SHAPE_STEPS, SHAPE_SETTLED = 20, 1e-13
 
 
 def shapes(shared: Shared, setting: Setting) -> Iterator[Shape]:
-    """Yields the faces of known shape, with their stated σ in the plane and the flatness off it."""
+    """Yields the faces of known shape, with their stated σ in the plane and the flatness off it.
+
+    None of a state that a step has sent to infinity, whose images have no finite cost either.
+    """
+    if not np.isfinite(shared.xyz_model).all():
+        return
     off, known = setting.bend_factor * setting.flatness_mm, known_points(setting.labels, setting.board)
     # What the sizes of all prints have in common counts once: each alone may be off by more.
     alone = float(np.sqrt(len(known)))
