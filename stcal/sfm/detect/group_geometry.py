@@ -112,13 +112,13 @@ Mirror = tuple[np.ndarray, np.ndarray]
 def _mirror_of_group(found: Arrangement, patterns: dict[str, Pattern], reach_mm: float) -> Mirror | None:
     """Returns the mirror that most images show, such as a shiny table; None without one.
 
-    A plane that is seen at two places is at one of them in a mirror if the mirror image of the one, turned over, is the
-    other. Of the two worlds the one on the cameras' side is real, the other one has its handedness reversed.
+    A plane that one image shows at two places is at one of them in a mirror if the mirror image of the one is the other.
+    Of the two worlds the one on the cameras' side is real, the other one has its handedness reversed.
     """
     mirrors = []
     for i, contradicted in found.contradicted.items():
-        centre = found.camera_from_group[i].inverse()
-        for view in (view for views in contradicted for view in views if view.plane in found.group_from_plane):
+        centre, planes = found.camera_from_group[i].inverse(), {view.plane for view in found.views[i]}
+        for view in (view for views in contradicted for view in views if view.plane in planes):
             pattern = patterns[view.plane]
             places = found.group_from_plane[view.plane], centre @ view.camera_from_plane
             mirror = _mirror_between(*(place @ pattern.xyz_mm() for place in places), pattern.radius_mm, reach_mm)
@@ -133,12 +133,18 @@ def _mirror_of_group(found: Arrangement, patterns: dict[str, Pattern], reach_mm:
 
 def _mirror_between(own: np.ndarray, other: np.ndarray, radius: np.ndarray, reach_mm: float) -> Mirror | None:
     """Returns normal and a point of the mirror that shows the circles ``own`` as ``other``, (n, 3) each, in any order;
-    None if there is none."""
+    None if there is none.
+
+    Nothing real lies on both sides of a mirror. (A grid that is numbered wrongly is shifted by less than its length, and
+    the plane half way would cut it.)
+    """
     between = own.mean(0) - other.mean(0)
     length = float(np.linalg.norm(between))
     if length < 2 * reach_mm:
         return None
     normal, middle = between / length, (own.mean(0) + other.mean(0)) / 2
+    if ((own - middle) @ normal <= 0).any():
+        return None
     apart, nearest = KDTree(other).query(own - 2 * ((own - middle) @ normal)[:, None] * normal)
     same = len(np.unique(nearest)) == len(own) and apart.max() < reach_mm and alike(radius, radius[nearest]).all()
     return (normal, middle) if same else None

@@ -164,6 +164,15 @@ def test_a_mirrored_group_whose_faces_pass_for_others_is_told_by_the_other_group
 
 
 @pytest.mark.slow
+def test_a_board_that_one_image_numbers_otherwise_is_no_mirror_image(bench):
+    """Half of it is covered, by something else in every image: a numbering that is shifted by its length looks as if a
+    mirror stood at its edge, but no image shows it twice."""
+    found = bench.label("board covered", 0.5, "15")
+    found.assert_all_found()
+    assert "in a mirror" not in found.notes()
+
+
+@pytest.mark.slow
 def test_circles_blurred_beyond_their_size_give_no_wrong_label(bench):
     """Circles of a third face at 75°, half as wide as their blur: not searched for, but seen by the first look."""
     found = bench.label("defocus", 5.0, *ALL)
