@@ -85,6 +85,9 @@ def run(
         A subclass of it, with a one-line message that says what to do.
     """
     options = options or RunOptions()
+    if camera is None:
+        require_printed(body_of(target))
+        options = replace(options, refine_camera=True)
     files = chosen_images(images, options.exclude)
     return run_on_files(files, images, camera, out, target, board, options, progress, reload_s)
 
@@ -105,9 +108,6 @@ def run_on_files(
     progress = progress or (lambda *_: None)
     model = read_camera(camera) if isinstance(camera, str | Path) else camera
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
-    if model is None:
-        require_printed(body_of(target))
-        options = replace(options, refine_camera=True)
     target_design = body_of(target)
     known = None if board is None and target_design.has_scale else board_of(board)
     designs = target_design, scale_reference(known, target_design)
