@@ -15,14 +15,14 @@ TO_LOOK_AT = {".html", ".pdf", ".svg", ".png", ".jpg", ".dxf", ".ply", ".gltf", 
 """Suffixes of pages, drawings and scenes, from which no number is taken."""
 OF_A_RUN = {
     *("stcal-run.json", "report.json", "labels.csv", "detections.csv", "database.db"),
-    *("models", "target_model", "overlays", "cache", "detections", "lock"),
+    *("models", "target_model", "overlays", "cache", "detections", "lock", "truth.json"),
 }
 """Files of a run that later commands of the same program read; COLMAP's are read again by the stage that writes them,
 and the faces are in ``faces.json``."""
 OPTIONS_OF_FIGURES = ("--json", "--report", "--plot")
-ELSEWHERE = {"sfm simulate", "sfm demo", "sfm draw", "sfm export-model", "sfm export-database", "sfm capture"}
-"""Commands that write photographs with their truth, drawings, and COLMAP's models and databases, which are compared by
-their own code (E-EXPORT-READ-BACK, E-OUTPUT-READ-BACK)."""
+ELSEWHERE = {"sfm demo", "sfm draw", "sfm export-model", "sfm export-database", "sfm capture"}
+"""Commands that call others, that draw, and that write COLMAP's models and databases, which are compared by their own
+code (E-EXPORT-READ-BACK, E-OUTPUT-READ-BACK)."""
 NUMBER = re.compile(rb"(?<![\w.])-?\d+\.\d+(?:e[-+]?\d+)?(?![\w.])")
 
 

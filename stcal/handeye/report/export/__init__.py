@@ -4,7 +4,6 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -139,7 +138,7 @@ def exported(
 
 def require_export_written(
     path: Path,
-    kind: Literal["json", "opencv", "ros", "urdf"],
+    kind: str,
     result: HandEye,
     parent: str = "",
     child: str = "",
@@ -147,7 +146,8 @@ def require_export_written(
 ) -> None:
     """Read a written file again, and require the transforms of ``result``.
 
-    ``kind`` : the result file, or what :func:`opencv_yaml`, :func:`ros_yaml` or :func:`urdf_joint` returns.
+    ``kind`` : ``json``, the result file, or ``opencv``, ``ros``, ``urdf`` of :func:`opencv_yaml`, :func:`ros_yaml` and
+    :func:`urdf_joint`.
     """
 
     def again() -> Poses:
