@@ -91,6 +91,8 @@ def run(
     target_design = body_of(target)
     known = None if board is None and target_design.has_scale else board_of(board)
     designs = target_design, scale_reference(known, target_design)
+    if target_design.with_faces(printed=True).faces:
+        _require_for_printed(options)
     options = options.settled(target_design)
     if options.compare:
         require_comparable(options.adjustment(designs[0]))
@@ -176,6 +178,26 @@ def assumed_camera(files: Sequence[ImageFile], target: TargetDesign) -> CameraMo
     if len(target.with_faces(printed=True).faces) < len(target.faces):
         require_printed(target.with_faces(printed=False))
     return model_of(guessed_cameras(files)[0])
+
+
+def _require_for_printed(options: RunOptions) -> None:
+    """Refuses options that a target with boards or tags on its faces has no use for.
+
+    Raises
+    ------
+    InputError
+        One of them is given.
+    """
+    given = {
+        "--solve paper": options.solve == "paper",
+        "--compare paper": options.compare is not None,
+        "--board-only": options.board_only,
+    }
+    for name in (name for name, is_given in given.items() if is_given):
+        raise InputError(
+            "E-OPTION-CONFLICT",
+            f"{name}: for targets of circles alone, and faces here have boards or tags; leave it out",
+        )
 
 
 def require_printed(target: TargetDesign) -> None:
