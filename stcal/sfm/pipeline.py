@@ -99,7 +99,7 @@ def run(
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
         result = _calibrated(images, model, folder, *designs, options, progress)
         result = replace(result, camera_given=model is not None)
-        if options.compare and result.target.target_from_face:
+        if options.compare and result.target.target_from_face and model is not None:
             published = _published(images, model, folder, *designs, options, progress)
             result = replace(result, comparison=compare_with_paper(result, published))
         result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera)), progress))
