@@ -162,7 +162,7 @@ def test_a_body_of_tags_gives_faces_and_camera(target):
 
 @pytest.mark.slow
 def test_a_run_of_photographs_without_board_and_camera(tmp_path):
-    scene = make_body_scene(tag_cube(60), body_camera(900), BodyOptions(images=14, distance_mm=300, seed=5))
+    scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=14, distance_mm=300, seed=2))
     write_body(tmp_path / "set", scene)
     result = pipeline.run(
         tmp_path / "set/images", None, tmp_path / "r", tmp_path / "set/target.toml", None, RunOptions()
