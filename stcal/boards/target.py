@@ -114,6 +114,7 @@ def _size_mm(board: FlatBoard) -> float:
     if isinstance(board, CharucoDesign):
         return board.square_mm
     layout = board.layout() if isinstance(board, AprilGridDesign) else board
+    assert isinstance(layout, TagLayout)
     corners = layout.corners_mm[0]
     return float(np.linalg.norm(corners[1] - corners[0]))
 

@@ -111,13 +111,15 @@ def run_on_files(
     target_design = body_of(target)
     known = None if board is None and target_design.has_scale else board_of(board)
     designs = target_design, scale_reference(known, target_design)
+    if target_design.with_faces(printed=True).faces:
+        _require_for_printed(options)
     options = options.settled(target_design)
     if options.compare:
         require_comparable(options.adjustment(designs[0]))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
         result = _calibrated(files, model, folder, *designs, options, progress)
         result = replace(result, camera_given=model is not None)
-        if options.compare and result.target.target_from_face:
+        if options.compare and result.target.target_from_face and model is not None:
             published = _published(files, model, folder, *designs, options, progress)
             result = replace(result, comparison=compare_with_paper(result, published))
         result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera)), progress))
@@ -190,6 +192,26 @@ def assumed_camera(files: Sequence[ImageFile], target: TargetDesign) -> CameraMo
     if len(target.with_faces(printed=True).faces) < len(target.faces):
         require_printed(target.with_faces(printed=False))
     return model_of(guessed_cameras(files)[0], PHOTOGRAPHS)
+
+
+def _require_for_printed(options: RunOptions) -> None:
+    """Refuses options that a target with boards or tags on its faces has no use for.
+
+    Raises
+    ------
+    InputError
+        One of them is given.
+    """
+    given = {
+        "--solve paper": options.solve == "paper",
+        "--compare paper": options.compare is not None,
+        "--board-only": options.board_only,
+    }
+    for name in (name for name, is_given in given.items() if is_given):
+        raise InputError(
+            "E-OPTION-CONFLICT",
+            f"{name}: for targets of circles alone, and faces here have boards or tags; leave it out",
+        )
 
 
 def require_printed(target: TargetDesign) -> None:

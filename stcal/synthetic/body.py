@@ -113,7 +113,8 @@ def _pose(scene: BodyScene, rng: np.random.Generator) -> Rigid:
     options, camera = scene.options, scene.camera
     size = np.array([camera.width, camera.height])
     for _ in range(TRIALS):
-        turn = Rotation.random(random_state=rng).as_matrix()
+        quaternion = rng.normal(size=4)  # of a turn that favours no direction
+        turn = Rotation.from_quat(quaternion / np.linalg.norm(quaternion)).as_matrix()
         depth = options.distance_mm * (1 + options.depth_share * rng.uniform(-1, 1))
         place = np.append(rng.uniform(-0.3, 0.3, 2) * size / camera.focal * depth, depth)
         pose = Rigid(turn, place - turn @ middle)

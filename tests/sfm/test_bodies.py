@@ -162,7 +162,7 @@ def test_a_body_of_tags_gives_faces_and_camera(target):
 
 @pytest.mark.slow
 def test_a_run_of_photographs_without_board_and_camera(tmp_path):
-    scene = make_body_scene(tag_cube(60), body_camera(900), BodyOptions(images=14, distance_mm=300, seed=5))
+    scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=14, distance_mm=300, seed=2))
     write_body(tmp_path / "set", scene)
     result = pipeline.run(
         tmp_path / "set/images", None, tmp_path / "r", tmp_path / "set/target.toml", None, RunOptions()
@@ -198,3 +198,11 @@ def test_a_real_cube_of_charuco_boards(tmp_path):
     beside = angles[(angles > 45) & (angles < 135)]
     assert len(beside) == 24
     assert np.abs(beside - 90).max() < 1.5
+
+
+@pytest.mark.parametrize("option", [{"solve": "paper"}, {"board_only": True}])
+def test_options_for_circles_are_refused(tmp_path, option):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images/a.png").write_bytes(b"")
+    with fails_with("E-OPTION-CONFLICT … --"):
+        pipeline.run(tmp_path / "images", None, tmp_path / "r", tag_cube(60), None, RunOptions(**option))

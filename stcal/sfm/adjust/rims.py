@@ -67,7 +67,8 @@ def radius_views(
     shape = np.concatenate([image.shape[keypoint] for image, keypoint in seen])
     blur = np.concatenate([image.blur_px[keypoint] for image, keypoint in seen])
     point = model.point_index[order]
-    radius = np.array([design_mm.get(label, np.nan) for label in model.labels])[point]  # corners have none
+    is_circle = np.array([label in design_mm for label in model.labels])[point]  # corners have no radius
+    radius = np.array([design_mm.get(label, 1.0) for label in model.labels])[point]
     normal = np.zeros((len(model.labels), 3))
     for members in model.points_by_face().values():
         normal[members] = fit_plane(model.xyz_model[members]).normal
@@ -84,7 +85,7 @@ def radius_views(
     return RadiusViews(
         point,
         radius,
-        (measured + lost) / size,
+        np.where(is_circle, (measured + lost) / size, np.nan),
         size,
         lost / size * radius,
         np.sqrt(np.maximum(1 - cosine**2, 0)) / cosine,

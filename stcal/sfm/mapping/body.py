@@ -18,7 +18,7 @@ from stcal.geometry.normal_equations import blocks_of, reduce
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma
-from stcal.labels import CircleLabel
+from stcal.labels import Label
 from stcal.sfm.data.model import MIN_POINTS, ImageObservations
 
 MIN_CORNERS = 4
@@ -54,11 +54,13 @@ class Corners:
     @classmethod
     def of(cls, observations: Sequence[ImageObservations], faces: Sequence[FaceDesign]) -> "Corners":
         """Returns the corners of views with at least four corners of a face."""
-        place = {label: (f, k) for f, face in enumerate(faces) for k, label in enumerate(face.labels())}
+        place: dict[Label, tuple[int, int]] = {
+            label: (f, k) for f, face in enumerate(faces) for k, label in enumerate(face.labels())
+        }
         rows: list[tuple[int, int, int]] = []
         pixels, covariances = [np.zeros((0, 2))], [np.zeros((0, 2, 2))]
         for i, image in enumerate(observations):
-            own = [k for k, label in enumerate(image.labels) if isinstance(label, CircleLabel) and label in place]
+            own = [k for k, label in enumerate(image.labels) if label in place]
             of_face = np.array([place[image.labels[k]][0] for k in own], int)
             keep = [k for k, f in zip(own, of_face, strict=True) if (of_face == f).sum() >= MIN_CORNERS]
             rows += [(i, *place[image.labels[k]]) for k in keep]
@@ -181,7 +183,7 @@ class _Views:
         def evaluate(poses: PoseStack) -> Normal:
             rotated = xyz @ np.swapaxes(poses.rotation, 1, 2)
             p = rotated + poses.translation[:, None]
-            possible = ((p[..., 2] > 0) | ~real).all(1)
+            possible = np.asarray(((p[..., 2] > 0) | ~real).all(1))
             depth = np.where(p[..., 2] > 0, p[..., 2], 1.0)
             by_point = np.zeros((*p.shape[:2], 2, 3))
             by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth
@@ -210,7 +212,7 @@ class _Edge:
 def _edges(views: _Views, faces: int) -> list[_Edge]:
     by_pair: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for image in np.unique(views.image):
-        own = np.flatnonzero(views.image == image)
+        own = np.flatnonzero(views.image == image).tolist()
         for x, v in enumerate(own):
             for w in own[x + 1 :]:
                 pair = (v, w) if views.face[v] < views.face[w] else (w, v)

@@ -188,14 +188,16 @@ def _mapped(
     return _own_mapping(database, names, ids, pair), seeded
 
 
-def left_out(group: list[ImageObservations], model: WorldModel) -> dict[str, str]:
-    """Returns why images of the group are not in the model, by image name."""
+def left_out(
+    group: list[ImageObservations], model: WorldModel, remedy: str = "photograph faces and board together"
+) -> dict[str, str]:
+    """Returns why images of the group are not in the model, by image name; ``remedy`` for too few circles in it."""
     reasons = {}
     for image in group:
         if image.name not in model.images:
             known = len(set(image.labels) & set(model.labels))
             reasons[image.name] = (
-                f"{known} of its circles are in the model, {MIN_POINTS} needed; photograph faces and board together"
+                f"{known} of its circles are in the model, {MIN_POINTS} needed; {remedy}"
                 if known < MIN_POINTS
                 else f"fewer than {MIN_POINTS} of its {known} circles fit the model to {MAX_REPROJECTION_PX:g} px; "
                 "check that it is sharp, and that nothing but the camera moved"

@@ -124,10 +124,10 @@ def _better(body: Body, other: Body) -> bool:
 
 
 def _named(body: Body, corners: Corners, camera: CalibratedCamera) -> PlacedBody:
-    placed = np.flatnonzero(body.placed_faces)
+    placed = np.flatnonzero(body.placed_faces).tolist()
     return PlacedBody(
         {corners.faces[f].id: body.body_from_face.rigid(f) for f in placed},
-        {corners.images[i]: body.camera_from_body.rigid(i) for i in np.flatnonzero(body.placed_images)},
+        {corners.images[i]: body.camera_from_body.rigid(i) for i in np.flatnonzero(body.placed_images).tolist()},
         tuple(corners.faces[f] for f in placed),
         camera,
         tuple(corners.faces[f].id for f in np.flatnonzero(~body.placed_faces) if (corners.face == f).any()),

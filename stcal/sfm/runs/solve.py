@@ -31,6 +31,7 @@ from stcal.sfm.report.judgement import LEFT_OUT_WHOLE
 from stcal.sfm.runs.options import RunOptions
 
 CACHE_VERSION = 6
+SHOW_MORE = "show two faces of it at once, or one by more corners"
 _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 
 
@@ -288,7 +289,7 @@ def solve_body(
             errors.append(error)
         else:
             members = [image for image in group if image.name in refined.model.images]
-            missing = left_out(group, model) | left_out(members, refined.model)
+            missing = left_out(group, model, SHOW_MORE) | left_out(members, refined.model, SHOW_MORE)
             pair = pair_of_model(refined.model)
             solutions.append(GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, refined.outliers))
         progress("map", done, len(groups))
