@@ -112,7 +112,7 @@ Mirror = tuple[np.ndarray, np.ndarray]
 def _mirror_of_group(found: Arrangement, patterns: dict[str, Pattern], reach_mm: float) -> Mirror | None:
     """Returns the mirror that most images show, such as a shiny table; None without one.
 
-    A plane that one image shows at two places is in a mirror at one of them if each is the mirror image of the other. Of
+    A plane that one image shows at two places, each the mirror image of the other, is in a mirror at one of them. Of
     the two worlds the one on the cameras' side is real, the other one has its handedness reversed.
     """
     mirrors = []
