@@ -112,7 +112,7 @@ Mirror = tuple[np.ndarray, np.ndarray]
 def _mirror_of_group(found: Arrangement, patterns: dict[str, Pattern], reach_mm: float) -> Mirror | None:
     """Returns the mirror that most images show, such as a shiny table; None without one.
 
-    A plane that one image shows at two places is at one of them in a mirror if the mirror image of one is the other. Of
+    A plane that one image shows at two places, each the mirror image of the other, is in a mirror at one of them. Of
     the two worlds the one on the cameras' side is real, the other one has its handedness reversed.
     """
     mirrors = []
@@ -135,8 +135,8 @@ def _mirror_between(own: np.ndarray, other: np.ndarray, radius: np.ndarray, reac
     """Returns normal and a point of the mirror that shows the circles ``own`` as ``other``, (n, 3) each, in any order;
     None if there is none.
 
-    Nothing real lies on both sides of a mirror. (A grid that is numbered wrongly is shifted by less than its length,
-    and the plane half way would cut it.)
+    Nothing real lies on both sides of a mirror; a plane half way between a grid and the same grid numbered otherwise
+    cuts both.
     """
     between = own.mean(0) - other.mean(0)
     length = float(np.linalg.norm(between))

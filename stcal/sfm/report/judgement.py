@@ -31,6 +31,8 @@ QUESTIONS = {
 Use = Literal["yes", "with care", "no"]
 CAUSE = "cause"
 """Key of the check that names what all images have in common and makes others fail."""
+GENERAL = ("centres", "agreement", "halves")
+"""Keys of the checks that tell that something is wrong and not what. Other checks are said before them."""
 OF_WHOLE_SET = "Cause of the whole set: "
 """How the title of that check begins, before the cause."""
 LEFT_OUT_WHOLE = "left out whole: "
@@ -259,11 +261,13 @@ def _gaps(report: dict) -> list[str]:
 
 
 def _first(report: dict, verdict: str) -> dict:
-    """Returns the cause of the whole set, else the first check of this verdict that names an image, or the first."""
+    """Returns the cause of the whole set, else the first check of this verdict that names an image, or the first that
+    is not a general one."""
     images = {image["name"] for image in report["images"]}
     matching = [check for check in report.get("checks", []) if check["verdict"] == verdict]
     naming = [check for check in matching if any(name in images for name in check["names"])]
-    return [*(check for check in matching if check["key"] == CAUSE), *naming, *matching][0]
+    telling = [check for check in matching if check["key"] not in GENERAL]
+    return [*(check for check in matching if check["key"] == CAUSE), *naming, *telling, *matching][0]
 
 
 # --- how good ---------------------------------------------------------------------------------------------------------
