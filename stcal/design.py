@@ -261,7 +261,7 @@ def require_face(
     if radius.min() <= 0:
         raise InputError(
             "E-TARGET-RADIUS",
-            f"{where}: circle {ids[radius.argmin()]} has a radius of {radius.min():g} mm; more needed",
+            f"{where}: circle {ids[int(radius.argmin())]} has a radius of {radius.min():g} mm; more needed",
         )
     gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
     np.fill_diagonal(gap, np.inf)

@@ -9,10 +9,12 @@ import signal
 import sys
 import threading
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
+    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
@@ -224,6 +226,8 @@ class OwnProcess:
         self._begin = (begin, *arguments)
         self._guard = threading.Lock()
         self._pool: ProcessPoolExecutor | None = None
+        self._line: deque[object] = deque()
+        self._moved = threading.Condition()
 
     def call(self, function: Callable[..., R], *arguments, given_up: Callable[[], bool] | None = None) -> R:
         """Returns the result of the function in the process, after all earlier calls.
@@ -237,6 +241,30 @@ class OwnProcess:
         CancelledError
             The call was given up before it began.
         """
+        if given_up is None:
+            return self._called(function, *arguments)
+        with self._in_turn(given_up):
+            return self._called(function, *arguments)
+
+    @contextlib.contextmanager
+    def _in_turn(self, given_up: Callable[[], bool]) -> Iterator[None]:
+        """Waits for the end of earlier calls: an executor begins a second one early, which then cannot be given up."""
+        own = object()
+        with self._moved:
+            self._line.append(own)
+        try:
+            with self._moved:
+                while self._line[0] is not own and not given_up():
+                    self._moved.wait(LOOK_S)
+            if given_up():
+                raise CancelledError
+            yield
+        finally:
+            with self._moved:
+                self._line.remove(own)
+                self._moved.notify_all()
+
+    def _called(self, function: Callable[..., R], *arguments) -> R:
         with self._guard:
             if self._pool is None:
                 with _starting():
@@ -245,10 +273,6 @@ class OwnProcess:
             else:
                 pool, future = self._pool, self._pool.submit(function, *arguments)
         try:
-            while given_up is not None and not wait((future,), LOOK_S).done:
-                if given_up():
-                    future.cancel()  # without effect once it has begun
-                    break
             return future.result()
         except BrokenExecutor:
             with self._guard:

@@ -84,6 +84,16 @@ def test_a_copy_and_a_file_that_is_no_image_are_named(detected):
     assert reasons["12/copy.jpg"] == f"the same image as {IMAGE}"
 
 
+def test_a_photograph_that_is_gone_is_an_error(detected, sample, monkeypatch):
+    """It was there when the folder was looked at: a result without it would be another one."""
+    detect, folder, _ = detected
+    listed = find_images(folder)
+    monkeypatch.setattr(f"{__name__}.find_images", lambda _: listed)
+    (folder / IMAGE).unlink()
+    with fails_with(f"E-IMAGES-GONE … {IMAGE}"):
+        detect()
+
+
 def test_no_usable_file_is_an_error(detected):
     detect, folder, _ = detected
     (folder / IMAGE).write_bytes(b"not an image")
