@@ -61,6 +61,8 @@ def _of_size(grey, start, along, half: int) -> tuple[np.ndarray, np.ndarray, np.
     angle = np.arctan2(along[..., 1], along[..., 0])
     value = np.zeros((n, q))  # shift, turns of both edges, variance of the blur, dark and rise with their gradients
     value[:, 4] = START_VARIANCE
+    residual = first = second = distance = level
+    design, inverse = np.zeros((*level.shape, q)), np.zeros((n, q, q))
     for k in range(STEPS + 1):
         direction = np.stack([np.cos(angle + value[:, 2:4]), np.sin(angle + value[:, 2:4])], axis=-1)
         normal = np.stack([-direction[..., 1], direction[..., 0]], axis=-1)

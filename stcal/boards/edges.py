@@ -108,7 +108,7 @@ def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray)
         lines = _by_area(grey, frame, rough)
         meeting, covariance = _meet(frame, lines)
     seen = good.mean(2) >= MIN_SHARE
-    seen &= np.isfinite(covariance).all((1, 2))[:, None] & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
+    seen &= np.isfinite(covariance.sum((1, 2)))[:, None] & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
     return EdgeCorners(meeting, covariance, seen.all(1))
 
 
@@ -261,7 +261,9 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Lines:
     m = len(pixels.level)
     normal, most = frame.normal.reshape(m, 2), frame.reach.ravel() ** 2
     weight, t, d = pixels.used.astype(float), pixels.along, pixels.across
-    relative, distance = 2 * t / frame.length.reshape(m, 1, 1), d
+    relative = 2 * t / frame.length.reshape(m, 1, 1)
+    distance = residual = third = d
+    design, inverse = np.zeros((*t.shape, 7)), np.zeros((m, 7, 7))
     value = np.zeros((m, 7))  # offset, slope, variance of the blur, dark and rise with their changes along the edge
     value[:, :2] = np.nan_to_num(np.stack([rough.offset, rough.slope], -1).reshape(m, 2))
     value[:, 2] = START_VARIANCE
@@ -277,12 +279,13 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Lines:
         rise = value[:, 5, None, None] + value[:, 6, None, None] * relative
         residual = pixels.level - np.einsum("mpsi,mi->mps", levels, value[:, 3:])
         design = np.concatenate([(rise * np.stack([-slope, -slope * t, widening])).transpose(1, 2, 3, 0), levels], -1)
+        third = rise * skew
         change, inverse = solved(design, weight, residual)
         if k < STEPS:
             value += change
             value[:, 2] = value[:, 2].clip(MIN_VARIANCE, most)
             value = np.where(np.isfinite(value), value, 0.0)
-    covariance = _covariance(residual, design, rise * skew, distance, weight, inverse, shape := frame.length.shape)
+    covariance = _covariance(residual, design, third, distance, weight, inverse, shape := frame.length.shape)
     line = np.moveaxis(value[:, :2].reshape(*shape, 2), 2, 0)
     settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
     offset, slope = np.where(settled, line, [rough.offset, rough.slope])
