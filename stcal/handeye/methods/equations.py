@@ -175,8 +175,10 @@ class Components:
         left = whole.eliminated(self.held)
         kept, corners = left.step()
         inverse = np.linalg.inv(left.normal)
-        mixed = None if left.from_kept is None else -left.from_kept @ inverse
-        of_corners = left.inverse if mixed is None else left.inverse - mixed @ np.swapaxes(left.from_kept, 1, 2)
+        mixed, of_corners = None, left.inverse
+        if left.from_kept is not None:
+            mixed = -left.from_kept @ inverse
+            of_corners = left.inverse - mixed @ np.swapaxes(left.from_kept, 1, 2)
         square, taken = np.zeros((2, len(each)))
         for i, own in enumerate(each):
             square[i] = own.cost + 2 * float(kept @ own.gradient + (corners * own.slope).sum())
