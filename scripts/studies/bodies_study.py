@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.solids import tag_cube, tag_dodecahedron
 from stcal.errors import StcalError
 from stcal.sfm import pipeline
 from stcal.sfm.report.compare import compare
 from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
+from stcal.synthetic.designs import tag_cube, tag_dodecahedron
 
 BODIES = {
     "cube of 60 mm, tags of about 100 px": (tag_cube(60.0), 300.0, 16),

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from stcal.boards.crossings import crossings
 from stcal.boards.design import BoardView, CharucoDesign, view_of
 from stcal.boards.dictionaries import dictionary_of
+from stcal.boards.edges import crossings
 from stcal.boards.tags import detector_settings
 from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian
 from stcal.geometry.robust import median_length, robust_sigma

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from stcal.boards.crossings import crossings
 from stcal.boards.design import BoardView, ChessboardDesign, view_of
+from stcal.boards.edges import crossings
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit
 

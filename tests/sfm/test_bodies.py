@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stcal.boards.solids import tag_cube, tag_dodecahedron
 from stcal.boards.target import body_toml, load_body
 from stcal.design import scale_reference
 from stcal.io.cameras.model import CalibratedCamera, camera_prior
@@ -22,6 +21,7 @@ from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
+from stcal.synthetic.designs import tag_cube, tag_dodecahedron
 from tests.outcome import fails_with
 
 CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
