@@ -104,7 +104,7 @@ class _Painter:
         level: float,
         canvas: np.ndarray | None = None,
         mirror: tuple[np.ndarray, float] | None = None,
-        tone: Callable[[np.ndarray], np.ndarray] = lambda level: level,
+        tone: Callable[[float], float] = lambda level: level,
     ):
         self.camera, self.camera_from_target = camera, camera_from_target
         self.canvas = np.full((camera.height, camera.width), round(level), np.uint8) if canvas is None else canvas

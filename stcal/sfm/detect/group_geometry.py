@@ -120,8 +120,9 @@ def _mirror_of_group(found: Arrangement, patterns: dict[str, Pattern], reach_mm:
         centre, planes = found.camera_from_group[i].inverse(), {view.plane for view in found.views[i]}
         for view in (view for views in contradicted for view in views if view.plane in planes):
             pattern = patterns[view.plane]
-            places = found.group_from_plane[view.plane], centre @ view.camera_from_plane
-            mirror = _mirror_between(*(place @ pattern.xyz_mm() for place in places), pattern.radius_mm, reach_mm)
+            own, other = found.group_from_plane[view.plane], centre @ view.camera_from_plane
+            xyz = pattern.xyz_mm()
+            mirror = _mirror_between(own @ xyz, other @ xyz, pattern.radius_mm, reach_mm)
             if mirror is not None:
                 normal, middle = mirror
                 mirrors.append((normal * np.sign((centre.translation - middle) @ normal), middle, i))
