@@ -19,7 +19,18 @@ PANELS = {
     "Output": ("out", "strict"),
     "Performance": ("workers", "scheduler", "send_images"),
     "Input in other forms": (
-        *("rotation", "length_unit", "poses_are", "first", "second", "key", "quaternions", "columns", "columns_a"),
+        *(
+            "rotation",
+            "length_unit",
+            "poses_are",
+            "first",
+            "second",
+            "key",
+            "quaternions",
+            "columns",
+            "columns_a",
+            "undo_flips",
+        ),
     ),
     "Noise": (
         *("sigma_robot_mm", "sigma_robot_deg", "sigma_camera_mm", "sigma_camera_deg", "sigma_board_mm"),

@@ -246,12 +246,11 @@ def choose(
     jobs = [(pairs, setup, each.method, views, each.options(options, prior), rows) for each in candidates]
     finished: dict[int, _Outcome | StcalError] = {}
     for i, outcome in run_parallel(_solved, jobs, 1 if views is None else workers):
+        if i == 0 and isinstance(outcome, StcalError):  # what the first one cannot use, the others should not
+            raise outcome
         finished[i] = outcome
         progress(len(finished), len(jobs))
     outcomes = {candidate: finished[i] for i, candidate in enumerate(candidates)}
-    plain = outcomes[candidates[0]]
-    if isinstance(plain, StcalError):
-        raise plain
     trial = _Trial({each: outcome for each, outcome in outcomes.items() if isinstance(outcome, _Outcome)}, rows)
     chosen = trial.best()
     errors_of_split = []
