@@ -192,7 +192,7 @@ def load_run_board(path: str | Path) -> BoardDesign:
     InputError
         As :func:`load_flat_board`; or it is another board, or its circles have no radius.
     """
-    board = load_flat_board(path)
+    board = load_flat_board(path) if Path(path).is_file() else load_board(path)
     if isinstance(board, BoardDesign):
         return board
     if not isinstance(board, AsymmetricCirclesDesign):
