@@ -25,7 +25,7 @@ from stcal.parallel import ONE_THREAD
 from stcal.register import register
 from stcal.register.core.pairs import read_pairs
 from stcal.register.report.file import RegistrationFile
-from stcal.register.report.page import registration_page, registration_text
+from stcal.register.report.page import registration_report
 from stcal.register.workspace.findings import findings
 from tests.support.point_pairs import make_scene
 
@@ -58,9 +58,9 @@ def parts_once(path: Path) -> tuple[dict[str, float], int]:
     pairs = timed("reading", lambda: read_pairs(path))
     found = timed("registration", lambda: register(pairs.xyz_a, pairs.xyz_b, lines=pairs.lines))
     every = timed("field and cubes", lambda: findings("pairs", pairs.lines, pairs.xyz_a, pairs.xyz_b, found))
-    timed("tables", lambda: registration_text(every))
+    timed("tables", registration_report(every).text)
     timed("JSON", lambda: json_text(RegistrationFile.of(every)))
-    timed("page", lambda: registration_page(every))
+    timed("page", registration_report(every).page)
     return took, len(found.outliers)
 
 

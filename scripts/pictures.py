@@ -80,7 +80,7 @@ def photograph_page(page: Path, out: Path, size: tuple[int, int] = PAGE_PX) -> N
     words = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", f"--screenshot={out}"]
     window = f"--window-size={size[0]},{size[1]}"
     subprocess.run([browser, *words, window, page.resolve().as_uri()], check=True, capture_output=True)
-    Image.open(out).convert("RGB").quantize(128).save(out, optimize=True)
+    Image.open(out).convert("RGB").quantize(256, method=Image.Quantize.FASTOCTREE).save(out, optimize=True)
 
 
 def plates(result: Path, out: Path) -> None:

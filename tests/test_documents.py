@@ -2,12 +2,14 @@
 
 import ast
 import re
+import shlex
 from pathlib import Path
 
 from typer.main import get_command
 
 import stcal
 import stcal.errors
+from stcal.cli.examples import EXAMPLES, GROUPS
 from stcal.cli.main import app
 from tests.scripts import load_script
 
@@ -223,3 +225,19 @@ def test_nouns_and_sentences_are_no_fragments():
         "Giving the pose.",
     ):
         assert fragment(text), text
+
+
+def test_every_command_has_an_example_that_can_be_parsed():
+    root = get_command(app)
+    found = dict(commands(root))
+    assert set(EXAMPLES) == set(found)
+    for words, calls in EXAMPLES.items():
+        for call in calls:
+            found[words].make_context(words, shlex.split(call))
+
+
+def test_the_groups_of_the_help_hold_every_command():
+    for words, groups in GROUPS.items():
+        names = [name for group in groups.values() for name in group]
+        group = get_command(app) if words == "stcal" else get_command(app).commands[words]
+        assert sorted(names) == sorted(group.commands)

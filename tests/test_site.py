@@ -1,9 +1,14 @@
 """The site of the documents: what is made for it, and its links. `.ci/run` builds all of it."""
 
 import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
+from tests.report.browser import opened, show, sideways_px
 from tests.scripts import load_script
 
 site = load_script("build_site")
@@ -97,3 +102,48 @@ def test_pictures_are_cut_to_the_circles(tmp_path):
     pictures = load_script("pictures")
     (tmp_path / "d.csv").write_text("image,label,x_px,y_px\na,1:1,100,60\na,1:2,300,200\nb,1:1,900,900\na,,5,5\n")
     assert pictures.box_of_circles(tmp_path / "d.csv", "a", (320, 600)) == (55, 15, 320, 245)
+
+
+WIDE = (
+    "README.md",
+    "docs/howto/calibrate.md",
+    "docs/tutorials/tags.md",
+    "docs/sources.md",
+    "docs/reference/files/run.md",
+)
+"""Pages with long lines of output, long commands and wide tables."""
+
+
+@pytest.fixture(scope="module")
+def wide_pages(tmp_path_factory):
+    """Some pages as the site has them; links to others lead nowhere."""
+    pytest.importorskip("furo")
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("site")
+    for name in WIDE:
+        site.write(source / Path(name).name, (site.ROOT / name).read_text(encoding="utf-8"))
+    site.write(source / "index.md", "# Pages\n" + site.contents("", [Path(name).name for name in WIDE]))
+    for path in (site.SITE / "conf.py", site.SITE / "docstrings.py"):
+        site.write(source / path.name, path.read_text(encoding="utf-8"))
+    shutil.copytree(site.SITE / "static", source / "static")
+    made = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-b", "html", "-q", source, out], capture_output=True, text=True
+    )
+    assert made.returncode == 0, made.stderr
+    return sorted(out / Path(name).with_suffix(".html").name for name in WIDE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1280, 800, 400])
+def test_no_page_is_wider_than_its_window(wide_pages, width):
+    with opened() as chrome:
+        for page in wide_pages:
+            show(chrome, page, width)
+            assert sideways_px(chrome) == 0, page.name
+
+
+def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr(site, "build_main", None)
+    with pytest.raises(SystemExit) as caught:
+        site.build(tmp_path / "site")
+    assert 'pip install ".[docs]"' in str(caught.value)
+    assert "\n" not in str(caught.value)

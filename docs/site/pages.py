@@ -8,7 +8,7 @@ from typing import Any
 
 from typer.main import get_command
 
-from stcal.cli.help import PLAIN
+from stcal.cli.help import PLAIN, examples_of
 from stcal.cli.main import app
 
 SYSTEMS = {
@@ -56,7 +56,8 @@ def command_text(words: str, command: Any) -> list[str]:
     """Heading, help, and a table of arguments and options."""
     context = command.make_context(words, [], resilient_parsing=True, **PLAIN["context_settings"])
     usage = " ".join(command.collect_usage_pieces(context))
-    text = [f"## {words}", "", inspect.cleandoc(command.help or ""), "", "```", f"{words} {usage}", "```", ""]
+    calls = [f"{words} {usage}", *examples_of(words)]
+    text = [f"## {words}", "", inspect.cleandoc(command.help or ""), "", "```", *calls, "```", ""]
     records = [each.get_help_record(context) for each in command.params if each.name != "help"]
     rows = [f"| `{cell(names)}` | {plain(meaning)} |" for names, meaning in filter(None, records)]
     return [*text, "| argument or option | meaning |", "|---|---|", *rows, ""]

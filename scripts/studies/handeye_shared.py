@@ -18,7 +18,7 @@ import numpy as np
 from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.report.file import HandEyeFile
-from stcal.handeye.report.page import outcome_text
+from stcal.handeye.report.page import outcome_report
 from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.workflows.handeye.calibrate import ALL, Splits, calibrate
@@ -98,7 +98,7 @@ def _handeye(
     given = read_input(folder / "images", folder / "poses", camera, scratch / "board.toml", splits.workers)
     options = HandEyeOptions(intrinsics=given.prior if adjust else None, with_scale=adjust, symmetries=given.symmetries)
     outcome = calibrate(given, setup, method, options, splits)
-    return HandEyeFile.of(outcome, whole=True).content(), outcome_text(outcome)
+    return HandEyeFile.of(outcome, whole=True).content(), outcome_report(outcome).text()
 
 
 def by_split(data: dict) -> np.ndarray:

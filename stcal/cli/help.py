@@ -4,6 +4,8 @@ from typing import Any
 
 from typer.core import TyperCommand, TyperGroup
 
+from stcal.cli.examples import EXAMPLES, GROUPS
+
 PLAIN: dict[str, Any] = {
     "rich_markup_mode": None,  # rich takes twice as long to load as all the rest of `--help`
     "context_settings": {"max_content_width": 120, "help_option_names": ["-h", "--help"]},
@@ -59,8 +61,24 @@ def panel_of(name: str, reads: bool, writes: bool) -> str:
     return "Output" if writes else "Input" if reads else "Method"
 
 
+def words_of(path: str) -> str:
+    """Returns the words of a command without the program's: ``sfm run`` of ``stcal-sfm run`` and ``stcal sfm run``."""
+    return path.replace("stcal-sfm", "stcal sfm", 1).partition(" ")[2]
+
+
+def examples_of(path: str) -> list[str]:
+    """Returns typical calls of a command; ``path`` : its words, with the program's."""
+    return [f"{path} {arguments}".rstrip() for arguments in EXAMPLES.get(words_of(path), ())]
+
+
 class Command(TyperCommand):
-    """A command whose help has its options in panels."""
+    """A command whose help has its options in panels, and examples."""
+
+    def format_epilog(self, ctx, formatter) -> None:
+        """Writes the examples, each on one line to copy."""
+        if examples := examples_of(ctx.command_path):
+            with formatter.section("Examples" if len(examples) > 1 else "Example"):
+                formatter.write("".join(f"  {line}\n" for line in examples))
 
     def format_options(self, ctx, formatter) -> None:
         """Writes the arguments, and then the options panel by panel."""
@@ -79,7 +97,8 @@ class Command(TyperCommand):
 
 
 class Commands(TyperGroup):
-    """A group of commands, whose names may have two words. Its help has the whole sentence of each command."""
+    """A group of commands, whose names may have two words. Its help has those that belong together, each with its
+    sentence."""
 
     def resolve_command(self, ctx, args):
         """Resolves ``handeye plan`` before ``handeye``, whose first argument is a file."""
@@ -90,10 +109,12 @@ class Commands(TyperGroup):
     def format_commands(self, ctx, formatter) -> None:
         """Writes the name and help of each command."""
         commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        rows = [
-            (name, " ".join((command.help or "").split()))
+        rows = {
+            name: (name, " ".join((command.help or "").split()))
             for name, command in commands
             if command and not command.hidden
-        ]
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
+        }
+        groups = GROUPS.get(words_of(ctx.command_path) or "stcal", {"Commands": tuple(rows)})
+        for title, names in groups.items():
+            with formatter.section(title):
+                formatter.write_dl([rows[name] for name in names])

@@ -17,7 +17,7 @@ from stcal.cli.options import (
     ReportFile,
     Workers,
 )
-from stcal.cli.terminal import StageProgress, print_each, say, write
+from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 
 app = typer.Typer(
@@ -132,8 +132,7 @@ def calibrate(
     print_each("warning", warnings(result, plan.tags))
     write(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
     require_layout_written(out, result.layout)
-    if json_file:
-        write(json_file, calibrated_file(result))
+    write_if(json_file, lambda: calibrated_file(result))
 
 
 @app.command()
@@ -240,7 +239,7 @@ def run(
     from stcal.locate.pose.verdict import VerdictOptions
     from stcal.locate.report.chain import on_chain, read_chain, read_registered
     from stcal.locate.report.located import LocatedFile
-    from stcal.locate.report.page import accepted, poses_csv, run_text, uncertain
+    from stcal.locate.report.page import accepted, poses_csv, run_report, uncertain
 
     if hand_eye and registration:
         raise InputError(
@@ -280,19 +279,15 @@ def run(
         )
     results = list(located(scenes, target, model, LocateOptions(method.value, limits, patent, moved_px, workers)))
     doubts = on_chain(chain, {each.name: uncertain(each) for each in accepted(results)}) if chain else ()
-    say(run_text(results, chain))
+    document = run_report(results, scenes, target, model, chain)
+    say(document.text())
     print_each("warning", doubts)
     print_each("not used", (each for scene in scenes for each in scene.skipped))
-    if out:
-        write(out, poses_csv(results, chain))
-        if poses := [uncertain(each).rigid for each in accepted(results)]:
-            require_pose_table_written(out, {"": Poses.of(poses)})
-    if json_file:
-        write(json_file, LocatedFile.of(results, target, chain))
-    if report:
-        from stcal.locate.report.page import run_page
-
-        write(report, run_page(results, scenes, target, model, chain))
+    write_if(out, lambda: poses_csv(results, chain))
+    if out and (poses := [uncertain(each).rigid for each in accepted(results)]):
+        require_pose_table_written(out, {"": Poses.of(poses)})
+    write_if(json_file, lambda: LocatedFile.of(results, target, chain))
+    write_if(report, document.page)
     if not accepted(results):
         say(f"no pose accepted in {len(results)} scene{'s' * (len(results) > 1)}")
         raise typer.Exit(NOTHING_ACCEPTED)

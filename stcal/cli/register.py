@@ -18,7 +18,7 @@ from stcal.cli.options import (
     name_of,
     one_table,
 )
-from stcal.cli.terminal import print_each, say, write
+from stcal.cli.terminal import print_each, say, write, write_if
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 
 
@@ -109,7 +109,7 @@ def register(
     from stcal.register.core.liu2017 import Liu2017Options, sample_sizes
     from stcal.register.core.pairs import read_pairs
     from stcal.register.report.file import RegistrationFile, require_registration_written
-    from stcal.register.report.page import registration_page, registration_text, sample_size_section
+    from stcal.register.report.page import registration_report, sample_size_section
     from stcal.register.workspace.findings import findings
 
     if identified and not robot_file:
@@ -139,17 +139,17 @@ def register(
     registration = findings(
         pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, result, pairs.weights, pairs.covariances
     )
-    say(registration_text(registration))
-    print_each(f"warning: {pairs.where}", result.notes)
     content, sections, failed = RegistrationFile.of(registration), [], None
+    if report and liu2017:
+        limits = liu2017 if threshold is None else replace(liu2017, limit_mm=threshold)
+        sections.append(sample_size_section(sample_sizes(pairs.xyz_a, pairs.xyz_b, limits, seed), limits))
     if robot_file:
         from stcal.robot.identification.result import require_identified_written
         from stcal.robot.kinematics.file import robot_toml
-        from stcal.workflows.register_robot import compared, comparison_section, comparison_text, robot_part
+        from stcal.workflows.register_robot import compared, comparison_section, robot_part
 
         try:
             beside = compared(pairs, source, robot_file, registration, options, folds)
-            say("", comparison_text(beside), sep="\n")
             content = content.model_copy(update={"robot": robot_part(beside)})
             sections.append(comparison_section(beside))
             if identified:
@@ -158,13 +158,12 @@ def register(
                 require_identified_written(identified, beside.identified)
         except (DegenerateError, ConvergenceError) as error:  # the transform is valid without it
             failed = error
+    document = registration_report(registration, sections)
+    say(document.text())
+    print_each(f"warning: {pairs.where}", result.notes)
+    write_if(out, lambda: content)
     if out:
-        write(out, content)
         require_registration_written(out, registration)
-    if report:
-        if liu2017:
-            limits = liu2017 if threshold is None else replace(liu2017, limit_mm=threshold)
-            sections.insert(0, sample_size_section(sample_sizes(pairs.xyz_a, pairs.xyz_b, limits, seed), limits))
-        write(report, registration_page(registration, sections))
+    write_if(report, document.page)
     if failed is not None:
         raise failed

@@ -10,7 +10,7 @@ import re
 import sys
 import time
 import unicodedata
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from pathlib import Path
@@ -173,6 +173,12 @@ def write(path: Path, content, said: str = "written") -> None:
 
         require_result_written(path, content)
     say(f"{said}: {path}")
+
+
+def write_if(path: Path | None, content: Callable[[], object], said: str = "written") -> None:
+    """Saves what ``content`` returns if a path is given; it is not made else."""
+    if path:
+        write(path, content(), said)
 
 
 def _escaped(text: str, encoding: str) -> str:

@@ -7,6 +7,7 @@ import base64
 import io
 import warnings
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -42,27 +43,29 @@ def new_figure(width: float, height: float):
     return figure
 
 
-def calm(axes) -> None:
-    """Remove the frame of axes, and make ticks and remaining lines inconspicuous."""
+def calm(axes, x: str = "", y: str = "", grid: Literal["", "x", "y", "both"] = "") -> None:
+    """Remove the frame of axes, and make ticks and remaining lines inconspicuous; set labels and a faint grid."""
     axes.tick_params(labelsize=SMALL, length=2, color="#9aa0a8")
     axes.set_facecolor("none")
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axes.spines[side].set_color("#9aa0a8")
+    for text, label in ((x, axes.set_xlabel), (y, axes.set_ylabel)):
+        if text:
+            label(text, fontsize=SMALL + 1, color=INK)
+    if grid:
+        axes.grid(axis=grid, color=FAINT, lw=0.6)
+        axes.set_axisbelow(True)
 
 
 def plane(axes, x: str, y: str, margin: float) -> None:
     """Prepare the axes of a map: equal scales, a faint grid, and a ``margin`` as a share of the extent."""
     axes.set_aspect("equal", "datalim")
     axes.margins(margin)
-    axes.set_xlabel(x, fontsize=SMALL + 1, color=INK)
-    axes.set_ylabel(y, fontsize=SMALL + 1, color=INK)
     axes.xaxis.set_major_locator(locator())
     axes.yaxis.set_major_locator(locator())
-    calm(axes)
-    axes.grid(color=FAINT, lw=0.6)
-    axes.set_axisbelow(True)
+    calm(axes, x, y, "both")
 
 
 def uri(figure) -> str:

@@ -1,17 +1,14 @@
 """Pages as HTML and PDF."""
 
 import io
-from collections.abc import Sequence
 from functools import cache
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from stcal.errors import InputError
-from stcal.report.text import cells, join, number
+from stcal.report.text import number
 
-Sections = Sequence[tuple[str, str, Markup]]
-"""Sections of a page, each (anchor, heading, markup)."""
 MACROS = "report/templates/macros.html.jinja"
 
 
@@ -26,40 +23,16 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     env.filters["with_code"] = with_code
-    env.filters |= {"number": number, "listed": join, "cells": lambda rows, spec: [cells(row, spec) for row in rows]}
+    env.filters["number"] = number
     macros = vars(env.get_template(MACROS).module)
     env.globals |= {name: macro for name, macro in macros.items() if not name.startswith("_")}
     return env
-
-
-def render(template: str, **values) -> str:
-    """Return the page of a template with these values.
-
-    Raises
-    ------
-    LookupError
-        ``values`` lack a name that the template uses.
-    """
-    try:
-        return environment().get_template(template).render(values)
-    except UndefinedError as error:
-        raise LookupError(error.message) from error
 
 
 def with_code(text: str) -> Markup:
     """Return a sentence in which what stands between backticks is code."""
     parts = [escape(part) for part in text.split("`")]
     return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else p for i, p in enumerate(parts))
-
-
-def swatch(name: str, colour: str) -> Markup:
-    """Return a patch of colour and its meaning ``name``, for a cell of a table."""
-    return environment().globals["swatch"](name, colour)
-
-
-def verdict(text: str, colour: str) -> Markup:
-    """Return a word in its colour, for a cell of a table."""
-    return environment().globals["verdict"](text, colour)
 
 
 NEEDED = 'PDF: needs WeasyPrint, which is not installed; pip install "stcal[pdf]"'

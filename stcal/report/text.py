@@ -2,6 +2,7 @@
 
 import io
 import math
+import textwrap
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -11,6 +12,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.poses.columns import fixed
 
 NONE = "–"
+WIDTH = 100
+"""Largest number of characters of a line of sentences."""
 WIDEST = 10_000
 """Largest number of characters of a line: no line is ever wrapped, whatever the terminal."""
 
@@ -88,6 +91,14 @@ def _shortened(name: str, most: int, head: int | None = None) -> str:
         return name
     head = most // 2 if head is None else head
     return f"{name[:head]}…{name[len(name) - (most - 1 - head) :]}"
+
+
+def wrapped(line: str, width: int = WIDTH) -> list[str]:
+    """Return a sentence in lines of at most this width, the further ones indented; a row of a table stays whole."""
+    start = line[: len(line) - len(line.lstrip())]
+    if len(line) <= width or "  " in line.lstrip():
+        return [line]
+    return textwrap.wrap(line, width, subsequent_indent=f"{start}    ", break_long_words=False, break_on_hyphens=False)
 
 
 def text_table(rows: Iterable[Sequence[str]], least: Sequence[int] = (), gap: int = 2) -> list[str]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from markupsafe import Markup
 
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.errors import InputError
@@ -18,10 +17,10 @@ from stcal.register import register
 from stcal.register.core.pairs import WHAT, Pairs
 from stcal.register.core.result import ErrorFigures
 from stcal.register.report.file import FiguresRow, HeldOutBoth, MeanRmsMax, RobotPart
-from stcal.register.report.page import matrix_lines, matrix_rows
+from stcal.register.report.page import matrix_table
 from stcal.register.workspace.findings import Findings
-from stcal.report.page import render
-from stcal.report.text import number, text_table
+from stcal.report import document
+from stcal.report.text import number
 from stcal.robot.identification.residuals import State, tips
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
@@ -153,14 +152,6 @@ def positions(robot: Robot, data: Measurements) -> np.ndarray:
     return tips(State(robot.chain(), tools), data.q, data.targets, data.conditions).translation
 
 
-def comparison_text(beside: Comparison) -> str:
-    """Returns the comparison as text for the terminal."""
-    heads = ["<held out, mm", "points", "mean", "RMS", "max"]
-    lines = [_title(beside), *text_table([heads, *_rows(beside)], (52, 6, 8, 8, 8))]
-    lines += ["b_from_base of the identified robot, mm", *matrix_lines(_b_from_base(beside))]
-    return "\n".join(lines + _notes(beside))
-
-
 def robot_part(beside: Comparison) -> RobotPart:
     """Returns the comparison as part of the registration's file."""
     result, lines = beside.identified, beside.lines
@@ -188,23 +179,17 @@ def robot_part(beside: Comparison) -> RobotPart:
     )
 
 
-def comparison_section(beside: Comparison) -> tuple[str, str, Markup]:
-    """Returns the comparison as a section of the page."""
-    content = render(
-        "workflows/register_robot.html.jinja",
-        title=_title(beside),
-        rows=_rows(beside),
-        matrix=matrix_rows(_b_from_base(beside)),
-        notes=_notes(beside),
-    )
-    return "robot", "Base and kinematics together", Markup(content)
-
-
-def _title(beside: Comparison) -> str:
+def comparison_section(beside: Comparison) -> document.Section:
+    """Returns the comparison as a section of the report."""
     result = beside.identified
-    return (
-        f"robot {beside.robot.name}: {result.rank} of {len(result.names)} parameters of axes, base and tool determined"
+    told = (
+        f"robot {beside.robot.name}: {result.rank} of {len(result.names)} parameters of axes, base and tool "
+        "determined, solved together from the joint values and the positions in b; the same rows are held out of both "
+        "ways"
     )
+    errors = document.Table(["<held out, mm", "points", "mean", "RMS", "max"], _rows(beside))
+    blocks = [told, errors, matrix_table("b_from_base of the identified robot", _b_from_base(beside)), *_notes(beside)]
+    return document.Section("Base and kinematics together", blocks, terminal=True)
 
 
 def _rows(beside: Comparison) -> list[list[str]]:

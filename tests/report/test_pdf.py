@@ -6,28 +6,21 @@ import sys
 
 import pytest
 
-from stcal.report.page import environment, pdf_of
+from stcal.report.document import Document, Html, Section, Table, fold
+from stcal.report.page import pdf_of
 from tests.outcome import fails_with
 
 pytestmark = pytest.mark.skipif(shutil.which("pdftotext") is None, reason="poppler-utils is not installed")
-PAGE = """
-{% extends "report/templates/base.html.jinja" %}
-{% set title = "a title" %}
-{% set sections = [("one", "First"), ("two", "Second")] %}
-{% block banner %}{{ heading("The <target>", "counts") }}{% endblock %}
-{% block one %}
-{{ table(["<Name", "Value"], rows) }}
-{{ fold("Hidden", table(["<Name"], [["folded away"]])) }}
-<button>press me</button><script>never shown</script>
-<img src="http://192.0.2.1/from-elsewhere.png" alt="left out">
-{% endblock %}
-{% block two %}<p>{{ long }}</p>{% endblock %}
-"""
+OUTSIDE = (
+    "<button>press me</button><script>never shown</script>"
+    '<img src="http://192.0.2.1/from-elsewhere.png" alt="left out">'
+)
 
 
 def page(rows: int) -> str:
-    own = [[f"row {i}", i] for i in range(rows)]
-    return environment().from_string(PAGE).render(rows=own, long="word " * 100)
+    one = [Table(["<Name", "Value"], [[f"row {i}", i] for i in range(rows)])]
+    one += [fold("Hidden", Table(["<Name"], [["folded away"]])), Html(lambda: OUTSIDE)]
+    return Document("The <target>", "counts", [Section("First", one), Section("Second", ["word " * 100])]).page()
 
 
 def words(pdf: bytes, command: str = "pdftotext", *options: str) -> str:

@@ -38,7 +38,7 @@ from stcal.cli.options import (
     require_new,
     require_passed,
 )
-from stcal.cli.terminal import StageProgress, print_each, say, write
+from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 from stcal.io.files import keep_apart
 
@@ -275,7 +275,7 @@ def handeye(
     )
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.outcome import judged
-    from stcal.handeye.report.page import outcome_page, outcome_text
+    from stcal.handeye.report.page import outcome_report
     from stcal.io.files import require_same
     from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye.calibrate import AUTO, Splits, calibrate
@@ -354,25 +354,22 @@ def handeye(
             inputs, options, offset = at_offset(inputs, chosen, options)
         outcome = with_offset(calibrate(inputs, chosen, method, options, validation, progress, time_offset), offset)
     result = outcome.result
-    say(outcome_text(outcome))
+    document = outcome_report(outcome)
+    say(document.text())
     for option, given_, able in (("--with-scale", with_scale, SCALED), ("--refine-camera", refine_camera, SCALED[1:])):
         if given_ and result.method not in able:
             say(f"note: {option} does nothing for {result.method}, only for {' and '.join(able)}")
     for name, reason in outcome.left_out:
         say(f"left out {name}: {reason}")
     print_each("note", outcome.all_notes())
-    for path, content in (
-        (out, lambda: HandEyeFile.of(outcome)),
-        (ros, lambda: ros_yaml(result, parent, child, camera_frame.value)),
-        (urdf, lambda: urdf_joint(result, parent, child, camera_frame.value)),
-        (opencv, lambda: opencv_yaml(result)),
-        (report, lambda: outcome_page(outcome)),
-    ):
-        if path:
-            write(path, content())
+    write_if(out, lambda: HandEyeFile.of(outcome))
+    write_if(ros, lambda: ros_yaml(result, parent, child, camera_frame.value))
+    write_if(urdf, lambda: urdf_joint(result, parent, child, camera_frame.value))
+    write_if(opencv, lambda: opencv_yaml(result))
     for path, kind in ((out, "json"), (ros, "ros"), (urdf, "urdf"), (opencv, "opencv")):
         if path:
             require_export_written(path, kind, result, parent, child, camera_frame.value)
+    write_if(report, document.page)
     for form, path in exports:
         write(path, text := exported(result, form, path.stem, parent, child, camera_frame.value))
         require_same(path, path.read_text, text)  # which gave the transform back
@@ -381,8 +378,7 @@ def handeye(
     if robot_out and inputs.arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
         save_robot(robot_out, inputs.arm.identified(result.reprojection.arm))
         say(f"written: {robot_out}")
-    if json_file:
-        write(json_file, HandEyeFile.of(outcome, whole=True))
+    write_if(json_file, lambda: HandEyeFile.of(outcome, whole=True))
     require_passed(strict, judged(outcome).failed(), report)
 
 

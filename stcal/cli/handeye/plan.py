@@ -29,7 +29,7 @@ from stcal.cli.options import (
     SecondTable,
     Workers,
 )
-from stcal.cli.terminal import StageProgress, print_each, say, write
+from stcal.cli.terminal import StageProgress, print_each, say, write_if
 
 
 def plan(
@@ -64,7 +64,7 @@ def plan(
 ) -> None:
     """Name the robot poses that would lower the worst σ at the board most, after those of a hand-eye calibration."""
     from stcal.handeye.data.formats.record import Said
-    from stcal.handeye.report.planned import planned_csv, planned_file, planned_text
+    from stcal.handeye.report.planned import planned_csv, planned_file, planned_report
     from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
     from stcal.workflows.handeye.inputs import read_input, setup_of
@@ -79,13 +79,12 @@ def plan(
     for line in inputs.understood:
         say(line)
     planned = plan_next(inputs, setup_of(statements, inputs.setup, inputs.where), count, robot, seed)
-    say(planned_text(planned.result, planned.poses, planned.joints))
+    say(planned_report(planned.result, planned.poses, planned.joints).text())
     for name, reason in inputs.left_out:
         say(f"left out {name}: {reason}")
     print_each("note", planned.notes)
+    write_if(out, lambda: planned_csv(planned.poses, planned.joints))
     if out:
-        write(out, planned_csv(planned.poses, planned.joints))
         frames = ("base_from_flange", "camera_from_board")
         require_pose_table_written(out, {f"{name}_": getattr(planned.poses, name) for name in frames})
-    if json_file:
-        write(json_file, planned_file(planned.result, planned.poses, planned.joints))
+    write_if(json_file, lambda: planned_file(planned.result, planned.poses, planned.joints))

@@ -16,7 +16,7 @@ from stcal.cli.options import (
     Workers,
     require_passed,
 )
-from stcal.cli.terminal import StageProgress, print_each, say, write
+from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.io.files import keep_apart
 
 
@@ -66,7 +66,7 @@ def rig(
     from stcal.handeye.data.rig import read_rig_file
     from stcal.handeye.report.file import HandEyeRigFile
     from stcal.handeye.report.outcome import rig_judged
-    from stcal.handeye.report.page import rig_page, rig_text
+    from stcal.handeye.report.page import rig_report
     from stcal.workflows.handeye.calibrate import Splits
     from stcal.workflows.handeye.rig import calibrate_rig, read_rig
 
@@ -79,15 +79,12 @@ def rig(
         print_each("understood", inputs.understood)
         validation = Splits(splits, held_out, seed, workers)
         outcome = calibrate_rig(inputs, refine_camera, with_scale, validation, progress)
-    say(rig_text(outcome))
+    document = rig_report(outcome)
+    say(document.text())
     for name, what, why in outcome.left_out():
         say(f"left out {name}: {what}: {why}")
     print_each("note", outcome.all_notes())
-    for path, content in (
-        (out, lambda: HandEyeRigFile.of(outcome)),
-        (report, lambda: rig_page(outcome)),
-        (json_file, lambda: HandEyeRigFile.of(outcome, whole=True)),
-    ):
-        if path:
-            write(path, content())
+    write_if(out, lambda: HandEyeRigFile.of(outcome))
+    write_if(report, document.page)
+    write_if(json_file, lambda: HandEyeRigFile.of(outcome, whole=True))
     require_passed(strict, rig_judged(outcome).failed(), report)

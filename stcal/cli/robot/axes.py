@@ -19,7 +19,7 @@ from stcal.cli.options import (
     name_of,
     one_table,
 )
-from stcal.cli.terminal import print_each, say, write
+from stcal.cli.terminal import print_each, say, write_if
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def axes(
 ) -> None:
     """Find each joint's axis from sweeps of that joint alone, and the robot that follows (the axis method)."""
     from stcal.robot.axes.model import robot_from_sweeps
-    from stcal.robot.axes.report import axes_file, axes_page, axes_text
+    from stcal.robot.axes.report import axes_file, axes_report
     from stcal.robot.axes.sweeps import ring
     from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
@@ -73,19 +73,18 @@ def axes(
         )
     length_mm = _length(orientations, data)
     result = robot_from_sweeps(data, nominal, math.radians(still_deg), None if length_mm is None else ring(length_mm))
-    say(axes_text(result))
+    document = axes_report(result, data.where)
+    say(document.text())
     if length_mm is not None:
         say(f"orientations: used, as points {length_mm:.0f} mm from the target")
     elif data.rotations is not None:
         say("orientations: not used; state σ (cov_… columns), or give --orientations a length")
     print_each(f"warning: {data.where}", result.notes)
+    write_if(out, lambda: robot_toml(result.robot, [f"Identified by the axis method from {name_of(source)}."]))
     if out:
-        write(out, robot_toml(result.robot, [f"Identified by the axis method from {name_of(source)}."]))
         require_robot_written(out, result.robot, result.chain)
-    if json_file:
-        write(json_file, axes_file(result))
-    if report:
-        write(report, axes_page(result, data.where))
+    write_if(json_file, lambda: axes_file(result))
+    write_if(report, document.page)
 
 
 def _length(text: str, data: "Measurements") -> float | None:

@@ -22,7 +22,7 @@ from stcal.cli.options import (
     one_table,
     require_new,
 )
-from stcal.cli.terminal import print_each, say, write
+from stcal.cli.terminal import print_each, say, write, write_if
 from stcal.errors import DegenerateError, InputError
 from stcal.io.files import keep_apart
 
@@ -88,6 +88,7 @@ def compensate(
     from stcal.robot.export import exported, require_form
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import compensation as stage
+    from stcal.robot.use.report import compensation_report
     from stcal.robot.use.targets import read_targets
 
     exports, pulses = exports_of(export or [], require_form), _pulses(pulses_per_deg)
@@ -104,20 +105,15 @@ def compensate(
     )
     wanted = read_targets(source, identified, quaternions.value, rotation, payload_kg)
     result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
-    say(stage.compensated_text(result, identified))
-    for line in stage.compensated_summary(result):
-        say(line)
+    document = compensation_report(result, identified)
+    say(document.text())
     print_each(f"note: {wanted.where}", wanted.notes)
     print_each(f"warning: {wanted.where}", result.notes())
+    write_if(out, lambda: stage.compensated_csv(result, identified))
     if out:
-        write(out, stage.compensated_csv(result, identified))
         stage.require_compensated_written(out, result, identified)
-    if json_file:
-        write(json_file, stage.compensation_file(result, identified))
-    if report:
-        from stcal.robot.use.report import compensation_page
-
-        write(report, compensation_page(result, identified))
+    write_if(json_file, lambda: stage.compensation_file(result, identified))
+    write_if(report, document.page)
     for form, path in exports if result.found.usable.any() else ():
         exported_file = exported(result, identified, form, path, export_as.value, pulses)
         write(path, exported_file.text)

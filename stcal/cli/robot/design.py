@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import MOST_SEED, JsonFile, ReportFile, RobotFile
-from stcal.cli.terminal import say, write
+from stcal.cli.terminal import say, write_if
 from stcal.errors import InputError
 
 
@@ -45,24 +45,22 @@ def design(
     """Choose measurement poses that show the robot's parameters best."""
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import design as stage
+    from stcal.robot.use.report import design_report
 
     options = stage.DesignOptions(
         count, seed, observe.value, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target
     )
     robot = load_robot(robot_file)
     result = stage.design(robot, options)
-    say(stage.design_text(result))
+    document = design_report(result, robot)
+    say(document.text())
     also = f" and {sigma_rad:g} rad" if observe is ObservedKind.pose else ""
     say(f"for an instrument whose {observe.value}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
+    write_if(out, lambda: stage.design_csv(result, robot))
     if out:
-        write(out, stage.design_csv(result, robot))
         stage.require_design_written(out, result, robot, target)
-    if json_file:
-        write(json_file, stage.design_file(result))
-    if report:
-        from stcal.robot.use.report import design_page
-
-        write(report, design_page(result, robot))
+    write_if(json_file, lambda: stage.design_file(result))
+    write_if(report, document.page)
 
 
 def _box(text: str) -> tuple[float, ...]:

@@ -20,7 +20,7 @@ from stcal.cli.options import (
     one_table,
     several_tables,
 )
-from stcal.cli.terminal import print_each, say, write
+from stcal.cli.terminal import print_each, say, write, write_if
 from stcal.errors import InputError
 
 
@@ -72,15 +72,14 @@ def evaluate(
         read_measurements(source, robot, quaternions.value, payload_kg=payload_kg) for robot in robots.values()
     ]
     result = evaluated(robots, data[0], refit.value)
-    say(shown.evaluated_text(result))
+    document = shown.evaluation_report(result)
+    say(document.text())
     print_each("note", data[0].notes)
+    write_if(out, lambda: shown.evaluated_csv(result))
     if out:
-        write(out, shown.evaluated_csv(result))
         shown.require_evaluated_written(out, result)
-    if json_file:
-        write(json_file, shown.evaluation_file(result))
-    if report:
-        write(report, shown.evaluation_page(result))
+    write_if(json_file, lambda: shown.evaluation_file(result))
+    write_if(report, document.page)
 
 
 def verify(
@@ -110,6 +109,7 @@ def verify(
     """Compare distances of measured positions from the first with the commanded ones, before and after."""
     from stcal.io.join import stack
     from stcal.robot.use import verification as stage
+    from stcal.robot.use.report import verification_report
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
         raise InputError("E-OUTPUT-SUFFIX", f"--plot {plot}: a name ending in .png or .svg needed")
@@ -120,16 +120,13 @@ def verify(
         tables if not isinstance(tables, list) else stack(tables, [path.stem for path in seconds or ()], {"pose": key})
     )
     result = stage.verify(stage.read_measured(source))
-    say(stage.verified_text(result))
+    document = verification_report(result)
+    say(document.text())
     print_each("note", result.notes)
     print_each("warning", result.warnings())
     if plot:
         from stcal.robot.use.report import figure_bytes, verification_figure
 
         write(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
-    if json_file:
-        write(json_file, stage.verification_file(result))
-    if report:
-        from stcal.robot.use.report import verification_page
-
-        write(report, verification_page(result))
+    write_if(json_file, lambda: stage.verification_file(result))
+    write_if(report, document.page)

@@ -23,7 +23,7 @@ from stcal.cli.options import (
     name_of,
     one_table,
 )
-from stcal.cli.terminal import say, write
+from stcal.cli.terminal import say, write, write_if
 
 
 class Kind(StrEnum):
@@ -115,7 +115,7 @@ def identify(
 ) -> None:
     """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
     from stcal.robot.identification.prior import adjusted
-    from stcal.robot.identification.report import identified_file, identified_page, identified_text
+    from stcal.robot.identification.report import identified_file, identified_report
     from stcal.robot.identification.result import IdentifyOptions, require_identified_written
     from stcal.robot.identification.solve import identify as identified_from
     from stcal.robot.kinematics.file import load_robot, robot_toml
@@ -131,7 +131,8 @@ def identify(
         kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model.value, adjust=adjusted(adjust)
     )
     result = identified_from(nominal, data, options)
-    say(identified_text(result, nominal))
+    document = identified_report(result, nominal)
+    say(document.text())
     if out:
         write(
             out,
@@ -143,7 +144,5 @@ def identify(
 
         write(offsets, offsets_csv(result, nominal))
         require_offsets_written(offsets, result, nominal)
-    if json_file:
-        write(json_file, identified_file(result, nominal))
-    if report:
-        write(report, identified_page(result, nominal))
+    write_if(json_file, lambda: identified_file(result, nominal))
+    write_if(report, document.page)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import JsonFile, ReportFile, Run
-from stcal.cli.terminal import say, write
+from stcal.cli.terminal import say, write, write_if
 from stcal.errors import InputError
 from stcal.io.files import keep_apart
 
@@ -59,7 +59,7 @@ def budget(
     from stcal.sfm.budget.combine import budget_of_run
     from stcal.sfm.budget.file import BudgetFile
     from stcal.sfm.budget.lengths import against_run, against_stated
-    from stcal.sfm.budget.page import budget_page, budget_text
+    from stcal.sfm.budget.page import budget_report
     from stcal.sfm.budget.sources import statement_of
     from stcal.sfm.runs.saved import load_run
     from stcal.sfm.runs.verify import verify
@@ -85,11 +85,11 @@ def budget(
             against_run(computed, budget_of_run(second, statement_of_second), lengths, (saved.board, second.board))
         )
     file = BudgetFile.of(computed, saved, verify(run), tests)
-    say(budget_text(file))
-    if out:
-        write(out, file, "as JSON")
+    document = budget_report(file)
+    say(document.text())
+    write_if(out, lambda: file, "as JSON")
     if page:
-        html = budget_page(file)
+        html = document.page()
         write(page, html, "report")
         if pdf:
             write(page.with_suffix(".pdf"), pdf_of(html), "PDF")

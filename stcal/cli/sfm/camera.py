@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import ReportFile, Strict, TargetFile, Workers, designs_told, require_new, require_passed
-from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, write
+from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 
 app = typer.Typer()
@@ -101,7 +101,7 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
     from stcal.io.cameras.write import save_camera
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.file import CalibrationFile
-    from stcal.sfm.camera.report import calibration_text
+    from stcal.sfm.camera.report import calibration_report
     from stcal.workflows.calibrate_camera import calibrate_camera_by_corners
 
     json_file = json_file or out.with_suffix(".json")
@@ -114,13 +114,12 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
     intrinsics = result.intrinsics
     save_camera(out, CalibratedCamera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance))
     summary = CalibrationFile.of(result)
-    say(calibration_text(result, summary))
+    document = calibration_report(result, summary, str(images))
+    say(document.text())
+    print_each("warning", result.warnings)
     say(f"camera file: {out}")
     write(json_file, summary, "figures and checks")
-    if report:
-        from stcal.sfm.camera.report import calibration_page
-
-        write(report, calibration_page(result, summary, str(images)), "report")
+    write_if(report, document.page, "report")
     return ["split-half check"] if result.split is not None and result.split.verdict == "failed" else []
 
 
@@ -128,7 +127,7 @@ def _rig(images: Path, out: Path, target, board, models, json_file, report, work
     """Calibrates the cameras of a rig, and returns the failed checks."""
     from stcal.io.files import require_new_folder, save_folder
     from stcal.sfm.camera.file import RigCalibrationFile
-    from stcal.sfm.camera.report import rig_page, rig_text
+    from stcal.sfm.camera.report import rig_report
     from stcal.workflows.calibrate_camera import calibrate_rig_from_photographs, files_of, require_rig_written
 
     require_new_folder(out, images)
@@ -137,13 +136,15 @@ def _rig(images: Path, out: Path, target, board, models, json_file, report, work
     files, missing = files_of(calibration)
     save_folder(out, files)
     require_rig_written(out, files, calibration)
-    say(rig_text(calibration))
+    document = rig_report(calibration, str(images))
+    say(document.text())
+    print_each("warning", calibration.warnings)
+    for name, single in zip(calibration.names, calibration.cameras, strict=True):
+        print_each("warning", (f"{name}: {text}" for text in single.warnings))
     print_each("note", missing)
     say(f"rig: {out}: {', '.join(files)}")
-    if json_file:
-        write(json_file, RigCalibrationFile.of(calibration), "figures and checks")
-    if report:
-        write(report, rig_page(calibration, str(images)), "report")
+    write_if(json_file, lambda: RigCalibrationFile.of(calibration), "figures and checks")
+    write_if(report, document.page, "report")
     named_cameras = zip(calibration.names, calibration.cameras, strict=True)
     return [
         f"split-half check of {name}"

@@ -20,7 +20,7 @@ from stcal.cli.options import (
     ellipse_options,
     load_ahead,
 )
-from stcal.cli.terminal import StageProgress, print_each, say, write
+from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
@@ -97,8 +97,7 @@ def plan(
     with designs_told(target, board):
         result = planned(options, design, board_of(board), nominal_poses(design, faces))
     say(plan_text(result, source))
-    if out:
-        write(out, PlanFile.of_plan(result), "as JSON")
+    write_if(out, lambda: PlanFile.of_plan(result), "as JSON")
 
 
 @app.command()
@@ -121,8 +120,7 @@ def advise(
     with StageProgress() as progress:
         advice = advice_for(geometry, count, progress)
     say(advice_text(advice))
-    if out:
-        write(out, AdviceFile.of_advice(advice), "as JSON")
+    write_if(out, lambda: AdviceFile.of_advice(advice), "as JSON")
 
 
 @app.command()

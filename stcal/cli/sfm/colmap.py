@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from stcal.cli.options import JsonFile, Run, Workers
-from stcal.cli.terminal import StageProgress, say, write
+from stcal.cli.terminal import StageProgress, say, write_if
 from stcal.errors import InputError, MappingError
 
 app = typer.Typer()
@@ -208,8 +208,7 @@ def pairs(
         images = len({image for row in rows for image in (row.score.first, row.score.second)})
         say(pairs_table(name, images, rows, len(rows) if everything else SHOWN_PAIRS), end="\n\n")
     say(limits_text(saved.options.pairs))
-    if out:
-        write(out, PairsFile.of(gates_by_group), "as JSON")
+    write_if(out, lambda: PairsFile.of(gates_by_group), "as JSON")
 
 
 @app.command()
@@ -235,5 +234,4 @@ def doctor(
     with StageProgress() as progress:
         diagnosis = diagnose(saved, images, workers, progress)
     say(findings.table(diagnosis, None if everything else findings.MAX_LINES))
-    if out:
-        write(out, DoctorFile.of(diagnosis), "as JSON")
+    write_if(out, lambda: DoctorFile.of(diagnosis), "as JSON")

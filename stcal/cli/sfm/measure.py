@@ -24,7 +24,7 @@ from stcal.cli.options import (
     load_ahead,
     require_passed,
 )
-from stcal.cli.terminal import StageProgress, print_each, say, write
+from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 
 app = typer.Typer()
@@ -162,16 +162,13 @@ def measure(
             images, read_camera(camera), circles, design, load_board(board) if board else None, options, progress
         )
     text, apart = output.poses_csv(result, table)
-    say(output.measure_text(result))
+    document = output.measure_report(result, str(images))
+    say(document.text())
     print_each("not joined", apart)
     write(out, text, "poses")
     output.require_table_written(out, result, table)
-    if json_file:
-        write(json_file, output.poses_file(result), "as JSON")
-    if report:
-        from stcal.sfm.measurement.report import measure_page
-
-        write(report, measure_page(result, str(images)), "report")
+    write_if(json_file, lambda: output.poses_file(result), "as JSON")
+    write_if(report, document.page, "report")
     failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
     require_passed(strict, [f"χ² of {name}" for name in failed], report)
 

@@ -24,7 +24,7 @@ from stcal.cli.options import (
     handed_over,
     load_ahead,
 )
-from stcal.cli.terminal import StageProgress, say, verbose, write
+from stcal.cli.terminal import StageProgress, say, verbose, write_if
 from stcal.errors import ChecksFailed, InputError
 from stcal.io.files import keep_apart
 
@@ -258,8 +258,7 @@ def verify(run: Run, out: JsonFile = None) -> None:
 
     result = verified(run)
     say(verified_text(result))
-    if out:
-        write(out, result, "as JSON")
+    write_if(out, lambda: result, "as JSON")
     require_whole(result)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, TargetFile, Workers, designs_told
-from stcal.cli.terminal import StageProgress, say, write
+from stcal.cli.terminal import StageProgress, say, write_if
 from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER, json_text, real_place, save
 
@@ -280,8 +280,7 @@ def compare(
     comparison = against(run, truth)
     say(comparison_table(comparison))
     target = out or (into_run if run.is_dir() else None)
-    if target:
-        write(target, comparison, "as JSON")
+    write_if(target, lambda: comparison, "as JSON")
 
 
 @app.command()

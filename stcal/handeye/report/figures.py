@@ -185,18 +185,13 @@ def corner_figure(found: Reprojection):
     turn = np.linspace(0, 2 * np.pi, 100)
     axes.plot(radius * np.cos(turn), radius * np.sin(turn), color=INK, lw=0.8)
     axes.set_aspect("equal", adjustable="datalim")
-    _finish(axes, "x, px", "y, px (down)")
+    calm(axes, "x, px", "y, px (down)", "y")
     axes.invert_yaxis()
     return figure
 
 
 def image_figure(size: tuple[int, int], covered: ImageCoverage, seen: np.ndarray, off: np.ndarray):
-    """Draws where the board was in the image, and enlarged residuals ``off`` (n, 2) of the corners ``seen`` (n, 2).
-
-    Returns
-    -------
-    The figure, and the factor by which the residuals are enlarged.
-    """
+    """Draws where the board was in the image, and enlarged residuals ``off`` (n, 2) of the corners ``seen`` (n, 2)."""
     from matplotlib.collections import LineCollection
 
     width, height = size
@@ -221,10 +216,8 @@ def image_figure(size: tuple[int, int], covered: ImageCoverage, seen: np.ndarray
     axes.set_ylim(height - 0.5, -0.5)
     axes.xaxis.set_major_locator(locator())
     axes.yaxis.set_major_locator(locator())
-    axes.tick_params(labelsize=SMALL, length=2)
-    axes.set_xlabel("x, px", fontsize=SMALL + 1, color=INK)
-    axes.set_ylabel("y, px", fontsize=SMALL + 1, color=INK)
-    return figure, factor
+    calm(axes, "x, px", "y, px")
+    return figure
 
 
 def enlargement(off: np.ndarray, width: float) -> float:
@@ -269,7 +262,7 @@ def turns_figure(turns: np.ndarray, seen: Observability | None):
     counts = figure.add_axes((0.60, 0.13, 0.385, 0.82))
     largest = max(10.0, 10.0 * np.ceil(np.degrees(angle.max(initial=0)) / 10))
     counts.hist(np.degrees(angle), bins=np.linspace(0, largest, 19).tolist(), color=GOOD)
-    _finish(counts, "turn between two poses, °", "pairs of poses")
+    calm(counts, "turn between two poses, °", "pairs of poses", "y")
     counts.yaxis.set_major_locator(locator(integer=True))
     return figure
 
@@ -277,14 +270,6 @@ def turns_figure(turns: np.ndarray, seen: Observability | None):
 def _some(count: int) -> np.ndarray:
     """Returns the rows that are drawn: all of them, or a random sample of :data:`MOST_VECTORS`."""
     return np.sort(np.random.default_rng(0).permutation(count)[:MOST_VECTORS])
-
-
-def _finish(axes, x: str, y: str) -> None:
-    calm(axes)
-    axes.grid(axis="y", color=FAINT, lw=0.6)
-    axes.set_axisbelow(True)
-    axes.set_xlabel(x, fontsize=SMALL + 1, color=INK)
-    axes.set_ylabel(y, fontsize=SMALL + 1, color=INK)
 
 
 WIDTH_PX = 800

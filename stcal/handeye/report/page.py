@@ -1,5 +1,6 @@
-"""Reports of hand-eye calibrations, of one camera or of a rig, for the terminal and as a page."""
+"""Reports of hand-eye calibrations, of one camera or of a rig."""
 
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
@@ -13,6 +14,7 @@ from stcal.handeye.report.figures import (
     GOOD,
     by_robot,
     corner_figure,
+    enlargement,
     image_coverage,
     image_figure,
     overlays,
@@ -25,9 +27,28 @@ from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared
 from stcal.io.cameras.model import PARAMETER_NAMES, parameter_names
-from stcal.report.figure import uri
-from stcal.report.page import render, verdict
-from stcal.report.text import HEADS, NONE, number, text_table, transform_rows
+from stcal.report.document import (
+    Block,
+    Document,
+    Html,
+    Printed,
+    Section,
+    Table,
+    bullets,
+    fold,
+    html,
+    legend,
+    macro,
+    page_only,
+    plot,
+    plots,
+    sentence,
+    subheading,
+    tiles,
+    tone_of,
+)
+from stcal.report.document import Verdict as VerdictWord
+from stcal.report.text import HEADS, NONE, number, transform_rows
 
 ERRORS = {
     "rotation_rad": ("rotation °", np.degrees(1.0), 4),
@@ -48,40 +69,6 @@ SIGMA_NAMES = {
     "arm_mm": ("axis of the arm, place", "mm", 1.0),
     **{key: (f"camera file, {name}", "times its σ", 1.0) for key, name in FACTORS.items()},
 }
-VERDICTS = {"good": "#1b7837", "use with care": "#b26a00", "do not use": "#b3261e"}
-"""Colours of the verdicts."""
-
-
-def outcome_text(outcome: Outcome) -> str:
-    """Returns the report for the terminal."""
-    result, frames = outcome.result, FRAMES[outcome.result.setup]
-    lines = [_headline(outcome), f"verdict: {judged(outcome).sentence()}"]
-    for name, pose, covariance in _transforms(result):
-        lines += ["", *text_table([["<" + name, *HEADS[1:]], *transform_rows(pose, covariance)])]
-    turn, shift = result.rms()
-    if outcome.time_offset is not None:
-        lines += ["", outcome.time_offset.in_words()]
-    lines += ["", f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin"]
-    if outcome.held_out is not None:
-        lines.append(f"held out ({_splits_text(outcome)}): {means_text(outcome.held_out.means())}")
-        lines += [f"held out, {text}" for text in _agreeing_text(outcome)]
-    if outcome.motions is not None:
-        lines += ["", _motions_text(outcome), *text_table(_motion_cells(outcome)), ""]
-    lines += [f"σ of {text}: {value} ({how})" for text, value, how in sigma_rows(outcome)]
-    if result.sigma_scale is not None:
-        lines.append(scale_text(outcome, result.sigma_scale))
-    if result.observability is not None:
-        lines.append(turns_text(result.observability))
-    if outcome.choice is not None:
-        lines += ["", *text_table(_choice_cells(outcome))]
-    if outcome.arm is not None:
-        lines += ["", *text_table(_arm_cells(outcome.arm))]
-    if outcome.sentence():
-        lines += ["", outcome.sentence()]
-    if outcome.compared:
-        lines += ["", f"Methods, on the same {_splits_text(outcome)} held out; off: from {frames.camera} above"]
-        lines += text_table(_compared_cells(outcome))
-    return "\n".join(lines)
 
 
 def _motions_text(outcome: Outcome) -> str:
@@ -211,72 +198,165 @@ def _off(each: Compared, result: HandEye) -> list[str]:
     return [number(float(np.linalg.norm(off.translation)), 3), number(np.degrees(off.angle_rad()), 4)]
 
 
-def outcome_page(outcome: Outcome) -> str:
-    """Returns the report as a page."""
-    result = outcome.result
-    compared = _compared_cells(outcome)
-    observability = result.observability
-    return render(
-        "handeye/report/page.html.jinja",
-        outcome=outcome,
-        camera=FRAMES[result.setup].camera,
-        counts=_headline(outcome),
-        headline=_tiles(outcome),
-        agreeing=_agreeing_text(outcome) if outcome.held_out is not None else [],
-        notes=[note for note in outcome.all_notes() if isinstance(note, Aside)],
-        heads=HEADS,
-        transforms=[
-            (name, transform_rows(pose, covariance), matrix_text(pose))
-            for name, pose, covariance in _transforms(result)
+def outcome_report(outcome: Outcome) -> Document:
+    """Returns the report of ``handeye`` for one camera."""
+    result, frames = outcome.result, FRAMES[outcome.result.setup]
+    turn, shift = result.rms()
+    held_out = []
+    if outcome.held_out is not None:
+        held_out = [f"held out ({_splits_text(outcome)}): {means_text(outcome.held_out.means())}"]
+        held_out += [f"held out, {text}" for text in _agreeing_text(outcome)]
+    camera = adjusted(outcome)
+    answer: list[Block] = [
+        tiles(_tiles(outcome)),
+        *(block for item in _transforms(result) for block in _transform(*item)),
+        page_only(EXPLAINED),
+        "" if outcome.time_offset is None else f"{outcome.time_offset.in_words()}; the σ above hold that of the offset",
+        f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
+        *held_out,
+        outcome.sentence(),
+        Table(["<what errs, and by how much", "σ", "<"], sigma_rows(outcome)),
+        "" if result.sigma_scale is None else scale_text(outcome, result.sigma_scale),
+        "" if result.observability is None else turns_text(result.observability),
+        fold("Camera, as adjusted (first pixel's centre at 0, 0)", Table(["<", "value", "± σ", "<unit"], camera or [])),
+        *_remarks([note for note in outcome.all_notes() if isinstance(note, Aside)], outcome.understood),
+        _findings(judged(outcome)),
+    ]
+    heads = ["<pose", "rotation °", "mm", "x mm", "y mm", "z mm", *(["corners px"] if result.reprojection else []), "<"]
+    return Document(
+        f"Hand-eye calibration: {frames.camera}",
+        f"{outcome.where}: {_headline(outcome)}",
+        [
+            Section("Result", answer, terminal=True),
+            Section("What was tried", _tried(outcome), terminal=True),
+            Section("The arm", _arm(outcome.arm), terminal=True),
+            Section("Methods", _methods(outcome), terminal=True),
+            Section("Motions held out", _motions(outcome), terminal=True),
+            Section(
+                "Poses",
+                _poses(
+                    result, heads, "By how much the chain through each pose misses the board", len(outcome.outliers())
+                ),
+            ),
+            Section("Coverage of the image", [Html(lambda: html(*_coverage(outcome)))]),
+            Section("What the motions tell", _turns(outcome)),
+            Section("Overlays", _photographs(outcome)),
+            Section("Left out", [page_only(Table(["<image", "<reason"], outcome.left_out))]),
         ],
-        sigmas=sigma_rows(outcome),
-        adjusted=adjusted(outcome),
-        compared=compared,
-        splits=_splits_text(outcome),
-        choice=_choice_cells(outcome),
-        arm=_arm_cells(outcome.arm) if outcome.arm else [],
-        sentence=outcome.sentence(),
-        predicted=_motion_cells(outcome),
-        predicted_text=_motions_text(outcome),
-        board_seen=ERRORS["board_mm"][0] in compared[0],
-        good=GOOD,
-        bad=BAD,
-        bars=pose_bars(result),
-        poses=pose_rows(result),
-        **verdict_parts(judged(outcome)),
-        **coverage(outcome),
-        motions=observability and _motion_rows(observability),
-        sigma_deg=observability and np.degrees(observability.sigma_rad),
+        banner=_verdict(judged(outcome)),
     )
 
 
-def verdict_parts(found: Verdict) -> dict:
-    """Returns the verdict's word and colour, its reasons with remedies, and rows of all findings, for the template."""
-    rows = [
+EXPLAINED = (
+    "The rotation vector is axis times angle, no roll, pitch and yaw. σ are of turns about the axes, and of shifts "
+    "along the axes, of the frame named first"
+)
+CHANCE = (
+    "Care is advised for what happens by chance in one calibration of a thousand, use advised against for what "
+    "happens in one of a hundred thousand, and where the transform has more than half, or nine tenths, of the "
+    "variance of a prediction. Whether the millimetres above are few enough, the task tells"
+)
+
+
+def _verdict(found: Verdict) -> list[Block]:
+    """Returns the verdict with its reasons and remedies."""
+    reasons = [sentence(": ".join(filter(None, (finding.said, finding.remedy)))) for finding in found.reasons()]
+    return [Printed([f"verdict: {found.sentence()}"]), macro("judged", found.word, tone_of(found.word), reasons)]
+
+
+def _findings(found: Verdict) -> Block:
+    """Returns the findings that the verdict rests on, folded."""
+    rows = [[f.title, VerdictWord(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
+    table = Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], rows, css="text")
+    return fold("What the verdict rests on", table, CHANCE)
+
+
+def _remarks(notes: Sequence[str], understood: Sequence[str]) -> list[Block]:
+    blocks: list[Block] = [subheading("To know"), bullets(notes)] if notes else []
+    return blocks + ([subheading("What the files were taken for"), bullets(understood)] if understood else [])
+
+
+def _transform(name: str, pose: Rigid, covariance: np.ndarray | None) -> list[Block]:
+    """Returns a transform with σ, and its matrix, folded."""
+    matrix = "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
+    table = Table(["<" + name, *HEADS[1:]], transform_rows(pose, covariance))
+    return [table, fold(f"{name}: 4×4 matrix, mm", macro("verbatim", matrix))]
+
+
+def _tried(outcome: Outcome) -> list[Block]:
+    return (
         [
-            finding.title,
-            verdict(finding.word, VERDICTS[finding.word]),
-            finding.value or NONE,
-            finding.limit or NONE,
-            finding.said,
+            _rows(_choice_cells(outcome)),
+            page_only(
+                "Each way solves with the other poses and predicts where the board is in those held out. The best "
+                "is taken, unless one that trusts the files more, or knows its σ, is behind it by no more than chance. "
+                "The errors above are those of the choice as a whole: in each split "
+                "of the way that the errors on all other poses name"
+            ),
         ]
-        for finding in found.findings
+        if outcome.choice
+        else []
+    )
+
+
+def _arm(arm: ArmFound | None) -> list[Block]:
+    return (
+        [
+            _rows(_arm_cells(arm)),
+            page_only(
+                "By how much each axis is off the robot's file, and σ: turns (rx, ry) and shifts (x, y) of the joint's "
+                "frame, one after the other from the base. What poses do not tell stays near 0 by the σ of all axes, "
+                "which is estimated"
+            ),
+        ]
+        if arm
+        else []
+    )
+
+
+def _methods(outcome: Outcome) -> list[Block]:
+    if not outcome.compared:
+        return []
+    cells = _compared_cells(outcome)
+    board = (
+        " 3-D at the board: how far from each corner the ray on which the camera saw it meets the board where the "
+        "robot has put it; by pose: distance from the corners by the pose that the image gives alone."
+    )
+    return [
+        f"means over the same {_splits_text(outcome)} held out; off: from {FRAMES[outcome.result.setup].camera} above",
+        _rows(cells),
+        page_only(
+            "Each time all methods solve with the others and predict where the board is."
+            f"{board if ERRORS['board_mm'][0] in cells[0] else ''}"
+        ),
     ]
-    reasons = [": ".join(filter(None, (finding.said, finding.remedy))) for finding in found.reasons()]
-    return {"word": found.word, "verdict_colour": VERDICTS[found.word], "reasons": reasons, "findings": rows}
 
 
-def coverage(outcome: Outcome) -> dict:
-    """Returns figures of image coverage, corners and turns, and overlays; None or empty if there is nothing to show."""
-    shown, missing = overlays(outcome)
-    content: dict = {"image": None, "corners": None, "turns": None, "overlays": shown, "missing": missing}
+def _motions(outcome: Outcome) -> list[Block]:
+    return [_motions_text(outcome), _rows(_motion_cells(outcome))] if outcome.motions else []
+
+
+def _rows(cells: list[list[str]]) -> Table:
+    """Returns the table of cells whose first row holds the heads."""
+    return Table(cells[0], cells[1:], css="text")
+
+
+def _poses(result: HandEye, heads: list[str], caption: str, contradicting: int) -> list[Block]:
+    """Returns the chart of each pose's residuals, and their table, folded."""
+    colours = {"used": GOOD, "left out, contradicting the others": BAD} if contradicting else {}
+    rows = pose_rows(result)
+    return [
+        legend(colours),
+        macro("pose_chart", lambda: pose_bars(result), caption),
+        fold(f"{len(rows)} {'images' if heads[0] == '<image' else 'poses'}", Table(heads, rows)),
+    ]
+
+
+def _coverage(outcome: Outcome) -> list[Block]:
+    """Returns how much of the image the board covered, with the residuals over it."""
     views, pairs, board = outcome.views, outcome.pairs, outcome.result.reprojection
-    if board is not None:
-        content["corners"] = uri(corner_figure(board))
-    if pairs is not None:
-        content["turns"] = uri(turns_figure(turns_between(pairs), outcome.result.observability))
     if views is None or pairs is None:
-        return content
+        return []
     if board is None:
         measured = np.concatenate([view.xy_px for view in views.views])
         residuals = np.concatenate(by_robot(outcome.result, pairs, views)) - measured
@@ -284,42 +364,92 @@ def coverage(outcome: Outcome) -> dict:
         used = [views.views[i].xy_px for i in np.unique(board.view)]
         measured, residuals = np.concatenate(used), board.residuals_px
     finite = np.isfinite(residuals).all(1)
-    covered = image_coverage(views)
-    size = views.camera.width, views.camera.height
-    figure, factor = image_figure(size, covered, measured[finite], residuals[finite])
-    source = "the adjustment" if board is not None else "robot and transforms"
-    content["image"] = uri(figure), f"{covered.share:.0%}", f"{factor:g}", source
-    return content
+    size, residuals = (views.camera.width, views.camera.height), residuals[finite]
+    covered, factor = image_coverage(views), enlargement(residuals, views.camera.width)
+    by = "the adjustment" if board is not None else "robot and transforms"
+    return [
+        f"The board lay over {covered.share:.0%} of the image in one photograph or another. Where it never was, "
+        "nothing checks the distortion of the lens",
+        plots(
+            plot(
+                lambda: image_figure(size, covered, measured[finite], residuals),
+                "coverage of the image",
+                f"Darker: the board lay there more often; lines: residuals by {by}, {factor:g} times enlarged",
+                "",
+            ),
+            None
+            if board is None
+            else plot(
+                lambda: corner_figure(board), "residuals of corners", "Corners: projected minus seen; circle: 95 %", ""
+            ),
+        ),
+    ]
 
 
-def matrix_text(pose: Rigid) -> str:
-    return "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
+def _turns(outcome: Outcome) -> list[Block]:
+    """Returns what the rotations between poses tell of the transform."""
+    pairs, seen = outcome.pairs, outcome.result.observability
+    if seen is None:
+        return []
+    picture = (
+        "Left: the axes about which the flange turned between two poses each, in its own frame, on a half sphere seen "
+        "along Z (equal areas; circles: 30° and 60° from Z); 1, 2, 3: the principal axes. Right: by how much it turned"
+    )
+    rows = [
+        [str(i), *(number(v, 3) for v in axis), number(np.degrees(turn), 2)]
+        for i, (axis, turn) in enumerate(zip(seen.axes, seen.turns_rad, strict=True), 1)
+    ]
+    return [
+        plot(lambda: turns_figure(turns_between(pairs), seen), "rotations between poses", picture) if pairs else None,
+        Table(["axis", "x", "y", "z", "turn ° (RMS)"], rows),
+        "The principal axes of all rotations between poses, in the flange's frame, and the RMS turn about each. The "
+        "transform is known well where the second turn is large; where it is 0, the camera's place slides along the "
+        "first axis. From poses of a common camera (1 mrad, 0.5 mm) these motions give σ of "
+        f"{np.degrees(seen.sigma_rad):.3f}° and {seen.sigma_mm:.2f} mm in the worst direction",
+    ]
+
+
+def _photographs(outcome: Outcome) -> list[Block]:
+    """Returns some photographs with their corners; read when the page is written."""
+    if outcome.pairs is None or outcome.views is None or outcome.folder is None:
+        return []
+
+    def photographs():
+        shown, missing = overlays(outcome)
+        explained = (
+            "Circles: corners as measured. Lines lead to where they would be by the robot's pose as it was reported "
+            "and the transforms above, enlarged: what robot, transforms, camera and board miss together"
+        )
+        pictures = plots(*(macro("corner_photo", photo) for photo in shown))
+        return html(explained if shown else "", pictures, *missing)
+
+    return [Html(photographs)]
 
 
 def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
     """Returns the tiles of the headline: (value, unit, text)."""
-    result, tiles = outcome.result, []
+    result, headline = outcome.result, []
     if outcome.held_out is not None:
         means = outcome.held_out.means()
         name = "board_mm" if "board_mm" in means else "translation_mm"
         where = "3-D error at the board" if name == "board_mm" else "error of the board's origin"
-        tiles.append((f"{means[name]:.3f} mm", "", f"{where}, on poses held out ({_splits_text(outcome)})"))
+        headline.append((f"{means[name]:.3f} mm", "", f"{where}, on poses held out ({_splits_text(outcome)})"))
         turn = np.degrees(means["rotation_rad"])
-        tiles.append((f"{turn:.3f}°", "", "error of rotation, on poses held out"))
+        headline.append((f"{turn:.3f}°", "", "error of rotation, on poses held out"))
     if result.covariance is not None:
         sigma = np.sqrt(np.linalg.eigvalsh(result.covariance[3:, 3:])[-1])
-        tiles.append((f"{sigma:.3f} mm", "", "σ of the camera's place, in its worst direction"))
+        headline.append((f"{sigma:.3f} mm", "", "σ of the camera's place, in its worst direction"))
     turn, shift = result.rms()
-    tiles.append((f"{shift:.3f} mm", "", f"RMS residual at the board's origin, and {np.degrees(turn):.3f}°"))
+    headline.append((f"{shift:.3f} mm", "", f"RMS residual at the board's origin, and {np.degrees(turn):.3f}°"))
     if (offset := outcome.time_offset) is not None:
         said = f"robot's clock minus camera's, ± {1e3 * offset.sigma_s:.2g} ms"
-        tiles.append((f"{1e3 * offset.seconds:.2f} ms", "", said))
+        headline.append((f"{1e3 * offset.seconds:.2f} ms", "", said))
     if result.sigma_scale is not None:
         pitch = "" if outcome.pitch_mm is None else f": pitch {outcome.pitch_mm * result.scale:.3f} mm"
-        tiles.append(
+        headline.append(
             (f"{result.scale:.4f}", "", f"times its stated size is the board, ± {result.sigma_scale:.4f}{pitch}")
         )
-    return tiles
+    return headline
 
 
 def adjusted(outcome: Outcome) -> list[list[str]] | None:
@@ -351,41 +481,80 @@ def pose_rows(result: HandEye) -> list[list[str]]:
     return rows
 
 
-def _motion_rows(seen: Observability) -> list[list[str]]:
-    return [
-        [str(i + 1), *(number(v, 3) for v in axis), number(np.degrees(turn), 2)]
-        for i, (axis, turn) in enumerate(zip(seen.axes, seen.turns_rad, strict=True))
+def rig_report(outcome: RigOutcome) -> Document:
+    """Returns the report of ``handeye rig``."""
+    rig, frames, first = outcome.rig, FRAMES[outcome.rig.setup], outcome.rig.cameras[0]
+    cameras = [
+        block
+        for name, camera in zip(rig.names, rig.cameras, strict=True)
+        for block in _transform(f"{frames.mount}_from_{name}", camera.mount_from_camera, camera.covariance)
     ]
-
-
-def rig_text(outcome: RigOutcome) -> str:
-    """Returns the report for the terminal."""
-    rig, frames = outcome.rig, FRAMES[outcome.rig.setup]
-    lines = [_rig_headline(outcome), f"verdict: {rig_judged(outcome).sentence()}"]
-    for name, camera in zip(rig.names, rig.cameras, strict=True):
-        rows = transform_rows(camera.mount_from_camera, camera.covariance)
-        lines += ["", *text_table([[f"<{frames.mount}_from_{name}", *HEADS[1:]], *rows])]
-    for first, second in combinations(rig.names, 2):
-        lines += [
-            "",
-            *text_table([[f"<{first}_from_{second}", *HEADS[1:]], *transform_rows(*rig.relative(first, second))]),
-        ]
-    rows = transform_rows(rig.stand_from_board, rig.cameras[0].stand_covariance)
-    lines += ["", *text_table([["<" + frames.board, *HEADS[1:]], *rows])]
-    lines += ["", *text_table(_camera_cells(outcome))]
+    relative = [
+        block
+        for one, two in combinations(rig.names, 2)
+        for block in _transform(f"{one}_from_{two}", *rig.relative(one, two))
+    ]
+    answer: list[Block] = [
+        tiles(_rig_tiles(outcome)),
+        *cameras,
+        *_transform(frames.board, rig.stand_from_board, first.stand_covariance),
+        page_only(EXPLAINED),
+        Table(["<what errs, and by how much", "σ", "<"], _shared_sigmas(outcome)),
+        "" if first.sigma_scale is None else scale_text(outcome.cameras[0], first.sigma_scale),
+        "" if first.observability is None else turns_text(first.observability),
+        *_remarks(asides(outcome), outcome.understood),
+        _findings(rig_judged(outcome)),
+    ]
+    alone: list[Block] = [
+        _rows(_camera_cells(outcome)),
+        page_only(
+            "σ of a camera's place and turn in their worst directions, as the adjustment of all cameras and that of "
+            "this one alone have them"
+        ),
+    ]
     if outcome.held_out is not None:
-        lines += [
-            "",
-            f"Poses of the robot held out ({_rig_splits_text(outcome)}), 3-D at the board, all cameras or each alone",
+        alone += [
+            f"poses of the robot held out ({_rig_splits_text(outcome)}), 3-D at the board, all cameras or each alone",
+            _rows(_held_out_cells(outcome)),
+            page_only(
+                "Each time all cameras together, and each by itself, are solved for with the images of the other "
+                "poses, and predict where the board is in the images of those held out: how far from each corner the "
+                "ray on which the camera saw it meets the board where the robot has put it. Gain: by how much that is "
+                "less together"
+            ),
         ]
-        lines += text_table(_held_out_cells(outcome))
-    lines += ["", *(f"σ of {text}: {value} ({how})" for text, value, how in _shared_sigmas(outcome))]
-    first_camera = rig.cameras[0]
-    if first_camera.sigma_scale is not None:
-        lines.append(scale_text(outcome.cameras[0], first_camera.sigma_scale))
-    if first_camera.observability is not None:
-        lines.append(turns_text(first_camera.observability))
-    return "\n".join(lines)
+    told = page_only("From the joint covariance: what board and robot do to both cameras alike does not count")
+    return Document(
+        f"Hand-eye calibration of a rig: {', '.join(rig.names)}",
+        f"{outcome.where}: {_rig_headline(outcome)}",
+        [
+            Section("Result", answer, terminal=True),
+            Section("The cameras in each other", [*relative, told] if relative else [], terminal=True),
+            Section("Together, and each alone", alone, terminal=True),
+            Section("Cameras", [block for k in range(len(rig.names)) for block in _camera(outcome, k)]),
+            Section("Left out", [Table(["<camera", "<image", "<reason"], outcome.left_out())]),
+        ],
+        banner=_verdict(rig_judged(outcome)),
+    )
+
+
+def _camera(outcome: RigOutcome, k: int) -> list[Block]:
+    """Returns residuals, adjusted parameters, coverage and photographs of a camera of the rig."""
+    name, camera, own = outcome.rig.names[k], outcome.rig.cameras[k], outcome.cameras[k]
+    turn, shift = camera.rms()
+    errors = {} if own.held_out is None else own.held_out.means()
+    heads = ["<image", "rotation °", "mm", "x mm", "y mm", "z mm", "corners px", "<"]
+    parameters = Table(["<", "value", "± σ", "<unit"], adjusted(own) or [])
+    caption = f"By how much the chain through each image of {name} misses the board"
+    return [
+        subheading(name),
+        f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
+        f"held out: {means_text(errors)}" if errors else "",
+        *_poses(camera, heads, caption, len(own.outliers())),
+        fold("Camera, as adjusted (first pixel's centre at 0, 0)", parameters),
+        Html(lambda: html(*_coverage(own))),
+        fold("Photographs with their corners", *_photographs(own)),
+    ]
 
 
 def _rig_headline(outcome: RigOutcome) -> str:
@@ -470,59 +639,9 @@ def _shared_sigmas(outcome: RigOutcome) -> list[list[str]]:
     return sorted(rows, key=lambda row: "," in row[0] and not row[0].startswith("robot"))
 
 
-def rig_page(outcome: RigOutcome) -> str:
-    """Returns the report as a page."""
-    rig, frames, first_camera = outcome.rig, FRAMES[outcome.rig.setup], outcome.rig.cameras[0]
-    relative = []
-    for first, second in combinations(rig.names, 2):
-        pose, covariance = rig.relative(first, second)
-        relative.append((f"{first}_from_{second}", transform_rows(pose, covariance), matrix_text(pose)))
-    cameras = []
-    for name, camera, camera_outcome in zip(rig.names, rig.cameras, outcome.cameras, strict=True):
-        turn, shift = camera.rms()
-        errors = {} if camera_outcome.held_out is None else camera_outcome.held_out.means()
-        cameras.append(
-            {
-                "name": name,
-                "transform": f"{frames.mount}_from_{name}",
-                "rows": transform_rows(camera.mount_from_camera, camera.covariance),
-                "matrix": matrix_text(camera.mount_from_camera),
-                "said": f"Residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
-                "errors": means_text(errors) if errors else "",
-                "adjusted": adjusted(camera_outcome),
-                "bars": pose_bars(camera),
-                "poses": pose_rows(camera),
-                "outliers": camera_outcome.outliers(),
-                **coverage(camera_outcome),
-            }
-        )
-    return render(
-        "handeye/report/rig.html.jinja",
-        outcome=outcome,
-        rig=rig,
-        board=frames.board,
-        counts=_rig_headline(outcome),
-        headline=_rig_tiles(outcome),
-        notes=asides(outcome),
-        heads=HEADS,
-        cameras=cameras,
-        relative=relative,
-        stand=(transform_rows(rig.stand_from_board, first_camera.stand_covariance), matrix_text(rig.stand_from_board)),
-        table_of_cameras=_camera_cells(outcome),
-        held=_held_out_cells(outcome) if outcome.held_out else [],
-        splits=_rig_splits_text(outcome),
-        sigmas=_shared_sigmas(outcome),
-        scale=scale_text(outcome.cameras[0], first_camera.sigma_scale) if first_camera.sigma_scale is not None else "",
-        good=GOOD,
-        bad=BAD,
-        left_out=outcome.left_out(),
-        **verdict_parts(rig_judged(outcome)),
-    )
-
-
 def _rig_tiles(outcome: RigOutcome) -> list[tuple[str, str, str]]:
     """Returns the tiles of the headline: (value, unit, text)."""
-    rig, tiles = outcome.rig, []
+    rig, headline = outcome.rig, []
     if outcome.held_out is not None:
         for name, held in zip(rig.names, outcome.held_out.cameras, strict=True):
             if means := held.means():
@@ -530,11 +649,11 @@ def _rig_tiles(outcome: RigOutcome) -> list[tuple[str, str, str]]:
                 comparison = (
                     "" if gain is None else f", {number(held.means('alone')['board_mm'], 3)} mm if solved alone"
                 )
-                tiles.append(
+                headline.append(
                     (f"{means['board_mm']:.3f} mm", "", f"{name}: 3-D error at the board, held out{comparison}")
                 )
     sigma = rig.cameras[0].sigma
     if "robot_mm" in sigma:
         robot = f"σ of the robot's poses an axis, and {np.degrees(sigma.get('robot_rad', 0)):.3f}°"
-        tiles.append((f"{sigma['robot_mm']:.3f} mm", "", robot))
-    return tiles
+        headline.append((f"{sigma['robot_mm']:.3f} mm", "", robot))
+    return headline

@@ -11,7 +11,8 @@ from stcal.handeye.plan import NextPoses
 from stcal.handeye.result import HandEye
 from stcal.io.json import Part, Pose, ResultFile
 from stcal.io.table import POSE, pose_cells
-from stcal.report.text import NONE, number, text_table
+from stcal.report.document import Document, Section, Table
+from stcal.report.text import NONE, number
 
 JOINT_DIGITS = 3
 """Number of digits of joint values (deg or mm) on the terminal."""
@@ -40,33 +41,30 @@ class HandEyePlanFile(ResultFile):
     )
 
 
-def planned_text(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> str:
-    """Returns the tables for the terminal."""
+def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.ndarray]) -> Document:
+    """Returns the report of ``handeye plan``."""
     taken = int((~result.outliers).sum())
     rotvec = np.degrees([flange.log()[:3] for flange in planned.base_from_flange])
     heads = ["<pose", "worst σ, mm", "turn, °", "x, mm", "y, mm", "z, mm", "rx, °", "ry, °", "rz, °"]
     rows = [[f"{taken} taken", number(planned.sigma_mm[0], 3), *[NONE] * 7]]
+    cells = []
     for k, (sigma, turn) in enumerate(zip(planned.sigma_mm[1:], planned.turn_rad, strict=True)):
         place = [f"{value:.2f}" for value in (*planned.base_from_flange[k].translation, *rotvec[k])]
         rows.append([f"next {k + 1}", number(sigma, 3), f"{np.degrees(turn):.0f}", *place])
-    lines = [
+        cells.append([f"next {k + 1}", *(f"{values[k]:.{JOINT_DIGITS}f}" for values in joints.values())])
+    last = "joint limits and the image" if joints else "the image; give --robot for joint limits"
+    blocks = [
+        Table(heads, rows),
+        Table(["<joints", *joints], cells if joints else []),
+        "turn: against the nearest pose taken; rx, ry, rz: rotation vector. σ are of independent errors of the poses "
+        f"alone. Collisions are not looked at, only {last}",
+    ]
+    return Document(
+        "Poses to take next",
         f"{result.setup}, method {result.method}: poses of the flange in the base, in order, and the worst σ of a "
         "point at the board with each",
-        *text_table([heads, *rows]),
-    ]
-    if joints:
-        cells = [
-            [f"next {k + 1}", *(f"{joint_values[k]:.{JOINT_DIGITS}f}" for joint_values in joints.values())]
-            for k in range(len(rotvec))
-        ]
-        lines += ["", *text_table([["<joints", *joints], *cells])]
-    last = "joint limits and the image" if joints else "the image; give --robot for joint limits"
-    lines += [
-        "",
-        "turn: against the nearest pose taken; rx, ry, rz: rotation vector. σ are of independent errors of the poses",
-        f"alone. Collisions are not looked at, only {last}.",
-    ]
-    return "\n".join(lines)
+        [Section("Poses", blocks, terminal=True)],
+    )
 
 
 def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray]) -> str:

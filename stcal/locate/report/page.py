@@ -1,4 +1,4 @@
-"""Text and page of located tags, with their tables."""
+"""The report of located tags, and their table."""
 
 import base64
 import csv
@@ -6,7 +6,6 @@ import io
 from collections.abc import Sequence
 
 import numpy as np
-from markupsafe import Markup
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
@@ -20,70 +19,32 @@ from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pipeline import Located
 from stcal.locate.pose.patent import ASSUMED
 from stcal.locate.report.chain import GoalChain
+from stcal.report.document import Block, Document, Html, Notes, Section, Table, Verdict, columns, macro, page_only
 from stcal.report.figure import AXIS_COLOURS, COLOURS
-from stcal.report.page import render, verdict
-from stcal.report.text import NONE, number, text_table
+from stcal.report.text import NONE, number
 
 BASE = "base_from_goal_"
 
 
-def run_text(results: Sequence[Located], chain: GoalChain | None = None) -> str:
-    """Returns the results as text: a line for each scene, with reasons below scenes that are not accepted.
-
-    With ``chain``, the poses of the target in the robot's base follow.
-    """
-    width = max([5, *(len(scene.name) for scene in results)])
-    head = f"{'scene':<{width}}  verdict    tags  exposures      x_mm      y_mm      z_mm  sigma_mm  sigma_deg   rms_px"
-    lines = [head]
-    for scene in results:
-        exposures = len(scene.tags.readable())
-        tags = len(scene.merged.seen) if scene.merged else 0
-        start = f"{scene.name:<{width}}  {scene.verdict.decision:<9}  {tags:4d}  {exposures:9d}"
-        pose = camera_from_obj(scene)
-        if pose is not None:
-            start += "".join(f"{v:10.2f}" for v in pose.translation)
-        if scene.pose is not None:
-            sigma = scene.pose.sigma_mm(), np.degrees(scene.pose.sigma_rad()), scene.pose.rms_px()
-            start += "{:10.3f}{:11.4f}{:9.3f}".format(*sigma)
-        lines += [start, *(f"{'':<{width}}    {reason}" for reason in (*scene.verdict.reasons, *scene.notes))]
-        if scene.patent is not None:
-            lines += [f"    {line}" for line in text_table(patent_cells(scene))]
-            lines += [f"    gates: {gates_text(scene)}"]
-    if chain and accepted(results):
-        lines += ["", f"{'base_from_goal':<{width + 22}}      x_mm      y_mm      z_mm  rotation vector, deg"]
-        for scene in accepted(results):
-            goal = chain.base_from_goal(scene.name, uncertain(scene)).rigid
-            turn = np.degrees(goal.log()[:3])
-            place = "".join(f"{v:10.2f}" for v in goal.translation)
-            lines.append(f"{scene.name:<{width + 22}}{place}" + "".join(f"{v:10.3f}" for v in turn))
-    if any(scene.patent is not None for scene in results):
-        lines += ["", f"patent: {ASSUMED}"]
-    return "\n".join(lines)
-
-
-def patent_cells(each: Located) -> list[list[str]]:
-    """Returns heads, and one row per exposure: its result by the rules of the patent."""
-    rows = [["<exposure", "<", "tags", "area px²", "error px", "of the other", "det J 1/mm²"]]
+def _patent_blocks(each: Located) -> list[Block]:
+    """Returns a table with a row per exposure: its result by the rules of the patent."""
+    rows: list[list[str]] = []
     if each.patent is None:
-        return rows
+        return []
     for name, result in zip((e.name for e in each.tags.readable()), each.patent.exposures, strict=True):
         state = "kept" if result.exposure == each.patent.exposure else "candidate" if result.candidate else "left out"
         errors = result.errors_px or (None, None)
         det_j = NONE if result.det_j is None else f"{result.det_j:.3g}"
         rows.append([name, state, str(result.tags), number(result.area_px2, 0), *(number(e, 3) for e in errors), det_j])
-    return rows
-
-
-def gates_text(each: Located) -> str:
-    """Returns every gate with its value and limit, in words."""
-    gates = [
-        f"{check.name} {check.value:.4g}{check.unit} {'≥' if check.at_least is not None else '≤'} "
-        f"{check.at_least if check.at_least is not None else check.at_most:.4g}{'' if check.passed else ' failed'}"
-        for check in each.verdict.checks
+    return [
+        "both poses are one, no ratio" if each.patent.same else "",
+        page_only(
+            "By the published rules: exposures with most tags, of these the ones of more than S_dis of the largest "
+            "area; of these the pose of the smallest error"
+        ),
+        Table(["<exposure", "<", "tags", "area px²", "error px", "of the other", "det J 1/mm²"], rows),
+        f"patent: {ASSUMED}",
     ]
-    if each.patent is not None and each.patent.same:
-        gates.append("both poses are one, no ratio")
-    return "; ".join(gates)
 
 
 def camera_from_obj(each: Located) -> Rigid | None:
@@ -136,26 +97,30 @@ def poses_csv(results: Sequence[Located], chain: GoalChain | None = None) -> str
 
 
 WIDE_PX, SMALL_PX = 900, 215
-COLOUR = {"accept": "#1b7f3b", "ambiguous": "#a15c00", "reject": "#b3261e"}
 
 
-def run_page(
+def run_report(
     results: Sequence[Located],
     scenes: Sequence[SceneFiles],
     layout: TargetLayout,
     model: CameraModel,
     chain: GoalChain | None = None,
-) -> str:
-    """Returns the whole page, which opens offline."""
-    return render(
-        "locate/report/page.html.jinja",
-        layout=layout,
-        accepted=len(accepted(results)),
-        overview=_overview(results),
-        goals=_in_base(results, chain),
-        scenes=[
-            {"head": (f"scene-{i}", each.name), **_scene(each, files, layout, model)}
-            for i, (each, files) in enumerate(zip(results, scenes, strict=True), 1)
+) -> Document:
+    """Returns the report of ``locate run``: all scenes in a table, goals in the robot's base, then scene by scene."""
+    heads = ["<scene", "<verdict", "tags", "exposures", "x mm", "y mm", "z mm", "σ mm", "σ °", "RMS px", "<why"]
+    goal_heads = ["<base_from_goal", "x mm", "y mm", "z mm", "rotation vector x °", "y °", "z °"]
+    blocks: list[Block] = [Table(heads, _overview(results), css="text")]
+    if chain and accepted(results):
+        blocks += [page_only("Where the robot has to go"), Table(goal_heads, _in_base(results, chain))]
+    return Document(
+        f"Tags located: {layout.name}",
+        f"target {layout.name}, {len(layout.tags)} tags: {len(results)} scenes, {len(accepted(results))} accepted",
+        [
+            Section("Scenes", blocks, terminal=True),
+            *(
+                Section(each.name, _scene(each, files, layout, model), terminal=each.patent is not None)
+                for each, files in zip(results, scenes, strict=True)
+            ),
         ],
     )
 
@@ -169,21 +134,19 @@ def _overview(results: Sequence[Located]) -> list[list]:
         rows.append(
             [
                 located.name,
-                _decision(located),
+                Verdict(located.verdict.decision),
                 len(located.merged.seen) if located.merged else 0,
                 len(located.tags.readable()),
                 *(number(v, 2) for v in place),
                 *(number(v, 3) for v in sigma),
-                "; ".join(located.verdict.reasons),
+                "; ".join((*located.verdict.reasons, *located.notes)),
             ]
         )
     return rows
 
 
-def _in_base(results: Sequence[Located], chain: GoalChain | None) -> list[list[str]]:
+def _in_base(results: Sequence[Located], chain: GoalChain) -> list[list[str]]:
     """Returns rows of base_from_goal of the accepted scenes."""
-    if chain is None:
-        return []
     rows = []
     for located in accepted(results):
         goal = chain.base_from_goal(located.name, uncertain(located)).rigid
@@ -192,35 +155,33 @@ def _in_base(results: Sequence[Located], chain: GoalChain | None) -> list[list[s
     return rows
 
 
-def _decision(each: Located) -> Markup:
-    decision = each.verdict.decision
-    return verdict(decision, COLOUR[decision])
-
-
-def _scene(each: Located, files: SceneFiles, layout: TargetLayout, model: CameraModel) -> dict:
-    """Returns the values of a scene for the template."""
+def _scene(each: Located, files: SceneFiles, layout: TargetLayout, model: CameraModel) -> list[Block]:
+    """Returns verdict, checks and pictures of a scene."""
     by_name = {file.name: file for file in files.files}
     shown = each.tags.readable()
     best = best_exposure(shown, layout)
-    all_if_several = shown if len(shown) > 1 else []
-    return {
-        "decision": _decision(each),
-        "reasons": each.verdict.reasons,
-        "notes": each.notes,
-        "checks": [
-            [
-                check.name,
-                f"{check.value:.4g}{check.unit}" if np.isfinite(check.value) else "no other pose",
-                f"≥ {check.at_least:.4g}" if check.at_least is not None else f"≤ {check.at_most:.4g}",
-                "yes" if check.passed else verdict("no", COLOUR["reject"]),
-            ]
-            for check in each.verdict.checks
-        ],
-        "patent": [] if each.patent is None else patent_cells(each),
-        "assumed": "" if each.patent is None else ASSUMED,
-        "best": best and _picture(best, by_name[best.name], each, layout, model, WIDE_PX),
-        "small": [_picture(own, by_name[own.name], None, layout, model, SMALL_PX) for own in all_if_several],
-    }
+    checks = [
+        [
+            check.name,
+            f"{check.value:.4g}{check.unit}" if np.isfinite(check.value) else "no other pose",
+            f"≥ {check.at_least:.4g}" if check.at_least is not None else f"≤ {check.at_most:.4g}",
+            "yes" if check.passed else Verdict("no"),
+        ]
+        for check in each.verdict.checks
+    ]
+    several = shown if len(shown) > 1 else []
+
+    def photo(exposure: Exposure, of: Located | None, width_px: int) -> Html:
+        return macro("tag_photo", lambda: _picture(exposure, by_name[exposure.name], of, layout, model, width_px))
+
+    return [
+        " – ".join((each.verdict.decision, *each.verdict.reasons)),
+        Notes(each.notes),
+        Table(["<check", "value", "limit", "<kept"], checks),
+        *_patent_blocks(each),
+        photo(best, each, WIDE_PX) if best else None,
+        columns(*([photo(exposure, None, SMALL_PX)] for exposure in several), css="columns small"),
+    ]
 
 
 def best_exposure(exposures: Sequence[Exposure], layout: TargetLayout) -> Exposure | None:

@@ -21,7 +21,7 @@ MARGIN = 0.25
 
 
 def space_figure(found: Findings):
-    """Returns three views of the points in frame b with their residuals, and the factor by which these are enlarged."""
+    """Returns three views of the points in frame b with their residuals, enlarged."""
     result = found.registration
     rows = _shown(found)
     place = result.b_from_a @ found.xyz_a[rows]
@@ -65,15 +65,20 @@ def space_figure(found: Findings):
                 f"{length[row]:.2g}", end, (3, 3), textcoords="offset points", fontsize=SMALL - 1, color=INK, zorder=5
             )
         _frame(axes, "b", i, j, middle, reach)
-    return figure, scale
+    figure.text(0.99, 0.99, f"{scale:,g} times", ha="right", va="top", fontsize=SMALL + 1, color=INK)
+    return figure
+
+
+def has_field_figure(found: Findings, field: Field) -> bool:
+    """Returns whether the points have a width in all directions, so that planes through their middle show something."""
+    width = np.ptp(found.xyz_a[field.rows], axis=0)
+    return bool(width.min() >= 1e-3 * width.max())
 
 
 def field_figure(found: Findings, field: Field):
-    """Returns planes through the middle of the points with the expected error; None if the points have no width."""
+    """Returns planes through the middle of the points with the expected error."""
     own = found.xyz_a[field.rows]
     low, high = own.min(0), own.max(0)
-    if (high - low).min() < 1e-3 * (high - low).max():
-        return None
     middle, reach = (low + high) / 2, (high - low) / 2 * (1 + 2 * MARGIN)
     planes = []
     for i, j in VIEWS:
@@ -129,9 +134,7 @@ def errors_figure(found: Findings, reach: Cubes):
         axes.plot(side[tried <= top], tried[tried <= top], "_", color=COLOURS[2], ms=6, mew=1, label="held out")
     axes.set_ylim(0, 1.04 * top)
     axes.set_xlim(0, None)
-    calm(axes)
-    axes.set_xlabel("cube about the middle, side in mm (triangles: farther off than shown)", fontsize=SMALL + 0.5)
-    axes.set_ylabel("error, mm", fontsize=SMALL + 0.5)
+    calm(axes, "cube about the middle, side in mm (triangles: farther off than shown)", "error, mm")
     axes.legend(fontsize=SMALL, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
     return figure
 
@@ -153,9 +156,7 @@ def _frame(axes, frame: str, i: int, j: int, middle: np.ndarray, reach: np.ndarr
     axes.set_ylim(middle[j] - per_inch * height, middle[j] + per_inch * height)
     axes.xaxis.set_major_locator(locator())
     axes.yaxis.set_major_locator(locator())
-    axes.set_xlabel(f"{'xyz'[i]} of {frame}, mm", fontsize=SMALL + 0.5, color=INK)
-    axes.set_ylabel(f"{'xyz'[j]} of {frame}, mm", fontsize=SMALL + 0.5, color=INK, labelpad=1)
-    calm(axes)
+    calm(axes, f"{'xyz'[i]} of {frame}, mm", f"{'xyz'[j]} of {frame}, mm")
 
 
 def sample_size_figure(sizes: list[SampleSize], share: float):
@@ -167,10 +168,7 @@ def sample_size_figure(sizes: list[SampleSize], share: float):
     axes.plot(points, [100 * each.median for each in sizes], "o:", color=COLOURS[0], ms=2.5, lw=1.2, label="median")
     axes.axhline(100 * share, color=INK, lw=0.8, ls=(0, (4, 3)))
     axes.set(ylim=(0, 102))
-    axes.set_xlabel("points of a sample", fontsize=SMALL + 1, color=INK)
-    axes.set_ylabel("inliers of the other points, %", fontsize=SMALL + 1, color=INK)
     axes.legend(frameon=False, fontsize=SMALL + 0.5, loc="lower right")
     axes.xaxis.set_major_locator(locator(integer=True))
-    axes.grid(axis="y", color=FAINT, lw=0.6)
-    calm(axes)
+    calm(axes, "points of a sample", "inliers of the other points, %", "y")
     return figure

@@ -1,70 +1,74 @@
-"""Text and page of a registration."""
+"""The report of a registration."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from markupsafe import Markup
 
 from stcal.geometry.rigid import Affine, Similarity
-from stcal.parallel import one_thread
 from stcal.register.core.liu2017 import Liu2017Options, SampleSize
 from stcal.register.core.result import ErrorFigures
-from stcal.register.report.drawings import errors_figure, field_figure, sample_size_figure, space_figure
+from stcal.register.report.drawings import (
+    errors_figure,
+    field_figure,
+    has_field_figure,
+    sample_size_figure,
+    space_figure,
+)
 from stcal.register.report.file import matrix_of
 from stcal.register.workspace.field import Cubes, Field
 from stcal.register.workspace.findings import Findings
-from stcal.report.figure import COLOURS, uri
-from stcal.report.page import Sections, render
-from stcal.report.text import NONE, number, text_table
+from stcal.report.document import (
+    MOST_ROWS,
+    Block,
+    Document,
+    Section,
+    Table,
+    alarms,
+    fold,
+    legend,
+    page_only,
+    plot,
+    tiles,
+)
+from stcal.report.figure import COLOURS
+from stcal.report.text import NONE, number
 
 FEW_ROWS = 24
 """Largest number of rows that are all listed. Of more, only the outliers and some inliers are."""
 WORST = 5
 """Number of inliers that are then listed, those with the largest residuals."""
-MOST_OUTLIERS = 30
-ROWS_ON_PAGE = 2000
 
 
-def registration_text(found: Findings) -> str:
-    """Returns the tables for the terminal."""
-    result = found.registration
-    lines = [_heading(found), "", "b_from_a, mm", *matrix_lines(matrix_of(result.b_from_a)), *_parts_lines(found), ""]
-    heads = ["<mm", "points", "mean", "RMS", "max"]
-    lines += text_table([heads, *_error_cells(found)], least=(28, 8, 10, 10, 10), gap=0)
-    lines += ["", *_row_lines(found)]
-    reach = _field_lines(found) + _cube_lines(found)
-    return "\n".join(lines + (["", *reach] if reach else []))
-
-
-def sample_size_section(sizes: list[SampleSize], options: Liu2017Options) -> tuple[str, str, Markup]:
+def sample_size_section(sizes: list[SampleSize], options: Liu2017Options) -> Section:
     """Returns the paper's figure 6 for these points, as a section of the page."""
     rows = [
         [
-            str(each.points),
-            *(number(100 * share, 1) for share in (each.best, each.median)),
-            str(each.orthogonal),
-            f"{each.acceptable} of {each.tries}",
+            str(e.points),
+            number(100 * e.best, 1),
+            number(100 * e.median, 1),
+            str(e.orthogonal),
+            f"{e.acceptable} of {e.tries}",
         ]
-        for each in sizes
+        for e in sizes
     ]
-    content = render(
-        "register/report/sample_size.html.jinja",
-        figure=uri(sample_size_figure(sizes, options.share)),
-        rows=rows,
-        limit=f"{options.limit_mm:g}",
-        share=f"{100 * options.share:g}",
+    told = (
+        "Samples of every size, as in figure 6 of Liu et al. (2017): the share of the other points within "
+        f"{options.limit_mm:g} mm of what the sample says. A sample is acceptable with more than "
+        f"{100 * options.share:g} %; those whose 3×3 part is not orthogonal are out"
     )
-    return "sample", "Size of the sample", Markup(content)
+    figure = plot(
+        lambda: sample_size_figure(sizes, options.share),
+        "Share of inliers against the size of the sample: best and median",
+    )
+    heads = ["points", "best (%)", "median (%)", "orthogonal", "acceptable"]
+    return Section("Size of the sample", [told, figure, Table(heads, rows)])
 
 
-def matrix_lines(matrix: np.ndarray) -> list[str]:
-    """Returns a 4×4 matrix as text, row by row."""
-    return ["  " + "".join(f"{v:14.9f}" for v in row[:3]) + f"{row[3]:16.4f}" for row in matrix]
-
-
-def matrix_rows(matrix: np.ndarray) -> list[list[str]]:
-    """Returns a 4×4 matrix for a page: the images of the axes and the origin."""
-    return [[axis, *(f"{v:.9f}" for v in row[:3]), f"{row[3]:.4f}"] for axis, row in zip("xyz ", matrix, strict=True)]
+def matrix_table(name: str, matrix: np.ndarray) -> Table:
+    """Returns a 4×4 matrix: the images of the axes, and the origin."""
+    rows = [[axis, *(f"{v:.9f}" for v in row[:3]), f"{row[3]:.4f}"] for axis, row in zip("xyz ", matrix, strict=True)]
+    return Table([f"<{name}", "x axis", "y axis", "z axis", "origin, mm"], rows)
 
 
 def _heading(found: Findings) -> str:
@@ -108,25 +112,23 @@ def _figures(name: str, errors: ErrorFigures) -> list[str]:
     return [name, str(errors.points), *(number(v, 4) for v in (errors.mean_mm, errors.rms_mm, errors.max_mm))]
 
 
-def _row_lines(found: Findings) -> list[str]:
-    result, length = found.registration, found.length_mm
+def _rows(found: Findings) -> Table:
+    """Returns the residuals of all rows; of many rows those of outliers, and the largest of inliers."""
+    result = found.registration
     if len(result) <= FEW_ROWS:
-        rows, title = np.arange(len(result)), "residuals b − b_from_a a, mm"
-    else:
-        inliers = np.flatnonzero(result.inliers)
-        worst = inliers[np.argsort(-length[inliers], kind="stable")][:WORST]
-        rows = np.concatenate([result.outliers[:MOST_OUTLIERS], worst])
-        title = f"residuals b − b_from_a a of the outliers and of the {len(worst)} largest inliers, mm"
+        return _table_of(found, np.arange(len(result)))
+    inliers = np.flatnonzero(result.inliers)
+    worst = inliers[np.argsort(-found.length_mm[inliers], kind="stable")][:WORST]
+    return _table_of(found, np.concatenate([worst, result.outliers]))
+
+
+def _table_of(found: Findings, rows: np.ndarray) -> Table:
+    result, length = found.registration, found.length_mm
     cells = []
     for row in rows.tolist():
-        kind = "inlier" if result.inliers[row] else "OUTLIER"
-        values = [*result.residuals[row], length[row]]
-        cells.append([f"  {f'line {found.lines[row]}':<16}{kind}", *(number(v, 3) for v in values)])
-    heads = ["<" + title, "x", "y", "z", "length"]
-    lines = text_table([heads, *cells], (60, *[8] * 4)) if cells else []
-    if len(result) > FEW_ROWS and len(result.outliers) > MOST_OUTLIERS:
-        lines.append(f"  … and {len(result.outliers) - MOST_OUTLIERS} more outliers; all are in --out and --report")
-    return lines
+        values = (number(v, 4) for v in (*result.residuals[row], length[row]))
+        cells.append([f"line {found.lines[row]}", "inlier" if result.inliers[row] else "OUTLIER", *values])
+    return Table(["<residual, mm", "<", "x", "y", "z", "length"], cells)
 
 
 UNRELATED = 0.1
@@ -161,25 +163,10 @@ def field_sentence(found: Findings, field: Field) -> str:
     )
 
 
-def _field_lines(found: Findings) -> list[str]:
-    return [] if found.field is None else [field_sentence(found, found.field)]
-
-
 def shells(reach: Cubes) -> list[str]:
     """Returns names of the cubes: ``inner 200 mm``, ``200 … 300 mm`` …."""
     sides = [f"{side:g}" for side in reach.sides_mm]
     return [f"inner {sides[0]} mm"] + [f"{a} … {b} mm" for a, b in pairwise(sides)]
-
-
-def _cube_lines(found: Findings) -> list[str]:
-    reach = found.cubes
-    if reach is None:
-        return []
-    middle = " ".join(f"{v:.0f}" for v in reach.middle)
-    rows = [[f"{e.mean_mm:.3f} / {e.max_mm:.3f}" if e else "–" for e in row] for row in reach.errors]
-    heads = [f"<errors in cubes about {middle} of a, mean / max, mm", *shells(reach)]
-    fits = [[f"  fitted in the cube of {s:g} mm", *row] for s, row in zip(reach.sides_mm, rows, strict=True)]
-    return [*text_table([heads, *fits], (52, *[14] * len(rows))), *holds(reach)]
 
 
 def holds(reach: Cubes) -> list[str]:
@@ -195,32 +182,64 @@ def holds(reach: Cubes) -> list[str]:
     return [text]
 
 
-@one_thread()
-def registration_page(found: Findings, more: Sections = ()) -> str:
-    """Returns the report page. ``more`` : sections to insert before the rows."""
+def registration_report(found: Findings, more: Sequence[Section] = ()) -> Document:
+    """Returns the report of ``register``. ``more`` : sections to insert before the rows."""
     result = found.registration
-    space, enlarged = space_figure(found)
-    field = None if found.field is None else field_figure(found, found.field)
-    length = found.length_mm
-    return render(
-        "register/report/page.html.jinja",
-        more=list(more),
-        counts=_heading(found),
-        alarming=result.notes,
-        headline=_headline(found),
-        matrix=matrix_rows(matrix_of(result.b_from_a)),
-        parts=_parts_lines(found),
-        errors=_error_cells(found),
-        colours=COLOURS,
-        space=uri(space),
-        enlarged=enlarged,
-        systematic="" if found.field is None else field_sentence(found, found.field),
-        field=field and uri(field),
-        cubes=found.cubes and _cubes(found, found.cubes),
-        outliers=[_row(found, row, length) for row in result.outliers[:ROWS_ON_PAGE]],
-        rows=[_row(found, row, length) for row in range(min(len(result), ROWS_ON_PAGE))],
-        count=len(result),
+    matrix = matrix_table("b_from_a", matrix_of(result.b_from_a))
+    errors = Table(["<lengths of errors, mm", "points", "mean", "RMS", "max"], _error_cells(found))
+    answer = [page_only(alarms(result.notes)), tiles(_headline(found)), matrix, *_parts_lines(found), errors]
+    outliers = len(result.outliers) > 0
+    cut = "; arrows of outliers that would leave the picture end in a ring, their length in mm beside them"
+    space = [
+        legend({"inlier": COLOURS[0], **({"outlier": COLOURS[1]} if outliers else {})}),
+        plot(
+            lambda: space_figure(found),
+            "residuals in three views",
+            f"Points in frame b and their residuals b − b_from_a a, enlarged{cut if outliers else ''}",
+        ),
+    ]
+    rows, first = _rows(found), min(len(result), MOST_ROWS)
+    what = "All rows" if first == len(result) else f"The first {first} of {len(result)} rows"
+    every = fold(what, _table_of(found, np.arange(first))) if len(result) > FEW_ROWS else None
+    return Document(
+        "Registration",
+        _heading(found),
+        [
+            Section("Result", answer, terminal=True),
+            Section("Residuals in space", space),
+            Section("Where it holds", _where_it_holds(found), terminal=True),
+            *more,
+            Section("Rows", ["" if outliers else "no outliers", rows, every], terminal=True),
+        ],
     )
+
+
+def _where_it_holds(found: Findings) -> list[Block]:
+    """Returns whether residuals are systematic, and errors in cubes about the middle of the points."""
+    field, reach = found.field, found.cubes
+    blocks: list[Block] = []
+    if field is not None:
+        blocks.append(field_sentence(found, field))
+        if has_field_figure(found, field):
+            blocks.append(
+                plot(
+                    lambda: field_figure(found, field),
+                    "systematic error over the workspace",
+                    "Systematic error to expect of the transform (RMS: of what the residuals show and of what they "
+                    "leave open), in planes through the middle of the points, frame a. Dots: the points within an "
+                    "eighth of the plane; dashed: the box of all. Beyond it the model knows less and says more",
+                )
+            )
+    if reach is not None:
+        middle = " ".join(f"{v:.1f}" for v in reach.middle)
+        explained = (
+            f"Cubes about ({middle}) mm, along the axes of a. The transform is fitted again to the points in one cube "
+            "and tried on those of all; the points that it is fitted to are held out in turn. Nothing is assumed "
+            "about where errors come from"
+        )
+        place = plot(lambda: errors_figure(found, reach), "errors by place", "Lengths of the residuals by place")
+        blocks += [page_only(explained), *holds(reach), _cubes(reach), place]
+    return blocks or [page_only("Too few points to tell")]
 
 
 def _headline(found: Findings) -> list[tuple[str, str, str]]:
@@ -236,24 +255,11 @@ def _headline(found: Findings) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def _cubes(found: Findings, reach: Cubes) -> dict:
-    """Returns errors in cubes in the form of the template."""
+def _cubes(reach: Cubes) -> Table:
+    """Returns errors in cubes, one row for each cube that the transform is fitted to."""
     rows = []
     for side, row in zip(reach.sides_mm, reach.errors, strict=True):
         errors = [[str(e.points), number(e.mean_mm, 4), number(e.max_mm, 4)] if e else ["0", NONE, NONE] for e in row]
         rows.append([f"{side:g} mm", *(cell for error in errors for cell in error)])
-    return {
-        "middle": " ".join(f"{v:.1f}" for v in reach.middle),
-        "holds": holds(reach),
-        "shells": shells(reach),
-        "rows": rows,
-        "figure": uri(errors_figure(found, reach)),
-    }
-
-
-def _row(found: Findings, row: int, length: np.ndarray) -> list[str]:
-    """Returns the cells of a row. ``length`` : (n,) of all residuals."""
-    result = found.registration
-    kind = "inlier" if result.inliers[row] else "outlier"
-    values = [number(v, 4) for v in (*result.residuals[row], length[row])]
-    return [str(found.lines[row]), kind, *values]
+    over = [("", 1), *((f"{name}:", 3) for name in shells(reach))]
+    return Table(["<fitted in the cube of", *["points", "mean", "max"] * len(rows)], rows, over)

@@ -1,7 +1,7 @@
 // A scene that turns: dragged, by touch, or with the keys; drawn from the JSON beside its canvas, parallel projection.
 (() => {
   "use strict";
-  const START = { azimuth: -58, elevation: 22, zoom: 1.15 };
+  const START = { azimuth: -58, elevation: 22, zoom: 0.98 };
   const STEP = 6;
   const rad = (degrees) => (degrees * Math.PI) / 180;
 
@@ -20,7 +20,7 @@
     const pen = canvas.getContext("2d");
     // What of the scene is shown, by the value of its button; it fills the picture.
     const parts = { all: bounds(data), target: bounds(data.filter((each) => each.target)) };
-    let view = { ...START, part: "all" };
+    let view = { ...START, part: figure.querySelector("button")?.value ?? "all" };
     let placed = [];
 
     function project(size) {

@@ -8,9 +8,9 @@ from pydantic import Field
 
 import stcal
 from stcal.io.json import ByName, Matrix, Part, Pose, ResultFile, Vector3
-from stcal.report.figure import AXIS_COLOURS, FAINT, INK, SMALL, calm, new_figure, uri
-from stcal.report.page import render
-from stcal.report.text import number, text_table
+from stcal.report.document import Document, Section, Table, bullets, legend, page_only, plot
+from stcal.report.figure import AXIS_COLOURS, INK, calm, new_figure
+from stcal.report.text import number
 from stcal.robot.axes.fit import AxisFit
 from stcal.robot.axes.model import ROW_VALUES, AxesResult
 from stcal.robot.axes.pairs import Pair
@@ -126,32 +126,6 @@ class AxesFile(ResultFile):
         description="rows left out as grossly wrong, reflectors too close to an axis, arcs too short; columns that "
         "were not read, angles by their convention"
     )
-
-
-AXIS_HEADS = ("joint", "arcs", "points", "span", "RMS mm", "mean mm", "length RMS mm", "σ direction µrad", "σ place mm")
-PAIR_HEADS = ("joints", "angle °", "σ °", "distance mm", "σ mm", "D-H a mm", "σ mm", "foot m", "σ m", "row")
-ROW_HEADS = ("joint", "a mm", "alpha °", "d mm", "theta °", "beta °")
-SPREAD_HEADS = ("joints", "distance mm", "D-H a mm")
-
-
-def axes_text(result: AxesResult) -> str:
-    """Returns tables for the terminal."""
-    lines = ["Axes: residuals as RMS of a coordinate, and as mean and RMS length of the points' vectors"]
-    lines += text_table([AXIS_HEADS, *[_axis_cells(fit) for fit in result.fits]])
-    lines += ["", "Pairs of axes: robust distance, and the common normal of Denavit and Hartenberg"]
-    lines += text_table([PAIR_HEADS, *[_pair_cells(pair) for pair in result.pairs]])
-    lines += [f"refused D-H value of joints {_names(p)}: {p.refused}" for p in result.pairs if p.refused]
-    lines += ["", f"Leave-one-out: largest less smallest over {len(result.without_one.lines)} rows"]
-    lines += text_table([SPREAD_HEADS, *_spread_cells(result)])
-    lines += ["", f"Rows ({result.robot.convention}), ± σ where the axes determine them"]
-    lines += text_table([ROW_HEADS, *_row_cells(result)])
-    for name, tool in result.robot.tools.items():
-        x, y, z = tool.translation
-        lines.append(
-            f"{called(name)} on the flange: {x:.4f} {y:.4f} {z:.4f} mm, RMS {result.tool_spread_mm[name]:.3f} mm over "
-            "all rows"
-        )
-    return "\n".join(lines)
 
 
 def _axis_cells(fit: AxisFit) -> list[str]:
@@ -296,30 +270,81 @@ def _pair_json(pair: Pair) -> dict:
     }
 
 
-def axes_page(result: AxesResult, where: str) -> str:
-    """Returns the report page of ``axes``."""
-    return render(
-        "robot/axes/page.html.jinja",
-        robot=result.robot.name,
-        where=where,
-        heads={"axes": AXIS_HEADS, "pairs": PAIR_HEADS, "without_one": SPREAD_HEADS, "rows": ROW_HEADS},
-        axes=[_axis_cells(fit) for fit in result.fits],
-        residuals=_residuals(result),
-        colours=AXIS_COLOURS,
-        refused=[(_names(pair), pair.refused) for pair in result.pairs if pair.refused],
-        pairs=[_pair_cells(pair) for pair in result.pairs],
-        left_out=len(result.without_one.lines),
-        without_one=_spread_cells(result),
-        rows=_row_cells(result),
-        tools=[
-            [called(name), *(number(v, 4) for v in tool.translation), number(result.tool_spread_mm[name], 3)]
-            for name, tool in result.robot.tools.items()
+def axes_report(result: AxesResult, where: str) -> Document:
+    """Returns the report of ``axes``."""
+    tools = [
+        [called(name), *(number(v, 4) for v in tool.translation), number(result.tool_spread_mm[name], 3)]
+        for name, tool in result.robot.tools.items()
+    ]
+    axis_heads = ("joint", "arcs", "points", "span", "RMS mm", "mean mm", "length RMS mm", "direction µrad", "place mm")
+    pair_heads = ("joints", "angle °", "σ °", "distance mm", "σ mm", "a mm", "σ mm", "foot m", "σ m", "row")
+    return Document(
+        f"Axes of {result.robot.name}",
+        where,
+        [
+            Section(
+                "Axes",
+                [
+                    page_only(
+                        "One fit for each joint over all arcs of all reflectors. Residuals: RMS of a coordinate "
+                        "(radial, axial), mean and RMS length of the points' vectors"
+                    ),
+                    Table(
+                        axis_heads,
+                        [_axis_cells(fit) for fit in result.fits],
+                        [("", 4), ("residuals", 3), ("σ", 2)],
+                    ),
+                    legend({"radial": AXIS_COLOURS[0], "axial (both across, if prismatic)": AXIS_COLOURS[2]}),
+                    plot(
+                        lambda: _residuals(result),
+                        "residuals of each joint's points",
+                        "Residuals, reflector by reflector",
+                    ),
+                ],
+                terminal=True,
+            ),
+            Section(
+                "Pairs of axes",
+                [
+                    *(f"D-H value of joints {_names(p)} refused: {p.refused}" for p in result.pairs if p.refused),
+                    Table(
+                        pair_heads,
+                        [_pair_cells(pair) for pair in result.pairs],
+                        [("", 3), ("robust", 2), ("common normal", 4), ("", 1)],
+                    ),
+                    page_only(
+                        "Distance: of nearly parallel axes in the plane across the first that its row in the robot "
+                        "has (Hayati), of others along their common normal. Foot: of the common normal, along the "
+                        "first axis from where that was measured"
+                    ),
+                ],
+                terminal=True,
+            ),
+            Section(
+                "Leave-one-out",
+                [
+                    f"largest less smallest value when each of {len(result.without_one.lines)} rows (with its "
+                    "reflectors) is left out",
+                    Table(("joints", "distance mm", "D-H a mm"), _spread_cells(result)),
+                ],
+                terminal=True,
+            ),
+            Section(
+                "Robot",
+                [
+                    f"convention {result.robot.convention}; ± σ where the axes determine the value, the others are "
+                    "kept from the robot file",
+                    Table(("joint", "a mm", "alpha °", "d mm", "theta °", "beta °"), _row_cells(result)),
+                    Table(["<on the flange", "x mm", "y mm", "z mm", "RMS over all rows mm"], tools),
+                ],
+                terminal=True,
+            ),
+            Section("Left out", [bullets(result.notes)]),
         ],
-        notes=result.notes,
     )
 
 
-def _residuals(result: AxesResult) -> str:
+def _residuals(result: AxesResult):
     figure = new_figure(7.5, 2.9)
     axes = figure.add_axes((0.09, 0.17, 0.89, 0.78))
     for fit in result.fits:
@@ -329,9 +354,5 @@ def _residuals(result: AxesResult) -> str:
             axes.plot(fit.joint + 1 + beside, used[:, k], "o", ms=2.4, color=AXIS_COLOURS[2 * k], mew=0)
     axes.set_xticks(range(1, len(result.fits) + 1))
     axes.axhline(0, color=INK, lw=0.6)
-    calm(axes)
-    axes.grid(axis="y", color=FAINT, lw=0.6)
-    axes.set_axisbelow(True)
-    axes.set_xlabel("joint", fontsize=SMALL + 1, color=INK)
-    axes.set_ylabel("residual, mm", fontsize=SMALL + 1, color=INK)
-    return uri(figure)
+    calm(axes, "joint", "residual, mm", "y")
+    return figure

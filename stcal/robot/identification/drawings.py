@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.report.figure import COLOURS, INK, SMALL, calm, new_figure, plane, round_below, uri
+from stcal.report.document import Html, plot
+from stcal.report.figure import COLOURS, INK, SMALL, calm, new_figure, plane, round_below
 from stcal.robot.identification.residuals import Observed, State, as_seen, tips_of
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.kinematics.forward import joint_frames
@@ -70,10 +71,8 @@ def joints_figure(shown: Drawn, findings: Iterable[Finding]):
             fitted = np.linalg.lstsq(_wave(at, turns_of[i + 1]), along, rcond=None)[0]
             x = np.linspace(at.min(), at.max(), 100)
             axes.plot(x, _wave(x, turns_of[i + 1]) @ fitted, color=INK, lw=1.2)
-        calm(axes)
-        axes.set_xlabel(f"joint {i + 1}, {'mm' if sliding else 'deg'}", fontsize=SMALL + 0.5, color=INK)
-        if i % across == 0:
-            axes.set_ylabel("along its motion, mm", fontsize=SMALL + 0.5, color=INK)
+        unit = "mm" if sliding else "deg"
+        calm(axes, f"joint {i + 1}, {unit}", "" if i % across else "along its motion, mm")
     figure.subplots_adjust(left=0.08, right=0.99, bottom=0.42 / height, top=0.97, hspace=0.5, wspace=0.08)
     return figure
 
@@ -84,9 +83,20 @@ def _wave(degrees: np.ndarray, turns: int) -> np.ndarray:
     return np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=1)
 
 
-def space_picture(shown: Drawn) -> dict[str, str]:
-    """Returns ``picture`` and ``caption`` of the residuals of positions from above and from the side, exaggerated, with
-    a scale bar."""
+def residual_plots(shown: Drawn, findings: Iterable[Finding]) -> list[Html | None]:
+    """Returns the figures of residuals by joint and, of positions, in space."""
+    caption = "Residual along each joint's own motion, by the joint's value; a curve where residuals go with its angle"
+    in_space = "Residuals (measured minus modelled), exaggerated, from above and from the side; bar: their scale"
+    if not shown.good.all():
+        in_space += f"; in the other colour: {(~shown.good).sum()} that are not fitted"
+    return [
+        plot(lambda: joints_figure(shown, findings), "Residuals by joint", caption),
+        None if shown.seen.kind == "distance" else plot(lambda: space_figure(shown), "Residuals in space", in_space),
+    ]
+
+
+def space_figure(shown: Drawn):
+    """Returns a figure of the residuals of positions from above and from the side, exaggerated, with a scale bar."""
     good, colour, base_from_world = shown.good, shown.colour, shown.world_from_base.inverse()
     place = base_from_world @ shown.tips().translation
     errors = shown.residuals[:, -3:] @ base_from_world.rotation.T
@@ -118,9 +128,6 @@ def space_picture(shown: Drawn) -> dict[str, str]:
         plane(axes, f"{'xyz'[i]} of the base, mm", f"{'xyz'[j]} of the base, mm", 0.04)
         axes.plot([low[0], low[0] + scale * bar], [low[1], low[1]], color=INK, lw=2, solid_capstyle="butt")
         axes.annotate(f"{bar:g} mm", low, (0, 4), textcoords="offset points", fontsize=SMALL, color=INK)
-    caption = f"Residuals (measured minus modelled), {scale:g} times, from above and from the side"
-    if not good.all():
-        caption += f"; in the other colour: {(~good).sum()} that are not fitted"
-    if (cut < 1).any():
-        caption += f"; cut, as they are too long: {(cut < 1).sum()}"
-    return {"picture": uri(figure), "caption": caption}
+    cut_off = f"; cut, as they are too long: {(cut < 1).sum()}" if (cut < 1).any() else ""
+    figure.suptitle(f"{scale:g} times{cut_off}", x=0.99, y=0.99, ha="right", fontsize=SMALL + 1, color=INK)
+    return figure

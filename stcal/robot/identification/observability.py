@@ -26,8 +26,6 @@ MEANING = {
     "O5": "harmonic mean, near to A-optimality",
 }
 """The meaning of each index."""
-EXPLAINED = [f"  {name}: {words}" for name, words in MEANING.items()]
-"""Lines for the terminal, one for each index."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from stcal.io.json import Matrix, Part, ResultFile
-from stcal.report.figure import COLOURS, calm, new_figure, uri
-from stcal.report.page import render
-from stcal.report.text import NONE, number, text_table
-from stcal.robot.identification.drawings import Drawn, joints_figure, space_picture
-from stcal.robot.identification.observability import EXPLAINED, MEANING
+from stcal.report.document import Block, Document, Notes, Section, Table, fold, listed, page_only, plot, subheading
+from stcal.report.figure import COLOURS, calm, new_figure
+from stcal.report.text import NONE, number
+from stcal.robot.identification.drawings import Drawn, residual_plots
+from stcal.robot.identification.observability import MEANING
 from stcal.robot.identification.prior import DIMENSIONS, Placed, dh_values
 from stcal.robot.identification.result import OUTLIER_WEIGHT, Identified
 from stcal.robot.kinematics.forward import links, torques
@@ -198,45 +198,8 @@ class IdentifiedFile(ResultFile):
 DH = DIMENSIONS
 UNITS = ("mm", "deg", "mm", "deg", "deg")
 SHOWN = np.array([1.0, 180 / np.pi, 1.0, 180 / np.pi, 180 / np.pi])
-PLACE = ("x", "y", "z", "rx", "ry", "rz")
-FIRST_OUTLIERS = 10
 MDEG = 1000 * 180 / np.pi
 ELASTIC = ["<joint, mdeg", "gravity", "across axis", "once a turn", "twice a turn"]
-
-
-def identified_text(result: Identified, nominal: Robot) -> str:
-    """Returns tables for the terminal."""
-    kinds = ", ".join(f"{k}s {v}" for k, v in result.ranks.items())
-    lines = [
-        f"robot {nominal.name}: {_observations(result)}, {result.rank} parameters determined "
-        f"(what these joint values determine: {kinds})",
-        _noise(result),
-        *_price(result),
-        *_model(result),
-    ]
-    errors = [[name, *(number(v, 4) for v in _statistics(each))] for name, each in _errors(result).items()]
-    rows = [["joint", *(head for n, u in zip(DH, UNITS, strict=True) for head in (f"{n} {u}", "±"))]]
-    values, sigma = dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
-    for i, each in enumerate(zip(values, sigma, strict=True), 1):
-        rows.append([str(i), *(cell for v, s in zip(*each, strict=True) for cell in (number(v, 4), _sigma(s)))])
-    placed = [line for each in result.placed for line in _placed(each)]
-    lines += ["", *text_table([["<error, mm", "mean", "RMS", "max"], *errors], (34, *[7] * 3))]
-    lines += ["", *text_table(rows, (6, *[11, 7] * 5))]
-    lines += ["", *text_table([["<mm and rotation vector, deg", *PLACE], *placed], (34, *[9] * 6))]
-    if result.elasticity_sigma is not None:
-        head = elastic_head(result)
-        lines += ["", *text_table([head, *elastic_rows(result)], (16, *[12] * (len(head) - 1)))]
-    indices = result.observability.values()
-    lines += ["", "observability  " + "   ".join(f"{name} {value:.3g}" for name, value in indices.items())]
-    lines += EXPLAINED
-    outliers = result.outliers()
-    if outliers:
-        lines.append(f"outliers, of less than half weight: {len(outliers)}")
-        lines += [f"  {_place(result, row)}: {error:.3f} mm" for row, error in outliers[:FIRST_OUTLIERS]]
-    if result.undetermined:
-        lines.append(f"kept nominal, as the data leave it open: {', '.join(result.undetermined)}")
-    lines += [f"note: {note}" for note in result.notes]
-    return "\n".join(lines)
 
 
 def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
@@ -305,35 +268,61 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
     return IdentifiedFile.model_validate(content)
 
 
-def identified_page(result: Identified, nominal: Robot) -> str:
-    """Returns the report page."""
+def identified_report(result: Identified, nominal: Robot) -> Document:
+    """Returns the report of ``identify``."""
+    kinds = ", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items())
+    errors = [[name, *(number(v, 4) for v in _statistics(each))] for name, each in _errors(result).items()]
+    outliers = [[_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()]
+    sigma = [
+        [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
+        for name, s in zip(result.names, np.sqrt(np.diag(result.covariance)), strict=True)
+    ]
+    indices = [[name, f"{value:.4g}", MEANING[name]] for name, value in result.observability.values().items()]
+    accuracy = [
+        _noise(result),
+        *_price(result),
+        *_model(result),
+        Table(["<Error, mm", "mean", "RMS", "max"], errors),
+        page_only(
+            "Held out: rows that took no part in the fit that they judge. σ: of the tool's position, by the "
+            "covariance of the parameters"
+        ),
+        plot(lambda: _figure(result), "Errors by row", "Error by observation; held out: mean over the divisions"),
+        Notes(result.notes),
+    ]
+    rows = [
+        page_only(f"Convention {result.robot.convention}. β (Hayati) where axes are nearly parallel; d is then kept"),
+        *_dh_tables(result, nominal),
+        *_elastic_blocks(result),
+        subheading("Base in the instrument's frame, tools in the flange's"),
+        placed_table(result.placed),
+    ]
+    determined = [
+        f"{result.rank} of {len(result.names)} parameters; these joint values determine: {kinds}",
+        listed("kept nominal, as the data leave it open", result.undetermined),
+        fold("σ of the minimal parameters", Table(["<Parameter", "σ"], sigma)),
+        Table(["<Index", "value (1/mm, O2: none)", "<"], indices),
+    ]
     good = result.weights >= OUTLIER_WEIGHT
     drawn = Drawn(result.state, result.robot.world_from_base, result.seen, result.residuals, good)
-    return render(
-        "robot/identification/page.html.jinja",
-        robot=nominal.name,
-        result=result,
-        observations=_observations(result),
-        errors=[[name, *(number(v, 4) for v in _statistics(e))] for name, e in _errors(result).items()],
-        noise=_noise(result),
-        model=[*_price(result), *_model(result)],
-        elastic=elastic_rows(result),
-        elastic_head=elastic_head(result),
-        errors_by_row=uri(_figure(result)),
-        dh=_rows(result, nominal),
-        placed=[placed_cells(each) for each in result.placed],
-        left=[each.sentence() for each in result.left or ()],
-        told=result.left is not None,
-        residuals_by_joint=uri(joints_figure(drawn, result.left or ())),
-        residuals_in_space=space_picture(drawn) if result.seen.kind != "distance" else None,
-        kinds=", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items()),
-        sigma=[
-            [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
-            for name, s in zip(result.names, np.sqrt(np.diag(result.covariance)), strict=True)
-        ],
-        indices=[[name, f"{value:.4g}", MEANING[name]] for name, value in result.observability.values().items()],
-        outliers=[
-            [_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()
+    nothing = (
+        "too few observations to tell what the residuals go with"
+        if result.left is None
+        else "nothing is seen that the residuals go with (joints, gravity, place)"
+    )
+    left = [each.sentence() for each in result.left or ()] or [nothing]
+    return Document(
+        f"{nominal.name}: identified",
+        f"robot {nominal.name}: {_observations(result)} from {result.seen.data.where}, {result.rank} parameters "
+        "determined",
+        [
+            Section("Accuracy", accuracy, terminal=True),
+            Section("Denavit–Hartenberg rows", rows, terminal=True),
+            Section("What the data determine", determined, terminal=True),
+            Section("What the model leaves", [*left, *residual_plots(drawn, result.left or ())]),
+            Section(
+                "Outliers, of less than half weight", [Table(["<Where", "error mm", "weight"], outliers)], terminal=True
+            ),
         ],
     )
 
@@ -364,14 +353,12 @@ def _model(result: Identified) -> list[str]:
     ]
 
 
-def elastic_head(result: Identified) -> list[str]:
-    """Returns the heads of :func:`elastic_rows`."""
-    return [*ELASTIC, *(["hysteresis"] if result.state.hysteresis else [])]
+def _elastic_blocks(result: Identified) -> list[Block]:
+    """Returns a table with a row of each joint, with σ.
 
-
-def elastic_rows(result: Identified) -> list[list[str]]:
-    """Returns a row of each joint, values with σ: what its link gives way by at the torques of the measured rows (RMS),
-    the amplitudes of its gear, and its hysteresis if it was adjusted."""
+    What its link gives way by at the torques of the measured rows (RMS), the amplitudes of its gear, and its hysteresis
+    if it was adjusted.
+    """
     elasticity, sigma = result.state.chain.elasticity, result.elasticity_sigma
     if elasticity is None or sigma is None:
         return []
@@ -392,7 +379,14 @@ def elastic_rows(result: Identified) -> list[list[str]]:
         if result.state.hysteresis:
             cells.append((elasticity.hysteresis[i], sigma.hysteresis[i]))
         rows.append([str(i + 1), *(f"{MDEG * value:.1f} ± {MDEG * s:.1f}" for value, s in cells)])
-    return rows
+    return [
+        subheading("Elasticity"),
+        page_only(
+            "What links give way by at the torques of the measured rows (RMS), and amplitudes of the gears and their "
+            "hysteresis"
+        ),
+        Table([*ELASTIC, *(["hysteresis"] if result.state.hysteresis else [])], rows),
+    ]
 
 
 def _elasticity(result: Identified) -> dict | None:
@@ -411,13 +405,6 @@ def _elasticity(result: Identified) -> dict | None:
     return {"gravity": elasticity.gravity.tolist(), "joints": joints(elasticity), "sigma": joints(sigma)}
 
 
-def _placed(each: Placed) -> list[list[str]]:
-    """Returns a line of translation, mm, and rotation vector, deg; and a second line of their σ, if there are any."""
-    values, sigma = _shown(each)
-    lines = [[each.name, *(number(v, 4) for v in values)]]
-    return lines if np.isnan(sigma).all() else [*lines, ["  σ", *(number(s, 4) for s in sigma)]]
-
-
 def _shown(each: Placed) -> tuple[np.ndarray, np.ndarray]:
     """Returns translation, mm, and rotation vector, deg, (6,); and σ (6,) of shifts along, and turns about, the
     axes."""
@@ -425,10 +412,14 @@ def _shown(each: Placed) -> tuple[np.ndarray, np.ndarray]:
     return values, np.append(each.sigma[3:], np.degrees(each.sigma[:3]))
 
 
-def placed_cells(each: Placed) -> list[str]:
-    """Returns name, and value ± σ of translation, mm, and rotation vector, deg, for a page."""
-    cells = [number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in zip(*_shown(each), strict=True)]
-    return [each.name.partition(" in the")[0], *cells]
+def placed_table(placed: Iterable[Placed]) -> Table:
+    """Returns value ± σ of translation, mm, and rotation vector, deg, of base and tools; no σ where none is known."""
+    rows = []
+    for each in placed:
+        cells = (number(v, 4) + (f" ± {s:.4f}" if np.isfinite(s) else "") for v, s in zip(*_shown(each), strict=True))
+        rows.append([each.name.partition(" in the")[0], *cells])
+    over = [("", 1), ("translation ± σ", 3), ("rotation vector ± σ about the axes", 3)]
+    return Table(["<", "x mm", "y mm", "z mm", "x °", "y °", "z °"], rows, over)
 
 
 def placed_parts(placed: Iterable[Placed]) -> list[dict]:
@@ -436,9 +427,8 @@ def placed_parts(placed: Iterable[Placed]) -> list[dict]:
     return [{"name": each.name, "pose": each.pose.matrix(), "sigma": each.sigma_or_none()} for each in placed]
 
 
-def _rows(result: Identified, nominal: Robot) -> list[tuple[list, list]]:
-    """Returns a table for each unit: heads of the values in it, each with the number of columns it spans, and rows of
-    joints."""
+def _dh_tables(result: Identified, nominal: Robot) -> list[Table]:
+    """Returns a table for each unit, with a row for each joint."""
     values, before, sigma = dh_values(result.robot) * SHOWN, dh_values(nominal) * SHOWN, result.dh_sigma * SHOWN
     tables = []
     for unit in dict.fromkeys(UNITS):
@@ -450,7 +440,8 @@ def _rows(result: Identified, nominal: Robot) -> list[tuple[list, list]]:
                 change = NONE if sigma[i, k] == 0 else number(values[i, k] - before[i, k], 4)
                 cells += [number(values[i, k], 4), change, _sigma(sigma[i, k])]
             lines.append([str(i + 1), *cells])
-        tables.append(([(f"{DH[k]} ({unit})", 3) for k in kinds], lines))
+        heads = ["<joint", *["value", "change", "σ"] * len(kinds)]
+        tables.append(Table(heads, lines, [("", 1), *((f"{DH[k]} ({unit})", 3) for k in kinds)]))
     return tables
 
 
@@ -463,11 +454,9 @@ def _figure(result: Identified):
     if result.held_out is not None:
         errors = _by_row(result.held_out.position_mm)
         axes.plot(rows, errors, "_", color=COLOURS[1], ms=size * 2, mew=1.6, label="held out")
-    axes.set_xlabel("observation", fontsize=8)
-    axes.set_ylabel("error, mm", fontsize=8)
     axes.set_ylim(bottom=0)
     axes.legend(fontsize=7.5, frameon=False, ncols=2, loc="upper right", bbox_to_anchor=(1, 1.15))
-    calm(axes)
+    calm(axes, "observation", "error, mm")
     figure.subplots_adjust(left=0.07, right=0.99, bottom=0.18, top=0.92)
     return figure
 

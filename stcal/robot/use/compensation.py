@@ -434,31 +434,6 @@ def compensation_file(result: Compensated, robot: Robot) -> CompensationFile:
     )
 
 
-def compensated_text(result: Compensated, robot: Robot, most: int = 60) -> str:
-    """Returns nominal and compensated values side by side for the terminal, for the first ``most`` rows."""
-    digits = np.where(robot.prismatic, 4, 5)
-    unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
-    width = 12
-    head = [f"{'line':>6} {'':<12}", *(f"{c:>{width}}" for c in joint_columns(robot)), f"{'error mm':>11}  status"]
-    lines = ["".join(head)]
-
-    def line_of(number: str, name: str, found: Inverse, i: int, error: float) -> str:
-        shown = [f"{v:>{width}.{d}f}" for v, d in zip(found.q[i] * unit, digits, strict=True)]
-        values = "".join(shown) if found.usable[i] else " " * (width - 1) + "–" + " " * width * (len(unit) - 1)
-        return f"{number:>6} {name:<12}{values}{error:>11.4f}  {found.status[i]}"
-
-    for i in range(min(most, len(result))):
-        number = str(result.targets.lines[i])
-        if result.nominal:
-            error = result.before_mm[i] if result.nominal.usable[i] else result.nominal.error_mm[i]
-            lines.append(line_of(number, "nominal", result.nominal, i, error))
-            number = ""
-        lines.append(line_of(number, "compensated", result.found, i, result.found.error_mm[i]))
-    if len(result) > most:
-        lines.append(f"… and {len(result) - most} more (--out, --json)")
-    return "\n".join(lines)
-
-
 def compensated_summary(result: Compensated) -> list[str]:
     """Returns sentences on all poses together."""
     m = len(result)

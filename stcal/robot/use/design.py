@@ -19,7 +19,6 @@ from stcal.io.files import require_written
 from stcal.io.table import POSE, pose_cells, pose_values, read_table, require_pose_table_written
 from stcal.parallel import one_thread
 from stcal.robot.identification.observability import (
-    EXPLAINED,
     SEEN,
     ObservabilityIndices,
     identification_jacobian,
@@ -347,29 +346,3 @@ def design_file(result: PoseDesign) -> DesignFile:
             "random_predicted_sigma_mm": result.random_sigma_mm if np.isfinite(result.random_sigma_mm) else None,
         }
     )
-
-
-def design_text(result: PoseDesign) -> str:
-    """Returns the comparison for the terminal."""
-    lines = [
-        f"{len(result.q)} poses for {result.seen} parameters, {result.exchanges} exchanges after the greedy choice"
-    ]
-    if result.seen < result.parameters:
-        lines.append(
-            f"{result.parameters - result.seen} of {result.parameters} combinations of parameters move nothing that is "
-            "measured, in any pose (as with a tool on the last axis), and are left out"
-        )
-    median = result.median()
-    lines.append(f"{'':<3}{'chosen':>12}{'random':>12}{'ratio':>8}   (random: median of {len(result.random)} sets)")
-    for name, value in result.chosen.values().items():
-        ratio = f"{value / median[name]:.2f}" if median[name] > 0 else "–"
-        lines.append(f"{name:<3}{value:12.4g}{median[name]:12.4g}{ratio:>8}")
-    lines += EXPLAINED
-    text = f"σ of predicted positions: {1000 * result.sigma_mm:.1f} µm per axis"
-    if np.isfinite(result.random_sigma_mm):
-        ratio = result.random_sigma_mm / result.sigma_mm
-        text += (
-            f", of random poses {1000 * result.random_sigma_mm:.1f} µm; to be as good these would have to be "
-            f"{ratio**2:.2f} times as many"
-        )
-    return "\n".join([*lines, text, "collisions are not looked at: only joint limits and the box of the tool"])

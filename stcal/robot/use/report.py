@@ -13,12 +13,12 @@ from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.quaternions import COLUMNS
 from stcal.io.table import read_table
-from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, plane, uri
-from stcal.report.page import render
-from stcal.report.text import NONE, number, text_table
-from stcal.robot.identification.drawings import Drawn, joints_figure, space_picture
+from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
+from stcal.report.figure import COLOURS, INK, SMALL, calm, locator, new_figure, plane
+from stcal.report.text import NONE, number
+from stcal.robot.identification.drawings import Drawn, residual_plots
 from stcal.robot.identification.observability import MEANING
-from stcal.robot.identification.report import placed_cells, placed_parts
+from stcal.robot.identification.report import placed_parts, placed_table
 from stcal.robot.identification.residuals import tips_of
 from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.inverse import Inverse
@@ -28,9 +28,6 @@ from stcal.robot.use.design import PoseDesign
 from stcal.robot.use.evaluation import Evaluated, Evaluation, Figures
 from stcal.robot.use.files import EvaluationFile
 from stcal.robot.use.verification import Verification
-
-MOST_ROWS = 500
-"""Largest number of rows of a table on a page. The CSV file has all."""
 
 
 def verification_figure(result: Verification):
@@ -65,62 +62,81 @@ def figure_bytes(figure, kind: str) -> bytes:
     return stream.getvalue()
 
 
-def verification_page(result: Verification) -> str:
-    """Returns the report page of ``verify``."""
+def verification_report(result: Verification) -> Document:
+    """Returns the report of ``verify``."""
     rows = []
     for k, each in enumerate(result.sets):
         reduced = result.reduction(k) if k else {}
-        cells = [[number(v, 4), number(reduced.get(key), 1)] for key, v in each.figures().items()]
-        rows.append([each.name, *(c for pair in cells for c in pair)])
-    return render(
-        "robot/use/verification.html.jinja",
-        result=result,
-        figures=rows,
-        drawn=uri(verification_figure(result)),
-        names=[f"{each.name}: error mm" for each in result.sets],
-        every=[
-            [result.poses[i + 1], number(result.distance_mm[i], 3), *(number(s.error_mm[i], 4) for s in result.sets)]
-            for i in range(min(MOST_ROWS, len(result.distance_mm)))
+        cells = [(number(v, 4), f"{reduced[key]:.1f} %" if k else NONE) for key, v in each.figures().items()]
+        rows.append([each.name, *(cell for pair in cells for cell in pair)])
+    over = [("", 1), ("mean", 2), ("std", 2), ("max", 2), ("RMS of all pairs", 2)]
+    errors = [
+        [pose, number(distance, 3), *(number(each.error_mm[i], 4) for each in result.sets)]
+        for i, (pose, distance) in enumerate(zip(result.poses[1:], result.distance_mm, strict=True))
+    ]
+    answer = [
+        alarms(result.warnings()),
+        Table(["<set"] + ["mm", "less by"] * 4, rows, over),
+        "mean, std and max are of absolute errors, which all carry the error of the first position; the RMS over all "
+        "pairs depends less on any one",
+        plot(
+            lambda: verification_figure(result),
+            "distance error of each pose",
+            "Dashed: mean of the set of the same colour",
+        ),
+    ]
+    return Document(
+        "Verification",
+        f"{result.where}: distances of {len(result.poses) - 1} positions from the first (pose {result.poses[0]}), "
+        "measured against commanded",
+        [
+            Section("Result", answer, terminal=True),
+            Section(
+                "Poses",
+                [Table(["pose", "commanded distance mm", *(f"{e.name}: error mm" for e in result.sets)], errors)],
+            ),
         ],
     )
 
 
-def compensation_page(result: Compensated, robot: Robot) -> str:
-    """Returns the report page of ``compensate``."""
-    return render(
-        "robot/use/compensation.html.jinja",
-        robot=robot.name,
-        count=len(result),
-        counts=", ".join(f"{s} {result.found.status.count(s)}" for s in dict.fromkeys(result.found.status)),
-        summary=compensated_summary(result),
-        before=_before_plot(result) if result.compared().any() else "",
-        notes=[*result.targets.notes, *result.notes()],
-        most_rows=MOST_ROWS,
-        named=any(result.targets.tools),
-        joints=[name.replace("_", " ") for name in joint_columns(robot)],
-        rows=_joint_rows(result, robot),
+def compensation_report(result: Compensated, robot: Robot) -> Document:
+    """Returns the report of ``compensate``: nominal and compensated joint values of each pose."""
+    counts = ", ".join(f"{s} {result.found.status.count(s)}" for s in dict.fromkeys(result.found.status))
+    joints = [name.replace("_", " ") for name in joint_columns(robot)]
+    heads = ["line", *(["<target"] if any(result.targets.tools) else []), "<status", "<", *joints, "error mm"]
+    before = plot(
+        lambda: _before_figure(result),
+        "error of the nominal joint values",
+        "Position error of the nominal joint values by the identified robot: what compensation takes away",
+    )
+    return Document(
+        f"Compensation of {robot.name}",
+        f"{len(result)} poses: {counts}",
+        [
+            Section(
+                "Result", [*compensated_summary(result), before if result.compared().any() else None], terminal=True
+            ),
+            Section("Poses to look at", [bullets([*result.targets.notes, *result.notes()][:MOST_NOTES])]),
+            Section("Joint values", [Table(heads, _joint_rows(result, robot))], terminal=True),
+        ],
     )
 
 
-def _before_plot(result: Compensated) -> str:
+def _before_figure(result: Compensated):
     figure = new_figure(7.5, 2.8)
     axes = figure.add_axes((0.09, 0.18, 0.89, 0.76))
     rows = np.flatnonzero(result.compared())
     axes.vlines(rows + 1, 0, result.before_mm[rows], color=COLOURS[1], lw=max(0.5, min(3, 300 / len(result))))
     _pose_by_pose(axes, (0.2, len(result) + 0.8), "position error, mm")
-    return uri(figure)
+    return figure
 
 
 def _pose_by_pose(axes, limits: tuple[float, float], what: str) -> None:
     """Sets up the axes for an error of each pose."""
     axes.set_xlim(*limits)
     axes.set_ylim(0, None)
-    calm(axes)
-    axes.grid(axis="y", color=FAINT, lw=0.6)
-    axes.set_axisbelow(True)
     axes.xaxis.set_major_locator(locator(integer=True))
-    axes.set_xlabel("pose, in order of the file", fontsize=SMALL + 1, color=INK)
-    axes.set_ylabel(what, fontsize=SMALL + 1, color=INK)
+    calm(axes, "pose, in order of the file", what, "y")
 
 
 def _joint_rows(result: Compensated, robot: Robot) -> list[list[str]]:
@@ -131,7 +147,7 @@ def _joint_rows(result: Compensated, robot: Robot) -> list[list[str]]:
         return [number(v, 5) for v in found.q[i] * unit] if found.usable[i] else [NONE] * n
 
     rows = []
-    for i in range(min(MOST_ROWS, len(result))):
+    for i in range(len(result)):
         name = [
             str(result.targets.lines[i]),
             *([result.targets.tools[i] or NONE] if named else []),
@@ -150,21 +166,70 @@ def _colours(count: int) -> list[str]:
     return [order[i % len(order)] for i in range(count)]
 
 
-def design_page(result: PoseDesign, robot: Robot) -> str:
-    """Returns the report page of ``design``."""
-    known = np.isfinite(result.random_sigma_mm)
-    return render(
-        "robot/use/design.html.jinja",
-        robot=robot.name,
-        result=result,
-        times=(result.random_sigma_mm / result.sigma_mm) ** 2 if known else None,
-        indices=_indices(result),
-        index_plot=uri(_index_figure(result)),
-        views=[(_places(result, 1), "from above"), (_places(result, 2), "from the side")],
-        joints=[name.replace("_", " ") for name in joint_columns(robot)],
-        poses=[
-            [str(i), *(number(float(v), 3) for v in joint_cells(robot, q)), *(number(v, 2) for v in pose.translation)]
-            for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1)
+def design_report(result: PoseDesign, robot: Robot) -> Document:
+    """Returns the report of ``design``: indices of the chosen poses against random ones, places, joint values."""
+    told = f"σ of predicted positions: {1000 * result.sigma_mm:.1f} µm per axis"
+    if np.isfinite(result.random_sigma_mm):
+        told += (
+            f", of random poses {1000 * result.random_sigma_mm:.1f} µm; to be as good these would have to be "
+            f"{(result.random_sigma_mm / result.sigma_mm) ** 2:.2f} times as many"
+        )
+    unseen = result.parameters - result.seen
+    left_out = (
+        f"{unseen} of {result.parameters} combinations of parameters move nothing that is measured, in any pose (as "
+        "with a tool on the last axis), and are left out"
+    )
+    heads = ["<", "chosen", "median", "least", "most", "chosen / median", "<unit", "<"]
+    over = [("", 2), (f"{len(result.random)} random sets", 3), ("", 3)]
+    poses = [
+        [str(i), *(number(float(v), 3) for v in joint_cells(robot, q)), *(number(v, 2) for v in pose.translation)]
+        for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1)
+    ]
+    joints = [name.replace("_", " ") for name in joint_columns(robot)]
+    return Document(
+        f"Measurement poses for {robot.name}",
+        f"{len(result.q)} poses for {result.seen} parameters, {result.exchanges} exchanges after the greedy choice",
+        [
+            Section(
+                "Against random poses",
+                [
+                    told,
+                    left_out if unseen else "",
+                    Table(heads, _indices(result), over),
+                    page_only(
+                        "Larger is better. Of the Jacobian over the σ of the instrument, parameters in mm, an angle "
+                        "being the arc that it makes at the arm's whole reach"
+                    ),
+                    "collisions are not looked at: only joint limits and the box of the tool",
+                    plots(
+                        plot(
+                            lambda: _index_figure(result),
+                            "indices of chosen and random poses",
+                            "Each index over the median of the random sets; grey: the random sets, of as many poses "
+                            "each",
+                            "",
+                        )
+                    ),
+                ],
+                terminal=True,
+            ),
+            Section(
+                "Where the tool is",
+                [
+                    "Tool in the robot's base (square: its origin); the arrow is the tool's z axis",
+                    plots(
+                        plot(lambda: _places(result, 1), "tool positions from above", "From above", ""),
+                        plot(lambda: _places(result, 2), "tool positions from the side", "From the side", ""),
+                    ),
+                ],
+            ),
+            Section(
+                "Poses",
+                [
+                    "In order of choice: the first ones alone are a good set too",
+                    Table(["pose", *joints, "x mm", "y mm", "z mm"], poses),
+                ],
+            ),
         ],
     )
 
@@ -196,14 +261,11 @@ def _index_figure(result: PoseDesign):
     axes.set_xlim(-0.5, len(chosen) - 0.5)
     axes.set_ylim(0, None)
     axes.yaxis.set_major_locator(locator())
-    axes.set_ylabel("over the median of random sets", fontsize=SMALL + 1, color=INK)
-    calm(axes)
-    axes.grid(axis="y", color=FAINT, lw=0.6)
-    axes.set_axisbelow(True)
+    calm(axes, y="over the median of random sets", grid="y")
     return figure
 
 
-def _places(result: PoseDesign, up: int) -> str:
+def _places(result: PoseDesign, up: int):
     """Returns a plot of the tool's positions and z axes: x against the coordinate ``up``."""
     at, z = result.poses.translation[:, [0, up]], result.poses.rotation[:, [0, up], 2]
     length = 0.12 * float(np.ptp(result.poses.translation, axis=0).max())
@@ -216,9 +278,11 @@ def _places(result: PoseDesign, up: int) -> str:
     axes.plot(*at.T, "o", ms=4, color=COLOURS[0], mew=0)
     axes.plot(0, 0, "s", ms=6, color=INK, mew=0)
     plane(axes, "x, mm", f"{'xyz'[up]}, mm", 0.16)
-    return uri(figure)
+    return figure
 
 
+MOST_NOTES = 500
+"""Largest number of notes on single poses on a page."""
 MOST_WRONG = 10
 """Largest number of wrong rows that are named in the terminal."""
 FAR_APART = 5
@@ -240,12 +304,6 @@ def names_of(files: Sequence[Path]) -> list[str]:
         again = next(name for name in whole if whole.count(name) > 1)
         raise InputError("E-OPTION-REPEATED", f"--robot {again}: given twice; give each file once")
     return stems if len(set(stems)) == len(stems) else whole
-
-
-def evaluated_text(result: Evaluation) -> str:
-    """Returns tables and sentences for the terminal."""
-    lines = [f"{observations(result)}; {FITTED[result.refit]}", "", *text_table(_table(result), gap=2), ""]
-    return "\n".join(lines + notes(result))
 
 
 def observations(result: Evaluation) -> str:
@@ -272,24 +330,14 @@ def _table(result: Evaluation) -> list[list[str]]:
     return rows
 
 
-def notes(result: Evaluation) -> list[str]:
-    """Returns notes on the better robot, on rows that no robot explains, and on the causes of residuals."""
-    return [
-        *_verdicts(result),
-        *_wrong(result),
-        *_rigid(result),
-        *(f"{each.robot.name}: {said}" for each in result.robots for said in left_lines(each)),
-    ]
-
-
 def _verdicts(result: Evaluation) -> list[str]:
     found = []
     for each in result.differences:
         size = f"{each.mm:.3g} ± {each.sigma_mm:.2g} mm"
         if each.real:
-            found.append(f"{each.better} is better than {each.worse}: mean error {size} less, on the same rows")
+            found.append(f"robot {each.better} is better than {each.worse}: mean error {size} less, on the same rows")
         else:
-            found.append(f"{each.better} and {each.worse} differ by no more than chance: mean error {size}")
+            found.append(f"robots {each.better} and {each.worse} differ by no more than chance: mean error {size}")
     return [*found, *([f"best: {result.best}"] if result.best and len(result.robots) > 2 else [])]
 
 
@@ -413,29 +461,41 @@ def evaluation_file(result: Evaluation) -> EvaluationFile:
     return EvaluationFile.model_validate(content)
 
 
-def evaluation_page(result: Evaluation) -> str:
-    """Returns the report page of ``evaluate``."""
+def evaluation_report(result: Evaluation) -> Document:
+    """Returns the report of ``evaluate``: errors of each robot, which is better, and what residuals go with."""
     points = result.seen.kind != "distance"
     heads, *rows = _table(result)
-    return render(
-        "robot/use/evaluation.html.jinja",
-        observations=observations(result),
-        fitted=FITTED[result.refit],
-        heads=heads,
-        rows=rows,
-        notes=[*_verdicts(result), *_wrong(result), *_rigid(result)],
-        drawn_by_row=uri(_row_figure(result)),
-        by_place=uri(_place_figure(result)) if points else "",
-        robots=[
-            {
-                "name": each.robot.name,
-                "left": left_lines(each),
-                "joints": uri(joints_figure(drawn, each.left or ())),
-                "space": space_picture(drawn) if points else None,
-                "directions": _directions(result, each) if points else [],
-                "placed": [placed_cells(p) for p in each.placed],
-            }
-            for each, drawn in ((each, _drawn(result, each)) for each in result.robots)
+    answer: list[Block] = [
+        Table(heads, rows),
+        *_verdicts(result),
+        *_wrong(result),
+        *_rigid(result),
+        page_only(
+            "95 %: what 95 of 100 rows stay below. The median, and the lines without rows that no robot explains, are "
+            "not moved by a few bad rows"
+        ),
+    ]
+    place = plot(lambda: _place_figure(result), "Error by distance from the base's axis, and by height")
+    robots: list[Block] = []
+    for each in result.robots:
+        robots += [subheading(each.robot.name), *(f"{each.robot.name}: {line}" for line in left_lines(each))]
+        robots += residual_plots(_drawn(result, each), each.left or ())
+        if points:
+            heads = ["<Residual along", "mean mm", "± mm", "RMS mm", "max mm"]
+            robots.append(page_only(Table(heads, _directions(result, each))))
+        robots += [
+            page_only("Base in the instrument's frame, tools in the flange's; without σ: as the file has them"),
+            page_only(placed_table(each.placed)),
+        ]
+    return Document(
+        "Robots evaluated",
+        f"{observations(result)}; {FITTED[result.refit]}",
+        [
+            Section("Result", answer, terminal=True),
+            Section(
+                "By row and place", [plot(lambda: _row_figure(result), "Error of each row"), place if points else None]
+            ),
+            Section("What each robot leaves", robots, terminal=True),
         ],
     )
 
@@ -481,16 +541,13 @@ def _errors(axes, result: Evaluation, at: dict[int, np.ndarray], label: str) -> 
     for k, each in enumerate(result.robots):
         axes.plot(at[k], each.errors_mm, "o", color=_colour(result, each), ms=3.6 if few else 1.6, mew=0, alpha=0.85)
         axes.plot(at[k][result.wrong], each.errors_mm[result.wrong], "o", mfc="none", mec=INK, ms=7, mew=0.8)
-    calm(axes)
     middle = [float(np.median(each.errors_mm)) for each in result.robots]
     if min(middle) > 0 and (max(middle) > FAR_APART * min(middle) or every.max() > 4 * FAR_APART * max(middle)):
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
     else:
         axes.set_ylim(bottom=0)
-    axes.grid(axis="y", color=FAINT, lw=0.6)
-    axes.set_axisbelow(True)
-    axes.set_xlabel(label, fontsize=SMALL + 1, color=INK)
+    calm(axes, label, grid="y")
 
 
 def _row_figure(result: Evaluation):

@@ -13,7 +13,6 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.io.table import Table, read_table
-from stcal.report.text import number, text_table
 from stcal.robot.kinematics.conditions import unread
 from stcal.robot.kinematics.measurements import within
 from stcal.robot.use.files import VerificationFile
@@ -246,22 +245,6 @@ def _set_result(data: MeasuredPoses, name: str, rows: np.ndarray) -> SetResult:
         pairs_mm=float(np.sqrt(commanded_squares / pairs)),
         scale=product / commanded_squares,
     )
-
-
-def verified_text(result: Verification) -> str:
-    """Returns the table for the terminal."""
-    rows = [["<", "mean mm", "std mm", "max mm", "all pairs RMS mm"]]
-    for k, result_of_set in enumerate(result.sets):
-        rows.append([result_of_set.name, *(number(v, 4) for v in result_of_set.figures().values())])
-        if k:
-            rows.append(["  reduced", *(f"{v:.1f} %" for v in result.reduction(k).values())])
-    lines = [
-        f"distances of {len(result.poses) - 1} positions from the first (pose {result.poses[0]}), measured against "
-        "commanded",
-        *text_table(rows, (9, 10, 10, 10, 17), gap=1),
-        "mean, std, max all carry the error of the first position; the RMS over all pairs depends less on any one",
-    ]
-    return "\n".join(lines)
 
 
 def verification_file(result: Verification) -> VerificationFile:

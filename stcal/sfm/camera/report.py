@@ -1,12 +1,23 @@
-"""Text and page of calibrated intrinsics, of one camera or of a rig."""
+"""The report of calibrated intrinsics, of one camera or of a rig."""
 
 import numpy as np
 
 from stcal.io.cameras.model import COLMAP_PIXEL_ORIGIN, CalibratedCamera
 from stcal.report.camera import distortion_figure
-from stcal.report.figure import COLOURS, INK, SMALL, calm, new_figure, plane, round_below, uri
-from stcal.report.page import render
-from stcal.report.text import HEADS, number, text_table, transform_rows
+from stcal.report.document import (
+    Block,
+    Document,
+    Section,
+    Table,
+    alarms,
+    bullets,
+    page_only,
+    plot,
+    plots,
+    subheading,
+)
+from stcal.report.figure import COLOURS, INK, SMALL, calm, new_figure, plane, round_below
+from stcal.report.text import HEADS, number, transform_rows
 from stcal.sfm.camera.calibrate import CameraCalibration
 from stcal.sfm.camera.checks import FAILED_P, GRID, SUSPICIOUS_P, projection_jacobian
 from stcal.sfm.camera.file import CalibrationFile
@@ -17,44 +28,116 @@ CELLS = (12, 8)
 MIN_IN_CELL = 3
 ARROW_SHARE = 0.7
 """Largest length of a drawn mean residual, as a share of the cell."""
-MOST_ROWS = 500
 
 
-def calibration_page(result: CameraCalibration, summary: CalibrationFile, where: str) -> str:
+def calibration_report(result: CameraCalibration, summary: CalibrationFile, where: str) -> Document:
     """Returns the report of ``calibrate-camera``."""
-    intrinsics = result.intrinsics
-    return render(
-        "sfm/camera/page.html.jinja",
-        where=where,
-        summary=summary,
-        views=len(result.views),
-        dots=sum(len(view) for view in result.views),
-        sigma=sigma_map(result),
-        halves=_halves(result),
-        split=result.split,
-        residuals=residual_map(result),
-        lens=uri(distortion_figure(CalibratedCamera.of(intrinsics.camera, intrinsics.colmap_model))),
-        parameters=[
-            [name, number(each.value, 4 if name[0] in "fc" else 7), number(each.sigma, 4 if name[0] in "fc" else 7)]
-            for name, each in summary.parameters.items()
-        ],
-        models=[
-            [
-                "*" if each.model == summary.model else "",
-                each.model,
-                each.parameters,
-                number(each.rms_px, 4),
-                number(each.worse, 4),
-                number(each.worse_sigma, 4),
-                each.why,
-            ]
-            for each in summary.models
-        ],
-        images=[[each.image, each.dots, number(each.tilt_deg, 1), number(each.rms_px, 4)] for each in summary.images],
-        left_out=[[each.name, each.reason] for each in summary.left_out],
-        outliers=[[o.image, o.label, number(o.residual_px, 3), number(o.weight, 2)] for o in summary.outliers],
-        most=MOST_ROWS,
+    lens = CalibratedCamera.of(result.intrinsics.camera, result.intrinsics.colmap_model)
+    parameters = [
+        [name, number(each.value, 4 if name[0] in "fc" else 7), number(each.sigma, 4 if name[0] in "fc" else 7)]
+        for name, each in summary.parameters.items()
+    ]
+    models = [
+        ["*" if each.model == summary.model else "", each.model, str(each.parameters)]
+        + [number(v, 4) for v in (each.rms_px, each.worse, each.worse_sigma)]
+        + [each.why]
+        for each in summary.models
+    ]
+    images = [[each.image, each.dots, number(each.tilt_deg, 1), number(each.rms_px, 4)] for each in summary.images]
+    outliers = [[o.image, o.label, number(o.residual_px, 3), number(o.weight, 2)] for o in summary.outliers]
+    held_out = (
+        ""
+        if result.held_out is None
+        else f"views held out, {result.held_out.folds} parts: residual RMS {result.held_out.rms_px():.4f} px after "
+        "their poses were fitted"
     )
+    sigma = (
+        f"σ of a projection: {np.median(result.projection.sigma_px):.4f} px median over the image, "
+        f"{result.projection.corner_sigma_px.max():.4f} px in the worst corner"
+    )
+    return Document(
+        "Calibration of a camera",
+        f"{where}: {summary.model}, {summary.size_px[0]}×{summary.size_px[1]} px: {len(result.views)} views of the "
+        f"board, {sum(len(view) for view in result.views)} dots, residual RMS {summary.residual_rms_px:.4f} px, "
+        f"{result.rounds} rounds of detection",
+        [
+            Section(
+                "Parameters",
+                [
+                    alarms(summary.warnings),
+                    Table(["<parameter", "value, px", "σ"], parameters),
+                    "cx, cy count from the centre of the top-left pixel; the camera file is COLMAP's, counts from that "
+                    f"pixel's corner and has them {COLMAP_PIXEL_ORIGIN:g} px larger",
+                    sigma,
+                    held_out,
+                    *_split_half(result),
+                    plot(lambda: distortion_figure(lens), "What the lens moves"),
+                ],
+                terminal=True,
+            ),
+            Section(
+                "Uncertainty over the image",
+                [
+                    "How well it is known where the camera sees a known direction, up to a rotation of the camera, "
+                    "which poses absorb. White: dots",
+                    plots(
+                        plot(lambda: sigma_map(result), "σ of a projection over the image", "σ, by the covariance", ""),
+                        None
+                        if result.split is None
+                        else plot(
+                            lambda: _halves(result),
+                            "difference of two halves over the image",
+                            f"Every second view against the others: {result.split.verdict}, p = "
+                            f"{result.split.p_value:.2g}",
+                            "",
+                        ),
+                    ),
+                ],
+            ),
+            Section(
+                "Residuals",
+                [
+                    "Means over cells of the image. Arrows that are alike in neighbouring cells are what the lens "
+                    "model leaves",
+                    plot(lambda: residual_map(result), "Mean residuals, measured minus projected"),
+                ],
+            ),
+            Section(
+                "Lens models",
+                [
+                    f"--model auto: {summary.model}, the simplest that foretells views held out as well as the best",
+                    page_only(
+                        "Each model calibrated without a fifth of the views and compared with these, five times. The "
+                        "star is the simplest that is not worse than the best by more than two standard errors"
+                    ),
+                    Table(["<", "<lens model", "parameters", "held out px", "worse σ²", "±", "<"], models),
+                ]
+                if models
+                else [],
+                terminal=True,
+            ),
+            Section("Views", [Table(["<image", "dots", "tilt °", "RMS px"], images)]),
+            Section(
+                "Left out",
+                [
+                    Table(["<image or file", "<reason"], [[e.name, e.reason] for e in summary.left_out], css="text"),
+                    Table(["<image", "<dot", "residual px", "weight"], outliers),
+                ],
+                terminal=True,
+            ),
+        ],
+    )
+
+
+def _split_half(result: CameraCalibration) -> list[str]:
+    split = result.split
+    if split is None:
+        return []
+    return [
+        f"split-half check: {split.verdict}; p = {split.p_value:.2g}, largest difference {split.largest_px:.4f} px "
+        f"where {np.sqrt(2) * split.largest_sigma_px:.4f} px is expected (suspicious by chance in one "
+        f"calibration in {1 / SUSPICIOUS_P:,.0f}, failed in one in {1 / FAILED_P:,.0f})"
+    ]
 
 
 def _image_axes(result: CameraCalibration):
@@ -62,10 +145,8 @@ def _image_axes(result: CameraCalibration):
     figure = new_figure(5.6, 0.9 + 4.6 * camera.height / camera.width)
     figure.set_layout_engine("constrained")
     axes = figure.add_subplot()
-    calm(axes)
+    calm(axes, "x, px", "y, px")
     axes.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5), aspect="equal")
-    axes.set_xlabel("x, px", fontsize=SMALL + 0.5, color=INK)
-    axes.set_ylabel("y, px", fontsize=SMALL + 0.5, color=INK)
     return figure, axes
 
 
@@ -80,21 +161,20 @@ def _map(result: CameraCalibration, values: np.ndarray, label: str):
     bar = figure.colorbar(contours, ax=axes, shrink=0.85, pad=0.02)
     bar.set_label(label, fontsize=SMALL + 0.5, color=INK)
     bar.ax.tick_params(labelsize=SMALL)
-    return uri(figure)
+    return figure
 
 
-def sigma_map(result: CameraCalibration) -> str:
+def sigma_map(result: CameraCalibration):
     return _map(result, result.projection.sigma_px, "σ of a projection, px")
 
 
-def _halves(result: CameraCalibration) -> str | None:
-    if result.split is None:
-        return None
+def _halves(result: CameraCalibration):
+    assert result.split is not None
     moved = projection_jacobian(result.intrinsics.camera, result.intrinsics.colmap_model) @ result.split.difference
     return _map(result, np.linalg.norm(moved, axis=1), "difference of the halves, px")
 
 
-def residual_map(result: CameraCalibration) -> str:
+def residual_map(result: CameraCalibration):
     """Returns a figure of mean residuals over cells of the image. Model errors are alike in neighbouring cells."""
     figure, axes = _image_axes(result)
     camera = result.intrinsics.camera
@@ -115,7 +195,7 @@ def residual_map(result: CameraCalibration) -> str:
         *middle.T, *(times * mean).T, angles="xy", scale_units="xy", scale=1, color=INK, width=0.003, headwidth=4
     )
     axes.set_title(f"enlarged {times:g} times; the longest is {longest:.4f} px", fontsize=SMALL + 1, color=INK)
-    return uri(figure)
+    return figure
 
 
 CAMERA_HEADS = (
@@ -132,32 +212,12 @@ FRUSTUM_SHARE = 0.15
 """Length of the drawn fields of view, as a share of the rig's extent."""
 
 
-def rig_text(rig: RigCalibration) -> str:
-    """Returns the cameras and their poses on the rig as text."""
-    lines = [
-        f"skipped {name}/{each.name}: {each.reason}"
-        for name, camera in zip(rig.names, rig.cameras, strict=True)
-        for each in camera.skipped
-    ]
-    lines += [f"apart {each.camera}/{each.image}: {each.reason}" for each in rig.apart]
-    lines += [_headline(rig), "", *text_table([list(CAMERA_HEADS), *_camera_rows(rig)])]
-    for name, rows in _poses(rig):
-        lines += ["", *text_table([["<" + name, *HEADS[1:]], *rows])]
-    lines += [f"warning: {each}" for each in _all_warnings(rig)]
-    return "\n".join(lines)
-
-
 def _headline(rig: RigCalibration) -> str:
     shared = sum(len(images) > 1 for images in rig.instants.values())
     return (
         f"{len(rig.names)} cameras, {len(rig.instants)} instants, {shared} of them seen by several; residuals are "
         f"{rig.factor:.3g} times those of the cameras alone"
     )
-
-
-def _all_warnings(rig: RigCalibration) -> list[str]:
-    each = zip(rig.names, rig.cameras, strict=True)
-    return [*rig.warnings, *(f"{name}: {text}" for name, own in each for text in own.warnings)]
 
 
 def _camera_rows(rig: RigCalibration) -> list[list[str]]:
@@ -183,35 +243,81 @@ def _poses(rig: RigCalibration) -> list[tuple[str, list[list[str]]]]:
     return [(f"{name}_from_{rig.names[0]}", transform_rows(pose, covariance)) for name, pose, covariance in each]
 
 
-def rig_page(rig: RigCalibration, where: str) -> str:
+def rig_report(rig: RigCalibration, where: str) -> Document:
     """Returns the report of ``calibrate-camera --rig``."""
-    return render(
-        "sfm/camera/rig.html.jinja",
-        where=where,
-        names=rig.names,
-        headline=_headline(rig),
-        warnings=rig.warnings,
-        camera_heads=CAMERA_HEADS,
-        cameras=_camera_rows(rig),
-        heads=HEADS,
-        poses=_poses(rig),
-        arrangement=uri(_arrangement(rig)),
-        by_instant=uri(_by_instant(rig)),
-        maps=[
-            (name, own.warnings, sigma_map(own), residual_map(own))
-            for name, own in zip(rig.names, rig.cameras, strict=True)
+    own = list(zip(rig.names, rig.cameras, strict=True))
+    left_out = [[each.camera, each.image, each.reason] for each in rig.apart]
+    left_out += [[name, each.name, each.reason] for name, camera in own for each in camera.skipped]
+    instants = [
+        [name, number(rig.rms_px[name], 4), *(images.get(camera, "") for camera in rig.names)]
+        for name, images in rig.instants.items()
+    ]
+    poses = [Table(["<" + name, *HEADS[1:]], rows) for name, rows in _poses(rig)]
+    maps: list[Block] = []
+    for name, camera in own:
+        maps += [
+            subheading(name),
+            bullets(camera.warnings),
+            plots(
+                plot(lambda camera=camera: sigma_map(camera), f"σ of a projection of {name}", css=""),
+                plot(lambda camera=camera: residual_map(camera), f"mean residuals of {name}", css=""),
+            ),
+        ]
+    return Document(
+        f"Calibration of a rig of cameras: {', '.join(rig.names)}",
+        f"{where}: {_headline(rig)}",
+        [
+            Section(
+                "Cameras",
+                [
+                    alarms(rig.warnings),
+                    Table(CAMERA_HEADS, _camera_rows(rig), css="text"),
+                    page_only(
+                        "Shared: instants that another camera saw too. Alone: residuals before the cameras were held "
+                        "to one rig. Views were held out from each camera by itself"
+                    ),
+                ],
+                terminal=True,
+            ),
+            Section(
+                "Where they sit",
+                [
+                    *poses,
+                    page_only(
+                        "The pose of the first camera in the other. σ are of turns about the axes, and of shifts "
+                        "along the axes, of the frame named first"
+                    ),
+                    plot(
+                        lambda: _arrangement(rig),
+                        "cameras from above and from the side",
+                        "Cameras and their fields of view from above and from the side, in the frame of "
+                        f"{rig.names[0]}",
+                    ),
+                ],
+                terminal=True,
+            ),
+            Section(
+                "Over the images",
+                [
+                    "σ of where a known direction is seen, up to a rotation of the camera; white: dots. Mean "
+                    "residuals are measured minus projected: what is alike in neighbouring cells is what the lens "
+                    "model leaves",
+                    *maps,
+                ],
+            ),
+            Section(
+                "Instants",
+                [
+                    plot(
+                        lambda: _by_instant(rig),
+                        "residuals by instant",
+                        "Residuals of each instant; grey: seen by one camera alone",
+                    ),
+                    Table(["<instant", "RMS px", *(name.replace("<", "") for name in rig.names)], instants, css="text"),
+                ],
+            ),
+            Section("Left out", [Table(["<camera", "<image or file", "<reason"], left_out, css="text")], terminal=True),
         ],
-        instants=[
-            [name, number(rig.rms_px[name], 4), *(images.get(camera, "") for camera in rig.names)]
-            for name, images in rig.instants.items()
-        ],
-        left_out=[[each.camera, each.image, each.reason] for each in rig.apart]
-        + [
-            [name, each.name, each.reason]
-            for name, own in zip(rig.names, rig.cameras, strict=True)
-            for each in own.skipped
-        ],
-        most=MOST_ROWS,
     )
 
 
@@ -228,7 +334,6 @@ def _arrangement(rig: RigCalibration):
     for axes, (a, b), labels in zip(
         figure.subplots(1, 2), ((0, 2), (2, 1)), (("x, mm", "z, mm"), ("z, mm", "y, mm")), strict=True
     ):
-        calm(axes)
         for k, (name, pose, calibration) in enumerate(zip(rig.names, inverse, rig.cameras, strict=True)):
             camera, colour = calibration.intrinsics.camera, COLOURS[k % len(COLOURS)]
             across = 0 if a == 0 else 1
@@ -251,62 +356,9 @@ def _by_instant(rig: RigCalibration):
     figure = new_figure(7.2, 2.2)
     figure.set_layout_engine("constrained")
     axes = figure.add_subplot()
-    calm(axes)
     shared = [len(images) > 1 for images in rig.instants.values()]
     axes.bar(
         range(len(shared)), list(rig.rms_px.values()), color=[COLOURS[0] if each else "#9aa0a8" for each in shared]
     )
-    axes.set_ylabel("RMS, px", fontsize=SMALL + 0.5, color=INK)
-    axes.set_xlabel("instant", fontsize=SMALL + 0.5, color=INK)
+    calm(axes, "instant", "RMS, px")
     return figure
-
-
-def models_table(summary: CalibrationFile) -> list[str]:
-    """Returns a table of how well lens models predict held-out views. The chosen model has a star."""
-    rows = [["<", "<lens model", "parameters", "held out px", "worse σ²", "±", "<"]]
-    for model in summary.models:
-        star = "*" if model.model == summary.model else ""
-        numbers = [number(model.rms_px, 4), number(model.worse, 4), number(model.worse_sigma, 4)]
-        rows.append([star, model.model, str(model.parameters), *numbers, model.why])
-    return text_table(rows)
-
-
-def calibration_text(result: CameraCalibration, summary: CalibrationFile) -> str:
-    """Returns the parameters with σ, checks, outliers and warnings as text."""
-    lines = [f"skipped {each.name}: {each.reason}" for each in result.skipped]
-    lines += [f"outlier {each.image} {each.label}: residual {each.residual_px:.3f} px" for each in summary.outliers]
-    width, height = summary.size_px
-    lines.append(
-        f"{summary.model}, {width}×{height} px: {len(result.views)} views of the board, "
-        f"{sum(len(v) for v in result.views)} dots, residual RMS {summary.residual_rms_px:.4f} px, "
-        f"{result.rounds} rounds of detection"
-    )
-    lines += [
-        f"{name:>4} {each.value:14.6f} ± {each.sigma:.6f}{' px' if name[0] in 'fc' else ''}"
-        for name, each in summary.parameters.items()
-    ]
-    lines.append(
-        "cx, cy count from the centre of the top-left pixel; the camera file is COLMAP's, counts from that pixel's "
-        f"corner and has them {COLMAP_PIXEL_ORIGIN:g} px larger"
-    )
-    lines.append(
-        f"σ of a projection: {np.median(result.projection.sigma_px):.4f} px median over the image, "
-        f"{result.projection.corner_sigma_px.max():.4f} px in the worst corner"
-    )
-    if result.held_out is not None:
-        lines.append(
-            f"views held out, {result.held_out.folds} parts: residual RMS {result.held_out.rms_px():.4f} px after "
-            "their poses were fitted"
-        )
-    if summary.models:
-        lines += [
-            f"--model auto: {summary.model}, the simplest that foretells them as well as the best",
-            *models_table(summary),
-        ]
-    if split := result.split:
-        lines.append(
-            f"split-half check: {split.verdict}; p = {split.p_value:.2g}, largest difference {split.largest_px:.4f} px "
-            f"where {np.sqrt(2) * split.largest_sigma_px:.4f} px is expected (suspicious by chance in one "
-            f"calibration in {1 / SUSPICIOUS_P:,.0f}, failed in one in {1 / FAILED_P:,.0f})"
-        )
-    return "\n".join(lines + [f"warning: {warning}" for warning in result.warnings])

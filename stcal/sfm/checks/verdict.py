@@ -14,8 +14,8 @@ import numpy as np
 from scipy.special import fdtrc
 
 from stcal.geometry.robust import ratio_limit
+from stcal.sfm.report.checks import ORDER
 from stcal.sfm.report.judgement import CAUSE, GENERAL
-from stcal.sfm.report.page import ORDER
 
 Verdict = Literal["passed", "suspicious", "failed", "not possible"]
 SUSPICIOUS = 1e-3

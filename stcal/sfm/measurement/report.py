@@ -1,4 +1,4 @@
-"""Result file, table, text and page of measured poses."""
+"""Result file, table and report of measured poses."""
 
 import csv
 import io
@@ -12,19 +12,19 @@ from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
 from stcal.io.json import Finite, Matrix6, NamedReason, Pair, Part, Pose, ResultFile
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells, require_pose_table_written
-from stcal.report.figure import (
-    COLOURS,
-    FAINT,
-    INK,
-    SMALL,
-    calm,
-    locator,
-    new_figure,
-    plane,
-    round_below,
-    uri,
+from stcal.report.document import (
+    Block,
+    Document,
+    Printed,
+    Section,
+    alarms,
+    fold,
+    legend,
+    plot,
+    plots,
 )
-from stcal.report.page import render
+from stcal.report.document import Table as ShownTable
+from stcal.report.figure import COLOURS, calm, locator, new_figure, plane, round_below
 from stcal.report.text import number
 from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import fit_verdict
@@ -211,7 +211,7 @@ def _image_json(each: MeasuredImage) -> dict:
     }
 
 
-def measure_text(result: MeasureResult) -> str:
+def _printed(result: MeasureResult) -> list[str]:
     """Returns the table for the terminal, 80 columns wide for names of eight characters.
 
     σ are the largest of three axes, n counts circles.
@@ -236,8 +236,7 @@ def measure_text(result: MeasureResult) -> str:
             f"  outlier {image.name} {o.label}: residual {o.residual_px:.3f} px, limit {o.limit_px:.3f} px"
             for o in pose.outliers
         ]
-    left_out = [f"left out {image.name}: {image.reason}" for image in result.left_out]
-    return "\n".join([*lines, *summary(result), *left_out])
+    return [*lines, *(f"left out {image.name}: {image.reason}" for image in result.left_out)]
 
 
 def summary(result: MeasureResult) -> list[str]:
@@ -269,43 +268,96 @@ def summary(result: MeasureResult) -> list[str]:
 
 
 COLOUR_OF = {"certain": COLOURS[0], "resolved": COLOURS[2], "ambiguous": COLOURS[1]}
-MOST_ROWS = 500
-"""Largest number of rows of the table on a page. The CSV file has all."""
 ELLIPSE_SHARE = 0.06
 """Length with which the largest σ is drawn, as a share of the plot's width."""
 
 
-def measure_page(result: MeasureResult, where: str) -> str:
-    """Returns the HTML report of ``measure``."""
+def measure_report(result: MeasureResult, where: str) -> Document:
+    """Returns the report of ``measure``."""
     at = np.array([image.pose.camera_from_target.translation for image in result.images])
     largest = np.sqrt(max(np.linalg.eigvalsh(image.pose.covariance[3:, 3:])[-1] for image in result.images))
     times = round_below(ELLIPSE_SHARE * max(float(np.ptp(at, axis=0).max()), 1.0) / largest)
     verdicts = any(fit_verdict(image.pose) != "passed" for image in result.images)
     statuses = {image.pose.status for image in result.images}
-    return render(
-        "sfm/measurement/page.html.jinja",
-        where=where,
-        lines=summary(result),
-        times=times,
-        statuses={status: colour for status, colour in COLOUR_OF.items() if status in statuses},
-        views=[
-            (_view(result, at, 0, 1, times), "as the camera sees it"),
-            (_view(result, at, 0, 2, times), "from above, the camera below"),
-        ],
-        sigma=_sigma(result),
-        verdicts=verdicts,
-        rows=[_row(image, verdicts) for image in result.images[:MOST_ROWS]],
-        count=len(result.images),
-        left_out=[(image.name, image.reason) for image in result.left_out],
-        outliers=[
-            [image.name, o.label, number(o.residual_px, 3), number(o.limit_px, 3)]
-            for image in result.images
-            for o in image.pose.outliers
+    colours = legend({s: c for s, c in COLOUR_OF.items() if s in statuses} if len(statuses) > 1 else {})
+    told = summary(result)
+    heads = [
+        "<image",
+        "<faces",
+        "circles",
+        "<status",
+        "x mm",
+        "y mm",
+        "z mm",
+        *["x", "y", "z"] * 2,
+        "RMS px",
+        "χ² / dof",
+    ]
+    over = [("", 4), ("origin of the target", 3), ("σ µm", 3), ("σ mdeg, about", 3), ("residuals", 2 + verdicts)]
+    rows = [_row(image, verdicts) for image in result.images]
+    outliers = [
+        [image.name, o.label, number(o.residual_px, 3), number(o.limit_px, 3)]
+        for image in result.images
+        for o in image.pose.outliers
+    ]
+    contradicting: Block = ShownTable(["<image", "<circle", "residual px", "limit px"], outliers)
+    if len(outliers) > 20:
+        contradicting = fold("Circles left out", contradicting)
+    return Document(
+        "Poses of the target",
+        f"{where}: {told[0]}",
+        [
+            Section("", [Printed(_printed(result)), Printed(told[1:])], terminal=True),
+            Section(
+                "Path in the camera frame",
+                [
+                    alarms(told[1:]),
+                    f"Origin of the target, mm. Ellipses: σ{f', {times:g} times enlarged' if times != 1 else ''}. "
+                    "Lines join the images of a folder by name",
+                    colours,
+                    plots(
+                        plot(
+                            lambda: _view(result, at, 0, 1, times),
+                            "path of the target as the camera sees it",
+                            "As the camera sees it",
+                            "",
+                        ),
+                        plot(
+                            lambda: _view(result, at, 0, 2, times),
+                            "path of the target from above, the camera below",
+                            "From above, the camera below",
+                            "",
+                        ),
+                    ),
+                ],
+            ),
+            Section(
+                "Uncertainty",
+                [
+                    colours,
+                    plot(
+                        lambda: _sigma(result),
+                        "σ of each pose",
+                        "Position: filled along the line of sight, open RMS across it; rotation: RMS of the three axes",
+                    ),
+                ],
+            ),
+            Section("Poses", [ShownTable(heads + ["<fit"] * verdicts, rows, over)]),
+            Section(
+                "Left out",
+                [
+                    ShownTable(
+                        ["<image or file", "<reason"], [[e.name, e.reason] for e in result.left_out], css="text"
+                    ),
+                    f"{len(outliers)} circles contradict the others of their image" if outliers else "",
+                    contradicting,
+                ],
+            ),
         ],
     )
 
 
-def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, times: float) -> str:
+def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, times: float):
     """Returns a plot of two coordinates of the path, with enlarged ellipses of σ."""
     from matplotlib.patches import Ellipse
 
@@ -323,7 +375,7 @@ def _view(result: MeasureResult, at: np.ndarray, i: int, j: int, times: float) -
     plane(axes, f"{'xyz'[i]}, mm", f"{'xyz'[j]}, mm", 0.12)
     if j == 1:
         axes.invert_yaxis()  # y of a camera points down
-    return uri(figure)
+    return figure
 
 
 def _folders(images: tuple[MeasuredImage, ...]) -> list[list[int]]:
@@ -334,7 +386,7 @@ def _folders(images: tuple[MeasuredImage, ...]) -> list[list[int]]:
     return list(folders.values())
 
 
-def _sigma(result: MeasureResult) -> str:
+def _sigma(result: MeasureResult):
     """Returns a plot of σ along and across the line of sight, and of the rotation, image by image."""
     figure = new_figure(9, 3)
     place = figure.add_axes((0.07, 0.17, 0.41, 0.74))
@@ -350,13 +402,9 @@ def _sigma(result: MeasureResult) -> str:
         axes.set_ylim(0, None)
         axes.yaxis.set_major_locator(locator())
         axes.set_xlim(0.4, len(rows) + 0.6)
-        axes.set_xlabel("image, in order of the table", fontsize=SMALL + 1, color=INK)
-        axes.set_ylabel(label, fontsize=SMALL + 1, color=INK)
         axes.xaxis.set_major_locator(locator())
-        calm(axes)
-        axes.grid(axis="y", color=FAINT, lw=0.6)
-        axes.set_axisbelow(True)
-    return uri(figure)
+        calm(axes, "image, in order of the table", label, "y")
+    return figure
 
 
 def _split(each: MeasuredImage) -> tuple[float, float, float]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from stcal.labels import dot_cells, parse_label, parse_labels
-from stcal.report.figure import AXIS_COLOURS, COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below, uri
+from stcal.report.figure import AXIS_COLOURS, COLOURS, INK, SMALL, calm, locator, new_figure, round_below, uri
 from stcal.report.text import number
 
 
@@ -62,18 +62,21 @@ def image_bars(rows: list[dict], colours: dict[str, str]) -> str:
     The horizontal axis is the number of the image in the table.
     """
     figure = new_figure(10.5, 2.9)
-    axes = figure.add_axes((0.055, 0.15, 0.935, 0.80))
+    axes = figure.add_axes((0.055, 0.16, 0.935, 0.75))
     place = np.arange(1, len(rows) + 1)
     axes.bar(place, [row["rms_px"] for row in rows], 0.72, color=[colours.get(row["group"], INK) for row in rows])
     axes.plot(place, [row["max_px"] for row in rows], "_", color=INK, markersize=9, markeredgewidth=1.4)
     axes.set(xlim=(0.2, len(rows) + 0.8), ylim=(0, None))
+    groups = [row["group"] for row in rows]
+    for i, group in enumerate(
+        groups
+    ):  # the name of each group stands over its first image, so that colour is not needed
+        if group not in groups[:i]:
+            axes.annotate(group, (i + 0.6, 1.0), xycoords=("data", "axes fraction"), va="bottom", fontsize=SMALL,
+                          color=colours.get(group, INK), parse_math=False)  # fmt: skip
     step = max(1, int(np.ceil(len(rows) / 40)))
     axes.set_xticks(place[::step])
-    axes.set_xlabel("number of the image in the table below", fontsize=SMALL + 0.5)
-    axes.set_ylabel("residual, px", fontsize=SMALL + 0.5)
-    axes.grid(axis="y", color=FAINT, linewidth=0.6)
-    axes.set_axisbelow(True)
-    calm(axes)
+    calm(axes, "number of the image in the table below", "residual, px", "y")
     return uri(figure)
 
 
@@ -196,6 +199,8 @@ def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
         parts.append(_part("point", [xyz], "#000000", name=label, size=2.2, target=True))
     for group, dots in scene["boards"].items():
         parts += [_part("point", [xyz], colours.get(group, INK), size=1.2) for xyz in dots]
+        if dots:
+            parts.append(_part("text", [np.mean(dots, axis=0)], colours.get(group, INK), name=f"group {group}"))
     places = [view["position_mm"] for view in scene["cameras"]]
     everything = np.array([*scene["circles"].values(), *chain.from_iterable(scene["boards"].values()), *places])
     depth = CAMERA * float(np.ptp(everything, axis=0).max()) if len(everything) else 1.0

@@ -5,115 +5,30 @@ from collections.abc import Callable, Mapping
 
 from stcal.labels import BOARD, parse_label
 from stcal.parallel import run_briefly
-from stcal.report.page import render, swatch, verdict
+from stcal.report.document import (
+    Block,
+    Document,
+    Section,
+    Swatch,
+    Table,
+    alarms,
+    columns,
+    fold,
+    html,
+    legend,
+    macro,
+    page_only,
+    plot,
+    plots,
+    subheading,
+    tiles,
+    tone_of,
+)
 from stcal.report.text import NONE, cells, join, number
 from stcal.sfm.report import figures
-from stcal.sfm.report.compare import comparison_cells
+from stcal.sfm.report.checks import checks_section, crosscheck_section, published_section
 from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, photographs, space_parts
-from stcal.sfm.report.judgement import CHANCE, Judgement, judgement_of, without_sigma
-
-LIMITS = (
-    ("mapped_sigma", "σ", "of faces and circles between the programs"),
-    ("sigma", "σ", "of these adjusted"),
-    ("face_um", "µm", "of faces"),
-    ("face_mdeg", "mdeg", "of faces"),
-    ("circle_um", "µm", "of circles"),
-    ("camera_um", "µm", "of cameras"),
-    ("camera_mdeg", "mdeg", "of cameras"),
-)
-COMPARISONS = ("mapping", "result", "plain")
-
-
-def crosscheck_values(check: dict) -> dict:
-    """Returns the section ``crosscheck`` of ``report.json`` as the template shows it."""
-    limits = check["tolerances"]
-    allowed = [f"{limits[key]:g} {unit} {object_name}" for key, unit, object_name in LIMITS if limits[key] is not None]
-    faces: dict[str, list[tuple[float, str]]] = {}
-    for label, value in check["mapping"]["circles_um"].items():
-        faces.setdefault(parse_label(label).plane, []).append((value, label))
-    sigmas = check["mapping"]["circles_sigmas"]
-    programs = {
-        "native": f"COLMAP {check['native']}",
-        "pycolmap": f"pycolmap {check['pycolmap']}",
-        "run": "this result",
-    }
-    return {
-        "allowed": allowed,
-        "models": [
-            [name, check["images"][key], number(check["residual_rms_px"][key], 4)] for key, name in programs.items()
-        ],
-        "faces": [_face_row(check, face) for face in check["mapping"]["faces"]],
-        "circles": [
-            [face, len(rows), number(sum(v for v, _ in rows) / len(rows), 3), number(max(rows)[0], 3), max(rows)[1]]
-            for face, rows in sorted(faces.items())
-        ],
-        "single": [
-            [label, number(value, 3), number(sigmas.get(label), 2)]
-            for label, value in check["mapping"]["circles_um"].items()
-        ],
-        "worst_camera": max(check["mapping"]["cameras"], key=lambda row: row["sigmas"], default=None),
-    }
-
-
-def _face_row(check: dict, face: str) -> list[str]:
-    """Returns the row of a face: position, rotation and σ of each comparison."""
-    row = [face]
-    for key in COMPARISONS:
-        entry = check[key]["faces"].get(face)
-        row += [*cells(entry, "translation_um:3 rotation_mdeg:3"), number(entry["sigmas"], 2)] if entry else [NONE] * 3
-    return row
-
-
-COLOURS = {"passed": "#1b7837", "suspicious": "#b26a00", "failed": "#b3261e", "not possible": "#556270"}
-ORDER = ("failed", "suspicious", "passed", "not possible")
-FIRST_NAMES = 6
-"""Number of names that a row has room for."""
-
-
-def count_verdicts(verdicts: list[str]) -> str:
-    """Returns the number of checks with each verdict as ``2 failed, 13 passed``, the worst first."""
-    return ", ".join(f"{verdicts.count(v)} {v}" for v in ORDER if v in verdicts) or "none"
-
-
-def checks_values(checks: list[dict]) -> dict:
-    """Returns the section ``checks`` of ``report.json`` as the template shows it."""
-    ranked = sorted(checks, key=lambda check: ORDER.index(check["verdict"]))
-    rows = [
-        [
-            check["title"],
-            verdict(check["verdict"], COLOURS[check["verdict"]]),
-            *(_number(check["measured"][0]) if check["measured"] else [NONE, NONE]),
-            _names(check),
-            check["reason"],
-            check["remedy"],
-        ]
-        for check in ranked
-    ]
-    measured = [
-        [check["title"], m["name"], *_number(m), NONE if m["probability"] is None else f"{m['probability']:.1g}"]
-        for check in ranked
-        for m in check["measured"]
-    ]
-    verdicts = count_verdicts([check["verdict"] for check in checks])
-    return {"verdicts": verdicts, "check_rows": rows, "measured": measured, "chance": CHANCE}
-
-
-def _number(measured: dict) -> list[str]:
-    """Returns value and limit with their unit."""
-    unit = f" {measured['unit']}" if measured["unit"] else ""
-    return [_short(measured["value"]) + unit, NONE if measured["limit"] is None else _short(measured["limit"]) + unit]
-
-
-def _short(value: float) -> str:
-    """Returns the value with about three digits."""
-    return f"{value:.3g}" if 1e-4 < abs(value) < 1e3 else number(value, 0) if abs(value) >= 1e3 else f"{value:.2g}"
-
-
-def _names(check: dict) -> str:
-    names = check["names"]
-    surplus = f" and {len(names) - FIRST_NAMES} more" if len(names) > FIRST_NAMES else ""
-    return ", ".join(names[:FIRST_NAMES]) + surplus if names else NONE
-
+from stcal.sfm.report.judgement import Judgement, judgement_of, without_sigma
 
 SIDES = {-58: "", 122: ", from the other side"}
 """Azimuths from which target and cameras are drawn."""
@@ -125,8 +40,6 @@ SOLVES = {
     "paper": "paper: as published by Zhang & Wei (2017), for comparison",
 }
 SCALES = {"board": "the board", "faces": "printed size of the faces", "distances": "known distances"}
-VERDICTS = {"yes": "passed", "with care": "suspicious", "no": "failed"}
-"""Verdict of a check that has the colour of each judgement."""
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
@@ -152,36 +65,173 @@ def report_html(
         report = without_sigma(report)
     colours = figures.group_colours([group["name"] for group in report["groups"]])
     boards, views, bars = _drawn(report, colours)
-    return render(
-        "sfm/report/page.html.jinja",
-        report=report,
-        reload_s=reload_s,
-        colours=colours,
-        factor=_factor_in_words(report["summary"]["sigma_factor"]),
-        judgement=_judgement(judgement),
-        headline=_headline(report),
-        settings=_settings(report),
-        worst_values=_worst_values(report),
-        single_way=[face for face, chains in report["chains"].items() if len(chains) == 1],
-        **_faces(report),
-        scales=_scales(report),
-        boards=boards,
-        space=space_parts(report, colours),
-        views=views,
-        **_residuals(report, colours),
-        bars=bars,
-        first_images=FIRST_IMAGES,
-        starts=_starts(report),
-        first_pairs=FIRST_PAIRS,
-        circles_left_out=_circles_left_out(report),
-        notes=list(enumerate(report["notes"], 1)),
-        **(checks_values(report["checks"]) if "checks" in report else {}),
-        **({"compared": comparison_cells(report["comparison"])} if "comparison" in report else {}),
-        **({"cross": crosscheck_values(report["crosscheck"])} if "crosscheck" in report else {}),
-        photographs=photographs(report, overlays, residuals or {}),
-        rest=len(report["images"]) - len(overlays) - gone,
-        gone=gone,
+    summary = report["summary"]
+    sections = [
+        Section("Faces", _answer(report, colours, views), name="faces"),
+        Section("May I use it?", _use(report, judgement), name="use"),
+        Section("How far to trust it", _trust(report, judgement), name="trust"),
+        Section("Faces in detail", _faces_in_detail(report), name="detail"),
+        Section("Scale", _scale(report, boards), name="scale"),
+        Section("Residuals", _residuals(report, colours, bars), name="residuals"),
+        Section("Focus", _focus(report), name="focus"),
+        Section("Initial pairs", _pairs(report), name="pairs"),
+        Section("Left out", _left_out(report), name="left-out"),
+        Section(
+            "As published", published_section(report["comparison"]) if "comparison" in report else [], name="comparison"
+        ),
+        Section(
+            "Cross-check", crosscheck_section(report["crosscheck"]) if "crosscheck" in report else [], name="crosscheck"
+        ),
+        Section("Settings", [Table(["<Setting", "<Value"], _settings(report), css="text facts")], name="settings"),
+        Section("Overlays", _overlays(report, overlays, residuals or {}, gone), name="overlays"),
+    ]
+    counts = (
+        f"{summary['images']} images in {summary['groups']} groups, {summary['images_mapped']} mapped, "
+        f"{summary['faces']} faces"
     )
+    banner = [_warning(report), macro("answers", judgement.answers()[:1], tone_of(judgement.verdict))]
+    return Document(
+        report["target"], counts, sections, banner, reload_s, f"{report['target']}: calibration report"
+    ).page()
+
+
+def _warning(report: dict) -> Block:
+    """Returns what makes all faces useless, or that there are none."""
+    if not report["faces"]:
+        return alarms(
+            [
+                "The board alone: no face of the target was recognised. λ and the board's residuals of each group are "
+                "under Scale; there is no calibrated target. If a face is in view, look at the overlays."
+            ]
+        )
+    if report["options"]["solve"] == "paper":
+        return alarms(
+            [
+                "As published, for comparison: centres of contours, alike in weight, without the eccentricity. Faces "
+                "are biased by tens of µm; residuals do not show it. Do not use these faces."
+            ]
+        )
+    if not report["options"]["eccentricity"]:
+        return alarms(
+            [
+                "Eccentricity is off: this is an uncorrected control. Faces are biased along their normals by tens of "
+                "µm; residuals do not show it. Do not use these faces."
+            ]
+        )
+    return None
+
+
+HOW_TO_USE = """import json, numpy as np
+
+faces = json.load(open("faces.json"))
+pose = np.array(faces["target_from_face"]["{face}"])  # 4x4, mm
+xyz_target = pose @ [x, y, 0, 1]  # of a point on face {face}
+
+# 6x6, rotation (rad) before translation (mm)
+covariance = faces["target_from_face_covariance"]["{face}"]"""
+"""Program that reads the result."""
+
+
+def _answer(report: dict, colours: dict[str, str], views: list[tuple[str, str, str]]) -> list[Block]:
+    """Returns the faces with σ, the target in space, and how to use the result."""
+    rows = []
+    for name, face in report["faces"].items():
+        datum = name == report["reference_face"]
+        sigma = [number(v, 1) for v in face["translation_sigma_um"] or [None] * 3]
+        sigma += [number(v, 2) for v in face["rotation_sigma_mdeg"] or [None] * 3]
+        rows.append(
+            [
+                f"{name} (datum)" if datum else name,
+                *[number(v, 4) for v in face["translation_mm"]],
+                *(["0"] * 6 if datum and face["translation_sigma_um"] else sigma),
+                *cells(face, "circles circles_of_design plane_rms_um:1 images"),
+                join(face["groups"]),
+            ]
+        )
+    heads = ["<Face"] + ["X", "Y", "Z"] * 3 + ["found", "of design", "Plane RMS (µm)", "Images", "<Groups"]
+    over = [("", 1), ("Position (mm)", 3), ("σ of position (µm)", 3), ("σ of rotation about (mdeg)", 3)]
+    over += [("Circles", 2), ("", 3)]
+    others = [face for face in report["faces"] if face != report["reference_face"]]
+    stills = []
+    for scene, target, side in views:
+        text = f"Cameras, boards and target (black){side}"
+        stills += [plot(lambda picture=scene: picture, text, css="")]
+        text = f"Circles of the target, frames of its faces{side}"
+        stills += [plot(lambda picture=target: picture, text, css="")]
+    space = [
+        macro(
+            "turned",
+            space_parts(report, colours),
+            "Target, boards and cameras in space",
+            [("target", "Target"), ("all", "With boards and cameras")],
+        ),
+        "In the target frame. Axes of the face frames: x red, y green, z blue; the name of a face stands at the end "
+        "of its normal",
+        legend(colours, "Groups:"),
+    ]
+    use = []
+    if others:
+        use = [
+            subheading("How to use it"),
+            "faces.json beside this page has the pose of each face as a 4×4 matrix, the covariance of each, and the "
+            "circles in the target frame; `stcal-sfm export RUN` writes it for other programs",
+            macro("verbatim", HOW_TO_USE.replace("{face}", others[0])),
+        ]
+    return [
+        f"Pose of each face in the target frame, which is the frame of face {report['reference_face']}: the position "
+        "is that of the face's origin circle, σ are one standard deviation"
+        if rows
+        else "",
+        Table(heads, rows, over),
+        columns(space, use) if use else page_only(*space),
+        macro("group", "plots still", lambda: [html(*stills)]),
+    ]
+
+
+def _use(report: dict, judgement: Judgement) -> list[Block]:
+    """Returns the answers in words, the headline, and the checks."""
+    checks = checks_section(report["checks"]) if "checks" in report else []
+    return [macro("answers", judgement.answers(), tone_of(judgement.verdict)), *checks, tiles(_headline(report))]
+
+
+def _trust(report: dict, judgement: Judgement) -> list[Block]:
+    """Returns for what σ hold, and the worst value of each kind."""
+    summary, options = report["summary"], report["options"]
+    pitch = "An error of the pitch as a whole (100 ppm is 4 K on aluminium) is not in them"
+    if options["solve"] != "joint":
+        told = (
+            "No σ were computed, because the solve was group by group; look at the chains. All holds for the given "
+            "intrinsics: an error of the camera calibration goes into the faces"
+        )
+    elif judgement.verdict == "no":
+        told = (
+            "No σ are shown, as they would not hold. What failed makes the result wrong by an amount that they do not "
+            "have in them"
+        )
+    elif options.get("refine_camera", False):
+        told = (
+            f"σ hold for the given pitch of the board; the intrinsics were adjusted, and their σ are in them. {pitch}"
+        )
+    else:
+        told = (
+            "σ hold for the given intrinsics and the given pitch of the board. An error of the camera calibration, or "
+            "of the pitch as a whole (100 ppm is 4 K on aluminium), is not in them"
+        )
+    factor = f"group by group, {_factor_in_words(summary['sigma_factor'])}"
+    if summary["sigma0"] is not None:
+        factor += (
+            ". The joint adjustment multiplies the centres' σ by that factor and leaves σ₀ = "
+            f"{summary['sigma0']:.2f}; near 1, groups and boards agree with one another. The σ of the faces include "
+            "both factors"
+        )
+    single = [face for face, chains in report["chains"].items() if len(chains) == 1]
+    one_way = "reached by one way only, so that no second way confirms them: face"
+    return [
+        f"{told}, and residuals hardly show it",
+        factor,
+        Table(["<Check", "Value", "<Where", "<Remark"], _worst_values(report), css="text"),
+        f"{one_way} {join(single)}" if single else "",
+    ]
 
 
 def _drawn(report: dict, colours: dict[str, str]) -> tuple[dict[str, str], list[tuple[str, str, str]], str]:
@@ -235,15 +285,6 @@ def _worst_chain(report: dict, key: str) -> tuple[float, str] | None:
         if len(chains) > 1
         for chain in chains
     )
-
-
-def _judgement(judgement: Judgement) -> dict:
-    """Returns colour and sentences."""
-    return {
-        "colour": COLOURS[VERDICTS[judgement.verdict]],
-        "answers": judgement.answers(),
-        "refused": judgement.verdict == "no",
-    }
 
 
 def _headline(report: dict) -> list[tuple[str, str, str]]:
@@ -316,25 +357,13 @@ def _worst_values(report: dict) -> list[list[str]]:
 # --- faces and scale --------------------------------------------------------------------------------------------------
 
 
-def _faces(report: dict) -> dict[str, list]:
-    """Returns rows of the poses, of their axes, of distances between faces, and of the ways to each face."""
-    poses, axes = [], []
+def _faces_in_detail(report: dict) -> list[Block]:
+    """Returns the axes of the faces, distances between faces, and the ways to each face."""
+    axes = []
     for name, face in report["faces"].items():
-        datum = name == report["reference_face"]
-        sigma = [number(v, 1) for v in face["translation_sigma_um"] or [None] * 3]
-        sigma += [number(v, 2) for v in face["rotation_sigma_mdeg"] or [None] * 3]
-        poses.append(
-            [
-                f"{name} (datum)" if datum else name,
-                *[number(v, 4) for v in face["translation_mm"]],
-                *(["0"] * 6 if datum and face["translation_sigma_um"] else sigma),
-                *cells(face, "circles circles_of_design plane_rms_um:1 images"),
-                join(face["groups"]),
-            ]
-        )
         matrix = face["target_from_face"]
-        axes.append([name, *[number(matrix[i][j], 7) for j in range(3) for i in range(3)]])
-        axes[-1].append(number(face["angle_to_reference_deg"], 4))
+        directions = [number(matrix[i][j], 7) for j in range(3) for i in range(3)]
+        axes.append([name, *directions, number(face["angle_to_reference_deg"], 4)])
     between = [
         [f"{row['a']} – {row['b']}", *cells(row, "distance_mm:4 distance_sigma_um:1 angle_deg:4")]
         for row in report["between_faces"]
@@ -344,7 +373,67 @@ def _faces(report: dict) -> dict[str, list]:
         for face, chains in report["chains"].items()
         for way in chains
     ]
-    return {"poses": poses, "axes": axes, "between": between, "ways": ways}
+    over = [("", 1), ("X axis of the face", 3), ("Y axis of the face", 3), ("Z axis: outward normal", 3), ("", 1)]
+    heads = ["<Face", "<Way", "<By groups", "Position off (µm)", "Rotation off (mdeg)"]
+    return [
+        "The axes of each face in the target frame: the columns of its rotation matrix",
+        Table(["<Face"] + ["x", "y", "z"] * 3 + ["Angle to datum (°)"], axes, over),
+        columns(
+            [
+                subheading("Between faces"),
+                "Distance of the origins, angle of the normals",
+                Table(["<Faces", "Distance (mm)", "σ (µm)", "Angle (°)"], between),
+            ],
+            [
+                subheading("Chains"),
+                "Ways to each face through single groups, and how far each is off the combined pose"
+                if ways
+                else "No face but the datum",
+                Table(heads, ways),
+            ],
+        ),
+    ]
+
+
+def _scale(report: dict, boards: dict[str, str]) -> list[Block]:
+    """Returns λ and the board's residuals of each group."""
+    heads = [
+        "<Group",
+        "λ, least squares (mm/unit)",
+        "λ, by rows (mm/unit)",
+        "Rows",
+        "Difference (ppm)",
+        "σ (ppm)",
+        "Dots",
+    ]
+    heads += ["Residual, mean (µm)", "± (µm)", "Residual, RMS (µm)", "Residual, max (µm)"]
+    pictures = [
+        plot(
+            lambda picture=boards[group["name"]]: picture,
+            f"Residual vectors of the board, group {group['name']}",
+            f"Group {group['name']}: RMS {number(group['scale']['board_rms_um'], 1)} µm",
+            "",
+        )
+        for group in report["groups"]
+        if group["name"] in boards
+    ]
+    without = (
+        "Without a board in view, λ is from the corners of faces with printed boards or tags, or from known distances "
+        "between points: they stand for the dots in this table"
+    )
+    of_boards = [
+        subheading("Board residuals"),
+        "Reconstructed minus design, in the board's frame, on the board's grid; one scale for all groups. Arrows show "
+        "x and y, colour shows z",
+        plots(*pictures),
+    ]
+    return [
+        "λ turns a group's model into mm, by least squares over all dots of the board, and by rows as published "
+        "(first and last row, all pairs). σ is that of λ from the board's stated σ",
+        Table(heads, _scales(report)),
+        *([without] if len(pictures) < len(report["groups"]) else []),
+        *(of_boards if pictures else []),
+    ]
 
 
 def _scales(report: dict) -> list[list]:
@@ -376,32 +465,111 @@ def _boards(report: dict) -> dict[str, tuple]:
 # --- residuals, pairs, left out ---------------------------------------------------------------------------------------
 
 
-def _residuals(report: dict, colours: dict[str, str]) -> dict:
-    """Returns the residuals: rows by image; by label, grouped face by face and board by board."""
-    images, labels = report["residuals_by_image"], report["residuals_by_label"]
+def _residuals(report: dict, colours: dict[str, str], bars: str) -> list[Block]:
+    """Returns the residuals by image; and by label, face by face and board by board."""
     target: dict[str, list] = {}
     board: dict[str, list] = {}
-    for row in labels:
-        plane = parse_label(row["label"]).plane
+    for row in report["residuals_by_label"]:
+        plane, shown = parse_label(row["label"]).plane, cells(row, "label observations rms_px:4 max_px:4")
         if plane == BOARD:
-            board.setdefault(f"Board, group {row['group']}", []).append(row)
+            board.setdefault(f"Board, group {row['group']}", []).append(shown)
         else:
-            target.setdefault(f"Face {plane}", []).append(row)
-    rows = [
+            target.setdefault(f"Face {plane}", []).append(shown)
+    images = [
         [
             i,
             row["image"],
-            swatch(row["group"], colours.get(row["group"], "")),
+            Swatch(row["group"], colours.get(row["group"], "")),
             *cells(row, "observations rms_px:4 max_px:4 worst"),
         ]
-        for i, row in enumerate(images, 1)
+        for i, row in enumerate(report["residuals_by_image"], 1)
     ]
-    return {
-        "by_image": rows,
-        "target_labels": target,
-        "board_labels": board,
-        "worst_label": max(labels, key=lambda row: row["rms_px"], default=None),
-    }
+    worst = max(report["residuals_by_label"], key=lambda row: row["rms_px"], default=None)
+    named = ""
+    if worst:
+        group = f" of group {worst['group']}" if worst["group"] else ""
+        named = f". The worst label is {worst['label']}{group} with {worst['rms_px']:.4f} px RMS"
+    table = Table(["No.", "<Image", "<Group", "Centres", "RMS (px)", "Max (px)", "<Worst label"], images)
+    return [
+        f"RMS is per axis, max is the length of the largest vector{named}",
+        subheading("By image"),
+        legend(colours, "Groups:"),
+        plot(lambda: bars, "Residuals by image", "Bars: RMS of the image; ticks: its largest"),
+        fold(f"All {len(images)} images", table) if len(images) > FIRST_IMAGES else table,
+        subheading("By label"),
+        _by_label(target),
+        fold("Dots of the board, by group", _by_label(board)),
+    ]
+
+
+def _by_label(planes: dict[str, list]) -> Block:
+    heads = ["<Label", "Images", "RMS (px)", "Max (px)"]
+    return columns(*([subheading(name), Table(heads, rows)] for name, rows in planes.items()), css="columns small")
+
+
+def _focus(report: dict) -> list[Block]:
+    """Returns what was corrected for blur that varies across a circle."""
+    if not report.get("focus"):
+        return []
+    heads = ["<Image", "In focus at (mm)", "Nearest circle (mm)", "Its blur (px)", "Farthest (mm)", "Its blur (px)"]
+    keys = "image focused_mm:0 nearest_mm:0 nearest_blur_px:2 farthest_mm:0 farthest_blur_px:2 shift_px:4"
+    return [
+        "Out of focus the blur grows with the distance from the plane of focus, also across a tilted circle, whose "
+        "centre then seems to lie nearer to its blurrier side. Centres are corrected for it, and what is uncertain of "
+        "it is in their σ",
+        Table([*heads, "Largest correction (px)"], [cells(row, keys) for row in report["focus"]]),
+    ]
+
+
+def _pairs(report: dict) -> list[Block]:
+    """Returns how each group's mapping began."""
+    heads = ["<First", "<Second", "Labels shared", "Median angle (°)", "In front", "Forward", "<Verdict"]
+    blocks: list[Block] = []
+    for group in report["groups"]:
+        pairs = [
+            cells(p, "first second shared median_angle_deg:2 in_front:2 forward:2 verdict") for p in group["pairs"]
+        ]
+        more = fold(f"{len(pairs) - FIRST_PAIRS} more pairs", Table(heads, pairs[FIRST_PAIRS:]))
+        blocks.append(fold(f"Group {group['name']}: {len(pairs)} pairs", Table(heads, pairs[:FIRST_PAIRS]), more))
+    heads = ["<Group", "Images mapped", "<Faces", "Points", "<Chosen pair", "Angle (°)", "<Started from", "Rounds"]
+    return [
+        "Each group starts from the pair of images with the largest median ray angle that is still safe "
+        f"({report['options']['max_pair_angle_deg']:.1f}° at most). In front is the share of points before both "
+        "cameras, forward that of the motion along the optical axis",
+        Table(heads, _starts(report)),
+        *blocks,
+    ]
+
+
+def _left_out(report: dict) -> list[Block]:
+    """Returns all that was left out, with reasons, and the notes."""
+    left, unseen = report["left_out"], report["summary"]["faces_not_seen"]
+    blocks: list[Block] = []
+    for title, heads, rows in (
+        ("Files", ["<File", "<Reason"], [cells(row, "name reason") for row in left["files"]]),
+        ("Images", ["<Image", "<Reason"], [cells(row, "name reason") for row in left["images"]]),
+        ("Circles", ["<Image", "Number", "<Circles", "<Reason"], _circles_left_out(report)),
+        ("Notes on images", ["<Image", "<Note"], [cells(row, "image note") for row in left["notes"]]),
+        ("Notes on the whole run", ["<No.", "<Note"], list(enumerate(report["notes"], 1))),
+    ):
+        if rows:
+            blocks += [subheading(title), Table(heads, rows, css="text")]
+    if unseen:
+        blocks.append(f"Faces of the design not seen: {join(unseen)}")
+    return blocks or ["Nothing was left out"]
+
+
+def _overlays(report: dict, overlays: dict, residuals: Mapping[str, Residuals], gone: int) -> list[Block]:
+    """Returns the photographs with their circles."""
+    rest = len(report["images"]) - len(overlays) - gone
+    shown = photographs(report, overlays, residuals)
+    lost = (
+        f"{gone} photographs are not shown: their overlays were no longer in the run's folder when this page was made"
+    )
+    return [
+        macro("photographs", shown, rest) if shown.each else "" if gone else "There are none",
+        lost if gone else "",
+    ]
 
 
 def _starts(report: dict) -> list[list]:

@@ -83,12 +83,23 @@ def _in_order(detection: DetectionResult, labelled: list[LabelledImage]):
 
 
 def overlay_path(out: Path, name: str) -> Path:
-    """Returns the path of an image's overlay; a long name is cut, and ends in its hash."""
+    """Returns the path of an image's overlay: the image's own name, with ``.jpg`` unless it is one of a JPEG.
+
+    A long name is cut, and ends in its hash.
+    """
     group, slash, file_name = name.rpartition("/")
     if len(os.fsencode(file_name)) > LONGEST_NAME:
         cut = os.fsencode(file_name)[: LONGEST_NAME - HASH_DIGITS - 1].decode(errors="ignore")
         file_name = f"{cut}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:HASH_DIGITS]}"
-    return out / "overlays" / f"{group}{slash}{file_name}.jpg"
+    suffix = "" if file_name.lower().endswith((".jpg", ".jpeg")) else ".jpg"
+    return out / "overlays" / f"{group}{slash}{file_name}{suffix}"
+
+
+def _overlay_in(run: Path, name: str) -> Path:
+    """Returns the path of an overlay in a finished run; earlier versions wrote ``.jpg`` after the suffix of a JPEG."""
+    path = overlay_path(run, name)
+    earlier = path.with_name(f"{path.name}.jpg")
+    return earlier if earlier.is_file() else path
 
 
 def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | None = None) -> Judgement:
@@ -194,7 +205,7 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
         raise InputError("E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again") from error
     with _as_written(path):
         shown = shown_overlays(report)
-        overlays = {name: overlay.read_bytes() for name in shown if (overlay := overlay_path(run, name)).is_file()}
+        overlays = {name: overlay.read_bytes() for name in shown if (overlay := _overlay_in(run, name)).is_file()}
     gone, residuals = len(shown) - len(overlays), _residuals(run, list(overlays))
     with _as_written(path):
         page = report_html(report, overlays, residuals, gone=gone)
@@ -207,7 +218,7 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
 
 
 def _report_page(run: Path, report: dict, reload_s: int | None = None) -> bytes:
-    overlays = {name: overlay_path(run, name).read_bytes() for name in shown_overlays(report)}
+    overlays = {name: _overlay_in(run, name).read_bytes() for name in shown_overlays(report)}
     return report_html(report, overlays, _residuals(run, list(overlays)), reload_s).encode("utf-8", "backslashreplace")
 
 

@@ -10,14 +10,14 @@ from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.files import REFINED_CAMERA
 from stcal.io.images import Skipped
 from stcal.labels import DotLabel
-from stcal.report.text import text_table
+from stcal.report.text import text_table, wrapped
 from stcal.sfm.adjust.scale import Scale
 from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
+from stcal.sfm.report.checks import count_verdicts
 from stcal.sfm.report.compare import comparison_cells
 from stcal.sfm.report.judgement import images_left_out
-from stcal.sfm.report.page import count_verdicts
 from stcal.sfm.runs.result import Comparison, RunResult
 from stcal.sfm.runs.solve import GroupSolution
 
@@ -62,7 +62,8 @@ def run_text(result: RunResult) -> str:
         lines.append(f"faces:  {result.out / 'faces.json'}")
     if result.refined_camera is not None:
         lines.append(f"camera: {result.out / REFINED_CAMERA}, as adjusted, with σ")
-    return "\n".join([*lines, f"report: {result.out / 'report.html'}"])
+    lines.append(f"report: {result.out / 'report.html'}")
+    return "\n".join(part for line in lines for part in wrapped(line))
 
 
 def _camera_taken_as_exact(camera: CalibratedCamera) -> str:
@@ -178,7 +179,7 @@ def _group(solution: GroupSolution, scale: Scale) -> Iterator[str]:
     yield (
         f"group {solution.model.group}: {len(solution.model.images)} images, {len(solution.model.labels)} circles, "
         f"initial pair {Path(pair.first).name} – {Path(pair.second).name} at "
-        f"{np.degrees(pair.median_angle_rad):.0f}°, {of_scale} within {1e3 * scale.rms_mm():.1f} µm RMS"
+        f"{np.degrees(pair.median_angle_rad):.0f}°, {of_scale} {1e3 * scale.rms_mm():.1f} µm RMS"
     )
     for name, reason in solution.left_out.items():
         yield f"left out {name}: {reason}"

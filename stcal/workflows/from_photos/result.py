@@ -7,13 +7,13 @@ import numpy as np
 
 from stcal.io.files import json_text
 from stcal.io.json import ResultFile, require_result_written
-from stcal.report.figure import COLOURS, calm, new_figure, uri
-from stcal.report.page import render
+from stcal.report.document import Block, Document, Section, Table, bullets, links, listed, plot, tiles
+from stcal.report.figure import COLOURS, calm, new_figure
 from stcal.report.text import number
 from stcal.robot.axes.model import AxesResult
-from stcal.robot.axes.report import axes_file, axes_page
+from stcal.robot.axes.report import axes_file, axes_report
 from stcal.robot.identification.predicted import predicted_at
-from stcal.robot.identification.report import identified_file, identified_page
+from stcal.robot.identification.report import identified_file, identified_report
 from stcal.robot.identification.result import Identified, require_identified_written
 from stcal.robot.kinematics.file import require_robot_written, robot_toml
 from stcal.robot.kinematics.measurements import Measurements
@@ -26,9 +26,15 @@ from stcal.robot.use.compensation import (
     require_compensated_written,
 )
 from stcal.robot.use.evaluation import Figures
-from stcal.robot.use.report import compensation_page
+from stcal.robot.use.report import compensation_report
 from stcal.sfm.measurement.images import MeasureResult
-from stcal.sfm.measurement.report import measure_page, poses_csv, poses_file, require_table_written, summary
+from stcal.sfm.measurement.report import (
+    measure_report,
+    poses_csv,
+    poses_file,
+    require_table_written,
+    summary,
+)
 
 STAGES = ("poses", "axes", "identified", "compensated")
 """Names of the files, in the order of the steps."""
@@ -160,13 +166,13 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
         if compensated is None or not compensated.compared().any()
         else compensated.before_mm[compensated.compared()]
     )
-    tiles = [
+    headline = [
         (str(len(result.data)), "", "poses measured, with joint values"),
         (number(result.errors[DRAWING].rms, 3), "mm RMS", "position error of the arm as drawn"),
         (number(last.rms, 3), "mm RMS", list(result.errors)[-1]),
     ]
     if before is not None:
-        tiles.append(
+        headline.append(
             (number(float(np.sqrt((before**2).mean())), 3), "mm RMS", "taken away at the targets, base included")
         )
     notes = [
@@ -175,25 +181,58 @@ def from_photos_page(result: FromPhotos, names: tuple[str, ...]) -> str:
         *result.identified.notes,
         *([] if compensated is None else compensated.notes()),
     ]
-    return render(
-        "workflows/from_photos/page.html.jinja",
-        robot=result.nominal.name,
-        images=result.images,
-        figures=tiles,
-        story=story(result),
-        errors=[
-            [name, str(entry.rows), *(number(v, 4) for v in (entry.mean, entry.rms, entry.p95, entry.max))]
-            for name, entry in result.errors.items()
+    errors = [
+        [name, str(entry.rows), *(number(v, 4) for v in (entry.mean, entry.rms, entry.p95, entry.max))]
+        for name, entry in result.errors.items()
+    ]
+    heads = [
+        "line",
+        "<status",
+        "as drawn, mm",
+        "σ, mm",
+        *(f"J{i}, {u.strip()}" for i, u in enumerate(_units(result), 1)),
+    ]
+    targets: list[Block] = [
+        Table(heads, rows := _target_rows(result)),
+        "as drawn: where the joint values of the drawing really lead, by the identified arm; nothing is fitted here, "
+        "so that errors of the base count, unlike above. σ: of the tool's position after compensation, as predicted. "
+        "Then how far each joint moves",
+        "compensated.html has all of them" if compensated is not None and len(compensated) > len(rows) else "",
+    ]
+    more = len(notes) - MOST_NOTES
+    return Document(
+        f"From photographs to points: {result.nominal.name}",
+        f"photographs of {result.images}",
+        [
+            Section("Result", [tiles(headline), *story(result)]),
+            Section(
+                "Errors of the arm's models",
+                [
+                    plot(
+                        lambda: _figure(result),
+                        "errors of each model of the arm",
+                        "Line: from the median to the largest error of a row",
+                    ),
+                    Table(["<position error, mm", "errors", "mean", "RMS", "95 %", "max"], errors),
+                    "As drawn and by the axis method, base and tool are fitted to the same rows. Rows held out took "
+                    "no part in what they are compared with: their error is what is to be expected at other poses "
+                    "among these",
+                ],
+            ),
+            Section("At the targets", targets if rows else []),
+            Section(
+                "To look at",
+                [bullets(notes[:MOST_NOTES]), f"and {more} more, in the pages of each step" if more > 0 else ""],
+            ),
+            Section(
+                "Each step",
+                [
+                    links((name, PAGES[name]) for name in names if name in PAGES),
+                    listed("for programs", [name for name in names if not name.endswith(".html")]),
+                ],
+            ),
         ],
-        drawn=uri(_figure(result)),
-        heads=[f"J{i}, {unit.strip()}" for i, unit in enumerate(_units(result), 1)],
-        targets=_target_rows(result),
-        more_targets=0 if compensated is None else max(len(compensated) - MOST_TARGETS, 0),
-        pages=[(name, PAGES[name]) for name in names if name in PAGES],
-        files=[name for name in names if not name.endswith(".html")],
-        notes=notes[:MOST_NOTES],
-        more=max(len(notes) - MOST_NOTES, 0),
-    )
+    ).page()
 
 
 def _target_rows(result: FromPhotos) -> list[list[str]]:
@@ -224,9 +263,8 @@ def _figure(result: FromPhotos):
     axes.set_yticks(range(len(result.errors)), list(result.errors), fontsize=8)
     axes.set_ylim(len(result.errors) - 0.5, -0.5)
     axes.set_xscale("log")
-    axes.set_xlabel("position error of a row, mm", fontsize=8)
     axes.legend(fontsize=7.5, frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1, 1))
-    calm(axes)
+    calm(axes, "position error of a row, mm")
     figure.subplots_adjust(left=0.3, right=0.97, bottom=0.5 / (0.5 * len(result.errors) + 0.9), top=0.86)
     return figure
 
@@ -251,19 +289,19 @@ def files_of(result: FromPhotos) -> dict[str, str]:
     source = f"Identified from {result.data.where}: {result.identified.rank} parameters."
     files = {name: json_text(content) for name, content in _results(result).items()} | {
         POSES: poses_csv(result.measured)[0],
-        "poses.html": measure_page(result.measured, result.images),
+        "poses.html": measure_report(result.measured, result.images).page(),
         "identified.toml": robot_toml(identified, [source]),
-        "identified.html": identified_page(result.identified, result.nominal),
+        "identified.html": identified_report(result.identified, result.nominal).page(),
     }
     if result.axes is not None:
         files |= {
             "axes.toml": robot_toml(result.axes.robot, ["Identified by the axis method from the sweeps."]),
-            "axes.html": axes_page(result.axes, result.data.where),
+            "axes.html": axes_report(result.axes, result.data.where).page(),
         }
     if compensated is not None:
         files |= {
             "compensated.csv": compensated_csv(compensated, identified),
-            "compensated.html": compensation_page(compensated, identified),
+            "compensated.html": compensation_report(compensated, identified).page(),
         }
     files = dict(sorted(files.items(), key=lambda item: STAGES.index(item[0].split(".")[0])))
     return files | {"report.html": from_photos_page(result, tuple(files))}

@@ -20,7 +20,7 @@ from stcal.handeye.report.figures import (
     turns_between,
 )
 from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.report.page import outcome_page
+from stcal.handeye.report.page import outcome_report
 from tests.support.handeye import simulated, simulated_views
 
 MOST_BYTES = 3_000_000
@@ -136,7 +136,7 @@ def test_a_robot_that_is_off_is_seen_in_the_image(truth, outcome):
 def test_a_board_behind_the_camera_is_nowhere(truth, outcome):
     behind = replace(outcome.result, stand_from_board=Rigid(translation=[0, 0, 1e5]) @ outcome.result.stand_from_board)
     assert any(np.isnan(px).any() for px in by_robot(behind, truth.pairs, truth.views))
-    assert outcome_page(replace(outcome, result=behind))
+    assert outcome_report(replace(outcome, result=behind)).page()
 
 
 def test_overlays_of_the_worst_a_usual_and_the_best(outcome, tmp_path):
@@ -157,7 +157,7 @@ def test_overlays_of_the_worst_a_usual_and_the_best(outcome, tmp_path):
     assert (x, y) == pytest.approx(tuple(seen))
     assert (u - x, v - y) == pytest.approx(tuple(found[0].factor * off))
     assert f"{np.hypot(*off):.2f} px" in title
-    page = outcome_page(outcome)
+    page = outcome_report(outcome).page()
     assert f"enlarged {found[0].factor:.0f} times" in page
     assert len(page) < MOST_BYTES
     assert page.count("<image href") == 3
@@ -173,10 +173,10 @@ def test_an_image_that_is_gone_is_said_and_no_error(outcome, tmp_path):
     assert missing == [f"{name} cannot be shown: No such file or directory"]
     (tmp_path / name).write_bytes(b"no image")
     assert "not readable as an image" in overlays(whole)[1][0]
-    assert "cannot be shown" in outcome_page(whole)
+    assert "cannot be shown" in outcome_report(whole).page()
     for path in tmp_path.iterdir():
         path.unlink()
-    assert "cannot be shown" in outcome_page(whole)
+    assert "cannot be shown" in outcome_report(whole).page()
 
 
 @pytest.mark.parametrize(("length", "factor"), [(0.05, 500), (0.2, 200), (1.0, 20), (30.0, 1), (500.0, 1), (0.0, 1)])
@@ -208,4 +208,4 @@ def test_a_chart_of_many_poses_has_room():
 @pytest.mark.slow
 def test_the_page_is_the_same_twice(outcome, tmp_path):
     whole = with_images(outcome, tmp_path)
-    assert outcome_page(whole) == outcome_page(whole)
+    assert outcome_report(whole).page() == outcome_report(whole).page()

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -11,7 +12,7 @@ import pytest
 from stcal.handeye import HandEyeOptions, handeye
 from stcal.handeye.report.file import HandEyeFile
 from stcal.handeye.report.outcome import Outcome
-from stcal.handeye.report.page import outcome_page, outcome_text
+from stcal.handeye.report.page import outcome_report
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.cameras.model import CalibratedCamera, camera_prior
@@ -76,7 +77,7 @@ def of_methods() -> Outcome:
 @pytest.mark.slow
 def test_the_text_has_the_transform_with_its_sigma(of_views):
     result = of_views.result
-    lines = outcome_text(of_views).splitlines()
+    lines = outcome_report(of_views).text().splitlines()
     row = next(i for i, line in enumerate(lines) if line.startswith("base_from_camera"))
     for k, axis in enumerate("xyz"):
         name, shift, sigma, _, turn_sigma = lines[row + 1 + k].split()
@@ -87,8 +88,7 @@ def test_the_text_has_the_transform_with_its_sigma(of_views):
     text = "\n".join(lines)
     assert f"pitch {25 * result.scale:.4f} ± {25 * result.sigma_scale:.4f} mm, stated 25 mm" in text
     assert "held out (2 × 2 of 10 poses): rotation" in text
-    assert "σ of corner in the image: " in text
-    assert " px (estimated)" in text
+    assert re.search(r"corner in the image +\S+ px +estimated", text)
 
 
 @pytest.mark.slow
@@ -101,26 +101,26 @@ def test_every_sigma_that_there_is_has_a_name():
     prior = camera_prior(CalibratedCamera.of(wrong, "PINHOLE"))
     result = handeye(truth.pairs, truth.setup, None, views, HandEyeOptions(intrinsics=prior))
     outcome = Outcome("images", result, colmap_model="PINHOLE")
-    assert "σ of camera file, focal length: " in outcome_text(outcome)
-    assert "Camera, as adjusted" in outcome_page(outcome)
+    assert "camera file, focal length" in outcome_report(outcome).text()
+    assert "Camera, as adjusted" in outcome_report(outcome).page()
     assert max(v for k, v in HandEyeFile.of(outcome).sigma.items() if k in FACTORS) > 1.5
 
 
 def test_corners_with_sigmas_of_their_own_have_a_factor(of_views):
-    text = outcome_text(replace(of_views, own_sigmas=True))
-    assert " times its own σ (estimated)" in text
-    assert " px (estimated)" not in text
+    text = outcome_report(replace(of_views, own_sigmas=True)).text()
+    assert re.search(r" times its own σ +estimated", text)
+    assert not re.search(r" px +estimated", text)
 
 
 @pytest.mark.slow
 def test_the_page_is_whole_and_shows_every_part(of_views, of_methods):
-    page = read(outcome_page(of_views))
+    page = read(outcome_report(of_views).page())
     assert page.images == 3
     text = " ".join(page.text)
     for part in ("base_from_camera", "flange_from_board", "a note with <markup> & more", "x<1>.png", "pose 10"):
         assert part in text
     assert "Coverage of the image" in text
-    page = read(outcome_page(of_methods))
+    page = read(outcome_report(of_methods).page())
     assert page.images == 1
     text = " ".join(page.text)
     assert "Coverage of the image" not in text
@@ -133,8 +133,8 @@ def test_an_outlier_is_marked_in_text_page_and_file(of_methods):
     bad = np.zeros(10, bool)
     bad[4] = True
     outcome = replace(of_methods, result=replace(of_methods.result, outliers=bad))
-    assert "9 poses, without 1 that contradicts them: pose 5" in outcome_text(outcome)
-    assert "left out, contradicting the others" in " ".join(read(outcome_page(outcome)).text)
+    assert "9 poses, without 1 that contradicts them: pose 5" in outcome_report(outcome).text()
+    assert "left out, contradicting the others" in " ".join(read(outcome_report(outcome).page()).text)
     assert HandEyeFile.of(outcome).outliers == ["pose 5"]
 
 
@@ -154,22 +154,22 @@ def test_the_file_is_plain_json_and_gives_the_transform_back(of_views, of_method
 def test_methods_of_which_none_could_be_validated_are_listed(of_methods):
     each = replace(of_methods.compared[0], held_out=None, reason="without pose 1: too few")
     outcome = replace(of_methods, held_out=None, compared=(each,))
-    assert "tsai-lenz" in outcome_text(outcome)
-    assert "without pose 1: too few" in " ".join(read(outcome_page(outcome)).text)
+    assert "tsai-lenz" in outcome_report(outcome).text()
+    assert "without pose 1: too few" in " ".join(read(outcome_report(outcome).page()).text)
 
 
 def test_a_page_without_poses_and_views_is_whole(of_views):
     """Of an outcome that a program made of a result alone."""
-    page = read(outcome_page(replace(of_views, pairs=None, views=None, held_out=None)))
+    page = read(outcome_report(replace(of_views, pairs=None, views=None, held_out=None)).page())
     assert page.images == 0
     assert "no errors on poses held out are known" in " ".join(page.text)
 
 
 def test_the_verdict_stands_in_text_page_and_file(of_views):
-    line = outcome_text(of_views).splitlines()[1]
+    line = outcome_report(of_views).text().splitlines()[1]
     assert line.startswith("verdict: use with care: ")
     assert line.endswith("; a note with <markup> & more")
-    text = " ".join(read(outcome_page(of_views)).text)
+    text = " ".join(read(outcome_report(of_views).page()).text)
     assert "Use with care" in text
     assert "What the verdict rests on" in text
     found = HandEyeFile.of(of_views).verdict
@@ -180,7 +180,7 @@ def test_the_verdict_stands_in_text_page_and_file(of_views):
 def test_the_chart_of_poses_has_the_names_that_tell_them_apart(of_methods):
     names = tuple(f"session_of_monday/left_{i:02d}_long_exposure.png" for i in range(10))
     outcome = replace(of_methods, result=replace(of_methods.result, names=names))
-    page = outcome_page(outcome)
+    page = outcome_report(outcome).page()
     for i, name in enumerate(names):
         assert f"<title>{name}</title>{i:02d}</text>" in page
         assert f"<title>{name}: " in page  # of its bar, with the value

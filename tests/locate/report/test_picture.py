@@ -9,7 +9,7 @@ from stcal.boards.tags import Tags
 from stcal.io.cameras.model import CameraModel
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.pipeline import run
-from stcal.locate.report.page import best_exposure, run_page
+from stcal.locate.report.page import best_exposure, run_report
 from stcal.synthetic.exposure import expose
 from tests.locate.drawn_target import CAMERA, LAYOUT, photo, tilted
 
@@ -33,7 +33,7 @@ def test_the_best_exposure_is_shown_not_the_darkest(scene):
     best = best_exposure(shown, LAYOUT)
     assert best is not None
     assert best.name.endswith("1.png")
-    page = run_page([located], scenes, LAYOUT, MODEL)
+    page = run_report([located], scenes, LAYOUT, MODEL).page()
     first = page.split("<figcaption>")[1]
     assert first.startswith(f"{best.name}: 6 of 6 tags")
 

@@ -439,7 +439,7 @@ def test_command(fanuc, tmp_path):
     options += ["--json", names["json"], "--report", names["html"]]
     done = CliRunner().invoke(app, ["axes", str(folder / "sweeps.csv"), *map(str, options)])
     assert done.exit_code == 0, done.output
-    assert "refused D-H value of joints 2–3: foot 59" in done.output
+    assert "D-H value of joints 2–3 refused: foot 59" in done.output
     assert "1075.57" in done.output
     again = load_robot(names["toml"])
     assert again.rows[1].a == result.robot.rows[1].a

@@ -8,7 +8,7 @@ import pytest
 from stcal.geometry.rigid import Rigid
 from stcal.robot import forward, read_measurements
 from stcal.robot.identification.prior import DOWN, HEAVIER, MOMENT, usual
-from stcal.robot.identification.report import identified_file, identified_text
+from stcal.robot.identification.report import identified_file, identified_report
 from stcal.robot.identification.result import Identified, IdentifyOptions, require_identified_written
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import USUAL, Conditions
@@ -17,7 +17,7 @@ from stcal.robot.kinematics.forward import joint_frames
 from stcal.robot.kinematics.model import Chain, Elasticity, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import evaluate
-from stcal.robot.use.report import notes
+from stcal.robot.use.report import evaluation_report
 from tests.outcome import fails_with
 from tests.support.arms import elastic
 
@@ -229,7 +229,7 @@ def test_files_of_measurements_say_what_was_carried(tmp_path):
     result = evaluate({"true": true, "drawn": mh80()}, read)
     errors = [each.errors_mm for each in result.robots]
     assert errors[0].mean() < 0.12 < errors[1].mean()
-    assert any(note.startswith("robot drawn is rigid, payload_kg moves nothing") for note in notes(result))
+    assert "\nrobot drawn is rigid, payload_kg moves nothing" in evaluation_report(result).text()
     for text, message in (
         ("-1", "E-PAYLOAD-VALUE … line 2 … payload_kg … -1 … 10000"),
         ("nan", "E-TABLE-NUMBER … payload_kg … 'nan'"),
@@ -263,7 +263,7 @@ def test_hysteresis_is_found_where_rows_say_from_where_joints_came():
     assert np.abs((own - half) / sigma).max() < 3.5
     assert sigma[:3].max() < 2e-5
     assert found.weighting.sigma_mm == pytest.approx(0.05, rel=0.3)
-    assert "hysteresis" in identified_text(found, mh80())
+    assert "hysteresis" in identified_report(found, mh80()).text()
     assert identified_file(found, mh80()).elasticity.joints[0].hysteresis_rad == pytest.approx(own[0])
     rigid = identify(mh80(), data, IdentifyOptions(folds=0))
     assert "the direction from which joint" in rigid.left[0].what

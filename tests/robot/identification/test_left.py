@@ -7,7 +7,7 @@ import pytest
 
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.adjustment import Weighting
-from stcal.robot.identification.report import identified_file, identified_page, identified_text
+from stcal.robot.identification.report import identified_file, identified_report
 from stcal.robot.identification.residuals import State, jacobian, observed
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
@@ -202,13 +202,13 @@ def test_identify_says_it_in_notes_file_and_page():
     sentence = found.left[0].sentence()
     assert "the angle of joint 3, once a turn" in sentence
     assert sentence in found.notes
-    assert f"note: {sentence}" in identified_text(found, nominal)
-    assert sentence.split(":")[0] in identified_page(found, nominal).split('id="left"')[1]
+    assert f"note: {sentence}" in identified_report(found, nominal).text()
+    assert sentence.split(":")[0] in identified_report(found, nominal).page().split('id="left"')[1]
     assert identified_file(found, nominal).content()["left"][0]["joint"] == 3
     clean = identify(mh80(), simulated(3, 40)[1], QUICK)
     assert clean.left == ()
     assert not any("residuals go with" in note for note in clean.notes)
-    assert "Nothing is seen that the residuals go with" in identified_page(clean, mh80())
+    assert "Nothing is seen that the residuals go with" in identified_report(clean, mh80()).page()
 
 
 @pytest.mark.full

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.prior import dh_values
-from stcal.robot.identification.report import identified_file, identified_page, identified_text
+from stcal.robot.identification.report import identified_file, identified_report
 from stcal.robot.identification.residuals import jacobian, moved, observed, residuals, tips
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
@@ -232,7 +232,7 @@ def test_an_outlier_is_named_and_does_no_harm():
     assert [row for row, _ in spoilt.outliers()] == [17]
     change = [abs(a.a - b.a) for a, b in zip(clean.robot.rows, spoilt.robot.rows, strict=True)]
     assert max(change) < 0.05  # of σ about 0.03 mm; 5 mm in one of 50 rows would make tenths of a mm
-    assert "line 19" in identified_text(spoilt, mh80())
+    assert "line 19" in identified_report(spoilt, mh80()).text()
     assert spoilt.weighting.sigma_mm == pytest.approx(clean.weighting.sigma_mm, rel=0.05)
 
 
@@ -257,7 +257,7 @@ def test_report_and_json_hold_the_result():
     assert len(content["covariance"]) == 30
     assert content["held_out"]["mean_mm"] == pytest.approx(float(found.held_out.position_mm.mean()))
     assert content["held_out"]["max_mm"] >= content["held_out"]["mean_mm"] > content["errors"]["identified"]["mean_mm"]
-    html = identified_page(found, mh80())
+    html = identified_report(found, mh80()).page()
     assert f"{content['held_out']['mean_mm']:.4f}" in html
 
 

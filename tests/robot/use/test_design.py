@@ -168,12 +168,12 @@ def test_same_seed_same_poses_within_limits_and_box():
 
 def test_what_no_pose_shows_is_left_out_and_told():
     """A tool on the last axis: two tilts of that axis look like two shifts."""
-    from stcal.robot.use.design import design_text
+    from stcal.robot.use.report import design_report
 
     result = design(mh80(), DesignOptions(count=20, candidates=200))
     assert (result.seen, result.parameters) == (25, 27)
     assert result.chosen.o3 > 0
-    assert "2 of 27 combinations of parameters move nothing" in design_text(result)
+    assert "2 of 27 combinations of parameters move nothing" in design_report(result, mh80()).text()
 
 
 def test_mistakes_are_named():

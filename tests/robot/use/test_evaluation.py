@@ -15,7 +15,7 @@ from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80
 from stcal.robot.simulated import joint_vectors, made, measured, placed
 from stcal.robot.use.evaluation import Figures, evaluate
-from stcal.robot.use.report import evaluated_csv, evaluated_text, evaluation_file, evaluation_page, names_of
+from stcal.robot.use.report import evaluated_csv, evaluation_file, evaluation_report, names_of
 from stcal.robot.use.verification import read_measured, verify
 from tests.outcome import fails_with
 from tests.robot.identification.test_solve import rokae
@@ -110,7 +110,7 @@ def test_the_better_robot_is_named_with_its_error(pair):
     errors = [each.errors_mm for each in pair.robots]
     assert difference.mm == pytest.approx((errors[0] - errors[1]).mean())
     assert difference.sigma_mm == pytest.approx((errors[0] - errors[1]).std(ddof=1) / np.sqrt(60))
-    assert "true is better than nominal: mean error " in evaluated_text(pair)
+    assert "true is better than nominal: mean error " in evaluation_report(pair).text()
 
 
 @pytest.mark.full
@@ -124,7 +124,7 @@ def test_equal_robots_are_told_apart_seldom():
     assert named <= 8
     same = evaluate({"a": true, "b": true}, seen(true, 1))
     assert same.best == ""
-    assert "a and b differ by no more than chance" in evaluated_text(same)
+    assert "a and b differ by no more than chance" in evaluation_report(same).text()
 
 
 def test_wrong_rows_are_named_and_not_fitted_to():
@@ -137,7 +137,7 @@ def test_wrong_rows_are_named_and_not_fitted_to():
     own = result.robots[1]
     assert own.errors_mm[~result.wrong] == pytest.approx(clean.errors_mm, abs=1e-6)
     assert own.errors_mm[7] == pytest.approx(30, abs=0.5)
-    text = evaluated_text(result)
+    text = evaluation_report(result).text()
     assert "no robot explains, with the least error that one leaves: line 9 (" in text
     assert "line 22 (" in text
     plain, robust = (line.split() for line in text.splitlines() if line.startswith(("true  ", "true, ")))
@@ -160,7 +160,7 @@ def test_what_a_file_leaves_is_said_and_whether_identification_takes_it_up():
     [found] = evaluate({"a": shifted}, seen(true, 5, 60)).robots
     assert [each.what for each in found.left][:1] == ["the zero of joint 3"]
     assert found.beyond == ()
-    text = evaluated_text(evaluate({"a": shifted}, seen(true, 5, 60)))
+    text = evaluation_report(evaluate({"a": shifted}, seen(true, 5, 60))).text()
     assert "a: residuals go with the zero of joint 3: " in text
     assert "a: parameters identified from these rows would leave nothing of that to be seen" in text
     [clean] = evaluate({"a": true}, seen(true, 5, 60)).robots
@@ -185,8 +185,8 @@ def test_distances_have_their_own_errors(refit):
     # two positions, the first in all: σ of one distance is √2 times a coordinate's
     assert 0.6 * SIGMA_MM < Figures.of(result.robots[0].errors_mm).rms < 2 * SIGMA_MM
     assert result.best == "a"
-    assert "49 distances" in evaluated_text(result)
-    assert "by distance" not in evaluation_page(result)
+    assert "49 distances" in evaluation_report(result).text()
+    assert "by distance" not in evaluation_report(result).page()
 
 
 @pytest.mark.slow
@@ -251,7 +251,7 @@ def test_file_and_page(pair):
     assert content["best"] == "true"
     assert content["robots"][1]["position_mm"]["rms"] == pytest.approx(Figures.of(pair.robots[1].errors_mm).rms)
     assert np.shape(content["robots"][0]["residuals"]) == (60, 3)
-    page = evaluation_page(pair)
+    page = evaluation_report(pair).page()
     assert "true is better than nominal" in page
     for said in ("Error of each row", "Residuals by joint", "Residuals in space", "outwards from the base"):
         assert said in page

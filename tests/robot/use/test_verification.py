@@ -8,7 +8,8 @@ import pytest
 
 from stcal.cli.main import main
 from stcal.geometry.rigid import Rigid
-from stcal.robot.use.verification import MeasuredPoses, read_measured, verification_file, verified_text, verify
+from stcal.robot.use.report import verification_report
+from stcal.robot.use.verification import MeasuredPoses, read_measured, verification_file, verify
 from tests.outcome import fails_with
 
 HEAD = "set,commanded_x_mm,commanded_y_mm,commanded_z_mm,x_mm,y_mm,z_mm"
@@ -58,7 +59,7 @@ def test_figures_by_hand(tmp_path):
         (np.linalg.norm(moved[i] - moved[j]) - np.linalg.norm(COMMANDED[i] - COMMANDED[j])) ** 2 for i, j in pairs
     ]
     assert before.pairs_rms_mm == pytest.approx(np.sqrt(np.mean(squares)))
-    text = verified_text(result)
+    text = verification_report(result).text()
     assert "RMS over all pairs depends less on any one" in text
     assert "0.3500" in text
     assert "71.4 %" in text

@@ -100,7 +100,7 @@ def test_command(stcal_sfm, small_run, budget, tmp_path):
     path, out = lengths_csv(tmp_path / "lengths.csv", budget, 1.5), tmp_path / "budget.json"
     code, text, _ = stcal_sfm("budget", small_run, "--check-lengths", path, "--lengths", small_run, "--json", out)
     assert code == 0
-    assert f"length test against {path}:" in text
+    assert f"length test against {path}: differs: 4 of 4" in text
     assert "differs: 4 of 4 lengths beyond U, by chance 1 in 22 is; largest |E_n| 1.50, up to 1.27 for 4" in text
     assert "agrees: 0 of " in text
     one, two = json.loads(out.read_text())["length_tests"]

@@ -12,7 +12,7 @@ from stcal.sfm.camera.calibrate import judged, of_chosen_model, require_model
 from stcal.sfm.camera.checks import choose_model, held_out
 from stcal.sfm.camera.file import CalibrationFile
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, closed_form, start_camera
-from stcal.sfm.camera.report import calibration_page, calibration_text
+from stcal.sfm.camera.report import calibration_report
 from tests.levels import sampled
 from tests.outcome import fails_with
 from tests.sfm.camera.test_intrinsics import BOARD, TRUE, calibrated, views_of
@@ -174,7 +174,7 @@ def result():
 @pytest.mark.slow
 def test_text_and_file_have_all_models(result):
     summary = CalibrationFile.of(result)
-    text = calibration_text(result, summary)
+    text = calibration_report(result, summary, "images").text()
     assert re.search(r"views held out, 5 parts: residual RMS 0\.0\d+ px after their poses were fitted", text)
     assert re.search(r"\* +OPENCV +8 +0\.0\d+ +0\.0000", text)
     assert [each.model for each in summary.models] == ["SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV"]
@@ -183,7 +183,7 @@ def test_text_and_file_have_all_models(result):
 
 @pytest.mark.slow
 def test_the_page_shows_sigma_and_models(result):
-    page = calibration_page(result, CalibrationFile.of(result), "images")
+    page = calibration_report(result, CalibrationFile.of(result), "images").page()
     assert page.count("data:image/svg+xml") == 4
     for words in ("σ of a projection over the image", "difference of two halves", "Lens models", "SIMPLE_RADIAL"):
         assert words in page

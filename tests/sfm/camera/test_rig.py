@@ -15,7 +15,7 @@ from stcal.labels import DotLabel
 from stcal.sfm.adjust.refine import moved_poses
 from stcal.sfm.camera.equations import Setting, derivatives
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, design_shapes, model_parameters
-from stcal.sfm.camera.report import rig_page, rig_text
+from stcal.sfm.camera.report import rig_report
 from stcal.sfm.camera.rig import _sightings, _start, adjust_rig, calibrate_rig, gathered, symmetries
 from stcal.workflows.calibrate_camera import Models, camera_names, files_of
 from tests.outcome import fails_with
@@ -220,12 +220,12 @@ def test_files(pair, rig, tmp_path):
     first_to_second = np.array(chain["cam1"]["T_cn_cnm1"])
     assert first_to_second[:3, 3] * 1e3 == pytest.approx(seen.sits[1].translation, abs=0.1)
     assert read_lens(tmp_path / "camchain.yaml", "cam1").focal == pytest.approx(camera.focal)
-    assert "right_from_left" in rig_text(rig)
+    assert "right_from_left" in rig_report(rig, "photographs").text()
 
 
 @pytest.mark.slow
 def test_page(rig):
-    page = rig_page(rig, "photographs")
+    page = rig_report(rig, "photographs").page()
     assert page.count("data:image/svg") == 6  # two of the rig, two of each camera
     assert "right_from_left" in page
 

@@ -19,7 +19,7 @@ from stcal.sfm.checks.culprits import culprits
 from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS, Trial, judge
 from stcal.sfm.pipeline import run
-from stcal.sfm.report.page import checks_values, count_verdicts
+from stcal.sfm.report.checks import checks_section, count_verdicts
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, render
@@ -297,7 +297,7 @@ def test_a_run_of_photographs_passes(small_run):
     assert len({check["key"] for check in checks}) == len(checks) == 20
     assert all(set(check) == set(checks[0]) for check in checks)
     assert "19 " not in count_verdicts([check["verdict"] for check in checks])
-    assert "not possible" in checks_values(checks)["verdicts"]
+    assert "not possible" in checks_section(checks)[0]
 
 
 @pytest.mark.slow

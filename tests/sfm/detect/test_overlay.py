@@ -84,5 +84,5 @@ def test_a_long_name_is_cut_to_one_of_its_own():
     for path, name in zip(paths, long, strict=True):
         assert 190 < len(path.name.encode()) <= 204
         assert path.name[:80] == name[:80]
-    assert overlay_path(Path("out"), "12/a.jpg") == Path("out/overlays/12/a.jpg.jpg")
-    assert overlay_path(Path("out"), "a.jpg") == Path("out/overlays/a.jpg.jpg")
+    assert overlay_path(Path("out"), "12/a.jpg") == Path("out/overlays/12/a.jpg")
+    assert overlay_path(Path("out"), "a.png") == Path("out/overlays/a.png.jpg")

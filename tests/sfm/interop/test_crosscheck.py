@@ -596,7 +596,7 @@ SPOILT_REPORTS = {
         "of another version (no 'scene')",
     ),
     "damaged": (lambda run: edit(run, lambda report: report.update(faces=[1])), "damaged, or of another version"),
-    "without an overlay": (lambda run: (run / "overlays/12/IMG_1000.jpg.jpg").unlink(), "IMG_1000.jpg.jpg: No such"),
+    "without an overlay": (lambda run: (run / "overlays/12/IMG_1000.jpg").unlink(), "IMG_1000.jpg: No such"),
 }
 
 
@@ -616,7 +616,7 @@ def test_a_report_that_cannot_be_added_to(own_run, refused_page_and_all, tmp_pat
 
 def test_no_half_of_a_report(own_run):
     """Should an overlay go meanwhile, neither file is written."""
-    (own_run / "overlays/12/IMG_1000.jpg.jpg").unlink()
+    (own_run / "overlays/12/IMG_1000.jpg").unlink()
     before = state_of(own_run)
     with pytest.raises(FileNotFoundError):
         write_report(own_run, load_run(own_run).report | {"notes": ["new"]}, own_run)

@@ -23,7 +23,7 @@ from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import project_circles
 from stcal.sfm.measurement.images import MeasureOptions, measure, measure_labelled
 from stcal.sfm.measurement.pose import NO_FACE, PoseOptions, pose_from_circles, resolved
-from stcal.sfm.measurement.report import measure_page, measure_text, poses_file
+from stcal.sfm.measurement.report import measure_report, poses_file
 from stcal.sfm.measurement.target import TargetCircles, read_target
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.levels import FULL
@@ -210,7 +210,7 @@ def test_the_page_shows_every_pose_and_what_was_left_out(scene, known):
     ]
     result = measure_labelled(images, scene.camera, known.truth)
     result = replace(result, left_out=(Skipped("b.jpg", "no face of the target recognised", "pose"),))
-    html = measure_page(result, "some folder")
+    html = measure_report(result, "some folder").page()
     rows = re.findall(r'<tr><th scope="row" class="l">(.*?)</th>(.*?)</tr>', html)
     assert [name for name, _ in rows] == ["&lt;a&gt;/0", "&lt;a&gt;/1", "&lt;a&gt;/2", "&lt;a&gt;/3", "b.jpg"]
     for (_, cells), each in zip(rows, result.images, strict=False):
@@ -220,7 +220,7 @@ def test_the_page_shows_every_pose_and_what_was_left_out(scene, known):
     assert "no face of the target recognised" in rows[-1][1]
     assert html.count("<img") == 3
     assert "ambiguous: two poses fit" in html
-    assert measure_page(result, "some folder") == html
+    assert measure_report(result, "some folder").page() == html
 
 
 def test_derivatives_of_the_ellipse_centres(scene, known):
@@ -580,7 +580,7 @@ def test_the_table_fits_into_80_columns(scene, known):
     images = [see(scene, view(faces_view(scene, ("1", "2")), 0.3, 9000, rng), ("1", "2"), 0.02, rng) for _ in range(2)]
     named = [replace(image, name=f"{k:04}.jpg") for k, image in enumerate(images)]
     result = measure_labelled(named, scene.camera, known.truth)
-    head, *rows = measure_text(result).splitlines()[:3]
+    head, *rows = measure_report(result, "images").text().splitlines()[2:5]
     assert [head.split()[:3], len(head)] == [["image", "faces", "n"], len(rows[0])]
     assert len(head) <= 80
     assert [row.split()[0] for row in rows] == ["0000.jpg", "0001.jpg"]

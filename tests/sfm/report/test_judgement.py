@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from stcal.report.document import tone_of
 from stcal.report.page import environment
 from stcal.sfm import checks
 from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS
@@ -241,7 +242,7 @@ def test_the_intrinsics_are_no_premise_where_they_were_adjusted():
 def test_the_page_has_the_same_sentences(stored):
     own = report()
     page = report_html(judged(own) if stored else own, {})
-    answers = environment().globals["answers"](judgement_of(own).answers(), "#1b7837")
+    answers = environment().globals["answers"](judgement_of(own).answers(), tone_of(judgement_of(own).verdict))
     assert str(answers) in page
     assert CHANCE.replace("'", "&#39;") in page
 

@@ -684,7 +684,7 @@ def test_a_group_with_an_odd_name(small_set, stcal_sfm):
     (small.images / "12").rename(small.images / "Gruppe „12“ & <b>")
     out = assert_success(stcal_sfm(*small.arguments(*CHAIN)))
     assert "group Gruppe „12“ & <b>: 4 images" in out
-    assert (small.out / "overlays" / "Gruppe „12“ & <b>" / "IMG_1003.jpg.jpg").exists()
+    assert (small.out / "overlays" / "Gruppe „12“ & <b>" / "IMG_1003.jpg").exists()
 
 
 def to_exif(path: Path) -> None:

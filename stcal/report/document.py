@@ -1,0 +1,319 @@
+"""A report that a system writes once: lines for the terminal, and a page.
+
+A block is a sentence, a :class:`Table`, :class:`Notes`, or :class:`Html`, which a page alone has. A block without
+content, such as None or a table without rows, is left out, and so is a section without blocks.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from stcal.parallel import one_thread
+from stcal.report.figure import uri
+from stcal.report.text import NONE, join, text_table
+
+MOST_ROWS, MOST_PRINTED = 500, 60
+"""Largest number of rows of a table on a page, and on the terminal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table, on the terminal and on a page.
+
+    Parameters
+    ----------
+    heads : of the columns; ``<`` before a head aligns its column to the left
+    rows : cells; the first one is the head of its row
+    over : heads above the heads, each with the number of columns that it spans
+    css : ``text`` if cells hold sentences, ``text facts`` for names and values without heads
+
+    Of many rows only the first ones are shown, and their number is told; result files have all.
+    """
+
+    heads: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    over: Sequence[tuple[str, int]] = ()
+    css: str = ""
+
+    def __bool__(self) -> bool:
+        return len(self.rows) > 0
+
+    def lines(self) -> list[str]:
+        """Return the lines of the table; a head above others stands in front of each of them."""
+        if "facts" in self.css:
+            return [f"{name}: {value}" for name, value in self.rows if value != NONE]
+        above = [text for text, span in self.over for _ in range(span)] or [""] * len(self.heads)
+        heads = [
+            ("<" if head.startswith("<") else "") + f"{text} {head.removeprefix('<')}".strip()
+            for text, head in zip(above, self.heads, strict=True)
+        ]
+        lines = text_table([heads, *([str(cell) for cell in row] for row in self.rows[:MOST_PRINTED])])
+        more = len(self.rows) - MOST_PRINTED
+        return [*lines, f"… and {more} more rows; result files have all"] if more > 0 else lines
+
+    def __html__(self) -> str:
+        table = _macro("table", self.heads, self.rows[:MOST_ROWS], self.over, self.css)
+        count = len(self.rows)
+        told = f"The first {MOST_ROWS} of {count} rows; result files have all" if count > MOST_ROWS else ""
+        return html(told) + table
+
+
+@dataclass(frozen=True, slots=True)
+class Notes:
+    """Remarks: a list on the page, lines that begin with ``note:`` on the terminal."""
+
+    texts: Sequence[str]
+
+    def __bool__(self) -> bool:
+        return len(self.texts) > 0
+
+    def lines(self) -> list[str]:
+        """Return a line for each remark."""
+        return [f"note: {text}" for text in self.texts]
+
+    def __html__(self) -> str:
+        return _macro("bullets", [sentence(text) for text in self.texts])
+
+
+@dataclass(frozen=True, slots=True)
+class Html:
+    """Markup for the page alone. ``make`` : writes it, and draws its figures, when the page is written."""
+
+    make: Callable[[], str]
+
+    def __html__(self) -> str:
+        return self.make()
+
+
+TONES = {
+    "passed": ("passed", "good", "accept", "yes"),
+    "care": ("suspicious", "use with care", "ambiguous", "with care"),
+    "failed": ("failed", "do not use", "reject", "no"),
+    "open": ("not possible",),
+}
+"""Words of verdicts that look alike on a page."""
+
+
+def tone_of(word: str) -> str:
+    """Return the tone in which a page has a verdict."""
+    return next(tone for tone, words in TONES.items() if word in words)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The word of a verdict, for a cell."""
+
+    word: str
+
+    def __str__(self) -> str:
+        return self.word
+
+    def __html__(self) -> str:
+        return _macro("verdict", self.word, tone_of(self.word))
+
+
+@dataclass(frozen=True, slots=True)
+class Swatch:
+    """A word for a cell, with a patch of its colour before it."""
+
+    text: str
+    colour: str
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __html__(self) -> str:
+        return _macro("swatch", self.text, self.colour)
+
+
+@dataclass(frozen=True, slots=True)
+class Printed:
+    """Lines for the terminal alone."""
+
+    content: Sequence[str]
+
+    def __bool__(self) -> bool:
+        return len(self.content) > 0
+
+    def lines(self) -> list[str]:
+        """Return the lines."""
+        return list(self.content)
+
+    def __html__(self) -> str:
+        return ""
+
+
+Block = str | Table | Notes | Printed | Html | None
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A section of a page.
+
+    ``terminal`` : whether its sentences and tables are printed too; ``name`` : by which links lead to it, made from its
+    heading if not given
+    """
+
+    heading: str
+    blocks: Sequence[Block]
+    terminal: bool = False
+    name: str = ""
+
+    def anchor(self) -> str:
+        """Return the name by which a link leads to the section."""
+        return self.name or re.sub(r"[^\w]+", "-", self.heading.lower()).strip("-")
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """A report: its title, a line on what it is about, and its sections, the answer first.
+
+    ``banner`` : blocks between title and contents; ``reload_s`` : time after which an open page loads itself again;
+    ``window`` : title of the browser's window if it is another one
+    """
+
+    title: str
+    about: str
+    sections: Sequence[Section]
+    banner: Sequence[Block] = ()
+    reload_s: float | None = None
+    window: str = ""
+
+    def page(self) -> str:
+        """Return the page, which opens offline."""
+        from stcal.report.page import environment
+
+        with one_thread():  # small matrices of figures, on which threads wait for each other
+            sections = [(each.anchor(), each.heading, html(*each.blocks)) for each in self.sections]
+            return (
+                environment()
+                .get_template("report/templates/base.html.jinja")
+                .render(
+                    title=self.title,
+                    about=self.about,
+                    banner=html(*self.banner),
+                    sections=[section for section in sections if section[2].strip()],
+                    reload_s=self.reload_s,
+                    window=self.window or self.title,
+                )
+            )
+
+    def text(self) -> str:
+        """Return the sections for the terminal; headings tell them apart where there are several."""
+        shown = {each.heading: list(_lines(each.blocks)) for each in self.sections if each.terminal}
+        shown = {heading: lines for heading, lines in shown.items() if lines}
+        lines = [self.about, *_lines(self.banner)]
+        for heading, content in shown.items():
+            lines += ["", *([heading] if heading and len(shown) > 1 else []), *content]
+        return "\n".join(lines)
+
+
+def _lines(blocks: Iterable[Block]) -> Iterator[str]:
+    """Yield the lines of sentences and tables; an empty line stands between a table and what is beside it."""
+    before: Block = None
+    for block in blocks:
+        if not block or isinstance(block, Html):
+            continue
+        if before and (isinstance(block, Table) or isinstance(before, Table)):
+            yield ""
+        yield from [block] if isinstance(block, str) else block.lines()
+        before = block
+
+
+def _macro(name: str, *values) -> str:
+    from stcal.report.page import environment
+
+    return environment().globals[name](*values)
+
+
+def html(*blocks: Block):
+    """Return blocks as markup: sentences as paragraphs, with a capital at their start and a full stop."""
+    from markupsafe import Markup, escape
+
+    from stcal.report.page import with_code
+
+    paragraph = Markup("<p>{}</p>")
+    return Markup("\n").join(
+        paragraph.format(with_code(sentence(block))) if isinstance(block, str) else escape(block)
+        for block in blocks
+        if block
+    )
+
+
+def sentence(text: str) -> str:
+    """Return a message as a sentence; symbols, file names and what ends in a colon keep their small letters."""
+    first = re.split(r"[\s,]", text, maxsplit=1)[0]
+    start = text[0].upper() if first.isascii() and first.isalpha() else text[0]
+    return start + text[1:] + ("" if text[-1] in ".!?:)" else ".")
+
+
+def macro(name: str, *values) -> Html:
+    """Return what a macro of ``macros.html.jinja`` writes; functions among ``values`` are called when it does."""
+    return Html(lambda: _macro(name, *(value() if callable(value) else value for value in values)))
+
+
+def page_only(*blocks: Block) -> Html | None:
+    """Return blocks that the terminal does not show."""
+    return Html(lambda: html(*blocks)) if any(blocks) else None
+
+
+def subheading(text: str) -> Html:
+    return macro("subheading", text)
+
+
+def fold(summary: str, *blocks: Block) -> Html | None:
+    """Return blocks behind a summary to click on."""
+    return Html(lambda: _macro("fold", summary, html(*blocks))) if any(blocks) else None
+
+
+def plot(draw: Callable[[], Any], alt: str, caption: str = "", css: str = "wide") -> Html:
+    """Return a figure with its caption.
+
+    ``draw`` : returns the figure, of matplotlib or as a data URI, when the page is written
+    """
+
+    def picture() -> str:
+        figure = draw()
+        return _macro("plot", figure if isinstance(figure, str) else uri(figure), alt, caption or alt, css)
+
+    return Html(picture)
+
+
+def plots(*figures: Html | None) -> Html | None:
+    """Return figures side by side where the page is wide enough."""
+    return Html(lambda: _macro("group", "plots", [html(*filter(None, figures))])) if any(figures) else None
+
+
+def columns(*parts: Sequence[Block], css: str = "columns") -> Html | None:
+    """Return parts, each of several blocks, side by side where the page is wide enough."""
+    return Html(lambda: _macro("group", css, [html(*part) for part in parts])) if parts else None
+
+
+def bullets(texts: Sequence[str]) -> Html | None:
+    return macro("bullets", texts) if texts else None
+
+
+def alarms(texts: Sequence[str]) -> Html | None:
+    return macro("alarms", texts) if texts else None
+
+
+def tiles(values: Sequence[tuple[str, str, str]]) -> Html:
+    """Return figures of the headline, each (value, unit, what it is)."""
+    return macro("tiles", values)
+
+
+def legend(colours: dict[str, str], title: str = "") -> Html | None:
+    """Return patches of colour with their meanings."""
+    return macro("legend", colours, title) if colours else None
+
+
+def links(pages: Iterable[tuple[str, str]]) -> Html:
+    """Return a list of links, each (address, words)."""
+    return macro("links", list(pages))
+
+
+def listed(what: str, values: Iterable) -> str:
+    """Return ``what: a, b, c``; nothing if there are no values."""
+    values = list(values)
+    return f"{what}: {join(values)}" if values else ""
