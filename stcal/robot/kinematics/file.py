@@ -324,8 +324,10 @@ def require_robot_written(path: str | Path, robot: Robot, chain: Chain | None = 
     """
     q = fixed_values(len(robot.rows))
 
+    tools = list(robot.tools)
+
     def values(robot: Robot, chain: Chain) -> np.ndarray:
-        poses = [carried_poses(robot.chain(), q, [name] * len(q)) @ robot.tool(name) for name in robot.tools]
+        poses = [carried_poses(robot.chain(), q, [name] * len(q)) @ robot.tool(name) for name in tools]
         rotation, origin = joint_frames(chain, q)
         along = rotation[..., 2]
         lines = np.concatenate([LEVER_MM * along, np.cross(origin, along)])

@@ -79,8 +79,9 @@ def stayed(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, found
 
 
 def _between(robot: Robot, limits: np.ndarray) -> Robot:
-    """Returns the robot with other limits (n, 2)."""
-    joints = (Joint(own.type, low, high) for own, (low, high) in zip(robot.joints, limits.tolist(), strict=True))
+    """Returns the robot with other limits (n, 2); those of a joint that cannot move differ in the last bit."""
+    low, high = limits[:, 0], np.maximum(limits[:, 1], np.nextafter(limits[:, 0], np.inf))
+    joints = (Joint(own.type, *ends) for own, *ends in zip(robot.joints, low.tolist(), high.tolist(), strict=True))
     return replace(robot, joints=tuple(joints))
 
 
