@@ -7,6 +7,7 @@
 
 import argparse
 import ast
+import functools
 import re
 import sys
 from collections.abc import Iterator
@@ -58,6 +59,7 @@ def errors_in(source: str) -> Iterator[tuple[str, str, str]]:
                 yield ast.unparse(node.func), str(code.value), sentence(text)
 
 
+@functools.cache
 def all_errors() -> list[tuple[str, str, str]]:
     """:func:`errors_in` of all modules of the package."""
     sources = (path.read_text(encoding="utf-8") for path in sorted((ROOT / "stcal").rglob("*.py")))

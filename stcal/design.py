@@ -1,18 +1,30 @@
 """Designs of the hardware: the target's faces and circles, and the dot board. Their files: ``io/design.py``."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, freeze
+from stcal.geometry.arrays import Array, freeze, require_choices
 from stcal.geometry.rigid import Rigid
-from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
+from stcal.labels import BOARD, CircleLabel, DotLabel, Label, dot_cells
+from stcal.lengths import Length, radius, require_millimetres, side
+from stcal.lookalikes import MAX_GAP, MAX_RADIUS_RATIO, Likeness, whole_likeness
 
 Polarity = Literal["bright", "dark"]
+POINT_RADIUS_MM = 1e-6
+"""Radius of a corner as a circle: it has no extent and therefore no eccentricity."""
+
+
+class Printed(Protocol):
+    """A board or tags printed on a face: what :mod:`stcal.boards` finds in images."""
+
+    def xy_mm(self) -> np.ndarray:
+        """Returns the corners, (n, 2) mm, in the frame of the board."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +37,12 @@ class FaceDesign:
     states none. Plans and simulations use it, a calibration does not;
     ``outline_mm`` : (k, 2) corners of its plate in order, face frame, for drawings, or None if the design states none;
     ``rim_mm`` : (n,) heights of the rims in front of the circles, negative for discs that stand out, or None if the
-    circles lie in the surface of the plate.
+    circles lie in the surface of the plate;
+    ``printed`` : the board or tags on the face, whose corners are the face's points (radii are then nearly zero), and
+    whose frame is the face frame, Z into the body; None for a face of circles;
+    ``sigma_mm`` : σ of a point's place in the plane about the design if the design is what the face was made by, as
+    print is; None if the design only names the points; ``size_sigma`` : relative σ of the printed size; ``of_tags`` :
+    whether the corners are those of tags, four by four, whose edges light and ink move.
     """
 
     id: str
@@ -38,10 +55,15 @@ class FaceDesign:
     rough_target_from_face: Rigid | None = None
     outline_mm: Array | None = None
     rim_mm: Array | None = None
+    printed: Printed | None = None
+    sigma_mm: float | None = None
+    size_sigma: float = 0.0
+    of_tags: bool = False
 
     def __post_init__(self):
         freeze(self, "xy_mm", (len(self.ids), 2), f"face {self.id}: circles")
         freeze(self, "radius_mm", (len(self.ids),), f"face {self.id}: radii")
+        require_face(self.ids, self.xy_mm, self.radius_mm, (self.origin, self.x, self.y), f"face {self.id}")
         if self.outline_mm is not None:
             freeze(self, "outline_mm", (None, 2), f"face {self.id}: outline")
         if self.rim_mm is not None:
@@ -51,14 +73,59 @@ class FaceDesign:
         """Returns the label ``face:circle`` of every circle, in order."""
         return [CircleLabel(self.id, circle) for circle in self.ids]
 
+    def places_mm(self, circles: Iterable[str]) -> np.ndarray:
+        """Returns the places of these circles, (n, 3), face frame."""
+        row = {circle: i for i, circle in enumerate(self.ids)}
+        return np.pad(self.xy_mm[[row[circle] for circle in circles]].reshape(-1, 2), ((0, 0), (0, 1)))
+
+    @property
+    def outward(self) -> Literal[1, -1]:
+        """1 if the face's Z points out of the body, −1 if it points into it, as the Z of boards and tags does."""
+        return 1 if self.printed is None else -1
+
+
+@dataclass(frozen=True, slots=True)
+class KnownDistance:
+    """A measured distance between two points of the target, mm, with its σ: a scale bar."""
+
+    first: CircleLabel
+    second: CircleLabel
+    mm: float
+    sigma_mm: float
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetDesign:
-    """Target: its faces, and whether its circles are brighter or darker than their surroundings."""
+    """Target: its faces, and whether its circles are brighter or darker than their surroundings.
+
+    ``unusual_size`` : whether radii that no hardware has in mm are meant as they stand;
+    ``distances`` : known distances between its points.
+    """
 
     name: str
     polarity: Polarity
     faces: tuple[FaceDesign, ...]
+    unusual_size: bool = False
+    distances: tuple[KnownDistance, ...] = ()
+
+    def __post_init__(self):
+        where = f"target {self.name}"
+        require_choices(self, where)
+        require_ids([face.id for face in self.faces], where)
+        circles = [face for face in self.faces if face.printed is None]
+        sizes = [(label, mm) for face in circles for label, mm in zip(face.labels(), face.radius_mm, strict=True)]
+        radii = [radius(f"radius_mm of circle {label}", float(mm)) for label, mm in sizes]
+        require_millimetres(radii, self.unusual_size, where)
+        require_distinct(circles, where)
+
+    @property
+    def has_scale(self) -> bool:
+        """True if the target itself tells its size: by printed faces, or by known distances."""
+        return bool(self.distances) or any(face.printed is not None for face in self.faces)
+
+    def with_faces(self, printed: bool) -> "TargetDesign":
+        """Returns the design with only the printed faces, or only the faces of circles."""
+        return replace(self, faces=tuple(face for face in self.faces if (face.printed is not None) == printed))
 
     def face(self, face_id: str) -> FaceDesign:
         """Returns the face with this id; raises InputError if there is none."""
@@ -119,7 +186,8 @@ class BoardDesign:
     """Board with a rectangular grid of dots; X along a row, Y down the columns, Z into the board, origin at dot (0, 0).
 
     ``corner`` : (row, column) of the one larger dot, with ``corner_radius_mm``, or None for a plain board.
-    ``sigma_mm`` : standard deviation of the dots' positions about the grid, per axis; ``stated`` : its stated size.
+    ``sigma_mm`` : standard deviation of the dots' positions about the grid, per axis; ``stated`` : its stated size;
+    ``unusual_size`` : whether a pitch or radius that no hardware has in mm is meant as it stands.
     """
 
     rows: int
@@ -131,6 +199,15 @@ class BoardDesign:
     corner: tuple[int, int] | None = None
     corner_radius_mm: float | None = None
     stated: StatedSize = StatedSize()
+    unusual_size: bool = False
+
+    def __post_init__(self):
+        require_choices(self, "board")
+        if not (np.isfinite(self.sigma_mm) and self.sigma_mm >= 0):
+            raise InputError("E-SIGMA-VALUE", f"board: sigma_mm {self.sigma_mm:g}; 0 or a positive number needed")
+        require_millimetres(board_lengths(self.pitch_mm, self.radius_mm), self.unusual_size, "board")
+        size = self.rows, self.columns, self.pitch_mm, self.radius_mm
+        require_board(*size, self.corner, self.corner_radius_mm, "board")
 
     def cells(self) -> np.ndarray:
         """Returns row and column of every dot, (rows·columns, 2), row-major."""
@@ -159,6 +236,192 @@ class BoardDesign:
     def radius_of(self) -> dict[DotLabel, float]:
         """Returns the radius in mm by label."""
         return dict(zip(self.labels(), self.radii_mm().tolist(), strict=True))
+
+
+MIN_SINE = 0.02
+"""Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
+
+
+def require_face(
+    ids: Sequence[str], xy: np.ndarray, radius: np.ndarray, frame: tuple[str, str, str], where: str
+) -> None:
+    """Refuses circles of a face that occur twice or overlap, and frame circles (origin, x, y) that give no frame.
+
+    Raises
+    ------
+    InputError
+        The message begins with ``where``.
+    """
+    _require_different(ids, f"{where}: circle id")
+    for key, circle in zip(("origin", "x", "y"), frame, strict=True):
+        if circle not in ids:
+            raise InputError(
+                "E-TARGET-FRAME", f"{where}: {key} circle {circle} is not among the circles {', '.join(ids)}"
+            )
+    if radius.min() <= 0:
+        raise InputError(
+            "E-TARGET-RADIUS",
+            f"{where}: circle {ids[int(radius.argmin())]} has a radius of {radius.min():g} mm; more needed",
+        )
+    gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
+    np.fill_diagonal(gap, np.inf)
+    if gap.min() <= 0:
+        i, j = np.unravel_index(gap.argmin(), gap.shape)
+        raise InputError("E-TARGET-OVERLAP", f"{where}: circles {ids[i]} and {ids[j]} overlap; move them apart")
+    origin, x, y = (xy[ids.index(circle)] for circle in frame)
+    length_x, length_y = np.linalg.norm(x - origin), np.linalg.norm(y - origin)
+    named = ", ".join(frame)
+    if min(length_x, length_y) == 0:
+        raise InputError("E-TARGET-FRAME", f"{where}: frame circles {named}; three different ones needed")
+    axis = (x - origin) / length_x
+    sine = float(axis[0] * (y - origin)[1] - axis[1] * (y - origin)[0]) / length_y
+    if abs(sine) < MIN_SINE:
+        raise InputError("E-TARGET-FRAME", f"{where}: frame circles {named} are collinear; choose three off one line")
+    if sine < 0:
+        raise InputError(
+            "E-TARGET-FRAME",
+            f"{where}: X to Y through {frame[1]} and {frame[2]} turns clockwise seen from outside; swap x and y, or "
+            "give positions as seen from outside with y up",
+        )
+
+
+def require_ids(ids: Sequence[str], where: str) -> None:
+    """Refuses ids of faces that occur twice, or that are the board's.
+
+    Raises
+    ------
+    InputError
+        The message begins with ``where``.
+    """
+    _require_different(ids, f"{where}: face id")
+    if BOARD in ids:
+        raise InputError("E-TARGET-ID", f"{where}: face id {BOARD} is taken by the board; choose another")
+
+
+def _require_different(ids: Sequence[str], what: str) -> None:
+    for i, value in enumerate(ids):
+        if value in ids[:i]:
+            raise InputError("E-TARGET-ID", f"{what} {value} occurs twice; ids must differ")
+
+
+def require_distinct(faces: Sequence[FaceDesign], where: str) -> None:
+    """Refuses faces that look alike in photographs, and a face that looks the same after a rotation.
+
+    Raises
+    ------
+    InputError
+        The message begins with ``where``.
+    """
+    for i, face in enumerate(faces):
+        for second in faces[i:]:
+            few, many = (face, second) if len(face.ids) <= len(second.ids) else (second, face)
+            patterns = (few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm)
+            like = _likeness(*(values.tobytes() for values in patterns), few is many)
+            if like is None:
+                continue
+            size = "" if abs(like.scale - 1) < 0.005 else f" at {like.scale:.2f} times the size"
+            deviation = f"places differ by up to {round(like.gap_mm, 3):g} mm, radii by {round(like.radius_mm, 3):g} mm"
+            if few is many:
+                finding = f"face {face.id} looks the same after a turn by {abs(np.degrees(like.turn_rad)):.0f}°"
+            elif len(few.ids) == len(many.ids):
+                finding = f"faces {face.id} and {second.id} have the same pattern{size}"
+            else:
+                finding = f"the {len(few.ids)} circles of face {few.id} are all on face {many.id} too{size}"
+            raise InputError(
+                "E-TARGET-LIKENESS",
+                f"{where}: {finding} ({deviation}); "
+                f"change a circle on {'it' if few is many else 'one of them'}, its place by more than "
+                f"{MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}",
+            )
+
+
+@lru_cache(maxsize=256)
+def _likeness(xy: bytes, radius: bytes, other_xy: bytes, other_radius: bytes, same: bool) -> Likeness | None:
+    """Returns the likeness of two patterns, given as the bytes of their arrays; designs are often made anew."""
+    places, radii, other_places, other_radii = map(np.frombuffer, (xy, radius, other_xy, other_radius))
+    in_place = np.arange(len(radii)) if same else None
+    return whole_likeness(places.reshape(-1, 2), radii, other_places.reshape(-1, 2), other_radii, in_place)
+
+
+def board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:
+    """Returns the lengths of a board of dots by which its unit is judged."""
+    return [side("pitch_mm", pitch_mm), radius("radius_mm", radius_mm)]
+
+
+def require_board(
+    rows: int,
+    columns: int,
+    pitch_mm: float,
+    radius_mm: float,
+    corner: tuple[int, int] | None,
+    corner_radius_mm: float | None,
+    where: str,
+) -> None:
+    """Refuses a grid of dots that is none, whose dots overlap, or whose larger dot is not larger or at no corner.
+
+    Raises
+    ------
+    InputError
+        The message begins with ``where``.
+    """
+    if min(rows, columns) < 1:
+        raise InputError("E-BOARD-SIZE", f"{where}: {rows} rows and {columns} columns; 1 or more of each needed")
+    if not 0 < 2 * radius_mm < pitch_mm:
+        raise InputError(
+            "E-BOARD-RADIUS", f"{where}: radius {radius_mm:g} mm, under half the pitch {pitch_mm:g} mm needed"
+        )
+    if corner is None:
+        return
+    if corner[0] not in (0, rows - 1) or corner[1] not in (0, columns - 1):
+        raise InputError(
+            "E-BOARD-CORNER", f"{where}: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed"
+        )
+    if corner_radius_mm is None or not 1.15 * radius_mm <= corner_radius_mm < pitch_mm - radius_mm:
+        raise InputError(
+            "E-BOARD-CORNER",
+            f"{where}: corner radius {corner_radius_mm} mm; at least {1.15 * radius_mm:g} mm and under "
+            f"{pitch_mm - radius_mm:g} mm needed",
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaleReference(BoardDesign):
+    """All that a run takes its scale from: the board if there is one, faces of known shape, known distances.
+
+    Without a board it has no dots: ``rows`` and ``columns`` are 0.
+    """
+
+    faces: tuple[FaceDesign, ...] = ()
+    distances: tuple[KnownDistance, ...] = ()
+
+    def __post_init__(self):
+        if self.rows:
+            BoardDesign.__post_init__(self)
+
+
+def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDesign:
+    """Returns the board, with the faces and distances of the target that tell its size if there are any."""
+    faces = tuple(face for face in target.faces if face.sigma_mm is not None)
+    if board is not None and not faces and not target.distances:
+        return board
+    if board is not None and type(board) is not BoardDesign:
+        raise InputError(
+            "E-BOARD-TYPE",
+            "--board: asymmetric circles beside a target that tells its own size; a board of dots needed, or none",
+        )
+    known = {} if board is None else {entry.name: getattr(board, entry.name) for entry in fields(BoardDesign)}
+    none = {"rows": 0, "columns": 0, "pitch_mm": 1.0, "radius_mm": 0.25, "polarity": "bright", "sigma_mm": 1.0}
+    return ScaleReference(**(known or none), faces=faces, distances=target.distances)
+
+
+def faces_of_known_shape(board: BoardDesign) -> tuple[FaceDesign, ...]:
+    """Returns the faces of known shape among what the scale is taken from."""
+    return board.faces if isinstance(board, ScaleReference) else ()
+
+
+def known_distances(board: BoardDesign) -> tuple[KnownDistance, ...]:
+    """Returns the known distances among what the scale is taken from."""
+    return board.distances if isinstance(board, ScaleReference) else ()
 
 
 @lru_cache(maxsize=4)

@@ -44,7 +44,7 @@ class InputError(StcalError):
 
 
 class InputNote(UserWarning):
-    """A part of an input file was passed over, and does not change the result as far as it is known."""
+    """A part of an input was passed over, or work was done another way; the result is the same as far as is known."""
 
 
 class DetectionError(StcalError):

@@ -8,10 +8,13 @@ import os
 import signal
 import sys
 import threading
+import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
+    CancelledError,
     Executor,
     Future,
     ProcessPoolExecutor,
@@ -23,13 +26,17 @@ from importlib import import_module
 from operator import itemgetter
 from typing import TypeVar
 
+from stcal.errors import InputNote
+
 R = TypeVar("R")
 Progress = Callable[[str, int, int], None]
 """Function that is called with (stage, done, total)."""
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Variables from which libraries read their number of threads when they are loaded; parallel processes set it to 1."""
-LOADED_ONCE = "stcal.sfm.pipeline"
-"""Module that is loaded, with all its imports, before processes are forked."""
+LOADED_ONCE = "stcal.one_thread", "stcal.sfm.pipeline"
+"""Modules that are loaded, with all their imports, before processes are forked."""
+LOOK_S = 0.05
+"""Interval at which a waiting call looks whether its result is still wanted, s."""
 _limited = threading.Lock()
 _one_starts = threading.Lock()
 
@@ -74,7 +81,8 @@ def run_parallel(
 
     Processes are forked from a server that has loaded the libraries and has no threads (forking a process with threads
     can hang). They are spawned if the system cannot fork. They do not import the caller's main module, so that a script
-    needs no ``if __name__ == "__main__"``. One worker, or one job, runs in this process.
+    needs no ``if __name__ == "__main__"``. One worker, or one job, runs in this process; so does all work within a
+    process of ``multiprocessing.Pool``, which may start no others: a note says so.
 
     Parameters
     ----------
@@ -88,12 +96,12 @@ def run_parallel(
     if executor is not None:
         yield from _handed_over(executor, function, jobs, at_once or len(jobs))
         return
-    workers = min(workers or os.cpu_count() or 1, len(jobs))
+    kept = _kept.get()
+    workers = min(kept.workers if kept else _number_of_processes(workers), len(jobs))
     if workers <= 1:
         for i, job in enumerate(jobs):
             yield i, function(*job)
         return
-    kept = _kept.get()
     with contextlib.nullcontext(kept) if kept else _Processes(workers) as processes:
         yield from processes.run(function, jobs)
 
@@ -121,12 +129,21 @@ def kept_processes(workers: int | None = None) -> Iterator[None]:
     if _kept.get():
         yield
         return
-    with _Processes(workers or os.cpu_count() or 1) as processes:
+    with _Processes(_number_of_processes(workers)) as processes:
         token = _kept.set(processes)
         try:
             yield
         finally:
             _kept.reset(token)
+
+
+def _number_of_processes(workers: int | None) -> int:
+    wanted = workers or os.cpu_count() or 1
+    if wanted > 1 and multiprocessing.current_process().daemon:
+        note = "a process of multiprocessing.Pool may start no others: one process works, more slowly"
+        warnings.warn(note, InputNote, stacklevel=2)
+        return 1
+    return wanted
 
 
 class _Processes:
@@ -144,7 +161,7 @@ class _Processes:
 
     def run(self, function: Callable[..., R], jobs: Sequence[tuple]) -> Iterator[tuple[int, R]]:
         """Yields index and result of each job, in any order."""
-        with _plain_main(), _deaf_to_interrupts():
+        with _starting():
             pool = self._start()
             futures = {pool.submit(function, *job): i for i, job in enumerate(jobs)}
         try:
@@ -159,7 +176,7 @@ class _Processes:
 
     def everywhere(self, function: Callable, arguments: tuple) -> None:
         """Starts the function once per process, as far as processes are idle."""
-        with _plain_main(), _deaf_to_interrupts():
+        with _starting():
             for _ in range(self.workers):
                 self._start().submit(function, *arguments)
 
@@ -209,18 +226,48 @@ class OwnProcess:
         self._begin = (begin, *arguments)
         self._guard = threading.Lock()
         self._pool: ProcessPoolExecutor | None = None
+        self._line: deque[object] = deque()
+        self._moved = threading.Condition()
 
-    def call(self, function: Callable[..., R], *arguments) -> R:
+    def call(self, function: Callable[..., R], *arguments, given_up: Callable[[], bool] | None = None) -> R:
         """Returns the result of the function in the process, after all earlier calls.
+
+        ``given_up`` : returns whether the result is no longer wanted, so that a call that still waits is cancelled
 
         Raises
         ------
         BrokenExecutor
             The process ended during the call; the next call starts another one.
+        CancelledError
+            The call was given up before it began.
         """
+        if given_up is None:
+            return self._called(function, *arguments)
+        with self._in_turn(given_up):
+            return self._called(function, *arguments)
+
+    @contextlib.contextmanager
+    def _in_turn(self, given_up: Callable[[], bool]) -> Iterator[None]:
+        """Waits for the end of earlier calls: an executor begins a second one early, which then cannot be given up."""
+        own = object()
+        with self._moved:
+            self._line.append(own)
+        try:
+            with self._moved:
+                while self._line[0] is not own and not given_up():
+                    self._moved.wait(LOOK_S)
+            if given_up():
+                raise CancelledError
+            yield
+        finally:
+            with self._moved:
+                self._line.remove(own)
+                self._moved.notify_all()
+
+    def _called(self, function: Callable[..., R], *arguments) -> R:
         with self._guard:
             if self._pool is None:
-                with _as_processes_start():
+                with _starting():
                     self._pool = ProcessPoolExecutor(1, _context(), initializer=_begin_own, initargs=self._begin)
                     pool, future = self._pool, self._pool.submit(function, *arguments)
             else:
@@ -247,27 +294,38 @@ def _begin_own(begin: Callable[..., object], *arguments) -> None:
 
 
 @contextlib.contextmanager
-def _as_processes_start() -> Iterator[None]:
+def _starting() -> Iterator[None]:
+    """Prepares the start of processes, by one thread at a time, and leaves all that it changes as it was."""
     with _one_starts, _plain_main(), _deaf_to_interrupts():
-        yield
+        undecided = multiprocessing.get_start_method(allow_none=True) is None
+        try:
+            yield
+        finally:
+            if undecided:  # the start of a process asks for the default method, which then could not be set any more
+                multiprocessing.set_start_method(None, force=True)
 
 
 def load_ahead(workers: int | None = None) -> None:
     """Starts the server of processes, which loads their libraries while this process goes on."""
-    if (workers or os.cpu_count() or 1) > 1 and _context().get_start_method() == "forkserver":
-        from multiprocessing.forkserver import ensure_running
-
-        with _plain_main(), _deaf_to_interrupts():
-            ensure_running()
+    if (workers or os.cpu_count() or 1) > 1:
+        with _starting():
+            _context()
 
 
 def _context() -> multiprocessing.context.BaseContext:
-    """Returns the way to start processes: a server without threads that has loaded the libraries, or spawn."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([LOADED_ONCE])  # without effect if a server is running
-    return context
+    """Returns the way to start processes: a server without threads that loads the libraries, which it starts, or spawn.
+
+    To be called within :func:`_starting`.
+    """
+    if "forkserver" in multiprocessing.get_all_start_methods():
+        from multiprocessing.forkserver import ensure_running
+
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload([*LOADED_ONCE])  # without effect if a server is running
+        with contextlib.suppress(ChildProcessError):  # the server is of the process that forked this one
+            ensure_running()
+            return context
+    return multiprocessing.get_context("spawn")
 
 
 def _handed_over(executor: Executor, function, jobs: Sequence[tuple], at_once: int) -> Iterator[tuple[int, R]]:
@@ -308,7 +366,11 @@ def _deaf_to_interrupts():
 
 
 def _follow_parent() -> None:
-    """Lets a worker leave Ctrl-C to the parent, which stops the pool in order, and end when the parent is killed."""
+    """Lets a worker leave Ctrl-C to the parent, which stops the pool in order, and end when the parent is killed.
+
+    Libraries that it loads have one thread.
+    """
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     if parent is None:
@@ -323,24 +385,22 @@ def _follow_parent() -> None:
 
 @contextlib.contextmanager
 def _plain_main():
-    """Hides the main module's file and the working folder from new processes, and limits their libraries to one thread.
+    """Hides the main module's file and the working folder from new processes.
 
     The working folder might hold files with the names of modules.
     """
     main = sys.modules["__main__"]
     hidden = {name: getattr(main, name) for name in ("__file__", "__spec__") if getattr(main, name, None) is not None}
-    variables: dict[str, str] = dict.fromkeys((*ONE_THREAD, "PYTHONSAFEPATH"), "1")
-    before = {name: os.environ.get(name) for name in variables}
+    before = os.environ.get("PYTHONSAFEPATH")
     for name in hidden:
         setattr(main, name, None)
-    os.environ.update(variables)
+    os.environ["PYTHONSAFEPATH"] = "1"
     try:
         yield
     finally:
         for name, value in hidden.items():
             setattr(main, name, value)
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        if before is None:
+            os.environ.pop("PYTHONSAFEPATH", None)
+        else:
+            os.environ["PYTHONSAFEPATH"] = before

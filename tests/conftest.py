@@ -84,6 +84,12 @@ def shared_data() -> Callable[[str], Path]:
 
 
 @pytest.fixture(scope="session")
+def shared_case(shared_data) -> Callable[[str], Path]:
+    """An input that was reported, by its folder in ``../shared/cases``; without it, skips the test."""
+    return lambda place: shared_data(f"../cases/{place}")
+
+
+@pytest.fixture(scope="session")
 def sample() -> Path:
     """Twelve rendered images of the reference target, with truth: see its README. Not to be written to."""
     return SAMPLE

@@ -11,12 +11,18 @@ import re
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 
 import pytest
 
 import stcal
 from stcal import errors
+from stcal.design import TargetDesign, reference_board, reference_target
 from stcal.errors import InputError
+from stcal.geometry.rigid import Poses, Rigid, Similarity
+from stcal.robot import DesignOptions, DHRow, IdentifyOptions, Joint, Robot
+from stcal.sfm import RunOptions
+from tests.outcome import fails_with
 
 SYSTEMS = ("sfm", "robot", "register", "handeye", "locate")
 
@@ -118,6 +124,71 @@ def test_names_that_are_not_loaded_yet_are_listed(module):
 def test_public_names_are_documented():
     found = {name: lacks(value) for name, value in PUBLIC.items()}
     assert {name: missing for name, missing in found.items() if missing} == {}
+
+
+# --- what constructors refuse, like the readers of files ---
+
+FACE, TWO = reference_target().faces[:2]
+ROW = DHRow(100.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "error"),
+    [
+        (lambda: Joint("Prismatic"), "E-OPTION-VALUE … 'Prismatic' … revolute or prismatic"),
+        (lambda: Joint(lower=1.0, upper=-1.0), "E-ROBOT-LIMITS … 1 … -1"),
+        (lambda: Joint(fixed={"alpha_deg": "why"}), "E-ROBOT-FIXED … alpha_deg … alpha"),
+        (lambda: DHRow(float("nan"), 0, 0, 0), "E-ROBOT-ROW … a … nan"),
+        (lambda: DHRow(0, "0", 0, 0), "E-ROBOT-ROW … alpha … '0'"),
+        (lambda: Robot("a", "Modified", (ROW,), (Joint(),)), "E-OPTION-VALUE … robot a … 'Modified'"),
+        (lambda: Robot("a", "modified", ((1, 2, 3, 4),), (Joint(),)), "E-ROBOT-ENTRIES … DHRow"),
+        (lambda: Robot("a", "modified", (DHRow(0.4, 0, 0.1, 0),), (Joint(),)), "E-LENGTH-UNIT … 0.4 mm … metres"),
+        (lambda: TargetDesign("t", "black", (FACE,)), "E-OPTION-VALUE … 'black' … bright or dark"),
+        (lambda: TargetDesign("t", "dark", (FACE, replace(FACE, id="9"))), "E-TARGET-LIKENESS … 1 … 9"),
+        (lambda: TargetDesign("t", "dark", (FACE, replace(TWO, id="1"))), "E-TARGET-ID … 1"),
+        (lambda: TargetDesign("t", "dark", (replace(FACE, id="board"),)), "E-TARGET-ID … board"),
+        (
+            lambda: TargetDesign("t", "dark", (replace(FACE, xy_mm=FACE.xy_mm / 1e3, radius_mm=FACE.radius_mm / 1e3),)),
+            "E-LENGTH-UNIT … metres",
+        ),
+        (lambda: replace(FACE, ids=FACE.ids[:-1]), "E-ARRAY-SHAPE … face 1"),
+        (lambda: replace(FACE, ids=("1", *FACE.ids[:-1])), "E-TARGET-ID … face 1: circle id 1"),
+        (lambda: replace(FACE, x="z"), "E-TARGET-FRAME … z"),
+        (lambda: replace(FACE, x=FACE.y, y=FACE.x), "E-TARGET-FRAME … clockwise"),
+        (lambda: replace(FACE, radius_mm=5 * FACE.radius_mm), "E-TARGET-OVERLAP … face 1"),
+        (lambda: replace(FACE, radius_mm=0 * FACE.radius_mm), "E-TARGET-RADIUS … 0 mm"),
+        (lambda: replace(reference_board(), polarity="black"), "E-OPTION-VALUE … 'black'"),
+        (lambda: replace(reference_board(), radius_mm=15.0), "E-BOARD-RADIUS … 15 mm … 30 mm"),
+        (lambda: replace(reference_board(), pitch_mm=0.03, radius_mm=0.01), "E-LENGTH-UNIT … 0.03 mm"),
+        (lambda: replace(reference_board(), rows=0), "E-BOARD-SIZE … 0 rows"),
+        (lambda: replace(reference_board(), corner=(1, 1), corner_radius_mm=9.0), "E-BOARD-CORNER … row 1"),
+        (lambda: replace(reference_board(), corner=(0, 0)), "E-BOARD-CORNER … None"),
+        (lambda: replace(reference_board(), sigma_mm=-1.0), "E-SIGMA-VALUE … -1"),
+        (lambda: RunOptions(solve="Joint"), "E-OPTION-VALUE … solve 'Joint' … joint"),
+        (lambda: RunOptions(graph="some"), "E-OPTION-VALUE … graph 'some' … sparse"),
+        (lambda: IdentifyOptions(model="stiff"), "E-OPTION-VALUE … model 'stiff'"),
+        (lambda: DesignOptions(observe="poses"), "E-OPTION-VALUE … observe 'poses'"),
+    ],
+)
+def test_constructors_are_as_strict_as_readers_of_files(make, error):
+    with fails_with(error):
+        make()
+
+
+# --- how results look in a notebook, and when transforms are equal ---
+
+
+def test_transforms_are_equal_by_value():
+    turned = Rigid.exp([0.1, 0, 0, 1, 2, 3])
+    assert Rigid() == Rigid()
+    assert turned == Rigid(turned.rotation, turned.translation) != Rigid()
+    assert (
+        len({turned, Rigid(turned.rotation, turned.translation), Rigid(), Rigid([[1, 0, 0], [0, 1, -0.0], [0, 0, 1]])})
+        == 2
+    )
+    assert Poses.of([turned, Rigid()]) == Poses.of([turned, Rigid()]) != Poses.of([Rigid(), turned])
+    assert Similarity(2.0, turned) == Similarity(2.0, turned) != Similarity(2.0, Rigid())
+    assert Rigid() != "identity"
 
 
 # --- the checker itself ---

@@ -1,9 +1,10 @@
 """Who may import whom, folder by folder, and where heavy libraries belong: read from the source with ``ast``."""
 
 import ast
+import functools
 import importlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -16,9 +17,9 @@ MOST_ENTRIES = 16
 """Of ``sfm/``, folders and files."""
 
 LAYERS = (
-    ("errors", "parallel", "cross_validation"),
+    ("errors", "parallel", "one_thread", "cross_validation", "row_order"),
     ("geometry",),
-    ("design", "labels", "lookalikes"),
+    ("design", "labels", "lookalikes", "lengths"),
     ("io",),
     ("boards", "report"),
     ("synthetic", "drawing"),
@@ -40,7 +41,7 @@ INSIDE = {
         ("interop", "diagnose", "planning", "budget", "make"),
         (".",),
     ),
-    "robot": (("kinematics",), ("identification", "axes", "urdf"), ("use",), ("export",), (".",)),
+    "robot": (("kinematics",), ("identification", "urdf"), ("axes",), ("use",), ("export",), (".",)),
     "register": (("core",), ("judge", "workspace"), (".",), ("report",)),
     "handeye": (("data",), ("methods",), ("judge",), (".",), ("rig",), ("report",)),
     "locate": (("data",), ("pose", "calibration"), (".",), ("report",)),
@@ -55,7 +56,7 @@ LIBRARIES = {
     "pycolmap": ("sfm/mapping", "sfm/interop"),
     "sqlite3": ("sfm/mapping", "sfm/interop", "io/cameras/foreign.py"),
     "cv2": (
-        *("io/images.py", "boards", "sfm/detect", "sfm/diagnose", "synthetic"),
+        *("io/images.py", "io/photographs", "boards", "sfm/detect", "sfm/diagnose", "synthetic"),
         *("io/device.py", "io/cameras/foreign.py", "handeye/methods/closed_form.py", "sfm/mapping/pairs.py"),
     ),
 }
@@ -63,13 +64,14 @@ LIBRARIES = {
 GEOMETRY_USES = {"numpy", "scipy", "dataclasses", "typing", "collections", "math", "functools", "itertools"}
 
 
-def imports_in(source: str, module: str) -> set[str]:
+@functools.cache
+def imports_in(source: str, module: str) -> frozenset[str]:
     """Absolute dotted names that a module imports, wherever in it; ``from a import b`` gives ``a`` and ``a.b``."""
-    found = set()
+    found: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) == "import_module":
             found |= {argument.value for argument in node.args[:1] if isinstance(argument, ast.Constant)}
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
@@ -77,7 +79,12 @@ def imports_in(source: str, module: str) -> set[str]:
                 package = module.split(".")[: -node.level]
                 base = ".".join([*package, *([base] if base else [])])
             found |= {f"{base}.{alias.name}" for alias in node.names} | ({base} if base.count(".") != 0 else set())
-    return found
+    return frozenset(found)
+
+
+def module_of(path: str) -> str:
+    """``stcal.sfm.detect.faces`` of ``sfm/detect/faces.py``."""
+    return "stcal." + path.removesuffix(".py").replace("/", ".")
 
 
 def place_of(path: str) -> str:
@@ -130,7 +137,7 @@ def forbidden(path: str, target: str) -> str:
     return ""
 
 
-def violations(path: str, imports: set[str]) -> list[str]:
+def violations(path: str, imports: Collection[str]) -> list[str]:
     """What in ``imports`` the file at ``path`` (below ``stcal/``) may not import, with the reason."""
     targets = {target_of(name) for name in imports} - {None}
     bad = [why for target in sorted(targets) if (why := forbidden(path, target))]
@@ -153,7 +160,7 @@ def test_the_source_is_found():
 
 def violations_of(path: str, source: str) -> list[str]:
     """:func:`violations` of a file with this content."""
-    return violations(path, imports_in(source, "stcal." + path.removesuffix(".py").replace("/", ".")))
+    return violations(path, imports_in(source, module_of(path)))
 
 
 def test_imports_go_one_way():
@@ -188,7 +195,7 @@ def circle(sources: Mapping[str, str]) -> list[str]:
     ----------
     sources : contents of files by their paths below ``stcal/``
     """
-    files = {path: f"stcal.{path.removesuffix('.py').replace('/', '.')}" for path in sources}
+    files = {path: module_of(path) for path in sources}
     modules = {path: name.removesuffix(".__init__") for path, name in files.items()}
     graph = {modules[path]: imports_in(sources[path], name) & set(modules.values()) for path, name in files.items()}
     try:

@@ -48,6 +48,7 @@ def test_a_size_that_the_file_does_not_state_is_asked_for(folder):
         call("convert", folder / "a.txt", folder / "b.json")
 
 
+@pytest.mark.slow
 def test_what_is_shown_is_the_cameras(folder):
     """Field of view of a lens without distortion: 2 atan(640 / 900) across."""
     plain = Camera(1280, 960, [900.0, 900.0], [639.5, 479.5], np.zeros(8))

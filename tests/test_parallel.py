@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 import time
+import warnings
+from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 import pytest
@@ -28,7 +30,7 @@ BEGIN = """
 import threading
 import numpy, scipy.linalg
 from threadpoolctl import threadpool_info
-from stcal.parallel import one_thread, run_parallel
+from stcal.parallel import kept_processes, one_thread, run_parallel
 from tests.test_parallel import threads
 def say():
     print(*{library["num_threads"] for library in threadpool_info()}, end=" ")
@@ -71,6 +73,54 @@ except ValueError:
     say()
 """
 
+NOTHING_LEFT = """
+import asyncio, ctypes, multiprocessing, os, signal, sys, warnings
+
+system = ctypes.CDLL(None)
+def handler_of(number):
+    action = ctypes.create_string_buffer(1024)
+    system.sigaction(int(number), None, action)
+    restorer = 0x04000000  # of the C library, which sets it with whatever handler
+    return action.raw[:16], int.from_bytes(action.raw[136:140], "little") & ~restorer  # with the mask's filled part
+def state():
+    main = sys.modules["__main__"]
+    return {
+        "environment": dict(os.environ),
+        "main": (getattr(main, "__file__", None), main.__spec__),
+        "handlers": {n: (signal.getsignal(n), handler_of(n)) for n in signal.valid_signals()},
+        "start method": multiprocessing.get_start_method(allow_none=True),
+        "warnings": list(warnings.filters),
+        "threads": sorted((each["filepath"], each["num_threads"]) for each in threadpool_info() if each in known),
+    }
+@one_thread()
+def work(fails=False):
+    with kept_processes(2):
+        dict(run_parallel(pow, [(2, 3)] * 4))
+        import stcal.sfm.mapping.colmap
+        if fails:
+            raise ValueError
+def in_threads():
+    both = [threading.Thread(target=work) for _ in range(2)]
+    [each.start() for each in both]
+    [each.join() for each in both]
+def failing():
+    try:
+        work(fails=True)
+    except ValueError:
+        pass
+answered = []
+signal.signal(signal.SIGTERM, lambda *_: answered.append("answered"))
+known = threadpool_info()
+before = state()
+ways = [lambda: asyncio.run(asyncio.to_thread(work)), in_threads, work, failing]
+for way in ways:
+    way()
+    after = state()
+    print(*(name.replace(" ", "-") for name in before if before[name] != after[name]) , end=" ")
+signal.raise_signal(signal.SIGTERM)
+print(*answered, end=" ")
+"""
+
 WORKERS = """
 print(*(number for _, found in run_parallel(threads, [(), ()], 2) for number in found))
 """
@@ -79,7 +129,7 @@ print(*(number for _, found in run_parallel(threads, [(), ()], 2) for number in 
 @pytest.fixture(scope="module")
 def said() -> dict[str, list[str]]:
     """What each of the programs says in a process whose number of threads nobody limits."""
-    programs = (OUTERMOST, SEVERAL_THREADS, ERROR, WORKERS)
+    programs = (OUTERMOST, SEVERAL_THREADS, ERROR, NOTHING_LEFT, WORKERS)
     code = "\nprint()\n".join([BEGIN, *programs])
     done = subprocess.run([sys.executable, "-c", code], env=UNLIMITED, capture_output=True, text=True, check=True)
     return dict(zip(programs, map(str.split, done.stdout.splitlines()[1:]), strict=True))
@@ -89,6 +139,7 @@ def test_tests_have_one_thread():
     assert threads() == {1}
 
 
+@pytest.mark.slow
 def test_the_limit_ends_with_the_outermost_call(said):
     assert said[OUTERMOST] == [CORES, "1", "1", "1", CORES]
 
@@ -100,6 +151,35 @@ def test_calls_of_several_threads_leave_no_limit_behind(said):
 
 def test_an_error_lifts_the_limit(said):
     assert said[ERROR] == [CORES]
+
+
+def test_nothing_is_left_behind(said):
+    """By the first work of a process, in a thread of asyncio; by two threads at once; the main one; after an error."""
+    assert said[NOTHING_LEFT] == ["answered"]
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # what it is about
+def test_a_process_of_a_pool_works_alone():
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        found, notes = pool.apply(in_a_pool)
+    assert found == [(0, 8), (1, 8)]
+    assert notes == ["a process of multiprocessing.Pool may start no others: one process works, more slowly"]
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_forked_process_starts_its_own():
+    """The server of the process that forked it answers that one alone."""
+    dict(run_parallel(process, [(0,), (1,)], 2))
+    with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
+        assert pool.submit(in_a_pool).result(60) == ([(0, 8), (1, 8)], [])
+
+
+def in_a_pool() -> tuple[list, list[str]]:
+    with warnings.catch_warnings(record=True) as noted:
+        warnings.simplefilter("always")
+        with kept_processes(2):
+            found = sorted(run_parallel(pow, [(2, 3)] * 2))
+    return found, [str(note.message) for note in noted]
 
 
 def test_workers_have_one_thread(said):
@@ -119,6 +199,7 @@ def process(_) -> int:
     return os.getpid()
 
 
+@pytest.mark.slow
 def test_processes_are_kept_from_call_to_call():
     with kept_processes(2):
         first = {found for _, found in run_parallel(process, [(i,) for i in range(6)])}
@@ -158,6 +239,7 @@ def test_brief_work_goes_on_here_when_a_process_is_ended():
         load_in_processes("json")
 
 
+@pytest.mark.slow
 def test_files_beside_the_user_are_no_modules(tmp_path):
     """A folder with files named like libraries, where a program works in several processes."""
     for name in ("numpy", "scipy", "stcal"):

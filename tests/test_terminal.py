@@ -21,7 +21,7 @@ from stcal.cli.main import app, main
 from stcal.cli.sfm import app as sfm
 from stcal.errors import lacks_memory
 from tests.commands import COMMANDS
-from tests.outcome import INPUT, assert_error, ended
+from tests.outcome import INPUT, assert_error, ended, fails_with
 
 CLI = Path(stcal.__file__).parent / "cli"
 
@@ -109,6 +109,21 @@ def test_text_that_nothing_takes_is_one_line(words):
     assert found.returncode == 2
     assert found.stderr.startswith("error: No space left on device; ")
     assert found.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such shell there")
+def test_closed_streams_end_no_command(tmp_path):
+    """The first files that are opened would take their numbers."""
+    call = f"{sys.executable} -P -c 'from stcal.cli.entry import main; main()' robot init a.toml <&- >&- 2>&-"
+    assert subprocess.run(["sh", "-c", call], cwd=tmp_path, check=False).returncode == 0
+    assert (tmp_path / "a.toml").read_text().startswith("#")
+
+
+def test_a_file_for_standard_output_needs_one_that_is_open(monkeypatch):
+    with open(os.devnull, "w") as closed, fails_with("E-OUTPUT-UNWRITABLE … --json"):
+        monkeypatch.setattr(sys, "stdout", closed)
+        with terminal.said_apart():
+            terminal.write(terminal.STANDARD_OUTPUT, {})
 
 
 # --- how the program is called ---

@@ -1,21 +1,24 @@
-"""What each form of camera files holds: every lens is written, read back and compared, and lenses of other programs are
-fitted.
+"""What each form of camera files holds: every lens is written, read back and compared, lenses of other programs are
+fitted, and their files compared with OpenCV's projection, or the programs' formulas, of the numbers that stand in them.
 
-.venv/bin/python scripts/studies/camera_formats.py
+.venv/bin/python scripts/studies/camera_formats.py [../shared/cases]
 """
 
+import sys
 import tempfile
+import warnings
 from pathlib import Path
 
 import numpy as np
 
-from stcal.errors import InputError
+from stcal.errors import InputError, InputNote
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.difference import fit_lens
 from stcal.io.cameras.foreign import ForeignLens
 from stcal.io.cameras.forms import WRITERS, written
 from stcal.io.cameras.model import CalibratedCamera, parameter_names
 from stcal.io.cameras.read import read_lens
+from tests.io import camera_files, reported_cameras
 
 WIDTH, HEIGHT = 1280, 961
 LENSES = {
@@ -140,7 +143,19 @@ def held(form: str, folder: Path) -> list[str]:
     ]
 
 
+def read_as(path: Path, name: str, rays: np.ndarray, wanted: np.ndarray) -> str:
+    """Cells of a file: the model, and how far its pixels are from those wanted."""
+    lens = read_lens(path, name)
+    if isinstance(lens, ForeignLens):
+        called, off = f"{lens.called}, fitted", np.abs(lens.project(rays) - wanted).max()
+    else:
+        camera = lens.sized(lens.width or WIDTH, lens.height or HEIGHT)
+        called, off = lens.colmap_model, np.abs(camera.project(rays) - wanted).max()
+    return f"{called} | {f'{off:.2g}' if off > EXACT_PX else 'less than 1e-9'}"
+
+
 def main() -> None:
+    warnings.simplefilter("ignore", InputNote)
     print("| `--form` | read back exactly | refused | lost |")
     print("|---|---|---|---|")
     with tempfile.TemporaryDirectory() as scratch:
@@ -157,6 +172,20 @@ def main() -> None:
             turn = np.degrees(found.camera_from_lens.angle_rad())
             figures = f"{found.rms_px:.4f} | {found.most_px:.3f} | {f'{turn:.2f}°' if turn else '–'}"
             print(f"| {program} | {name} | {found.camera.colmap_model} | {figures} |")
+        print("\n| written by | read as | px off at most |")
+        print("|---|---|---|")
+        for program, (text, wanted) in camera_files.FILES.items():
+            (folder / "camera").write_text(text)
+            print(f"| {program} | {read_as(folder / 'camera', '', camera_files.RAYS, wanted)} |")
+    if len(sys.argv) < 2:
+        return
+    print("\n| reported file | read as | px off at most |")
+    print("|---|---|---|")
+    for (place, name), wanted in reported_cameras.CASES.items():
+        chosen = f" {name}" if name else ""
+        print(f"| {place}{chosen} | {read_as(Path(sys.argv[1]) / place, name, reported_cameras.RAYS, wanted())} |")
+    for (place, _), why in reported_cameras.REFUSED.items():
+        print(f"| {place} | refused: {why.split(' … ')[0]} | – |")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 corners are the truth, the same exposed again in simulated light, simulated corners, and the time of it.
 
 .venv/bin/python scripts/studies/locate_study.py [../shared/data/charuco_handeye/test_set_charuco]
-    [--part subsets|exposures|covariance|time] [--only GATE] [--most 200]
+    [--part subsets|exposures|covariance|edges|time] [--only GATE] [--most 200]
 
 The folder holds ``images/`` of a 7×5 board of DICT_6X6_250 (squares of 36.195 mm, tags of 18.256 mm) and
 ``cal_data.yaml`` with its intrinsics. Even images calibrate the layout, odd ones are located; then the other way round.
@@ -17,17 +17,20 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from stcal.boards.design import CharucoDesign
+from stcal.boards.design import CharucoDesign, TagLayout
+from stcal.boards.dictionaries import dictionary_of
 from stcal.boards.tags import Tags, find_tags
-from stcal.geometry.rigid import Poses
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import decode, find_images
 from stcal.locate.calibration.solve import CalibrationImages
 from stcal.locate.data.exposures import find_scenes
 from stcal.locate.data.layout import LayoutPlan, TargetLayout
-from stcal.locate.pipeline import LocateOptions, run
+from stcal.locate.pipeline import LocateOptions, locate_image, run
 from stcal.locate.pose.estimate import locate
 from stcal.locate.pose.merge import merge
 from stcal.locate.pose.patent import PatentOptions
@@ -35,6 +38,7 @@ from stcal.locate.pose.verdict import VerdictOptions, judge
 from stcal.parallel import one_thread
 from stcal.synthetic.exposure import Light, expose
 from stcal.workflows.board_views import calibration_images
+from tests.support.areas import homography, rendered, squares_nees, warped
 from tests.support.holdout import PoseTrial, half_calibrated, subset_trials
 from tests.support.tags import CAMERA, CornerNoise, example_layout, random_pose, simulated_exposures
 
@@ -42,7 +46,12 @@ BOARD = CharucoDesign(7, 5, 36.195, 18.256, "DICT_6X6_250")
 TAGS = 17
 ORIGIN = 8
 TIMES = np.geomspace(1 / 16, 16, 5)
-PARTS = ("subsets", "exposures", "covariance", "time")
+PARTS = ("subsets", "exposures", "covariance", "edges", "time")
+EDGE_LAYOUT = TagLayout.from_tags(
+    "APRILTAG_36h11", (0, 1, 2), [[0.0, 0.0], [120.0, 0.0], [0.0, 110.0]], [60.0, 60.0, 40.0], [0.0, 90.0, 180.0]
+)
+EDGE_CAMERA = Camera(640, 560, [1100.0, 1100.0], [319.5, 279.5], np.zeros(8))
+SHEET_PER_MM, SHEET_MARGIN_MM = 6, 30.0
 
 
 def charuco_plan() -> LayoutPlan:
@@ -170,6 +179,57 @@ def calibration(
     return float(np.mean(squares)), len(squares), int(wrong)
 
 
+def edges(count: int) -> None:
+    print(f"three tags of 30 to 130 px, rendered with noise of 1 % of the contrast, {count} scenes a row\n")
+    print("| rendered | blur, px | turned | tilted | mean of e'C^-1 e / 6 | largest | accepted |")
+    print("|---|---|---|---|---|---|---|")
+    sheet, sheet_from_mm = _drawn_sheet()
+    matrix = np.array([[1100.0, 0, 319.5], [0, 1100.0, 279.5], [0, 0, 1]])
+    views = [(turn, 0) for turn in (0, 1, 2, 5, 20, 45)] + [(0, 20), (0, 40), (0, 60), (20, 60)]
+    for kind, blur in (("by area", 0.5), ("by area", 1.0), ("warped sheet", 0.5)):
+        for turn, tilt in views:
+            rng, squares, accepted = np.random.default_rng(7), [], 0
+            for _ in range(count):
+                truth = _edge_pose(rng, turn, tilt)
+                place, size = homography(matrix, truth.rotation, truth.translation), (640, 560)
+                if kind == "by area":
+                    image = rendered(EDGE_LAYOUT, place, size, rng, blur)
+                else:
+                    image = warped(sheet, place @ np.linalg.inv(sheet_from_mm), size, rng, blur)
+                result = locate_image(image, EDGE_LAYOUT, EDGE_CAMERA)
+                accepted += result.verdict.decision == "accept"
+                if result.pose is not None:
+                    error = Poses.of([result.pose.camera_from_obj]).difference(Poses.of([truth]))
+                    squares.append(squares_nees(error, result.pose.covariance[None])[0])
+            figures = f"{np.mean(squares):.2f} | {np.max(squares):.1f}"
+            print(f"| {kind} | {blur} | {turn}° | {tilt}° | {figures} | {accepted} of {count} |", flush=True)
+
+
+def _edge_pose(rng: np.random.Generator, turn_deg: float, tilt_deg: float) -> Rigid:
+    """camera_from_obj of a target turned in the image, then tilted to any side."""
+    side = rng.uniform(0, 2 * np.pi)
+    tilt = Rotation.from_rotvec(np.radians(tilt_deg) * np.array([np.cos(side), np.sin(side), 0]))
+    rotation = (tilt * Rotation.from_euler("z", turn_deg + 90 * rng.integers(4), degrees=True)).as_matrix()
+    middle = EDGE_LAYOUT.corners_mm.reshape(-1, 2).mean(0)
+    depth = rng.uniform(500, 900)
+    return Rigid(rotation, np.array([*rng.uniform(-15, 15, 2), depth]) - rotation[:, :2] @ middle)
+
+
+def _drawn_sheet() -> tuple[np.ndarray, np.ndarray]:
+    """The target drawn in pixels, and the homography to them from mm."""
+    corners = EDGE_LAYOUT.corners_mm
+    first, last = corners.min((0, 1)) - SHEET_MARGIN_MM, corners.max((0, 1)) + SHEET_MARGIN_MM
+    sheet = np.full(np.rint((last - first)[::-1] * SHEET_PER_MM).astype(int), 255, np.uint8)
+    for (name, tag), place in zip(EDGE_LAYOUT.tags, corners, strict=True):
+        side = round(np.linalg.norm(place[1] - place[0]) * SHEET_PER_MM)
+        turns = round(np.degrees(np.arctan2(*(place[1] - place[0])[::-1])) / 90)
+        left, top = np.rint((place.min(0) - first) * SHEET_PER_MM).astype(int)
+        drawn = cv2.aruco.generateImageMarker(dictionary_of(name), tag, side)
+        sheet[top : top + side, left : left + side] = np.rot90(drawn, -turns)
+    scale, half = SHEET_PER_MM, 0.5
+    return sheet, np.array([[scale, 0, -scale * first[0] - half], [0, scale, -scale * first[1] - half], [0, 0, 1]])
+
+
 def timing(folder: Path, images: CalibrationImages, rounds: int = 5) -> None:
     print("time of a scene of 5 exposures of 2 MP, against decoding them")
     layout = half_calibrated(images, charuco_plan(), range(len(images.names))).layout
@@ -208,7 +268,7 @@ def main() -> None:
     parser.add_argument("--most", type=int)
     arguments = parser.parse_args()
     chosen = [arguments.part] if arguments.part else PARTS
-    images = None if arguments.part == "covariance" else charuco_images(arguments.folder)
+    images = None if arguments.part in ("covariance", "edges") else charuco_images(arguments.folder)
     for part in chosen:
         match part:
             case "subsets":
@@ -217,6 +277,8 @@ def main() -> None:
                 exposures(arguments.folder, images)
             case "covariance":
                 covariance()
+            case "edges":
+                edges(arguments.most or 40)
             case "time":
                 timing(arguments.folder, images)
 

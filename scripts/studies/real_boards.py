@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 
 from stcal.boards.design import CharucoDesign, ChessboardDesign
+from stcal.boards.dictionaries import dictionary_of
 from stcal.boards.file import load_flat_board
-from stcal.boards.tags import dictionary_of
 from stcal.design import BoardDesign
 from stcal.errors import StcalError
 from stcal.io.design import target_of

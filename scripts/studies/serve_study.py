@@ -5,6 +5,9 @@ The clients are processes of this script that send simulated photographs of 2 me
 rate over connections that stay open; the fourth sends what is no photograph, what is too large, what ends too early and
 broken requests, as many a second as each of the others. Lost is what gets no answer, or another image's. Memory is that
 of the server and its processes, pages that they share counted once, at the tenth and at the last part of the time.
+
+With ``--hostile`` one client follows the target, and another one attacks: connections that send nothing, photographs
+whose sender leaves, bytes one by one, uploads of 60 MB that lack the last byte, broken and smuggled requests.
 """
 
 import argparse
@@ -76,13 +79,14 @@ def due(start: float, rate: float, i: int) -> float:
 
 
 def follow(client: int, port: int, frames: list, start: float, seconds: float, rate: float) -> dict:
-    """Send photographs at a rate; latencies in s from when each was due, and what was lost or refused."""
+    """Send photographs at a rate; latencies in s from when each was due and was sent, and what was lost or refused."""
     line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     order = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
-    latencies, lost, refused, none, i = [], 0, 0, 0, 0
+    latencies, taken, lost, refused, none, i = [], [], 0, 0, 0, 0
     while (at := due(start, rate, i)) < start + seconds:
         name, data = frames[order[i % len(order)]]
         name = f"client{client}/{i}/{name}"
+        sent = time.time()
         try:
             line.request("POST", f"/measure?name={name}&sequence=client{client}", body=data)
             answer = line.getresponse()
@@ -96,8 +100,9 @@ def follow(client: int, port: int, frames: list, start: float, seconds: float, r
             lost += 1
             line.close()
         latencies.append(time.time() - at)
+        taken.append(time.time() - sent)
         i += 1
-    return {"sent": i, "latencies": latencies, "lost": lost, "refused": refused, "without": none}
+    return {"sent": i, "latencies": latencies, "taken": taken, "lost": lost, "refused": refused, "without": none}
 
 
 def rubbish(port: int, frames: list, start: float, seconds: float, rate: float) -> dict:
@@ -123,13 +128,84 @@ def rubbish(port: int, frames: list, start: float, seconds: float, rate: float) 
                     line.sendall(head.replace(b"Content-Length: 0", b"Content-Length: 500000") + photograph[:1000])
                 else:
                     line.sendall(rng.randbytes(300) + b"\r\n\r\n" if kind == "broken" else head + body)
-                    line.shutdown(socket.SHUT_WR)
                     answer = line.recv(1 << 16)
                     lost += kind != "broken" and not answer.startswith(b"HTTP/1.1 4")
         except OSError:
             lost += 1
         i += 1
     return {"sent": i, "lost": lost}
+
+
+IDLE, STALLED, SLOW = 100, 20, 30
+"""Number of connections of each kind that are held open."""
+STALLED_BYTES = 60_000_000
+SMUGGLED = b"GET / HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\n%b\r\nGET / HTTP/1.1\r\nHost: x\r\n\r\n"
+
+
+def attack(port: int, frames: list, start: float, seconds: float, rate: float) -> dict:
+    """Use up what the service has; number of requests, and of those of which a part was answered as a second one."""
+    photograph, held, smuggled, i = frames[0][1], {"idle": [], "stalled": [], "slow": []}, 0, 0
+    whole = b"POST /measure HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n"
+    kinds = ["idle", "idle", "left", "slow", "stalled", "smuggled", "broken", "left"]
+    while due(start, rate, i) < start + seconds:
+        kind = kinds[i % len(kinds)]
+        kind = "idle" if kind == "stalled" and len(held[kind]) == STALLED else kind
+        i += 1
+        try:
+            line = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
+            if kind == "left":
+                line.sendall(whole % len(photograph) + photograph)
+                line.close()
+            elif kind == "smuggled":
+                line.sendall(SMUGGLED % (b"Content-Length: 6\r\n" if i % 2 else b""))
+                line.settimeout(2)
+                answer = b""
+                while part := line.recv(1 << 16):
+                    answer += part
+                smuggled += answer.count(b"HTTP/1.1 ") > 1
+                line.close()
+            elif kind == "broken":
+                line.sendall(random.Random(i).randbytes(300) + b"\r\n\r\n")
+                line.close()
+            else:
+                if kind == "stalled":
+                    line.sendall(whole % STALLED_BYTES + bytes(STALLED_BYTES - 1))
+                held[kind].append(line)
+        except OSError:
+            line.close()
+        for slow in list(held["slow"]):
+            try:
+                slow.send(b"P")
+            except OSError:  # ended from the other side
+                held["slow"].remove(slow)
+        for kind, most in (("idle", IDLE), ("slow", SLOW)):
+            while len(held[kind]) > most:
+                held[kind].pop(0).close()
+    return {"sent": i, "smuggled": smuggled}
+
+
+def hostile(options, films: list, port: int, pid: int) -> None:
+    """Send beside an attacker for the time, and print what came of it."""
+    context = multiprocessing.get_context("fork")
+    answers = [context.SimpleQueue() for _ in range(2)]
+    start = time.time() + LATE_START_S
+    jobs = [(follow, 0, port, films[0], start, options.seconds, options.rate / 10)]
+    jobs.append((attack, port, films[0], start, options.seconds, options.rate))
+    clients = [context.Process(target=run_client, args=(q, *job)) for q, job in zip(answers, jobs, strict=True)]
+    for client in clients:
+        client.start()
+    memory = []
+    while time.time() < start + options.seconds:
+        memory.append(memory_mb(pid))
+        time.sleep(0.2)
+    found, attacked = (queue.get() for queue in answers)
+    for client in clients:
+        client.join()
+    print(f"{found['sent']} photographs beside {attacked['sent']} hostile requests in {options.seconds:g} s")
+    print(f"lost answers: {found['lost']}; refused photographs: {found['refused']}; without a pose: {found['without']}")
+    print(f"from sent to answered, s: median {np.median(found['taken']):.2f}, most {max(found['taken']):.2f}; ", end="")
+    print(f"parts answered as second requests: {attacked['smuggled']}")
+    print(f"memory: {memory[0]:.0f} MB at first, {max(memory):.0f} MB at most")
 
 
 def run_client(answers, function, *arguments) -> None:
@@ -151,6 +227,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate", type=float, default=50.0, help="images a second of all clients, rubbish included")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument("--hostile", action="store_true", help="one client beside an attacker")
     parser.add_argument("--keep", type=Path, help="render to this folder, or take what is there")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
@@ -162,7 +239,7 @@ def main() -> None:
         program = [sys.executable, "-P", "-c", "from stcal.cli.entry import main_sfm; main_sfm()", *map(str, words)]
         with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
             port = int(re.search(r":(\d+)/measure", server.stdout.readline()).group(1))
-            report(options, films, port, server.pid)
+            (hostile if options.hostile else report)(options, films, port, server.pid)
             server.send_signal(signal.SIGINT)
             print("\n".join(server.stdout.read().split("\n")[:1]))
 

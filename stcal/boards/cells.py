@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign, TagLayout
-from stcal.boards.tags import dictionary_of
+from stcal.boards.dictionaries import dictionary_of
 
 SquaresOrTags = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign
 UNKNOWN_BITS = 2

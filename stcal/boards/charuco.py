@@ -11,7 +11,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from stcal.boards.design import BoardView, CharucoDesign, view_of
-from stcal.boards.tags import detector_settings, dictionary_of
+from stcal.boards.dictionaries import dictionary_of
+from stcal.boards.edges import crossings
+from stcal.boards.tags import detector_settings
 from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian
 from stcal.geometry.robust import median_length, robust_sigma
 from stcal.io.images import grey_8bit
@@ -55,8 +57,9 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardVie
     tag lie several px off, each corner is measured from where the corners about it foretell it, and is left out if the
     measurement ends far from there.
 
-    It is where the edges meet in a window clear of the tags; or, if these edges are too blurred, it is the saddle in
-    a window of the size to which the board is symmetric about the corner.
+    It is where the edges cross by the areas that they leave in the pixels of a window clear of the tags; if what is
+    seen there does not fit, where the gradients of the edges meet; if these edges are too blurred, the saddle in a
+    window of the size to which the board is symmetric about the corner.
     """
     grey = grey_8bit(image)
     ids, corners = _read(grey, board)
@@ -70,7 +73,9 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardVie
         blurred = _saddles(smooth, foretold.xy_px, _half_px(large, foretold))
         corners = blurred.xy_px
     sharp = _edges_meet(_gradient(smooth), corners, _half_px(small, foretold))
-    measured = sharp.otherwise(blurred)
+    along = np.swapaxes(homography_jacobian(_robust_homography(squares, corners), squares), 1, 2)
+    by_area = crossings(grey, sharp.otherwise(blurred).xy_px, along, _half_px(small, foretold))
+    measured = _Corners(by_area.xy_px, by_area.covariance_px2, by_area.seen).otherwise(sharp).otherwise(blurred)
     good = measured.seen & _foretold(squares, measured.xy_px).agrees(measured.xy_px)
     if good.sum() < LEAST_CORNERS:
         return None

@@ -1,8 +1,9 @@
 """Detection of the inner corners of a chessboard, by both detectors of OpenCV in images of several sizes.
 
 ``cv2.findChessboardCornersSB`` (after Duda & Frese 2018) tolerates noise, shade and small squares; the older detector,
-which joins dark squares, tolerates steep views and blur. A board that neither finds in the original image may be found
-in a smaller one, in which blur is smaller. A large image is first searched at a smaller size, which is faster.
+which joins dark squares, tolerates steep views and blur. Images are searched at the smallest size that shows the
+squares, which is fastest, and then at others: a board that neither detector finds in one size may be found in another.
+Corners are measured in the original image.
 """
 
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 
 from stcal.boards.design import BoardView, ChessboardDesign, view_of
+from stcal.boards.edges import crossings
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit
 
@@ -18,16 +20,22 @@ WINDOW_SHARE = 0.4
 """Half the side of the window in which a corner is refined, as a share of the smallest square's side."""
 REFINE_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-5)
 LEAST_WINDOW, MOST_WINDOW, MOST_AT_FIRST = 2.0, 20.0, 100.0
-"""Limits of half that window's side, px: smallest, largest, and largest in the first pass."""
+MOST_BY_AREA = 10.0
+"""Limits of half that window's side, px: smallest, largest, largest in the first pass, and largest for areas."""
 SMOOTHED_SHARE, LEAST_SMOOTHING = 0.05, 0.3
 """σ of the smoothing before refinement, as a share of half the window's side, and its lower limit in px. Smoothing does
 not move a saddle, but removes noise of the gradients, which would hold a corner at its start."""
-FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
+MARGIN, LEAST_MARGIN = 3.0, 10.0
+"""Margin about the corners in which the image is smoothed, in windows and then in px: no window comes near its end."""
+FLAGS = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 OLDER_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 PART, PART_FLAGS = (3, 3), cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
 """Smallest grid of inner corners that counts as a part of a chessboard, and the flags to find one."""
 FIRST_SIDE, LEAST_SIDE = 1600, 300
-"""Longer side of the first image that is searched, and of the smallest one, px."""
+"""Longer side of the largest image that is searched before the original, and of the smallest one, px."""
+PX_A_SQUARE = 25.0
+"""Longer side of the first image that is searched, per square of the board's longer side, px: a board that fills a
+third of it has squares of 8 px."""
 
 
 def find_chessboard(image: np.ndarray, name: str, board: ChessboardDesign) -> BoardView | None:
@@ -47,10 +55,11 @@ def _found(grey: np.ndarray, board: ChessboardDesign) -> Iterator[np.ndarray]:
     """Yield the grids (rows, columns, 2) that the detectors find, px of the original image."""
     height, width = grey.shape
     longer = max(height, width)
-    sides = [longer * 0.5**k for k in range(6)]
-    first = [side for side in sides if side <= FIRST_SIDE][:1]
-    others = [side for side in sides if side not in first and side >= LEAST_SIDE]
-    for side in first + others:
+    sides = [longer * 0.5**k for k in range(6) if k == 0 or longer * 0.5**k >= LEAST_SIDE]
+    needed = min(PX_A_SQUARE * (max(board.rows, board.columns) + 1), FIRST_SIDE)
+    first = [side for side in sides if side >= needed][-1:]
+    moderate = [side for side in sides if side <= FIRST_SIDE and side not in first]
+    for side in (*first, *moderate, *(side for side in sides if side not in (*first, *moderate))):
         scale = side / longer
         size = (max(round(scale * width), 1), max(round(scale * height), 1))
         small = grey if scale == 1 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
@@ -89,6 +98,10 @@ def _refined(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
     window = max(WINDOW_SHARE * min(steps), LEAST_WINDOW)
+    margin = MARGIN * min(window, MOST_AT_FIRST) + LEAST_MARGIN
+    first = np.floor(np.maximum(grid.min((0, 1)) - margin, 0)).astype(int)
+    last = np.ceil(grid.max((0, 1)) + margin).astype(int) + 1
+    grey, grid = grey[first[1] : last[1], first[0] : last[0]], grid - first
     for most in (MOST_AT_FIRST, MOST_WINDOW):
         half = int(min(window, most))
         smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), max(SMOOTHED_SHARE * half, LEAST_SMOOTHING))
@@ -96,7 +109,16 @@ def _refined(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
         grid = cv2.cornerSubPix(smooth, places, (half, half), (-1, -1), REFINE_STEPS).reshape(grid.shape).astype(float)
         if window <= MOST_WINDOW:
             break
-    return grid
+    return _by_area(grey, grid, int(min(window, MOST_BY_AREA))) + first
+
+
+def _by_area(grey: np.ndarray, grid: np.ndarray, half: int) -> np.ndarray:
+    """Return the corners by the areas of black and white in their windows, or unchanged where these do not fit.
+
+    Where edges lie along the pixel rows, gradients place all corners by up to 0.02 px to one side.
+    """
+    along = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=2).reshape(-1, 2, 2)
+    return crossings(grey, grid.reshape(-1, 2), along, np.full(len(along), half)).xy_px.reshape(grid.shape)
 
 
 def _first_is_black(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> bool:

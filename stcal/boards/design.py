@@ -1,15 +1,16 @@
 """Boards and tags: the places of their corners, and the rotations that leave their appearance unchanged."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from stcal.boards.dictionaries import known_tags
 from stcal.design import BoardDesign, Polarity
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import frozen, require_choices
 from stcal.geometry.rigid import Rigid
-from stcal.labels import Label, dot_cells
+from stcal.labels import DotLabel, Label, dot_cells
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +74,22 @@ class CharucoDesign:
         return []
 
 
+UNIT_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
+"""Corners of a tag of side 1 about its middle: top left, top right, bottom right, bottom left."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TagLayout:
     """Tags in one plane, Z into it.
 
-    ``tags`` : (n,) dictionary and id of each tag; ``corners_mm`` : (n, 4, 2) top left, top right, bottom right, bottom
-    left as printed, mm; ``sigma_mm`` : σ of a corner's coordinate.
+    Parameters
+    ----------
+    tags : tuple of (str, int)
+        Dictionary and id of each of the n tags.
+    corners_mm : (n, 4, 2) array
+        Top left, top right, bottom right and bottom left corner as printed, mm.
+    sigma_mm : float
+        σ of a corner's coordinate.
     """
 
     tags: tuple[tuple[str, int], ...]
@@ -86,12 +97,52 @@ class TagLayout:
     sigma_mm: float = 0.0
 
     def __post_init__(self):
+        object.__setattr__(self, "tags", known_tags(self.tags, "tag layout"))
         object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (len(self.tags), 4, 2), "tags' corners"))
-        if len(set(self.tags)) < len(self.tags):
-            twice = next(tag for tag in self.tags if self.tags.count(tag) > 1)
-            raise InputError(
-                "E-TAG-REPEATED", f"tag layout: tag {twice[1]} of {twice[0]} occurs twice; tags must differ"
-            )
+
+    @classmethod
+    def from_tags(
+        cls,
+        dictionary: str,
+        ids: Sequence[int],
+        xy_mm: np.ndarray,
+        size_mm: float | np.ndarray,
+        angle_deg: float | np.ndarray = 0.0,
+        sigma_mm: float = 0.0,
+    ) -> "TagLayout":
+        """Return the layout of square tags of one dictionary.
+
+        Parameters
+        ----------
+        dictionary : str
+            Name in ``cv2.aruco``, with or without ``DICT_``: ``"4X4_50"``.
+        ids : sequence of int
+            Ids of the n tags.
+        xy_mm : (n, 2) array
+            Middles of the tags, mm; X to the right and Y down on the printed sheet.
+        size_mm : float or (n,) array
+            Outer sides of the black borders, mm.
+        angle_deg : float or (n,) array
+            Angles by which the tags are turned, from X to Y.
+        sigma_mm : float
+            σ of a corner's coordinate, mm.
+
+        Raises
+        ------
+        InputError
+            A value is not finite, a size is not positive, or a tag is unknown or occurs twice.
+        """
+        n = len(ids)
+        middle = frozen(xy_mm, (n, 2), "tags' middles")
+        one_each = np.ones(n)
+        size = frozen(size_mm * one_each if np.ndim(size_mm) == 0 else size_mm, (n,), "tags' sizes")
+        angle = np.radians(frozen(angle_deg * one_each if np.ndim(angle_deg) == 0 else angle_deg, (n,), "tags' angles"))
+        if not (size > 0).all():
+            raise InputError("E-TAG-SIZE", f"tag layout: size {size.min():g} mm; a positive number needed")
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+        corners = size[:, None, None] * UNIT_SQUARE @ np.swapaxes(turn, 1, 2) + middle[:, None]
+        return cls(tuple((dictionary, tag) for tag in ids), corners, sigma_mm)
 
     def xy_mm(self) -> np.ndarray:
         """Return the corners (4n, 2), tag by tag, mm."""
@@ -148,13 +199,25 @@ class AprilGridDesign:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatticePart(BoardDesign):
-    """A grid of dots in which only some places have a dot. ``taken`` : (n, 2) rows and columns of these places."""
+    """A grid of dots in which only some places have a dot.
+
+    ``taken`` : (n, 2) rows and columns of these places; ``circles`` : the asymmetric circles that these are, if any.
+    """
 
     taken: np.ndarray | None = None
+    circles: "AsymmetricCirclesDesign | None" = None
 
     def cells(self) -> np.ndarray:
         """Return row and column of every dot, (n, 2)."""
         return BoardDesign.cells(self) if self.taken is None else self.taken
+
+    def radii_mm(self) -> np.ndarray:
+        """Return the radius of every dot, (n,), mm."""
+        return np.full(len(self.cells()), self.radius_mm)
+
+    def labels(self) -> list[DotLabel]:
+        """Return the labels of the dots."""
+        return [DotLabel(row, column) for row, column in self.cells().tolist()]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,6 +258,9 @@ class AsymmetricCirclesDesign:
     polarity: Polarity
     sigma_mm: float = 0.005
 
+    def __post_init__(self):
+        require_choices(self, "asymmetric circles")
+
     def _steps(self) -> np.ndarray:
         row, place = np.divmod(np.arange(self.rows * self.columns), self.columns)
         return np.column_stack([2 * place + row % 2, row])
@@ -226,7 +292,9 @@ class AsymmetricCirclesDesign:
         cells = cells - cells.min(0)
         rows, columns = (cells.max(0) + 1).tolist()
         pitch = float(np.sqrt(2) * self.spacing_mm)
-        return LatticePart(rows, columns, pitch, self.radii_mm()[0], self.polarity, self.sigma_mm, taken=cells)
+        return LatticePart(
+            rows, columns, pitch, self.radii_mm()[0], self.polarity, self.sigma_mm, taken=cells, circles=self
+        )
 
 
 FlatBoard = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign | AsymmetricCirclesDesign

@@ -1,6 +1,5 @@
 """Readers of board files: dots (``stcal.io.design``), chessboards, ChArUco boards, AprilGrids, and Kalibr's YAML."""
 
-import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -13,34 +12,25 @@ from pydantic import AfterValidator, Field, model_validator
 from stcal.boards.bundle import KEYS as BUNDLE_KEYS
 from stcal.boards.bundle import bundle_content, tags_of_bundle
 from stcal.boards.design import (
+    UNIT_SQUARE,
     AprilGridDesign,
     AsymmetricCirclesDesign,
     CharucoDesign,
     ChessboardDesign,
     FlatBoard,
+    LatticePart,
     TagLayout,
 )
-from stcal.design import BoardDesign, Polarity
+from stcal.boards.dictionaries import count_of, known_dictionary
+from stcal.design import BoardDesign, Polarity, reference_board
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.design import BoardEntry, Count, Squares, board_design, load_board
-from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.design import BoardEntry, Count, Squares, board_design, board_toml, load_board
+from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.json import mistake
 from stcal.io.plain_yaml import load_yaml
-from stcal.io.toml import (
-    LEAST_SIDE_MM,
-    MOST_SIDE_MM,
-    Finite,
-    Length,
-    Positive,
-    Sized,
-    Strict,
-    load_toml,
-    radius,
-    require_millimetres,
-    side,
-    validated,
-)
+from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, validated
+from stcal.lengths import LEAST_SIDE_MM, MOST_SIDE_MM, Length, radius, require_millimetres, side, stated_unusual
 
 KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles")
 """Types of flat boards."""
@@ -57,37 +47,6 @@ NESTED = 0.5
 """Largest ratio of the sides of two tags of which one may be inside the other, as in nested markers."""
 OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_mm", "board"}
 """Keys that occur only in files of other boards than dots."""
-
-
-OF_OPENCV = ("tag36h11", "tag36h10", "tag25h9", "tag16h5")
-"""Families of AprilTag that OpenCV detects."""
-_APRILTAG = re.compile(r"(?:april)?[_ -]?t(?:ag)?[_ -]?(standard|circle|custom)?[_ -]?(\d{2}h\d{1,2})", re.I)
-
-
-def known_dictionary(name: str) -> str:
-    """Return the full name of a dictionary of ``cv2.aruco``; ``name`` may lack ``DICT_``, and be in any case.
-
-    Families of AprilTag have their own names, too: ``tag36h11``, ``t36h11``.
-
-    Raises
-    ------
-    ValueError
-        The name is unknown; the message lists similar names. Or OpenCV lacks the family.
-    """
-    family = _APRILTAG.fullmatch(name.strip())
-    if family is not None:
-        if family[1] is not None or f"DICT_APRILTAG_{family[2].lower()}" not in dir(cv2.aruco):
-            raise ValueError(
-                f"OpenCV does not detect this family of AprilTag; print tags of {', '.join(OF_OPENCV)} for the target"
-            )
-        name = f"APRILTAG_{family[2]}"
-    plain = name.strip().upper()
-    plain = plain if plain.startswith("DICT_") else f"DICT_{plain}"
-    dictionaries = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
-    if plain not in dictionaries:
-        alike = sorted(k for k in dictionaries if k[5:9] == plain[5:9]) or sorted(dictionaries)
-        raise ValueError(f"unknown dictionary; one of {', '.join(alike)} needed")
-    return dictionaries[plain]
 
 
 Dictionary = Annotated[str, AfterValidator(known_dictionary)]
@@ -166,7 +125,7 @@ class TagEntry(Strict):
             raise InputError(
                 "E-TAG-PLACE", f"{where}: tag {self.id}: x_mm, y_mm and size_mm needed together, or corners_mm"
             )
-        square = self.size_mm / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+        square = self.size_mm * UNIT_SQUARE
         cosine, sine = np.cos(np.radians(self.angle_deg)), np.sin(np.radians(self.angle_deg))
         return square @ np.array([[cosine, sine], [-sine, cosine]]) + [self.x_mm, self.y_mm]
 
@@ -216,13 +175,64 @@ def load_tags(path: str | Path, what: str) -> TagsFile:
         The file is unreadable or invalid; the message begins with ``what``, and names file, place and reason.
     """
     try:
-        content = bundle_content(read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig"))
+        content = bundle_content(text_of(read_bytes(path, SETTINGS_BYTES)))
     except (OSError, UnicodeDecodeError):
         content = None  # the error of the reader of TOML says why
     if content is None:
         return load_toml(path, TagsFile, what, REMEDY)
     where = f"{what} {path}"
     return validated(tags_of_bundle(content, where), TagsFile, where)
+
+
+def load_run_board(path: str | Path) -> BoardDesign:
+    """Read the file of a board beside a target: dots, or asymmetric circles as places of a lattice.
+
+    Raises
+    ------
+    InputError
+        As :func:`load_flat_board`; or it is another board, or its circles have no radius.
+    """
+    board = load_flat_board(path) if Path(path).is_file() else load_board(path)
+    if isinstance(board, BoardDesign):
+        return board
+    if not isinstance(board, AsymmetricCirclesDesign):
+        raise InputError(
+            "E-BOARD-TYPE",
+            f"board file {path}: a board of dots or of asymmetric circles needed here: `calibrate-camera`, `handeye` "
+            "and `locate` take others",
+        )
+    if board.radius_mm is None:
+        raise InputError(
+            "E-BOARD-RADIUS",
+            f"board file {path}: circles without a radius, which their eccentricity needs here; write a file with "
+            'type = "asymmetric-circles" and radius_mm',
+        )
+    return board.lattice()
+
+
+def run_board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
+    """Return the given board, or the board of a file; the reference board if ``given`` is None."""
+    return reference_board() if given is None else given if isinstance(given, BoardDesign) else load_run_board(given)
+
+
+def run_board_toml(board: BoardDesign) -> str:
+    """Return the text of a board file that :func:`load_run_board` reads."""
+    circles = board.circles if isinstance(board, LatticePart) else None
+    if circles is None:
+        return board_toml(board)
+    return (
+        f'type = "asymmetric-circles"\nrows = {circles.rows}\ncolumns = {circles.columns}\n'
+        f"spacing_mm = {circles.spacing_mm!r}\nradius_mm = {circles.radius_mm!r}\n"
+        f'polarity = "{circles.polarity}"\nsigma_mm = {circles.sigma_mm!r}\n'
+        + "".join(f"{line}\n" for line in stated_unusual([side("", circles.spacing_mm), radius("", board.radius_mm)]))
+    )
+
+
+def save_run_board(path: str | Path, board: BoardDesign) -> None:
+    """Write the file of a board beside a target, and require that it is read as the same board."""
+    text = run_board_toml(board)
+    save(Path(path), text)
+    require_same(path, lambda: run_board_toml(load_run_board(path)), text)
 
 
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
@@ -282,7 +292,7 @@ def board_content(path: str | Path) -> dict[str, Any] | None:
         The file is unreadable.
     """
     try:
-        text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")
+        text = text_of(read_bytes(path, SETTINGS_BYTES))
         return tomllib.loads(text)
     except OSError as error:
         raise InputError("E-BOARD-UNREADABLE", f"board file {path}: {error.strerror or error}; {REMEDY}") from error
@@ -330,7 +340,7 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
         place_of_tag = f"{where}: tag {tag.id}"
         if place is None:
             raise InputError("E-TAG-PLACE", f"{place_of_tag}: no place; x_mm, y_mm and size_mm, or corners_mm needed")
-        if tag.id >= (count := _tags_of(tag.dictionary)):
+        if tag.id >= (count := count_of(tag.dictionary)):
             raise InputError(
                 "E-TAG-ID-RANGE", f"{place_of_tag}: {tag.dictionary} has 0 … {count - 1}; correct id or dictionary"
             )
@@ -414,17 +424,12 @@ def _aprilgrid(data: _AprilGrid, where: str) -> AprilGridDesign:
 def _require_tags(board: CharucoDesign | AprilGridDesign, where: str) -> None:
     """Refuse a board that needs more tags than its dictionary has."""
     ids = board.tag_ids()
-    if ids.stop > (count := _tags_of(board.dictionary)):
+    if ids.stop > (count := count_of(board.dictionary)):
         raise InputError(
             "E-TAG-ID-RANGE",
             f"{where}: tags {ids.start} … {ids.stop - 1}, {board.dictionary} has 0 … {count - 1}; correct rows, "
             "columns, first_id or dictionary",
         )
-
-
-def _tags_of(dictionary: str) -> int:
-    """Return the number of tags in a dictionary."""
-    return len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)).bytesList)
 
 
 def _asymmetric(data: _AsymmetricCircles, where: str) -> AsymmetricCirclesDesign:

@@ -66,6 +66,7 @@ def convert(
 ) -> None:
     """Convert a camera file to the form of another program, and say what that has no place for."""
     from stcal.io.cameras.forms import SUFFIXES, name_to_write, written
+    from stcal.io.cameras.write import require_camera_written
 
     kind = form.value if form else SUFFIXES.get(out.suffix.lower())
     if kind is None:
@@ -78,6 +79,7 @@ def convert(
     say(f"{source}: {camera.colmap_model}, {camera.width}×{camera.height} px; written as {kind}")
     print_each(f"note: not in {kind}", converted.lost)
     write(out, converted.content)
+    require_camera_written(out, camera)
 
 
 @app.command()

@@ -30,6 +30,7 @@ def _run(name: str) -> None:
     Signals that come after the end of the program do not change its exit code. Python removes handlers while it ends,
     and a signal would then end a command as if it had failed, although its results are in place.
     """
+    _replace_closed_streams()
     try:
         if sys.argv[1:] == ["--version"]:
             _print_version()
@@ -38,6 +39,20 @@ def _run(name: str) -> None:
     finally:
         for number in LOADING:
             signal.signal(number, signal.SIG_IGN)
+
+
+def _replace_closed_streams() -> None:
+    """Opens the null device in place of standard streams that are closed (`>&-`).
+
+    The first files that are opened would take their numbers, and C libraries print into these.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # takes the lowest free number, which is this one
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w" if number else "r", encoding="utf-8"))  # noqa: SIM115
 
 
 def _print_version() -> None:

@@ -21,14 +21,25 @@ PANELS = {
     "Output": ("out", "strict"),
     "Performance": ("workers", "scheduler", "send_images"),
     "Input in other forms": (
-        *("rotation", "length_unit", "poses_are", "first", "second", "key", "quaternions", "columns", "columns_a"),
+        *(
+            "rotation",
+            "length_unit",
+            "poses_are",
+            "first",
+            "second",
+            "key",
+            "quaternions",
+            "columns",
+            "columns_a",
+            "undo_flips",
+        ),
     ),
     "Noise": (
         *("sigma_robot_mm", "sigma_robot_deg", "sigma_camera_mm", "sigma_camera_deg", "sigma_board_mm"),
         *("sigma_px", "sigma_mm", "sigma_rad"),
     ),
     "Cross-validation": ("held_out", "splits", "folds", "motions_held_out"),
-    "Clocks of robot and camera": ("time_offset", "image_times", "time_tolerance"),
+    "Clocks of robot and camera": ("time_offset", "image_times", "times_columns", "time_tolerance"),
     "Errors of the arm itself": ("with_kinematics", "robot_out"),
     "Files for other programs": (
         *("ros", "urdf", "opencv", "export", "parent", "child", "camera_frame", "camera_out"),

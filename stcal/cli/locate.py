@@ -118,7 +118,7 @@ def calibrate(
     from stcal.boards.file import load_flat_board
     from stcal.io.cameras.read import read_camera
     from stcal.locate.calibration.solve import calibrate as calibrated
-    from stcal.locate.data.layout import layout_toml, load_plan
+    from stcal.locate.data.layout import layout_toml, load_plan, require_layout_written
     from stcal.locate.report.calibration import calibrated_file, calibrated_text, warnings
     from stcal.workflows.board_views import calibration_images
 
@@ -131,6 +131,7 @@ def calibrate(
     print_each("left out", (*observed.left_out, *result.left_out))
     print_each("warning", warnings(result, plan.tags))
     write(out, layout_toml(result.layout, [f"Calibrated by stcal locate from {len(result.images)} images."]))
+    require_layout_written(out, result.layout)
     write_if(json_file, lambda: calibrated_file(result))
 
 
@@ -227,7 +228,9 @@ def run(
 
     Exit code 3 when no pose is accepted.
     """
+    from stcal.geometry.rigid import Poses
     from stcal.io.cameras.read import read_camera
+    from stcal.io.table import require_pose_table_written
     from stcal.locate.data.exposures import find_scenes
     from stcal.locate.data.layout import load_layout
     from stcal.locate.pipeline import LocateOptions
@@ -281,6 +284,8 @@ def run(
     print_each("warning", doubts)
     print_each("not used", (each for scene in scenes for each in scene.skipped))
     write_if(out, lambda: poses_csv(results, chain))
+    if out and (poses := [uncertain(each).rigid for each in accepted(results)]):
+        require_pose_table_written(out, {"": Poses.of(poses)})
     write_if(json_file, lambda: LocatedFile.of(results, target, chain))
     write_if(report, document.page)
     if not accepted(results):

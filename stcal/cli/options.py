@@ -32,12 +32,27 @@ CameraFile = Annotated[
         "--camera", help="Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB."
     ),
 ]
+OptionalCamera = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        help="Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB; found from "
+        "the target's printed faces if not given.",
+    ),
+]
 CAMERA = "--camera"
 CameraName = Annotated[
     str,
     typer.Option("--camera-name", help="Take this camera of a --camera file of several: its name, or COLMAP's number."),
 ]
 """Option that every command with ``--camera`` has."""
+Bayer = Annotated[
+    str,
+    typer.Option(
+        "--bayer", help="Take images for mosaics of a sensor with this Bayer pattern: RGGB, BGGR, GRBG or GBRG."
+    ),
+]
+"""Option that every command has that reads a folder of images."""
 TargetFile = Annotated[
     Path | None,
     typer.Option("--target", help="Read the target's design from this target.toml, in place of the reference design."),
@@ -317,7 +332,7 @@ def protect_outputs(application: typer.Typer) -> None:
 def _protected(command: Callable) -> Callable:
     if hasattr(command, "outputs"):  # reached through two applications
         return command
-    words, outputs = {}, set()
+    words, outputs, reads_images = {}, set(), False
     signature = inspect.signature(command, eval_str=True)
     for name, parameter in signature.parameters.items():
         for info in get_args(parameter.annotation)[1:]:
@@ -326,10 +341,19 @@ def _protected(command: Callable) -> Callable:
             words[name] = names[0] if names else name
             writes = bool(getattr(info, "writable", False))
             outputs |= {name} if writes else set()
+            of_images = name in ("images", "exposures") or "IMAGES" in str(getattr(info, "metavar", ""))
+            reads_images |= of_images and "Path" in str(parameter.annotation) and command.__name__ != "capture"
             info.rich_help_panel = panel_of(name, "Path" in str(parameter.annotation), writes)
 
     @wraps(command)
-    def checked(overwrite: bool = False, quiet: bool = False, verbose: bool = False, camera_name: str = "", **given):
+    def checked(
+        overwrite: bool = False,
+        quiet: bool = False,
+        verbose: bool = False,
+        camera_name: str = "",
+        bayer: str = "",
+        **given,
+    ):
         paths = [
             (name, path)
             for name, value in given.items()
@@ -352,7 +376,7 @@ def _protected(command: Callable) -> Callable:
             if command.__name__ not in ALWAYS_NEW and not any(given.get(name) for name in WRITE_NOTHING):
                 require_new(written)
             with manner(quiet, verbose), said_apart() if to_stdout else nullcontext(), input_notes():
-                return command(**given) if not camera_name else _of_camera(camera_name, command, given)
+                return command(**given) if not camera_name + bayer else _with(camera_name, bayer, command, given)
         finally:
             _replacing.reset(token)
 
@@ -367,17 +391,22 @@ def _protected(command: Callable) -> Callable:
         further["camera_name"] = CameraName
         name = inspect.Parameter("camera_name", inspect.Parameter.KEYWORD_ONLY, default="", annotation=CameraName)
         added.insert(0, name)
+    if reads_images:
+        pattern = inspect.Parameter("bayer", inspect.Parameter.KEYWORD_ONLY, default="", annotation=Bayer)
+        further["bayer"] = Bayer
+        added.insert(0, pattern)
     # Typer reads both.
     checked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore[attr-defined]
     checked.__annotations__ = {**command.__annotations__, **further}
     return checked
 
 
-def _of_camera(name: str, command: Callable, given: dict):
-    """Run a command that reads camera files, with the camera of this name of a file of several."""
+def _with(camera_name: str, bayer: str, command: Callable, given: dict):
+    """Run a command with the camera of this name of files of several, and with images as mosaics of this pattern."""
     from stcal.io.cameras.read import camera_chosen
+    from stcal.io.images import mosaic_of
 
-    with camera_chosen(name):
+    with camera_chosen(camera_name), mosaic_of(bayer) if bayer else nullcontext():
         return command(**given)
 
 
@@ -414,11 +443,13 @@ def designs_told(
     with_target, with_board : bool
         Whether the reference design replaces a file that was not given.
     """
-    from stcal.io.design import target_of
+    from stcal.boards.target import body_of
     from stcal.sfm.detect.sightings import likeness_notes
 
     if target is not None:
-        print_each("note", likeness_notes(target_of(target)))
+        design = body_of(target)
+        print_each("note", likeness_notes(design.with_faces(printed=False)))
+        with_board = with_board and not design.has_scale
     assumed = assumed_designs(target is None and with_target, board is None and with_board)
     for design in assumed:
         say(f"assumed: {design}")

@@ -108,7 +108,7 @@ def register(
     from stcal.register import register as registered
     from stcal.register.core.liu2017 import Liu2017Options, sample_sizes
     from stcal.register.core.pairs import read_pairs
-    from stcal.register.report.file import RegistrationFile
+    from stcal.register.report.file import RegistrationFile, require_registration_written
     from stcal.register.report.page import registration_report, sample_size_section
     from stcal.register.workspace.findings import findings
 
@@ -144,6 +144,7 @@ def register(
         limits = liu2017 if threshold is None else replace(liu2017, limit_mm=threshold)
         sections.append(sample_size_section(sample_sizes(pairs.xyz_a, pairs.xyz_b, limits, seed), limits))
     if robot_file:
+        from stcal.robot.identification.result import require_identified_written
         from stcal.robot.kinematics.file import robot_toml
         from stcal.workflows.register_robot import compared, comparison_section, robot_part
 
@@ -154,12 +155,15 @@ def register(
             if identified:
                 comments = [f"Identified from {name_of(source)}: {beside.identified.rank} parameters."]
                 write(identified, robot_toml(beside.identified.robot, comments))
+                require_identified_written(identified, beside.identified)
         except (DegenerateError, ConvergenceError) as error:  # the transform is valid without it
             failed = error
     document = registration_report(registration, sections)
     say(document.text())
     print_each(f"warning: {pairs.where}", result.notes)
     write_if(out, lambda: content)
+    if out:
+        require_registration_written(out, registration)
     write_if(report, document.page)
     if failed is not None:
         raise failed

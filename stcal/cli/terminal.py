@@ -16,6 +16,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
+from stcal.errors import InputError
 from stcal.io import files
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ def _instead(character: str) -> str:
 def say(*values: object, sep: str = " ", end: str = "\n") -> None:
     """Prints the values, unless the command is quiet. Names from files may contain any characters."""
     if not _quiet.get():
-        print(_coloured(printable(sep.join(map(str, values)))), end=end)
+        print(_coloured(printable(sep.join(map(str, values)))) + end, end="")  # at once: threads may say something too
 
 
 def _coloured(text: str) -> str:
@@ -161,10 +162,16 @@ def said_apart() -> Iterator[None]:
 def write(path: Path, content, said: str = "written") -> None:
     """Saves text, bytes, or a dict or result file as JSON, and prints the path; ``-`` is standard output."""
     if path == STANDARD_OUTPUT and (taker := _taker.get()) is not None:
+        if getattr(taker, "name", "") == os.devnull:  # see ``entry.py``
+            raise InputError("E-OUTPUT-UNWRITABLE", "--json -: standard output is closed; give the name of a file")
         taker.write(_escaped(files.json_text(content), taker.encoding or "ascii"))
         taker.flush()
         return
     files.save(path, content if isinstance(content, str | bytes) else files.json_text(content))
+    if not isinstance(content, str | bytes | dict):
+        from stcal.io.json import require_result_written
+
+        require_result_written(path, content)
     say(f"{said}: {path}")
 
 

@@ -1,6 +1,7 @@
 """Read-only arrays of a checked shape, for the fields of the package's frozen dataclasses."""
 
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
@@ -23,6 +24,33 @@ if TYPE_CHECKING:
 
 else:
     Array = np.ndarray
+
+
+@lru_cache
+def _choices(kind: type) -> dict[str, tuple]:
+    """Return the words that a dataclass's fields of a Literal type admit, by field; None among them if optional."""
+    found = {}
+    for name, hint in get_type_hints(kind).items():
+        parts = get_args(hint) if get_origin(hint) in (Union, type(int | str)) else (hint,)
+        words = [word for part in parts if get_origin(part) is Literal for word in get_args(part)]
+        if words:
+            found[name] = (*words, *([None] if type(None) in parts else []))
+    return found
+
+
+def require_choices(instance: object, what: str) -> None:
+    """Refuse words in fields of a dataclass that their Literal types do not list; to be called in ``__post_init__``.
+
+    Raises
+    ------
+    InputError
+        The message begins with ``what`` and names the field and its choices.
+    """
+    for name, words in _choices(type(instance)).items():
+        value = getattr(instance, name)
+        if not any(value is word or (isinstance(value, str) and value == word) for word in words):
+            listed = " or ".join(str(word) for word in words if word is not None)
+            raise InputError("E-OPTION-VALUE", f"{what}: {name} {value!r}: not a choice; use {listed}")
 
 
 def frozen(values: ArrayLike, shape: Shape | None = None, what: str = "array", dtype: DTypeLike = float) -> np.ndarray:

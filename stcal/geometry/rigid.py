@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, overload
 
 import numpy as np
@@ -50,8 +50,24 @@ def _off_proper(x: list[float], y: list[float], z: list[float]) -> float:
     )
 
 
+class _ByValue:
+    """Equality of transforms whose numbers are the same to the last bit."""
+
+    __slots__ = ()
+
+    def _values(self) -> tuple:
+        parts = [getattr(self, entry.name) for entry in fields(self)]  # pyright: ignore[reportArgumentType]
+        return tuple(part._values() if isinstance(part, _ByValue) else np.asarray(part).tolist() for part in parts)
+
+    def __eq__(self, other: object) -> bool:
+        return self._values() == other._values() if type(other) is type(self) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(repr(self._values()).replace("-0.0", "0.0"))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Rigid:
+class Rigid(_ByValue):
     """A rigid transform a_from_b: ``xyz_a = rotation @ xyz_b + translation``.
 
     Parameters
@@ -137,7 +153,7 @@ class Rigid:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Similarity:
+class Similarity(_ByValue):
     """A similarity a_from_b: ``xyz_a = scale * rotation @ xyz_b + translation``.
 
     COLMAP's world has no unit; a transform out of it is a Similarity, so that forgetting the scale is a type error.
@@ -177,7 +193,7 @@ class Similarity:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Poses:
+class Poses(_ByValue):
     """A stack of m transforms a_from_b.
 
     ``rotation`` : (m, 3, 3), proper to 1e-6; ``translation`` : (m, 3), origin of b in a, mm.
@@ -277,7 +293,7 @@ class Poses:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Affine:
+class Affine(_ByValue):
     """An affine transform a_from_b of twelve parameters.
 
     Parameters

@@ -1,29 +1,42 @@
 """Default way of solving, where the user names none: the one with the smallest errors on held-out poses."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from stcal.errors import DegenerateError, StcalError
+from stcal.errors import StcalError
 from stcal.handeye.data.pairs import HandEyePoses, Setup
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.symmetry import repair
+from stcal.handeye.methods.closed_form import AX_XB, AX_ZB
 from stcal.handeye.result import HandEye
-from stcal.handeye.solve import HandEyeOptions, handeye
-from stcal.handeye.validate import HeldOutPoses, errors_without, widened_by_scatter
+from stcal.handeye.solve import HandEyeOptions, solved
+from stcal.handeye.validate import (
+    HeldOutPoses,
+    deciding_error,
+    predicted,
+    require_solvable_without,
+    widened_by_scatter,
+    with_jackknife,
+)
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread, run_parallel
 
-FIRST_SPLITS = 5
-"""Number of splits after which candidates that are surely worse than the best are given up."""
-WORSE = 3.0
-"""A candidate is surely worse if its mean error exceeds the best by so many standard errors of the difference."""
 AS_GOOD = 1.0
-"""Number of standard errors within which a candidate is as good as the best. Among these the one that trusts the files
-most is taken (the one-standard-error rule of Breiman et al., "Classification and Regression Trees", 1984)."""
+"""Number of standard errors of the difference within which another candidate predicts as well as the chosen one."""
+BY_CHANCE = 0.3
+"""Number of standard errors by which the best candidate must be ahead of those before it, which trust the files more
+and know their σ. It is less than the one of Breiman et al. ("Classification and Regression Trees", 1984): a candidate
+that is ahead by half a standard error is better two times in three."""
+WITHOUT_WEIGHTS = 0.7
+"""The same for closed forms against adjustments: they are many, so that one of them is more often ahead by chance."""
+TINY_MM = 1e-9
+"""Least standard error of a difference: differences of exact data are rounding."""
+MANY_PERCENT = 99.5
+"""Change of the board's size from which on a factor is clearer than per cent."""
 CONTRADICT = 0.01
 """Significance level: σ are widened if two answers differ so much that their σ explain it more rarely than this."""
 
@@ -51,7 +64,9 @@ class Candidate:
         return replace(options, intrinsics=prior if self.camera else None, with_scale=self.scale)
 
 
-BY_POSES = (Candidate("pose"), Candidate("pose", scale=True))
+CLOSED_FORMS = tuple(Candidate(method) for method in (*AX_ZB, *AX_XB))
+"""They weigh nothing, so that nothing is wrong with their weights: with few poor images they may be the best."""
+BY_POSES = (Candidate("pose"), Candidate("pose", scale=True), *CLOSED_FORMS)
 BY_VIEWS = (
     Candidate("reprojection"),
     Candidate("pose"),
@@ -59,24 +74,18 @@ BY_VIEWS = (
     Candidate("reprojection", scale=True),
     Candidate("pose", scale=True),
     Candidate("reprojection", camera=True, scale=True),
+    *CLOSED_FORMS,
 )
 """Candidates that are tried with corners; those that trust the files come first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tried:
-    """A candidate and its errors.
-
-    ``error_mm`` : (s, k) errors on held-out poses, for the splits on which it was tried; ``reason`` : why it fails,
-    empty if it does not; ``out`` : number of splits after which it was given up as surely worse, else 0; ``best_mm`` :
-    mean error of the best candidate on these splits, NaN if it was not given up.
-    """
+    """A candidate and its errors: ``error_mm`` : (s, k) on held-out poses, (0, 0) if it fails, and then ``reason``."""
 
     candidate: Candidate
     error_mm: np.ndarray
     reason: str = ""
-    out: int = 0
-    best_mm: float = float("nan")
 
     def mean_mm(self) -> float:
         """Returns the mean of all errors, or NaN if there are none."""
@@ -112,88 +121,67 @@ class Choice:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(eq=False)
-class _Race:
-    """The candidates while they are tried, split by split.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Outcome:
+    """``result`` of a candidate from all poses, its ``partial`` results without the poses of each split, and their
+    errors on these, ``error_mm`` (s, k)."""
 
-    ``errors`` : list of errors of each candidate, one entry per split; ``failed`` : reasons by candidate; ``out`` :
-    candidates given up, with the number of splits and the mean error of the best candidate on these, mm.
-    """
+    result: HandEye
+    partial: tuple[HandEye, ...]
+    error_mm: np.ndarray
 
-    pairs: HandEyePoses
-    setup: Setup
-    views: Views | None
-    options: HandEyeOptions
-    prior: CameraPrior | None
+
+def _solved(
+    pairs: HandEyePoses, setup: Setup, method: str, views: Views | None, options: HandEyeOptions, rows: np.ndarray
+) -> _Outcome | StcalError:
+    """Returns what a candidate makes of all poses and without those of each split, or the error if it fails."""
+    try:
+        solution = solved(pairs, setup, method, views, options)
+        partial = tuple(solution.without(out) for out in rows)
+        result = solution.result
+        if result.covariance is None:
+            result = with_jackknife(result, [solution.without(np.array([i])) for i in range(len(pairs))])
+    except StcalError as error:
+        return error
+    errors = [
+        deciding_error(part, pairs[out], None if views is None else views[out])
+        for part, out in zip(partial, rows, strict=True)
+    ]
+    return _Outcome(result, partial, np.array(errors))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trial:
+    """The candidates that were solved, in their order, and the poses held out, (s, k)."""
+
+    outcomes: dict[Candidate, _Outcome]
     rows: np.ndarray
-    workers: int | None
-    running: list[Candidate]
-    errors: dict[Candidate, list[dict[str, np.ndarray]]] = field(default_factory=dict)
-    failed: dict[Candidate, str] = field(default_factory=dict)
-    out: dict[Candidate, tuple[int, float]] = field(default_factory=dict)
-
-    @property
-    def measure(self) -> str:
-        """Name of the error of :class:`HeldOutPoses` that decides."""
-        return "translation_mm" if self.views is None else "board_mm"
-
-    def run(self, splits: range, progress: Callable[[int, int], None]) -> None:
-        """Computes the errors of every running candidate on these splits. A candidate that fails leaves the race."""
-        jobs, owners = [], []
-        for candidate in self.running:
-            options = candidate.options(self.options, self.prior)
-            for k in splits:
-                jobs.append((self.pairs, self.setup, candidate.method, self.views, options, self.rows[k]))
-                owners.append((candidate, k))
-        outcomes = {}
-        for done, (i, errors) in enumerate(run_parallel(_tried, jobs, 1 if self.views is None else self.workers), 1):
-            outcomes[owners[i]] = errors
-            progress(done, len(jobs))
-        for candidate in list(self.running):
-            for k in splits:
-                outcome = outcomes[candidate, k]
-                if isinstance(outcome, str):
-                    self.failed.setdefault(candidate, outcome)
-                    break
-                self.errors.setdefault(candidate, []).append(outcome)
-        self.running = [candidate for candidate in self.running if candidate not in self.failed]
-
-    def of(self, candidate: Candidate) -> np.ndarray:
-        """Returns the candidate's errors so far, (s, k), mm."""
-        return np.array([errors[self.measure] for errors in self.errors.get(candidate, [])])
-
-    def give_up(self) -> None:
-        """Gives up the candidates that are surely worse than the best."""
-        if len(self.running) < 2:
-            return
-        rows = self.rows[: len(self.of(self.running[0]))]
-        best = min(self.running, key=lambda running: self.of(running).mean())
-        for candidate in [running for running in self.running if running != best]:
-            mean, standard_error = _difference(self.of(candidate) - self.of(best), rows)
-            if mean > WORSE * standard_error:
-                self.out[candidate] = len(rows), float(self.of(best).mean())
-        self.running = [candidate for candidate in self.running if candidate not in self.out]
 
     def best(self, but: np.ndarray | None = None) -> Candidate:
-        """Returns the first candidate that is as good as the best, judged by the errors on all poses except ``but``."""
+        """Returns the first candidate that is not behind the best by more than chance, by all poses except ``but``."""
         rows = self.rows if but is None else np.where(np.isin(self.rows, but), -1, self.rows)
         if (rows < 0).all():  # a single split: no other poses were held out
             rows = self.rows
-        mean = {each: float(self.of(each)[rows >= 0].mean()) for each in self.running}
-        best = min(self.running, key=mean.__getitem__)
-        for candidate in self.running:
-            excess, standard_error = _difference(self.of(candidate) - self.of(best), rows)
-            if excess <= AS_GOOD * standard_error:
-                return candidate
-        return best
+        adjusted = [each for each in self.outcomes if each not in CLOSED_FORMS]
+        closed = [each for each in self.outcomes if each in CLOSED_FORMS]
+        chosen = self._first_of(adjusted or closed, rows)
+        rival = self._first_of(closed, rows) if adjusted and closed else chosen
+        return rival if self._behind(chosen, rival, rows) > WITHOUT_WEIGHTS else chosen
 
+    def _first_of(self, candidates: list[Candidate], rows: np.ndarray) -> Candidate:
+        """Returns the first of the candidates that is not behind the best of them by more than chance."""
+        best = min(candidates, key=lambda each: float(self.outcomes[each].error_mm[rows >= 0].mean()))
+        return next(each for each in candidates if self._behind(each, best, rows) <= BY_CHANCE)
 
-def _tried(*job) -> dict[str, np.ndarray] | str:
-    """Returns the errors by name, or the message if the solution fails."""
-    try:
-        return errors_without(*job)
-    except StcalError as error:
-        return str(error)
+    def _behind(self, candidate: Candidate, other: Candidate, rows: np.ndarray) -> float:
+        """Returns the mean error of a candidate less that of another one, in standard errors of the difference."""
+        difference = self.outcomes[candidate].error_mm - self.outcomes[other].error_mm
+        excess, standard_error = _difference(difference, rows)
+        return excess / max(standard_error, TINY_MM) if excess > 0 else 0.0
+
+    def as_good(self, candidate: Candidate, chosen: Candidate) -> bool:
+        """True if the candidate predicts as well as the chosen one, within one standard error."""
+        return self._behind(candidate, chosen, self.rows) <= AS_GOOD
 
 
 def _difference(off: np.ndarray, rows: np.ndarray) -> tuple[float, float]:
@@ -218,11 +206,10 @@ def choose(
     workers: int | None = 1,
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> Choice:
-    """Solves with camera and board as filed and with either as unknown, by poses and by corners; chooses the best.
+    """Solves with camera and board as filed and with either as unknown, by poses, by corners and in closed form.
 
-    Errors on held-out poses decide: the 3-D error at the board if there are corners, else that of the board's origin.
-    Candidates that are surely worse are given up after a few splits. Among the candidates that are as good as the best
-    within one standard error, the one that trusts the files most is chosen.
+    The errors on held-out poses decide: the 3-D error at the board if there are corners, else that of the board's
+    origin. Solutions without some poses are one step from the solution of all.
 
     Parameters
     ----------
@@ -249,37 +236,44 @@ def choose(
     if options.symmetries:
         repaired = repair(pairs, setup, options.symmetries, views)
         pairs, views, options = repaired.pairs, repaired.views, replace(options, symmetries=())
-    candidates = [each for each in (BY_POSES if views is None else BY_VIEWS) if prior is not None or not each.camera]
-    plain = handeye(pairs, setup, candidates[0].method, views, candidates[0].options(options, prior))
-    race = _Race(pairs, setup, views, options, prior, rows, workers, candidates)
-    race.run(range(min(FIRST_SPLITS, len(rows))), progress)
-    if race.running:
-        race.give_up()
-        race.run(range(min(FIRST_SPLITS, len(rows)), len(rows)), progress)
-    if not race.running:
-        raise DegenerateError("E-HANDEYE-NO-METHOD", race.failed[candidates[0]])
-    chosen = race.best()
-    errors_of_split = [race.errors[race.best(but=out)][k] for k, out in enumerate(rows)]
+    for out in rows:
+        require_solvable_without(pairs, setup, options, out)
+    candidates = [
+        each
+        for each in (BY_POSES if views is None else BY_VIEWS)
+        if (prior is not None or not each.camera) and not (options.four_dof and each in CLOSED_FORMS)
+    ]
+    jobs = [(pairs, setup, each.method, views, each.options(options, prior), rows) for each in candidates]
+    finished: dict[int, _Outcome | StcalError] = {}
+    for i, outcome in run_parallel(_solved, jobs, 1 if views is None else workers):
+        if i == 0 and isinstance(outcome, StcalError):  # what the first one cannot use, the others should not
+            raise outcome
+        finished[i] = outcome
+        progress(len(finished), len(jobs))
+    outcomes = {candidate: finished[i] for i, candidate in enumerate(candidates)}
+    trial = _Trial({each: outcome for each, outcome in outcomes.items() if isinstance(outcome, _Outcome)}, rows)
+    chosen = trial.best()
+    errors_of_split = []
+    for k, out in enumerate(rows):
+        part = trial.outcomes[trial.best(but=out)].partial[k]
+        errors = predicted(part, pairs[out], None if views is None else views[out])
+        errors_of_split.append(errors | {"mount_from_camera": part.mount_from_camera.matrix()})
     held_out = HeldOutPoses(
         rows, **{name: np.array([each[name] for each in errors_of_split]) for name in errors_of_split[0]}
     )
-    results = {candidates[0]: plain}
-    for each in race.running:
-        if each not in results:
-            results[each] = handeye(pairs, setup, each.method, views, each.options(options, prior))
-    not_given_up = (0, float("nan"))
     tried = tuple(
-        Tried(each, race.of(each), race.failed.get(each, ""), *race.out.get(each, not_given_up)) for each in candidates
+        Tried(each, outcome.error_mm) if isinstance(outcome, _Outcome) else Tried(each, np.zeros((0, 0)), str(outcome))
+        for each, outcome in outcomes.items()
     )
-    rivals = {each: results[each] for each in race.running if each != chosen and _as_good(race, each, chosen)}
-    result, notes = _widened(widened_by_scatter(results[chosen], held_out), chosen, rivals)
-    return Choice(tried, chosen, result, held_out, _sentence(tried, chosen, result, race.measure), notes)
-
-
-def _as_good(race: _Race, candidate: Candidate, chosen: Candidate) -> bool:
-    """True if the candidate predicts as well as the chosen one, within one standard error."""
-    excess, standard_error = _difference(race.of(candidate) - race.of(chosen), race.rows)
-    return excess <= AS_GOOD * standard_error
+    rivals = {
+        each: outcome.result
+        for each, outcome in trial.outcomes.items()
+        if each != chosen and each not in CLOSED_FORMS and trial.as_good(each, chosen)
+    }
+    result = widened_by_scatter(trial.outcomes[chosen].result, held_out)
+    result, notes = _widened(result, chosen, rivals)
+    measure = "translation_mm" if views is None else "board_mm"
+    return Choice(tried, chosen, result, held_out, _sentence(tried, chosen, result, measure), notes)
 
 
 def _widened(result: HandEye, chosen: Candidate, rivals: dict[Candidate, HandEye]) -> tuple[HandEye, tuple[str, ...]]:
@@ -317,8 +311,10 @@ def _sentence(tried: tuple[Tried, ...], chosen: Candidate, result: HandEye, meas
         parts.append(f"the camera file costs {min(filed_mm) - chosen_mm:.2g} mm")
     if chosen.scale and result.sigma_scale is not None:
         percent = 100 * (result.scale - 1)
-        size = "larger" if percent > 0 else "smaller"
-        parts.append(f"the board is {abs(percent):.2g} ± {100 * result.sigma_scale:.1g} % {size} than stated")
+        size = f"{abs(percent):.2g} ± {100 * result.sigma_scale:.1g} % {'larger' if percent > 0 else 'smaller'} than"
+        if abs(percent) >= MANY_PERCENT:
+            size = f"{result.scale:.3g} ± {result.sigma_scale:.1g} times as large as"
+        parts.append(f"the board is {size} stated")
     rad, mm = (result.sigma.get(name) for name in ("robot_rad", "robot_mm"))
     if rad is not None and mm is not None and {"robot_rad", "robot_mm"} & set(result.estimated):
         parts.append(f"the robot's poses err by {np.degrees(rad):.2g}° and {mm:.2g} mm an axis")

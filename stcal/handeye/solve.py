@@ -13,7 +13,7 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log
 from stcal.handeye.data.views import Views
-from stcal.handeye.judge import remarks
+from stcal.handeye.judge import flips, remarks
 from stcal.handeye.judge.conventions import Guess, check_conventions
 from stcal.handeye.judge.observability import Observability, check, in_words, require_scale
 from stcal.handeye.judge.remarks import Aside
@@ -113,6 +113,11 @@ class _Task:
     seen: Observability
     notes: tuple[str, ...]
 
+    def only(self, rows: np.ndarray) -> "_Task":
+        """Returns the task with these poses alone."""
+        views = None if self.views is None else self.views[rows]
+        return replace(self, pairs=self.pairs[rows], loop=self.loop[rows], views=views)
+
 
 def _guess(options: HandEyeOptions, seen: Observability, loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
     """Returns the first X, Z and scale."""
@@ -166,6 +171,17 @@ def handeye(
     >>> found = handeye(pairs, "eye-in-hand")  # doctest: +SKIP
     >>> found.flange_from_camera @ [0, 0, 500]  # a point half a metre before the camera  # doctest: +SKIP
     """
+    return solved(pairs, setup, method, views, options).result
+
+
+def solved(
+    pairs: HandEyePoses,
+    setup: Setup,
+    method: str | None,
+    views: Views | None,
+    options: HandEyeOptions | None,
+) -> "Solved":
+    """Returns the result of :func:`handeye` with what solutions without some poses start from."""
     method = method or ("pose" if views is None else "reprojection")
     if method not in METHODS:
         raise InputError(
@@ -187,7 +203,45 @@ def handeye(
         return _by_poses(task)
     if method == "reprojection" and task.views is not None:
         return _by_views(task, task.views)
-    return _by_equations(task, method)
+    return Solved(task, _by_equations(task, method))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """``result`` of a ``task``, and the ``solution`` behind it where the method adjusts poses or corners."""
+
+    task: _Task
+    result: HandEye
+    solution: PoseSolution | AdjustedViews | None = None
+
+    def without(self, out: np.ndarray) -> HandEye:
+        """Returns the result without the poses ``out``, (k,) rows: X, Z, scale, camera and board. All else, σ and
+        outliers among them, is that of all poses.
+
+        Adjustments move from the solution of all poses by its equations; other methods are solved again.
+
+        Raises
+        ------
+        StcalError
+            The method fails without these poses.
+        """
+        task, solution = self.task, self.solution
+        if solution is None:
+            again = _by_equations(task.only(np.setdiff1d(np.arange(len(task.loop)), out)), self.result.method)
+            return replace(
+                self.result, mount_from_camera=again.mount_from_camera, stand_from_board=again.stand_from_board
+            )
+        board = None
+        if isinstance(solution, AdjustedViews):
+            state = solution.without(out)
+            found, corners = solution.found, state.scale * state.corners
+            board = replace(found, camera=state.camera, corners=corners)
+        else:
+            state = solution.without(task.loop, out)
+        x, z = state.mount_from_camera, state.stand_from_board
+        if task.options.four_dof:
+            x, z = closed_form.slid(x, z, task.seen.mount_axis, task.loop)
+        return replace(self.result, mount_from_camera=x, stand_from_board=z, scale=state.scale, reprojection=board)
 
 
 def _task(pairs: HandEyePoses, setup: Setup, views: Views | None, options: HandEyeOptions) -> _Task:
@@ -213,7 +267,7 @@ def _by_equations(task: _Task, method: str) -> HandEye:
     """Solves AX = XB or AX = ZB by the named method."""
     if task.options.four_dof:
         raise DegenerateError(
-            "E-HANDEYE-AXES", f"hand-eye: {method} needs rotations about two axes; with four_dof use method pose"
+            "E-HANDEYE-AXES", f"hand-eye: {method} needs rotations about two axes; with --four-dof use method pose"
         )
     loop, notes, noise = task.loop, task.notes, task.options.noise
     unit_mm = noise.camera_mm / noise.camera_rad if noise.camera_mm and noise.camera_rad else UNIT_MM
@@ -261,7 +315,7 @@ def _by_motions(loop: Loop, method: str, unit_mm: float, options: EvolutionOptio
     return polish(objective, x) if method == "de-polished" else x
 
 
-def _by_poses(task: _Task) -> HandEye:
+def _by_poses(task: _Task) -> Solved:
     options = task.options
     first = LoopState(*task.guess(task.loop, options.with_scale))
     solution, contradicted = _by_true_robot(
@@ -276,7 +330,7 @@ def _by_poses(task: _Task) -> HandEye:
         require_scale(state.scale, sigma_scale, task.loop, task.pairs.where)
     if options.four_dof:
         x, z, covariance, notes = _without_slide(task, x, z, normal)
-    notes += _remarks(task, solution.outliers, solution.residuals, solution.scale_hint)
+    notes += _remarks(task, x, solution.outliers, solution.residuals, solution.scale_hint)
     if (factor := solution.sigma.get("camera_factor", 1.0)) > WIDENED:
         notes += (f"the board's poses err {factor:.2g} times what their σ say: check the intrinsics",)
     if not solution.sigma or noise.robot_rad is not None or noise.camera_rad is not None:
@@ -288,7 +342,7 @@ def _by_poses(task: _Task) -> HandEye:
         error = of_poses(task.loop, solution, task.views, options.camera)
         covariance = error.covariance(covariance[:12, :12])
     stated = {name: getattr(noise, name) for name in ("robot_rad", "robot_mm", "camera_rad", "camera_mm")}
-    return HandEye(
+    result = HandEye(
         method="pose",
         setup=task.setup,
         mount_from_camera=x,
@@ -305,18 +359,19 @@ def _by_poses(task: _Task) -> HandEye:
         observability=task.seen,
         notes=notes + remarks.of_rounds(solution.settled),
     )
+    return Solved(task, result, solution)
 
 
-def _by_views(task: _Task, views: Views) -> HandEye:
+def _by_views(task: _Task, views: Views) -> Solved:
     options, names = task.options, task.pairs.names
     first = task.guess(task.loop, options.with_scale)
 
-    def solved(loop: Loop, noise: Noise) -> AdjustedViews:
+    def adjusted_by(loop: Loop, noise: Noise) -> AdjustedViews:
         flange = task.pairs.base_from_flange
         intrinsics, camera = options.intrinsics, options.camera
         return adjust_views(loop, flange, views, first, noise, intrinsics, options.with_scale, camera, options.arm)
 
-    solution, contradicted = _by_true_robot(task, solved)
+    solution, contradicted = _by_true_robot(task, adjusted_by)
     if solution.sigma_scale is not None:
         require_scale(solution.state.scale, solution.sigma_scale, task.loop, task.pairs.where)
     x, z = solution.state.mount_from_camera, solution.state.stand_from_board
@@ -327,9 +382,9 @@ def _by_views(task: _Task, views: Views) -> HandEye:
         covariance = solution.camera_error.covariance(covariance)
     adjusted = replace(solution.loop, camera_from_board=resected(names, views, solution.found))
     residuals = adjusted.residuals(x, z)
-    notes += _remarks(task, solution.outliers, residuals, solution.scale_hint)
+    notes += _remarks(task, x, solution.outliers, residuals, solution.scale_hint)
     notes += of_camera_file(solution.camera_gain, solution.sigma)
-    return HandEye(
+    result = HandEye(
         method="reprojection",
         setup=task.setup,
         mount_from_camera=x,
@@ -347,6 +402,7 @@ def _by_views(task: _Task, views: Views) -> HandEye:
         observability=task.seen,
         notes=notes + remarks.of_rounds(solution.settled),
     )
+    return Solved(task, result, solution)
 
 
 def of_camera_file(camera_gain: float, sigma: dict[str, float]) -> tuple[str, ...]:
@@ -405,11 +461,17 @@ def _contradicted(
     return any(found) and worse > REST_WORSE
 
 
-def _remarks(task: _Task, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]) -> tuple[str, ...]:
-    """Returns notes on outliers, groups of poses, the board's size, and distances."""
+def _remarks(
+    task: _Task, x: Rigid, outliers: np.ndarray, residuals: np.ndarray, hint: tuple[float, float]
+) -> tuple[str, ...]:
+    """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
     names = tuple(name for name, bad in zip(task.pairs.names, outliers, strict=True) if not bad)
     notes = remarks.of_outliers(task.pairs.names, outliers, residuals)
-    notes += remarks.of_groups(names, residuals[~outliers])
+    if outliers.any():
+        z = closed_form.mean_pose(task.loop[~outliers].chain(x))
+        notes += flips.note_of(task.pairs.names, flips.flipped(task.loop, x, z, outliers))
+    moved = remarks.of_order(task.pairs.names, residuals, task.loop.jacobian(x)[:, :, :12])
+    notes += moved or remarks.of_groups(names, residuals[~outliers])
     if not (task.options.with_scale or task.options.four_dof):
         notes += remarks.of_size(task.loop[~outliers], hint, task.options.noise)
     return notes + remarks.of_distance(task.loop)

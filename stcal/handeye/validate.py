@@ -1,6 +1,6 @@
 """Validation of a hand-eye calibration on poses and motions that were held out, and the scatter of its solutions."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,8 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Motions, Setup
 from stcal.handeye.data.views import View, Views, resect
-from stcal.handeye.judge.remarks import Grave
+from stcal.handeye.judge.observability import check
+from stcal.handeye.judge.remarks import Aside, Grave
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods.noise import UNKNOWNS
 from stcal.handeye.result import HandEye
@@ -196,13 +197,56 @@ def errors_without(
     try:
         result = handeye(pairs[remaining], setup, method, None if views is None else views[remaining], options)
     except DegenerateError as error:
-        names = ", ".join(pairs.names[i] for i in out)
-        raise DegenerateError(error.code, f"without {names}: {error}") from error
+        raise _without(pairs, out, error) from error
     unseen = pairs[out]
     if arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
         unseen = replace(unseen, base_from_flange=arm[out].poses(result.reprojection.arm))
     errors = predicted(result, unseen, None if views is None else views[out])
     return errors | {"mount_from_camera": result.mount_from_camera.matrix()}
+
+
+def _without(pairs: HandEyePoses, out: np.ndarray, error: DegenerateError) -> DegenerateError:
+    return DegenerateError(error.code, f"without {', '.join(pairs.names[i] for i in out)}: {error}")
+
+
+def require_solvable_without(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, out: np.ndarray) -> None:
+    """Checks that the poses besides ``out``, (k,), determine the answer.
+
+    Raises
+    ------
+    DegenerateError
+        They do not. The message names the poses that were held out.
+    """
+    remaining = np.setdiff1d(np.arange(len(pairs)), out)
+    try:
+        check(Loop.of(pairs[remaining], setup), setup, pairs.where, options.four_dof)
+    except DegenerateError as error:
+        raise _without(pairs, out, error) from error
+
+
+def deciding_error(result: HandEye, pairs: HandEyePoses, views: Views | None) -> np.ndarray:
+    """Returns the errors (k,), mm, by which ways of solving are chosen: ``board_mm`` of :class:`HeldOutPoses`, or
+    ``translation_mm`` without views."""
+    loop, scale = Loop.of(pairs, result.setup), result.scale
+    if views is None:
+        residuals = loop.residuals(result.mount_from_camera, result.stand_from_board, scale)
+        return np.linalg.norm(residuals[:, 3:], axis=1)
+    camera, adjusted_views = _as_adjusted(result, views)
+    poses = zip(adjusted_views, _by_robot(result, loop), strict=True)
+    return np.array([_beside(view, camera, pose) for view, pose in poses])
+
+
+def _as_adjusted(result: HandEye, views: Views) -> tuple[Camera, list[View]]:
+    """Returns the camera of the result, and the views with the corners at their places on its board."""
+    board = result.reprojection
+    if board is None:
+        return views.camera, [view.moved(result.scale * view.xyz_board) for view in views.views]
+    return board.camera, [view.moved(board.board(view.xyz_board)) for view in views.views]
+
+
+def _by_robot(result: HandEye, loop: Loop) -> Poses:
+    """Returns camera_from_board as the robot's poses give it."""
+    return result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
 
 
 def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict[str, np.ndarray]:
@@ -214,16 +258,12 @@ def predicted(result: HandEye, pairs: HandEyePoses, views: Views | None) -> dict
             "rotation_rad": np.linalg.norm(residuals[:, :3], axis=1),
             "translation_mm": np.linalg.norm(residuals[:, 3:], axis=1),
         }
-    board = result.reprojection
-    camera = views.camera if board is None else board.camera
-    adjusted_views = [
-        view.moved(scale * view.xyz_board if board is None else board.board(view.xyz_board)) for view in views.views
-    ]
+    camera, adjusted_views = _as_adjusted(result, views)
     pose_by_view = resect(Views(camera, tuple(adjusted_views)), pairs.names).camera_from_board
     residuals = replace(loop, camera_from_board=pose_by_view).residuals(
         result.mount_from_camera, result.stand_from_board
     )
-    pose_by_robot = result.mount_from_camera.inverse() @ loop.stand_from_mount.inverse() @ result.stand_from_board
+    pose_by_robot = _by_robot(result, loop)
     return {
         "rotation_rad": np.linalg.norm(residuals[:, :3], axis=1),
         "translation_mm": np.linalg.norm(residuals[:, 3:], axis=1),
@@ -343,6 +383,22 @@ def _apart(view: View, first: Rigid, second: Rigid) -> float:
     return float(np.linalg.norm(first @ view.xyz_board - second @ view.xyz_board, axis=1).mean())
 
 
+def with_jackknife(result: HandEye, without_one: list[HandEye]) -> HandEye:
+    """Returns a result with covariances by the delete-one jackknife (Quenouille 1956, Tukey 1958).
+
+    ``without_one`` : results without each of the m poses. Their scatter is (m − 1)⁻² of what solutions of independent
+    samples would have.
+    """
+    m, covariances = len(without_one), {}
+    for name, key in (("mount_from_camera", "covariance"), ("stand_from_board", "stand_covariance")):
+        poses = Poses.of([getattr(part, name) for part in without_one])
+        moved = poses.difference(Poses.of([getattr(result, name)] * m))
+        moved = moved - moved.mean(0)
+        covariances[key] = (m - 1) / m * moved.T @ moved
+    note = Aside(f"σ of both transforms are by the jackknife: the scatter of {result.method} without each of the poses")
+    return replace(result, **covariances, notes=(*result.notes, note))
+
+
 SCATTERED = 1.5
 """Scatter, in units of what σ predict, from which on there is a note. One in a hundred sets of twelve simulated poses
 scatters as much if the poses err as assumed."""
@@ -370,12 +426,38 @@ def scatter(result: HandEye, held_out: HeldOutPoses) -> float:
     """
     if result.covariance is None or held_out.mount_from_camera is None or not len(held_out.rows):
         return float("nan")
-    matrices, k = held_out.mount_from_camera, held_out.rows.shape[1]
-    solutions = Poses(matrices[:, :3, :3], matrices[:, :3, 3])
-    differences = solutions.difference(Poses.of([result.mount_from_camera] * len(solutions)))
-    squared = np.einsum("sa,ab,sb->s", differences, generalised_inverse(result.covariance), differences)
-    dof = 6 * (len(result.names) - k) - UNKNOWNS - 1
-    return float(np.sqrt(squared.mean() / 6 * dof / (6 * k)))
+    m, k = len(result.names), held_out.rows.shape[1]
+    return scatter_of(
+        [result.mount_from_camera], held_out.mount_from_camera[:, None], result.covariance, m, k / m, UNKNOWNS
+    )
+
+
+def scatter_of(
+    found: Sequence[Rigid], matrices: np.ndarray, covariance: np.ndarray, images: int, out: float, unknowns: int
+) -> float:
+    """Returns the :func:`scatter` of c cameras.
+
+    ``found`` : the c poses from all images, with their ``covariance`` (6c, 6c); ``matrices`` : (s, c, 4, 4) those of
+    each split; ``out`` : share of the ``images`` that each split holds out; ``unknowns`` : number of unknowns.
+    """
+    parts = []
+    for i, pose in enumerate(found):
+        solutions = Poses(matrices[:, i, :3, :3], matrices[:, i, :3, 3])
+        parts.append(solutions.difference(Poses.of([pose] * len(solutions))))
+    differences = np.concatenate(parts, axis=1)
+    squared = np.einsum("sa,ab,sb->s", differences, generalised_inverse(covariance), differences)
+    dof = 6 * images * (1 - out) - unknowns - 1
+    return float(np.sqrt(squared.mean() / differences.shape[1] * dof / (6 * images * out)))
+
+
+def scatter_notes(factor: float, which: str) -> tuple[str, ...]:
+    """Returns a note if the scatter is large. ``which`` : the transforms with widened σ."""
+    if factor <= SCATTERED:
+        return ()
+    return (
+        f"solutions of parts of the poses scatter {factor:.2g} times as much as σ say, so that poses do not err "
+        f"independently and alike: σ of {which} transforms are widened by that",
+    )
 
 
 def widened_by_scatter(result: HandEye, held_out: HeldOutPoses) -> HandEye:
@@ -383,13 +465,7 @@ def widened_by_scatter(result: HandEye, held_out: HeldOutPoses) -> HandEye:
     factor = scatter(result, held_out)
     if not factor > 1:
         return result
-    notes = result.notes
-    if factor > SCATTERED:
-        notes += (
-            f"solutions of parts of the poses scatter {factor:.2g} times as much as σ say, so that poses do not err "
-            "independently and alike: σ of both transforms are widened by that",
-        )
-    return replace(result.widened(factor), notes=notes)
+    return replace(result.widened(factor), notes=(*result.notes, *scatter_notes(factor, "both")))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

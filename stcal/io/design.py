@@ -1,51 +1,44 @@
 """Readers of ``target.toml`` and ``board.toml`` that name every mistake, and writers that add comments for editing."""
 
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from stcal.design import (
     BoardDesign,
     FaceDesign,
+    KnownDistance,
     Polarity,
     StatedSize,
     TargetDesign,
+    board_lengths,
     reference_board,
     reference_target,
+    require_board,
+    require_distinct,
+    require_face,
+    require_ids,
 )
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.files import SETTINGS_BYTES, read_bytes
-from stcal.io.toml import (
-    Finite,
-    Length,
-    Positive,
-    Sized,
-    Strict,
-    load_toml,
-    radius,
-    require_millimetres,
-    side,
-    stated_unusual,
-    toml_string,
-)
-from stcal.labels import BOARD
-from stcal.lookalikes import MAX_GAP, MAX_RADIUS_RATIO, whole_likeness
+from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
+from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_string
+from stcal.lengths import radius, require_millimetres, stated_unusual
 
 REMEDY = "`stcal-sfm init DIR` writes one"
 ROUGH_KEYS = "rough_pose = { origin_mm, x, normal }"
 """Form of the entry in which a face of a target file may state its rough pose."""
-MIN_SINE = 0.02
-"""Smallest sine of the angle between the X and Y circles as seen from the origin circle."""
-
-
 MIN_DIRECTION = 1e-6
 MAX_SKEW_DEG = 5.0
 """Largest deviation from a right angle between X and normal of a rough pose."""
+
+INWARDS = Rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+"""Turns a frame whose Z points out of a body into that of a board or tag, whose Z points into it."""
 
 Vector = tuple[Finite, Finite, Finite]
 Count = Annotated[int, Field(ge=2, le=1000, strict=True)]
@@ -91,10 +84,54 @@ class _FaceFile(Strict):
     circles: list[_CircleFile] = Field(min_length=4)
 
 
+class PrintedFaceFile(Strict):
+    """A face with a board or tags; their keys are those of a board file, and of a tag in a layout."""
+
+    id: Name
+    rough_pose: _RoughPoseFile | None = None
+    outline_mm: list[tuple[Finite, Finite]] | None = Field(default=None, min_length=3, max_length=1000)
+    board: dict[str, Any] | None = None
+    tags: list[dict[str, Any]] | None = Field(default=None, min_length=1)
+    sigma_mm: Positive | None = None
+    size_sigma_mm: Positive | None = None
+
+    def rough(self, where: str) -> Rigid | None:
+        """Return the rough pose, None if none is stated: its normal points out of the body, the face's Z into it."""
+        return None if self.rough_pose is None else _rough_pose(self.rough_pose, where) @ INWARDS
+
+
+def _kind_of_face(face: Any) -> str:
+    return "<printed>" if isinstance(face, dict) and ("board" in face or "tags" in face) else "<circles>"
+
+
+class _ScaleFile(Strict):
+    """A known distance between two points."""
+
+    first: str = Field(alias="from")
+    second: str = Field(alias="to")
+    mm: Positive
+    sigma_mm: Positive
+
+
 class _TargetFile(Sized):
     name: Annotated[str, AfterValidator(lambda v: " ".join(v.split()))] = "target"
     polarity: Polarity
-    face: list[_FaceFile] = Field(min_length=1)
+    face: list[
+        Annotated[
+            Annotated[_FaceFile, Tag("<circles>")] | Annotated[PrintedFaceFile, Tag("<printed>")],
+            Discriminator(_kind_of_face),
+        ]
+    ] = Field(min_length=1)
+    scale: list[_ScaleFile] = Field(default=[])
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_circles(cls, content: Any) -> Any:
+        """Adds a polarity where no face has circles that could have one."""
+        faces = content.get("face") if isinstance(content, dict) else None
+        if isinstance(faces, list) and faces and all(_kind_of_face(face) == "<printed>" for face in faces):
+            return {"polarity": "bright"} | content
+        return content
 
 
 class _CornerFile(Strict):
@@ -144,8 +181,15 @@ class BoardEntry(BoardSizeEntry):
     unusual_size: bool = False
 
 
-def load_target(path: str | Path) -> TargetDesign:
+PrintedReader = Callable[[PrintedFaceFile, bool, str], FaceDesign]
+"""Makes a face from its entry; ``True`` if the file states an unusual size; and the beginning of messages."""
+
+
+def load_target(path: str | Path, printed: PrintedReader | None = None) -> TargetDesign:
     """Read ``target.toml`` (form: ``data_layout.md``).
+
+    ``printed`` : reads faces with a board or tags, which :func:`stcal.boards.target.load_body` does; they are refused
+    if it is None.
 
     Raises
     ------
@@ -155,18 +199,44 @@ def load_target(path: str | Path) -> TargetDesign:
     """
     data = load_toml(path, _TargetFile, "target file", REMEDY)
     where = f"target file {path}"
+    of_circles = [face for face in data.face if isinstance(face, _FaceFile)]
     require_millimetres(
-        [radius(f"radius_mm of circle {face.id}:{c.id}", c.radius_mm) for face in data.face for c in face.circles],
+        [radius(f"radius_mm of circle {face.id}:{c.id}", c.radius_mm) for face in of_circles for c in face.circles],
         data.unusual_size,
         where,
     )
-    _no_duplicates([face.id for face in data.face], f"{where}: face id")
+    require_ids([face.id for face in data.face], where)
+    faces = []
     for face in data.face:
-        if face.id == BOARD:
-            raise InputError("E-TARGET-ID", f"{where}: face id {BOARD} is taken by the board; choose another")
-    faces = tuple(_face(face, f"{where}: face {face.id}") for face in data.face)
-    _require_distinct(faces, where)
-    return TargetDesign(data.name, data.polarity, faces)
+        of_face = f"{where}: face {face.id}"
+        if isinstance(face, _FaceFile):
+            faces.append(_face(face, of_face))
+        elif printed is None:
+            raise InputError(
+                "E-TARGET-PRINTED",
+                f"{of_face}: a board or tags, which this command does not take yet; `stcal-sfm run`, `detect`, "
+                "`measure` and `simulate` do",
+            )
+        else:
+            faces.append(printed(face, data.unusual_size, of_face))
+    require_distinct([face for face in faces if face.printed is None], where)
+    distances = tuple(_distance(entry, faces, where) for entry in data.scale)
+    return TargetDesign(data.name, data.polarity, tuple(faces), data.unusual_size, distances)
+
+
+def _distance(entry: _ScaleFile, faces: Sequence[FaceDesign], where: str) -> KnownDistance:
+    """Return the known distance of an entry, of whose points the target has both."""
+    known = {str(label): label for face in faces for label in face.labels()}
+    for name in (entry.first, entry.second):
+        if name not in known:
+            raise InputError(
+                "E-TARGET-SCALE",
+                f"{where}: scale from {entry.first} to {entry.second}: no point {name} on the target; points are "
+                f"{faces[0].labels()[0]}, …",
+            )
+    if entry.first == entry.second:
+        raise InputError("E-TARGET-SCALE", f"{where}: scale from {entry.first} to itself; two points needed")
+    return KnownDistance(known[entry.first], known[entry.second], entry.mm, entry.sigma_mm)
 
 
 def load_board(path: str | Path) -> BoardDesign:
@@ -178,7 +248,7 @@ def load_board(path: str | Path) -> BoardDesign:
 def _require_dots(path: str | Path) -> None:
     """Refuse a file that names another kind of board; one that cannot be read is left to the reader."""
     try:
-        text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")
+        text = text_of(read_bytes(path, SETTINGS_BYTES))
     except (OSError, ValueError):
         return
     named = re.search(r"(?m)^\s*(?:type\s*=|target_type\s*:)\s*[\"']?([\w-]+)", text.split("[[")[0])
@@ -192,25 +262,10 @@ def _require_dots(path: str | Path) -> None:
 
 def board_design(data: BoardEntry, where: str) -> BoardDesign:
     """Return the board of an entry; the message of an InputError begins with ``where``."""
-    require_millimetres(_board_lengths(data.pitch_mm, data.radius_mm), data.unusual_size, where)
-    if 2 * data.radius_mm >= data.pitch_mm:
-        raise InputError(
-            "E-BOARD-RADIUS", f"{where}: radius {data.radius_mm:g} mm, under half the pitch {data.pitch_mm:g} mm needed"
-        )
-    corner = None
-    if data.corner is not None:
-        corner = (data.corner.row, data.corner.column)
-        if corner[0] not in (0, data.rows - 1) or corner[1] not in (0, data.columns - 1):
-            raise InputError(
-                "E-BOARD-CORNER",
-                f"{where}: corner dot at row {corner[0]}, column {corner[1]}; a corner of the grid needed",
-            )
-        if not 1.15 * data.radius_mm <= data.corner.radius_mm < data.pitch_mm - data.radius_mm:
-            raise InputError(
-                "E-BOARD-CORNER",
-                f"{where}: corner radius {data.corner.radius_mm:g} mm; at least {1.15 * data.radius_mm:g} mm "
-                f"and under {data.pitch_mm - data.radius_mm:g} mm needed",
-            )
+    require_millimetres(board_lengths(data.pitch_mm, data.radius_mm), data.unusual_size, where)
+    corner = None if data.corner is None else (data.corner.row, data.corner.column)
+    corner_mm = None if data.corner is None else data.corner.radius_mm
+    require_board(data.rows, data.columns, data.pitch_mm, data.radius_mm, corner, corner_mm, where)
     return BoardDesign(
         data.rows,
         data.columns,
@@ -219,13 +274,10 @@ def board_design(data: BoardEntry, where: str) -> BoardDesign:
         data.polarity,
         data.sigma_mm,
         corner,
-        data.corner.radius_mm if data.corner else None,
+        corner_mm,
         data.stated(),
+        data.unusual_size,
     )
-
-
-def _board_lengths(pitch_mm: float, radius_mm: float) -> list[Length]:
-    return [side("pitch_mm", pitch_mm), radius("radius_mm", radius_mm)]
 
 
 def target_of(given: str | Path | TargetDesign | None) -> TargetDesign:
@@ -238,47 +290,13 @@ def board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
     return reference_board() if given is None else given if isinstance(given, BoardDesign) else load_board(given)
 
 
-def _no_duplicates(ids: list[str], what: str) -> None:
-    for i, value in enumerate(ids):
-        if value in ids[:i]:
-            raise InputError("E-TARGET-ID", f"{what} {value} occurs twice; ids must differ")
-
-
 def _face(face: _FaceFile, where: str) -> FaceDesign:
     ids = [circle.id for circle in face.circles]
-    _no_duplicates(ids, f"{where}: circle id")
-    for key in ("origin", "x", "y"):
-        if getattr(face, key) not in ids:
-            raise InputError(
-                "E-TARGET-FRAME",
-                f"{where}: {key} circle {getattr(face, key)} is not among the circles {', '.join(ids)}",
-            )
     xy = np.array([[circle.x_mm, circle.y_mm] for circle in face.circles])
     radius = np.array([circle.radius_mm for circle in face.circles])
-    gap = np.linalg.norm(xy[:, None] - xy, axis=2) - radius[:, None] - radius
-    np.fill_diagonal(gap, np.inf)
-    if gap.min() <= 0:
-        i, j = np.unravel_index(gap.argmin(), gap.shape)
-        raise InputError("E-TARGET-OVERLAP", f"{where}: circles {ids[i]} and {ids[j]} overlap; move them apart")
-    origin, x, y = (xy[ids.index(getattr(face, key))] for key in ("origin", "x", "y"))
-    length_x, length_y = np.linalg.norm(x - origin), np.linalg.norm(y - origin)
-    if min(length_x, length_y) == 0:
-        raise InputError(
-            "E-TARGET-FRAME", f"{where}: frame circles {face.origin}, {face.x}, {face.y}; three different ones needed"
-        )
-    axis = (x - origin) / length_x
-    sine = float(axis[0] * (y - origin)[1] - axis[1] * (y - origin)[0]) / length_y
-    if abs(sine) < MIN_SINE:
-        raise InputError(
-            "E-TARGET-FRAME",
-            f"{where}: frame circles {face.origin}, {face.x}, {face.y} are collinear; choose three off one line",
-        )
-    if sine < 0:
-        raise InputError(
-            "E-TARGET-FRAME",
-            f"{where}: X to Y through {face.x} and {face.y} turns clockwise seen from outside; swap x and y, or "
-            "give positions as seen from outside with y up",
-        )
+    require_face(ids, xy, radius, (face.origin, face.x, face.y), where)
+    origin, x = (xy[ids.index(key)] for key in (face.origin, face.x))
+    axis = (x - origin) / np.linalg.norm(x - origin)
     face_from_drawing = np.array([axis, [-axis[1], axis[0]]])
     rough = None
     if face.rough_pose is not None:
@@ -321,32 +339,6 @@ def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline:
         )
 
 
-def _require_distinct(faces: tuple[FaceDesign, ...], where: str) -> None:
-    """Refuse faces that look alike in photographs, and a face that looks the same after a rotation."""
-    for i, face in enumerate(faces):
-        for second in faces[i:]:
-            few, many = (face, second) if len(face.ids) <= len(second.ids) else (second, face)
-            like = whole_likeness(
-                few.xy_mm, few.radius_mm, many.xy_mm, many.radius_mm, np.arange(len(few.ids)) if few is many else None
-            )
-            if like is None:
-                continue
-            size = "" if abs(like.scale - 1) < 0.005 else f" at {like.scale:.2f} times the size"
-            deviation = f"places differ by up to {round(like.gap_mm, 3):g} mm, radii by {round(like.radius_mm, 3):g} mm"
-            if few is many:
-                finding = f"face {face.id} looks the same after a turn by {abs(np.degrees(like.turn_rad)):.0f}°"
-            elif len(few.ids) == len(many.ids):
-                finding = f"faces {face.id} and {second.id} have the same pattern{size}"
-            else:
-                finding = f"the {len(few.ids)} circles of face {few.id} are all on face {many.id} too{size}"
-            raise InputError(
-                "E-TARGET-LIKENESS",
-                f"{where}: {finding} ({deviation}); "
-                f"change a circle on {'it' if few is many else 'one of them'}, its place by more than "
-                f"{MAX_GAP:g} radii or its radius by more than {MAX_RADIUS_RATIO - 1:.0%}",
-            )
-
-
 def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
     """Return target_from_drawing; X is made perpendicular to the normal."""
     directions = []
@@ -372,16 +364,30 @@ def _rough_pose(pose: _RoughPoseFile, where: str) -> Rigid:
     return Rigid(np.column_stack([x, np.cross(z, x), z]), pose.origin_mm)
 
 
-def target_toml(target: TargetDesign) -> str:
-    """Return the text of a ``target.toml`` for ``target``, with comments."""
+def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]] | None = None) -> str:
+    """Return the text of a ``target.toml`` for ``target``, with comments.
+
+    ``printed`` : returns the lines of the board or tags of a face, needed if the target has such faces.
+    """
     lines = [
         "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
         "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
         f"name = {toml_string(target.name)}",
         f'polarity = "{target.polarity}"  # circles are "bright" or "dark" against what surrounds them',
-        *stated_unusual(radius("", float(r)) for face in target.faces for r in face.radius_mm),
+        *stated_unusual(radius("", float(r)) for face in target.with_faces(False).faces for r in face.radius_mm),
     ]
+    scales: list[str] = []
+    for known in target.distances:
+        ends = f"from = {toml_string(known.first)}, to = {toml_string(known.second)}"
+        scales.append(f"  {{ {ends}, mm = {_number(known.mm)}, sigma_mm = {_number(known.sigma_mm)} }},")
+    lines += ["scale = [", *scales, "]"] if scales else []
     for face in target.faces:
+        if face.printed is not None:
+            assert printed is not None, "faces with a board or tags are written by stcal.boards.target"
+            pose = _rough_lines(face.rough_target_from_face @ INWARDS) if face.rough_target_from_face else []
+            outline = _outline_lines(face.outline_mm)
+            lines += ["", "[[face]]", f"id = {toml_string(face.id)}", *pose, *outline, *printed(face)]
+            continue
         lines += [
             "",
             "[[face]]",
@@ -448,7 +454,7 @@ def board_toml(board: BoardDesign) -> str:
                 f'polarity = "{board.polarity}"  # dots are "bright" or "dark" against the board',
                 f"sigma_mm = {_number(board.sigma_mm)}  # standard deviation of the dots' positions, per axis",
                 *(f"{key} = {_number(value)}" for key, value in sizes if value is not None),
-                *stated_unusual(_board_lengths(board.pitch_mm, board.radius_mm)),
+                *stated_unusual(board_lengths(board.pitch_mm, board.radius_mm)),
                 "",
                 "# One larger dot in a corner of the grid tells the orientation; without it the board looks the",
                 "# same after half a turn, which a run settles by comparing the images of a group.",
@@ -464,3 +470,11 @@ def board_toml(board: BoardDesign) -> str:
 
 def _number(value: float) -> str:
     return repr(round(float(value), 9) + 0.0)
+
+
+def save_design(path: str | Path, design: TargetDesign | BoardDesign) -> None:
+    """Write the file of a target or a board, and require that it is read as the same design."""
+    target = isinstance(design, TargetDesign)
+    text = target_toml(design) if target else board_toml(design)
+    save(Path(path), text)
+    require_same(path, lambda: target_toml(load_target(path)) if target else board_toml(load_board(path)), text)

@@ -1,15 +1,20 @@
-"""Reading of files within a size limit, and writing: completely or not at all, and never over an input."""
+"""Reading of files within a size limit, and writing: completely or not at all, never over an input, and read again."""
 
+import codecs
 import errno
 import json
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from stcal.errors import InputError
+from stcal.errors import ConvergenceError, InputError, StcalError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 MB = 1_000_000
 SETTINGS_BYTES = 10 * MB
@@ -39,6 +44,19 @@ def read_bytes(path: str | Path, most: int) -> bytes:
         if not remaining:
             raise _too_large(path, most)
     return b"".join(chunks)
+
+
+def text_of(content: bytes) -> str:
+    """Return the text of a file in UTF-8, or in UTF-16 with a byte-order mark; each line ends in a line feed.
+
+    Raises
+    ------
+    UnicodeDecodeError
+        It is neither.
+    """
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = content.decode("utf-16" if wide else "utf-8-sig")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def require_size(path: str | Path, most: int) -> None:
@@ -105,7 +123,8 @@ def save(path: Path, content: str | bytes) -> None:
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        # names of files that are not UTF-8 hold surrogates: written as \udcff, which JSON reads back
+        partial.write_bytes(content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content)
         os.replace(partial, path)
     except OSError as error:
         raise InputError(
@@ -139,6 +158,60 @@ def require_new_folder(out: Path, images: Path) -> None:
         raise InputError(
             "E-OUTPUT-UNWRITABLE", f"--out {out}: cannot be written: {error.strerror or error}; give another place"
         ) from error
+
+
+def require_written(
+    path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike", most: float, unit: str
+) -> None:
+    """Read a written file again, and require that it gives the values that were reported.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, for the message.
+    read : callable
+        Reads the file with the reader of later commands, and returns what it predicts.
+    reported : array
+        The same quantity from the result in memory; nan where there is none.
+    most : float
+        Largest difference of one value: rounding by the decimals of the file.
+    unit : str
+        Unit of the values.
+
+    Raises
+    ------
+    ConvergenceError
+        The file cannot be read again, or gives other values.
+    """
+    difference = _difference(path, read, reported)
+    if not difference <= most:
+        raise ConvergenceError(
+            "E-WRITTEN-DIFFERS",
+            f"{path}: the file gives values that differ from those reported by up to {difference:.2g} {unit}, "
+            f"{most:g} allowed; do not use the file, and report this with its data",
+        )
+
+
+def _difference(path: str | Path, read: "Callable[[], ArrayLike]", reported: "ArrayLike") -> float:
+    """Returns the largest difference between a file and the reported values; infinite for another shape."""
+    import numpy as np
+
+    try:
+        again = np.asarray(read(), float)
+    except (StcalError, OSError, LookupError, ValueError, SyntaxError) as error:
+        raise ConvergenceError(
+            "E-WRITTEN-DIFFERS",
+            f"{path}: written, and cannot be read again: {error}; do not use the file, and report this with its data",
+        ) from error
+    reported = np.asarray(reported, float)
+    if again.shape != reported.shape or (np.isnan(again) != np.isnan(reported)).any():
+        return float("inf")
+    return float(np.nanmax(np.abs(again - reported), initial=0.0))
+
+
+def require_same(path: str | Path, read: Callable[[], object], content: object) -> None:
+    """Read a written file again, and require that what is read equals ``content``: a text, or plain values."""
+    require_written(path, lambda: 0.0 if read() == content else float("inf"), 0.0, 0.0, "(content)")
 
 
 def save_folder(out: Path, files: dict[str, str]) -> None:

@@ -9,7 +9,9 @@ import unicodedata
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -17,19 +19,16 @@ import cv2
 import numpy as np
 from PIL import ExifTags, Image
 
-from stcal.errors import InputError
+from stcal.errors import InputError, InputNote
 from stcal.io.files import IMAGE_BYTES, RUN_MARKER, read_bytes
+from stcal.io.photographs import extras
+from stcal.io.photographs.mosaic import PATTERNS, demosaiced, patterns_seen
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
-_RAW = "a raw photograph, which is not read; develop it to TIFF without correction of the lens, crop or turn"
-OTHER_PHOTOGRAPHS = {
-    **dict.fromkeys(
-        (".heic", ".heif"),
-        "a HEIC photograph, which is not read; export it as JPEG of its full size, not edited",
-    ),
-    **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), _RAW),
-}
-"""Suffixes of photographs that are not read, and what to do."""
+USUAL = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+SUFFIXES = (*USUAL, *extras.readable())
+"""Suffixes of the images that are read, some of them by optional packages."""
+UNPACKED = (".png", ".tif", ".tiff", ".bmp")
+"""Forms in which programs of industrial cameras write pixels as the sensor gave them."""
 EXCLUDED = "taken out with --exclude"
 HOLDS_IMAGES = "it holds images"
 """Part of the reason why a folder is left out."""
@@ -72,29 +71,40 @@ class ImageFile:
     """An image file.
 
     ``name`` : path below the image folder, with forward slashes; ``content`` : bytes of the file if they are carried
-    along to a machine that does not see the path, else None.
+    along to a machine that does not see the path, else None; ``bayer`` : pattern of the mosaic of coloured pixels that
+    the file holds, or empty.
     """
 
     path: Path
     name: str
     group: str
     content: bytes | None = field(default=None, repr=False)
+    bayer: str = ""
 
     def read(self) -> bytes:
-        """Return the content of the file.
+        """Return the content of the file; of a mosaic that of a PNG of its grey image.
 
         Raises
         ------
+        InputError
+            The file is gone. A result without it would be another one than was asked for.
         OSError
             The file cannot be read, or is too large for an image.
         """
-        return read_bytes(self.path, IMAGE_BYTES) if self.content is None else self.content
+        if self.content is not None:
+            return self.content
+        try:
+            data = read_bytes(self.path, IMAGE_BYTES)
+        except FileNotFoundError as error:
+            reason = "was there when the work began, and is gone; put it back, or begin again without it"
+            raise InputError("E-IMAGES-GONE", f"{self.path}: {reason}") from error
+        return _without_mosaic(data, self.name, self.bayer) if self.bayer else data
 
     def carried(self) -> "ImageFile":
         """Return the file with its content. An unreadable file is unchanged: its later read reports the error."""
         try:
             return replace(self, content=self.read())
-        except OSError:
+        except (OSError, InputError):
             return self
 
 
@@ -107,6 +117,70 @@ class Skipped:
     gate: str = "readable"
     value: str | None = None
     limit: str | None = None
+
+
+_bayer: ContextVar[str] = ContextVar("_bayer", default="")
+"""Pattern of the mosaics that :func:`find_images` finds."""
+
+
+@contextlib.contextmanager
+def mosaic_of(pattern: str) -> Iterator[None]:
+    """Read images as mosaics of this pattern; for a command's option, which applies to all images it finds.
+
+    Raises
+    ------
+    InputError
+        The pattern is unknown.
+    """
+    if pattern.upper() not in PATTERNS:
+        raise InputError("E-OPTION-VALUE", f"--bayer {pattern[:20]}: one of {', '.join(PATTERNS)} needed")
+    token = _bayer.set(pattern.upper())
+    try:
+        yield
+    finally:
+        _bayer.reset(token)
+
+
+def image_file(path: Path) -> ImageFile:
+    """Return a single image file, outside of any folder of images."""
+    return ImageFile(path, path.name, TOP_GROUP, bayer=_bayer.get())
+
+
+def _without_mosaic(data: bytes, name: str, pattern: str) -> bytes:
+    """Return a PNG of the grey image of a mosaic; data that are no image stay, as their decoder says why."""
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    if image is None:
+        return data
+    return cv2.imencode(".png", demosaiced(image, pattern, name), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+
+
+@lru_cache(maxsize=4)
+def _mosaics(path: Path, _: int) -> tuple[str, ...]:
+    """Return the patterns that an image may be a mosaic of; commands look for the same images more than once."""
+    with Image.open(path) as image:
+        if image.mode not in ("L", "I", "I;16", "I;16B"):
+            return ()
+    return patterns_seen(decode(read_bytes(path, IMAGE_BYTES), path.name))
+
+
+def _say_mosaic(files: Sequence[ImageFile]) -> None:
+    """Say that images are mosaics, by the first one in a form without losses, where no pattern was given."""
+    first = next((file for file in files if file.path.suffix.lower() in UNPACKED and not file.bayer), None)
+    if first is None:
+        return
+    try:
+        seen = _mosaics(first.path, first.path.stat().st_mtime_ns)
+    except Exception:  # whoever reads it says what is wrong
+        return
+    if seen:
+        warnings.warn(
+            f"{first.name}: its pixels look like a mosaic of colours, as a sensor with a Bayer filter delivers them; "
+            f"give --bayer {' or '.join(seen)}, as the sensor has it, or the images that the camera's program makes of "
+            "it",
+            InputNote,
+            stacklevel=3,
+        )
 
 
 def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
@@ -135,16 +209,17 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
             _sort_in(path, path.name, TOP_GROUP, files, skipped)
     if not files:
         # A nested folder is the most helpful hint: the images lie deeper than they should.
-        photographs = set(OTHER_PHOTOGRAPHS.values())
+        photographs = {extras.reason_unread(suffix) for suffix in extras.EXTRAS}
         most_telling = sorted(
             skipped, key=lambda s: (s.reason not in photographs, s.gate != "folder", HOLDS_IMAGES not in s.reason)
         )[:1]
         hint = "".join(f" (left out {s.name}: {s.reason})" for s in most_telling)
         raise InputError(
             "E-IMAGES-NONE",
-            f"image folder {root}: no image, one of {', '.join(s[1:] for s in SUFFIXES)}{hint}; "
+            f"image folder {root}: no image, one of {', '.join(s[1:] for s in USUAL)}{hint}; "
             f"put them into {root}/<group>/",
         )
+    _say_mosaic(files)
     return files, skipped
 
 
@@ -188,8 +263,8 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
                 reason += f"; {HOLDS_IMAGES}: did you mean {path.parent}?"
         skipped.append(Skipped(plain, reason, "folder"))
     elif path.suffix.lower() not in SUFFIXES:
-        kinds = ", ".join(SUFFIXES)
-        reason = OTHER_PHOTOGRAPHS.get(path.suffix.lower(), "not an image file")
+        kinds, suffix = ", ".join(USUAL), path.suffix.lower()
+        reason = extras.reason_unread(suffix) if suffix in extras.EXTRAS else "not an image file"
         skipped.append(Skipped(plain, reason, "file_type", path.suffix or "no suffix", kinds))
     elif plain != name or name_fault(name):
         # Result files cannot store such a name.
@@ -198,7 +273,7 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
     elif not path.is_file():
         skipped.append(Skipped(name, "cannot be read: not a file, or a broken link"))
     else:
-        files.append(ImageFile(path, name, group))
+        files.append(ImageFile(path, name, group, bayer=_bayer.get()))
 
 
 def name_fault(name: str) -> str | None:
@@ -228,6 +303,24 @@ def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.nd
         raise InputError("E-IMAGE-TRUNCATED", f"{name}: truncated ({len(data)} bytes); copy it again")
     if _is_png(data) and not _png_intact(data):
         raise InputError("E-IMAGE-DAMAGED", f"{name}: damaged (a checksum is wrong); copy it again")
+    if extras.is_heic(data):
+        image = extras.heic_grey(data, name)
+    elif name.lower().endswith(extras.RAW) or extras.is_dng(data):
+        image = extras.raw_grey(data, name)
+    else:
+        image = _decoded(data, name)
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
+    if image.dtype == np.uint16 and data[:4] in TIFF_HEADS and _tag(data, ExifTags.Base.PhotometricInterpretation) == 0:
+        image = np.iinfo(np.uint16).max - image  # white is zero; the decoder turns those of 8 bit alone
+    if size is not None and size[0] != size[1] and image.shape == size:  # (height, width) is (width, height)
+        turn = _turn(data)
+        return image if turn is None else cv2.rotate(image, turn)
+    return image
+
+
+def _decoded(data: bytes, name: str) -> np.ndarray:
+    """Return the grey image of a JPEG, PNG, TIFF or BMP."""
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     with _STANDARD_ERROR, _decoder_messages() as messages:
         try:
@@ -237,19 +330,12 @@ def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.nd
     if image is None:
         raise InputError(
             "E-IMAGE-UNREADABLE",
-            f"{name}: not readable as an image; copy it again, or convert it to {', '.join(SUFFIXES)}",
+            f"{name}: not readable as an image; copy it again, or convert it to {', '.join(USUAL)}",
         )
     if damage := _DAMAGE.search(messages):
         raise InputError(
             "E-IMAGE-DAMAGED", f"{name}: damaged ({damage[0].decode(errors='replace').strip()}); copy it again"
         )
-    if image.dtype not in (np.uint8, np.uint16):
-        raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
-    if image.dtype == np.uint16 and data[:4] in TIFF_HEADS and _tag(data, ExifTags.Base.PhotometricInterpretation) == 0:
-        image = np.iinfo(np.uint16).max - image  # white is zero; the decoder turns those of 8 bit alone
-    if size is not None and size[0] != size[1] and image.shape == size:  # (height, width) is (width, height)
-        turn = _turn(data)
-        return image if turn is None else cv2.rotate(image, turn)
     return image
 
 
@@ -356,8 +442,29 @@ def stated_size(data: bytes, name: str) -> tuple[int, int]:
         ) from error
     except Exception as error:  # data that are no image fail in many ways
         raise InputError(
-            "E-IMAGE-UNREADABLE", f"{name}: not readable as an image; convert it to {', '.join(SUFFIXES)}"
+            "E-IMAGE-UNREADABLE", f"{name}: not readable as an image; convert it to {', '.join(USUAL)}"
         ) from error
+
+
+def grey_of(image: np.ndarray, name: str) -> np.ndarray:
+    """Return the grey image (height, width) of an array, grey or with three channels RGB.
+
+    Raises
+    ------
+    InputError
+        The array has another shape, or its values are not of 8 or 16 bit.
+    """
+    image = np.asarray(image)
+    if not image.size or image.shape[2:] not in ((), (1,), (3,)) or image.ndim < 2:
+        raise InputError(
+            "E-ARRAY-SHAPE",
+            f"{name}: array of shape {image.shape}; (height, width) or (height, width, 3) needed, grey or RGB",
+        )
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError("E-IMAGE-TYPE", f"{name}: pixels of type {image.dtype}; 8 or 16 bit needed")
+    if image.ndim == 2:
+        return image
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.shape[2] == 3 else image[:, :, 0]
 
 
 def grey_8bit(image: np.ndarray) -> np.ndarray:
@@ -370,6 +477,27 @@ def grey_8bit(image: np.ndarray) -> np.ndarray:
 def grey_fine(image: np.ndarray) -> np.ndarray:
     """Return the image in the grey values of :func:`grey_8bit`, but without rounding."""
     return image if image.dtype == np.uint8 else image * np.float32(255.0 / _bright_end(image))
+
+
+def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "image") -> None:
+    """Refuse an array that is no grey image of 8 or 16 bits, or not of the camera's ``size``, (width, height) px.
+
+    Raises
+    ------
+    InputError
+        The message begins with ``name``.
+    """
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        remedy = "; of colours, give one: image[:, :, 1] is green" if image.ndim == 3 else ""
+        raise InputError(
+            "E-IMAGE-TYPE", f"{name}: {image.dtype} of shape {image.shape}; a grey image of 8 or 16 bits needed{remedy}"
+        )
+    if size is not None and image.shape[::-1] != size:
+        raise InputError(
+            "E-IMAGE-SIZE",
+            f"{name}: {image.shape[1]}×{image.shape[0]} px, camera {size[0]}×{size[1]} px; "
+            "give images as the camera took them",
+        )
 
 
 def same_photograph(image: np.ndarray, other: np.ndarray) -> bool:

@@ -6,6 +6,7 @@ that was given as None is null. Arrays and poses are lists of numbers in the fil
 
 import json
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -17,7 +18,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid
 from stcal.io.covariance import OF_POINT, OF_POSE, Rows, require_covariance
-from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.files import TABLE_BYTES, json_text, read_bytes, require_same, text_of
 
 LONGEST = 80
 """Largest number of characters of a value that a message shows."""
@@ -36,7 +37,8 @@ def first_mistake(error: ValidationError, where: str = "", missing: str = "key m
     ``missing`` : reason for a key that is missing.
     """
     first = error.errors()[0]
-    place = ".".join(str(part + 1 if isinstance(part, int) else part) for part in first["loc"])
+    keys = [part for part in first["loc"] if not str(part).startswith("<")]  # not which kind of entry it was taken for
+    place = ".".join(str(part + 1 if isinstance(part, int) else part) for part in keys)
     place = " ".join(place.split())  # a quoted TOML key may hold a line break
     if first["type"] == "extra_forbidden":
         code, reason = "E-KEY-UNKNOWN", "unknown key; remove it or correct its spelling"
@@ -186,7 +188,7 @@ def read_json(path: str | Path, what: str, remedy: str) -> dict[str, Any]:
     """
     where = f"{what} {path}".lstrip()
     try:
-        content = json.loads(read_bytes(path, TABLE_BYTES).decode("utf-8-sig"))  # Windows puts a byte-order mark first
+        content = json.loads(text_of(read_bytes(path, TABLE_BYTES)))
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; {remedy}") from error
     except (ValueError, RecursionError) as error:  # not UTF-8, a NUL in the name, a number of 5000 digits, deep nesting
@@ -222,3 +224,9 @@ def read_result(path: str | Path, model: type[F], what: str, remedy: str) -> F:
         return checked(content, model)
     except InputError as error:
         raise InputError(error.code, f"{what} {path}: {error}; {remedy}") from error
+
+
+def require_result_written(path: str | Path, content: ResultFile) -> None:
+    """Read a written result file again, and require the same content."""
+    again = partial(read_result, path, type(content), "result file", "report this with its data")
+    require_same(path, lambda: json.loads(json_text(again())), json.loads(json_text(content)))

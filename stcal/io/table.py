@@ -3,7 +3,7 @@
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
-from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.files import TABLE_BYTES, read_bytes, require_written, text_of
 from stcal.io.quaternions import COLUMNS as QUATERNION
 from stcal.io.quaternions import Order, require_unit
 
@@ -234,7 +234,8 @@ class Table:
 
 
 def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz") -> Table:
-    """Read a table with a header line; empty lines and lines that start with ``#`` or ``//`` are ignored.
+    """Read a table with a header line; empty lines and lines that start with ``#``, ``//`` or
+    ``%`` with a space are ignored.
 
     Commas, semicolons, tabs or spaces separate columns, as in the header. Without commas between columns, numbers may
     have decimal commas. Points of SpatialAnalyzer, ``Collection::Group::Target x y z``, need no header. Units in
@@ -253,7 +254,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
         return path
     where = f"{what} {path}"
     try:
-        text = read_bytes(path, TABLE_BYTES).decode("utf-8-sig")
+        text = text_of(read_bytes(path, TABLE_BYTES))
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
     except UnicodeDecodeError as error:
@@ -276,6 +277,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
         raise InputError(
             "E-TABLE-HEADER", f"{where}: line {used[0][0]}: {error}; a header with names and units needed"
         ) from error
+    names, used = _with_units_of_a_row(names, used, between)
     names = canonical(names, comments)
     for name in names:
         if names.count(name) > 1 or not name:
@@ -283,10 +285,17 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
             raise InputError(
                 "E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; every name once needed"
             )
-    if all(_is_number(name.replace(",", ".")) for name in names):
+    if 2 * sum(_is_number(name.replace(",", ".")) for name in names) > len(names):
         raise InputError(
             "E-TABLE-HEADER",
-            f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm",
+            f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm; or give "
+            "header = false in a file of --columns",
+        )
+    if len(names) == 1 and len(used) > 2 and len(cells_of(used[1][1], _separator([used[1][1]]))) > 1:
+        raise InputError(
+            "E-TABLE-HEADER",
+            f"{where}: line {used[0][0]} is no header of the rows below it; remove it, or give skip_lines in a file of "
+            "--columns",
         )
     if len(used) == 1:
         raise InputError("E-TABLE-EMPTY", f"{where}: a header but no rows; rows needed")
@@ -320,7 +329,10 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
 
 SEPARATORS = {";": "';' between columns", "\t": "tabs between columns", " ": "spaces between columns"}
 """Separators beside the comma, in words."""
-_UNIT = re.compile(r"(.*?)\s*[\[(]\s*(mm|cm|um|µm|m|in|rad|deg|°)\s*[\])]", re.I)
+_UNIT_WORD = "mm|cm|um|µm|m|in|rad|deg|°"
+_UNIT = re.compile(rf"(.*?)\s*(?:[\[(]\s*({_UNIT_WORD})\s*[\])]|/\s*({_UNIT_WORD}))", re.I)
+_IN_A_ROW = re.compile(rf"[\[(]?\s*({_UNIT_WORD}|)\s*[\])]?", re.I)
+"""A cell of a row of units below the header."""
 _ENDS_IN_UNIT = re.compile(r".+_(mm|cm|um|m|in|rad|deg)")
 _UNIT_SAID = re.compile(
     r"\bunits?\b(?:\W+(?:are|is|in|of|lengths?|distances?))*\W+"
@@ -339,8 +351,8 @@ _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 
 
 def is_comment(line: str) -> bool:
-    """Return True if a line of a table is a comment."""
-    return line.lstrip().startswith(("#", "//"))
+    """Return True if a line of a table is a comment; `rostopic echo -p` begins its header with ``%time``."""
+    return line.lstrip().startswith(("#", "//", "% ", "%%"))
 
 
 def separator_stated(line: str) -> str:
@@ -371,7 +383,7 @@ def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
         new = (
             name
             if bracketed is None
-            else f"{bracketed[1]}_{bracketed[2].lower().replace('µ', 'u').replace('°', 'deg')}"
+            else f"{bracketed[1]}_{(bracketed[2] or bracketed[3]).lower().replace('µ', 'u').replace('°', 'deg')}"
         )
         lower = new.lower()
         if unit and lower in ("x", "y", "z"):
@@ -382,6 +394,20 @@ def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
 
 
 _WORDS = {"mm": "millimet", "cm": "centimet", "m": "met", "in": "inch"}
+
+
+def _with_units_of_a_row(
+    names: list[str], used: list[tuple[int, str]], between: str
+) -> tuple[list[str], list[tuple[int, str]]]:
+    """Return the names with the units of a row of units below them, and the lines without that row."""
+    try:
+        row = cells_of(used[1][1], between) if len(used) > 2 else []
+    except csv.Error:
+        return names, used
+    units = [match[1] for cell in row if (match := _IN_A_ROW.fullmatch(cell))]
+    if len(units) != len(names) or not any(units):
+        return names, used
+    return [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)], [used[0], *used[2:]]
 
 
 def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> tuple[dict[str, list[str]], bool]:
@@ -494,3 +520,26 @@ def _number(text: str) -> float:
 
 def _is_number(text: str) -> bool:
     return np.isfinite(_number(text))
+
+
+LEVER_MM = 1000.0
+"""Distance at which an error of rotation is compared as one of position, mm."""
+POSE_MM = 1e-6
+"""Largest difference of a written pose, mm at :data:`LEVER_MM`. Decimals of degrees and quaternions cause less."""
+
+
+def pose_values(poses: Poses | Mapping[str, Rigid]) -> np.ndarray:
+    """Returns poses as lengths (m, 3, 4), mm: rotations at :data:`LEVER_MM`, and translations."""
+    matrices = [pose.matrix() for pose in poses.values()] if isinstance(poses, Mapping) else poses.matrix()
+    return np.reshape(matrices, (-1, 4, 4))[:, :3] * np.array([LEVER_MM] * 3 + [1.0])
+
+
+def require_poses_written(path: str | Path, read: Callable[[], Poses | Mapping[str, Rigid]], poses) -> None:
+    """Read a written file again, and require that its poses are ``poses``, of the type that ``read`` returns."""
+    require_written(path, lambda: pose_values(read()), pose_values(poses), POSE_MM, "mm")
+
+
+def require_pose_table_written(path: str | Path, poses: Mapping[str, Poses]) -> None:
+    """Read a written table again, and require that its poses are ``poses``, by the prefix of their columns."""
+    for prefix, own in poses.items():
+        require_poses_written(path, lambda prefix=prefix: read_table(path, "poses").poses(prefix), own)

@@ -2,8 +2,6 @@
 
 import json
 import tomllib
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -12,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses, Rigid
-from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 from stcal.io.json import first_mistake
 
 M = TypeVar("M", bound=BaseModel)
@@ -84,7 +82,7 @@ def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
         The file is unreadable, not TOML, or does not fit ``model``; the message names file, place and reason.
     """
     try:
-        text = read_bytes(path, SETTINGS_BYTES).decode("utf-8-sig")  # Windows editors put a byte-order mark first
+        text = text_of(read_bytes(path, SETTINGS_BYTES))
         content = tomllib.loads(text)
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{what} {path}: {error.strerror or error}; {remedy}") from error
@@ -99,75 +97,7 @@ def toml_string(value: str) -> str:
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-LEAST_SIDE_MM, MOST_SIDE_MM = 1.0, 5e3
-"""Sides of tags and squares, and pitches. Tags of 1 m are 1 mm if metres are taken as mm; in a file in metres whose
-values are mm, a tag of 5 mm is one of 5 m."""
-LEAST_RADIUS_MM, MOST_RADIUS_MM = 0.05, 2e3
-"""Radii of printed dots: 50 mm in metres are 0.05 mm, and dots of half a millimetre are the smallest in use."""
-LEAST_LINK_MM, MOST_LINK_MM = 10.0, 5e4
-"""The longest link of an arm: 10 m in metres are 10 mm, and no arm has links of 50 m. Along joint axes that are nearly
-parallel the common normal may be any distance away, so that ``d`` has no upper limit."""
-KEY = "unusual_size"
-"""The key with which a file states that its lengths are as small, or as large, as they stand."""
-
-
 class Sized(Strict):
     """A file of hardware, which may state that its lengths are meant as they stand."""
 
     unusual_size: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Length:
-    """A length of a file. ``place`` : its key, with what it belongs to; ``least``, ``most`` : between which hardware
-    has it, mm."""
-
-    place: str
-    value_mm: float
-    least: float
-    most: float
-
-    @property
-    def plausible(self) -> bool:
-        """True if hardware has such a length; True for an exact zero, which is meant."""
-        return not self.value_mm or self.least <= abs(self.value_mm) <= self.most
-
-
-def side(place: str, value_mm: float) -> Length:
-    """Returns the side of a tag or a square, or a pitch."""
-    return Length(place, value_mm, LEAST_SIDE_MM, MOST_SIDE_MM)
-
-
-def radius(place: str, value_mm: float) -> Length:
-    """Returns the radius of a dot."""
-    return Length(place, value_mm, LEAST_RADIUS_MM, MOST_RADIUS_MM)
-
-
-def implausible(lengths: Iterable[Length]) -> Iterator[Length]:
-    """Returns the lengths that no hardware has."""
-    return (each for each in lengths if not each.plausible)
-
-
-def require_millimetres(lengths: Iterable[Length], stated: bool, where: str) -> None:
-    """Refuse lengths that no hardware has in mm. ``stated`` : the file says with :data:`KEY` that they are right.
-
-    Raises
-    ------
-    InputError
-        The message names the first one, what is possible, and the likely unit.
-    """
-    wrong = None if stated else next(implausible(lengths), None)
-    if wrong is None:
-        return
-    small = abs(wrong.value_mm) < wrong.least
-    limit = f"at least {wrong.least:g} mm" if small else f"at most {wrong.most:g} mm"
-    remedy = "if lengths are metres, multiply them by 1000" if small else "if lengths are in another unit, convert them"
-    raise InputError(
-        "E-LENGTH-UNIT",
-        f"{where}: {wrong.place} is {wrong.value_mm:g} mm, {limit} usual; {remedy}; if it is right, add `{KEY} = true`",
-    )
-
-
-def stated_unusual(lengths: Iterable[Length]) -> list[str]:
-    """Returns the line of a file that states lengths as meant, where they would be refused without it."""
-    return [f"{KEY} = true"] if next(implausible(lengths), None) is not None else []

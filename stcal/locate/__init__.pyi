@@ -3,11 +3,13 @@ from .calibration.solve import calibrate as calibrate
 from .data.exposures import SceneFiles as SceneFiles
 from .data.exposures import find_scenes as find_scenes
 from .data.layout import LayoutPlan as LayoutPlan
+from .data.layout import TagLayout as TagLayout
 from .data.layout import TargetLayout as TargetLayout
 from .data.layout import load_layout as load_layout
 from .data.layout import load_plan as load_plan
 from .pipeline import Located as Located
 from .pipeline import LocateOptions as LocateOptions
+from .pipeline import locate_image as locate_image
 from .pipeline import run as run
 from .pose.estimate import ObjPose as ObjPose
 from .pose.estimate import SeenTags as SeenTags

@@ -1,15 +1,19 @@
 """Pipeline from exposures to poses with verdicts: the stages in order."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
+import numpy as np
+
+from stcal.boards.design import TagLayout
 from stcal.boards.tags import other_dictionaries
 from stcal.errors import InputError, StcalError
-from stcal.io.cameras.model import CameraModel, CameraPrior
-from stcal.io.files import IMAGE_BYTES, read_bytes
-from stcal.io.images import decode
-from stcal.locate.data.exposures import SceneFiles, SceneTags, read_scenes
+from stcal.geometry.camera import Camera
+from stcal.io.cameras.model import CameraModel, CameraPrior, model_of
+from stcal.io.images import decode, grey_8bit, grey_of, size_fault
+from stcal.locate.data.exposures import SceneFiles, SceneTags, detect, read_scenes
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pose.estimate import ObjPose, locate
 from stcal.locate.pose.merge import Merged, Shift, merge
@@ -110,10 +114,50 @@ def run(
     """
     options = options or LocateOptions()
     for files, tags in zip(scenes, read_scenes(scenes, layout, options.workers), strict=True):
-        located = locate_scene(tags, layout, camera, options)
-        if located.merged is not None and not sum(located.merged.counts):
-            located = replace(located, verdict=_rejected([_why_no_tag(located.tags, located.merged, files, layout)]))
-        yield located
+        yield _named(locate_scene(tags, layout, camera, options), layout, partial(_first_image, tags, files))
+
+
+def locate_image(
+    image: np.ndarray,
+    layout: TargetLayout | TagLayout,
+    camera: CameraModel | Camera,
+    options: LocateOptions | None = None,
+    name: str = "image",
+) -> Located:
+    """Locates the target in one image and judges the pose.
+
+    Parameters
+    ----------
+    image : (height, width) or (height, width, 3) array
+        Grey or RGB, 8 or 16 bit.
+    layout : TargetLayout or TagLayout
+        The target.
+    camera : CameraModel or Camera
+        The camera that took the image.
+    options : LocateOptions, optional
+        Options of the method; the defaults if None.
+    name : str
+        Name of the image, for messages.
+
+    Returns
+    -------
+    Located
+        Its ``pose`` is None if there is none; the verdict says why.
+
+    Raises
+    ------
+    InputError
+        The image is no grey or RGB array, or its size is not the camera's.
+    """
+    grey = grey_of(image, name)
+    target = TargetLayout.of(layout) if isinstance(layout, TagLayout) else layout
+    model = camera if isinstance(camera, CameraModel) else model_of(camera)
+    size = grey.shape[1], grey.shape[0]
+    wanted = model.width or size[0], model.height or size[1]
+    if size != wanted:
+        raise InputError("E-IMAGE-SIZE", f"{name}: {size_fault(name, size, wanted, 'the camera').reason}")
+    exposure = detect(grey_8bit(grey), name, target.dictionaries())
+    return _named(locate_scene(SceneTags(name, (exposure,)), target, model, options), target, lambda: grey)
 
 
 def locate_scene(
@@ -228,18 +272,27 @@ def _rejected(reasons: Sequence[str]) -> Verdict:
     return Verdict("reject", (), tuple(reasons))
 
 
-def _why_no_tag(tags: SceneTags, merged: Merged, files: SceneFiles, layout: TargetLayout) -> str:
-    """Returns why no tag of the layout is seen; the tags in view may be of another dictionary."""
-    dictionaries = layout.dictionaries()
+def _named(located: Located, layout: TargetLayout, image: Callable[[], np.ndarray]) -> Located:
+    """Returns the result; if no tag is seen, with the reason. ``image`` : returns one of the scene's grey images."""
+    if located.merged is None or sum(located.merged.counts):
+        return located
+    return replace(located, verdict=_rejected([_why_no_tag(located, located.merged, image(), layout)]))
+
+
+def _first_image(tags: SceneTags, files: SceneFiles) -> np.ndarray:
     used = {exposure.name for exposure in tags.readable()}
     file = next(file for file in files.files if file.name in used)
-    other_tags = other_dictionaries(decode(read_bytes(file.path, IMAGE_BYTES), file.name), dictionaries)
+    return decode(file.read(), file.name)
+
+
+def _why_no_tag(located: Located, merged: Merged, image: np.ndarray, layout: TargetLayout) -> str:
+    """Returns why no tag of the layout is seen; the tags in view may be of another dictionary."""
+    dictionaries = layout.dictionaries()
     if merged.unknown:
         names = ", ".join(str(tag) for _, tag in merged.unknown[:5])
         return f"no tag of the layout, but others of its dictionaries ({names}); is it the layout of this target?"
     reason = f"no tag of {', '.join(dictionaries)}; 1 of the layout needed"
-    if other_tags:
-        reason += (
-            f", and {file.name} shows {other_tags[0][1]} of {other_tags[0][0]}; correct dictionary in the layout file"
-        )
+    if other_tags := other_dictionaries(image, dictionaries):
+        name = located.tags.readable()[0].name
+        reason += f", and {name} shows {other_tags[0][1]} of {other_tags[0][0]}; correct dictionary in the layout file"
     return reason

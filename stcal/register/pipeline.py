@@ -29,6 +29,7 @@ from stcal.register.judge.degeneracy import check_extent, check_supports, row_na
 from stcal.register.judge.groups import Shifted, shifted_rows, two_groups
 from stcal.register.judge.mistakes import Wider, check_mirrored, check_units, mirrored_error, mirrored_ratio, wider
 from stcal.register.judge.notes import Subject, notes_of
+from stcal.register.judge.order import moved_meanwhile, order_note
 
 METHODS = ("robust", "least-squares", "liu2017")
 NEAREST_MM = 1e-9
@@ -120,11 +121,13 @@ def register(
     alternative = None if second is None else _alternative(fitted, second, problem.xyz_a)
     ambiguous = alternative is not None and len(alternative.rows) >= AS_GOOD * fitted.inliers.sum()
     if alternative is not None and ambiguous and not allow_ambiguous:
+        change = moved_meanwhile(problem, fitted.transform)
+        moved = "" if change is None else f"; {order_note(change, lambda row: row_name(row, lines))}"
         raise DegenerateError(
             "E-REGISTER-TWO-TRANSFORMS",
             f"registration: {fitted.inliers.sum()} point pairs agree on one transform and {len(alternative.rows)} "
             f"others on another, {alternative.apart_mm:.4g} mm from it; register one group of rows alone, or allow "
-            "ambiguous answers",
+            f"ambiguous answers{moved}",
         )
     inside = problem[fitted.inliers]
     covariance = covariance_of(inside, fitted.transform, fitted.sigma, fitted.threshold)

@@ -25,7 +25,7 @@ def made(robot: Robot, rng: np.random.Generator, sigma_mm: float = 0.3, sigma_ra
     shifted = robot_from_chain(moved_chain(chain, step), robot.tools, robot)
     rows = [shifted.rows[0]]
     rows += [replace(row, theta=row.theta + rng.normal(0, sigma_rad)) for row in shifted.rows[1:]]
-    return replace(shifted, rows=tuple(rows), tools=dict(robot.tools))
+    return replace(shifted, rows=tuple(rows), tools=dict(robot.tools), unusual_size=True)
 
 
 def joint_vectors(robot: Robot, count: int, rng: np.random.Generator, share: float = 0.6) -> np.ndarray:

@@ -1,33 +1,44 @@
 """The main job: calibrates a target from a folder of images. Each call is a stage, and its result is saved."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.boards.file import run_board_of as board_of
+from stcal.boards.target import body_of
+from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference
 from stcal.errors import InputError, StcalError
-from stcal.io.cameras.model import CameraModel, camera_prior, refinable
+from stcal.io.cameras.model import CalibratedCamera, CameraModel, camera_prior, model_of, refinable
+from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import board_of, target_of
 from stcal.io.files import save
-from stcal.io.images import chosen_images
+from stcal.io.images import TOP_GROUP, ImageFile, Skipped, chosen_images, require_common_size
 from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
+from stcal.sfm.adjust.scale import with_edge_sigma
+from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.detect.board_alone import is_board_alone, label_boards
-from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright
+from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright, seen_by
 from stcal.sfm.detect.labels import LabelledImage, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
+from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
+from stcal.sfm.mapping.placed import LENS, PlacedBody, place_and_find_camera, place_with_camera
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
 from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.solve import solve_groups, ungrouped, unseen_board, usable_groups
+from stcal.sfm.runs.solve import solve_body, solve_groups, ungrouped, unseen_board, usable_groups
 from stcal.sfm.runs.transaction import MarkerFile, RunFolder, run_folder
 
+PHOTOGRAPHS = "the photographs"
+"""Where a camera that was found is from, for messages."""
+ImageFiles = tuple[list[ImageFile], list[Skipped]]
+"""Files to use and files that are left out, as they were when the work began."""
 DRAWN_WITH = "matplotlib.backends.backend_svg", "mpl_toolkits.mplot3d.axes3d"
 """Modules that draw the figures of the report. They take half a second to load."""
 
@@ -35,7 +46,7 @@ DRAWN_WITH = "matplotlib.backends.backend_svg", "mpl_toolkits.mplot3d.axes3d"
 @one_thread()
 def run(
     images: str | Path,
-    camera: str | Path | CameraModel,
+    camera: str | Path | CameraModel | None,
     out: str | Path,
     target: str | Path | TargetDesign | None = None,
     board: str | Path | BoardDesign | None = None,
@@ -50,11 +61,12 @@ def run(
     images
         Folder with one folder of images for each group.
     camera
-        COLMAP's cameras.txt, OpenCV's YAML or XML, or the result of :func:`stcal.io.cameras.read.read_camera`.
+        COLMAP's cameras.txt, OpenCV's YAML or XML, or the result of :func:`stcal.io.cameras.read.read_camera`; if
+        None, it is found from the target's printed faces, and adjusted with all else.
     out
         The run's folder: new, empty, or of an earlier run.
     target, board
-        Designs or their TOML files; the reference design if None.
+        Designs or their TOML files; the reference design if None, or no board if the target tells its own size.
     options
         Options of the run; the defaults if None.
     progress
@@ -72,19 +84,43 @@ def run(
     StcalError
         A subclass of it, with a one-line message that says what to do.
     """
-    progress = progress or (lambda *_: None)
-    model = camera if isinstance(camera, CameraModel) else read_camera(camera)
-    given = {"images": images, "--camera": camera, "--target": target, "--board": board}
     options = options or RunOptions()
-    chosen_images(images, options.exclude)
-    designs = target_of(target), board_of(board)
-    options = options.settled(designs[0])
+    if camera is None:
+        require_printed(body_of(target))
+        options = replace(options, refine_camera=True)
+    files = chosen_images(images, options.exclude)
+    return run_on_files(files, images, camera, out, target, board, options, progress, reload_s)
+
+
+@one_thread()
+def run_on_files(
+    files: ImageFiles,
+    images: str | Path,
+    camera: str | Path | CameraModel | None,
+    out: str | Path,
+    target: str | Path | TargetDesign | None,
+    board: str | Path | BoardDesign | None,
+    options: RunOptions,
+    progress: Progress | None = None,
+    reload_s: int | None = None,
+) -> RunResult:
+    """Calibrates a target from some of the photographs in the folder ``images``; see :func:`run`."""
+    progress = progress or (lambda *_: None)
+    model = read_camera(camera) if isinstance(camera, str | Path) else camera
+    given = {"images": images, "--camera": camera, "--target": target, "--board": board}
+    target_design = body_of(target)
+    known = None if board is None and target_design.has_scale else board_of(board)
+    designs = target_design, scale_reference(known, target_design)
+    if target_design.with_faces(printed=True).faces:
+        _require_for_printed(options)
+    options = options.settled(target_design)
     if options.compare:
         require_comparable(options.adjustment(designs[0]))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
-        result = _calibrated(images, model, folder, *designs, options, progress)
-        if options.compare and result.target.target_from_face:
-            published = _published(images, model, folder, *designs, options, progress)
+        result = _calibrated(files, model, folder, *designs, options, progress)
+        result = replace(result, camera_given=model is not None)
+        if options.compare and result.target.target_from_face and model is not None:
+            published = _published(files, model, folder, *designs, options, progress)
             result = replace(result, comparison=compare_with_paper(result, published))
         result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera)), progress))
         result = replace(result, calibration=_on_surface(result))
@@ -92,17 +128,106 @@ def run(
 
 
 def _calibrated(
-    images: str | Path,
-    model: CameraModel,
+    files: ImageFiles,
+    model: CameraModel | None,
     folder: RunFolder,
     target: TargetDesign,
     board: BoardDesign,
     options: RunOptions,
     progress: Progress,
 ) -> RunResult:
-    detection, labelled = labelled_images(images, model, folder, target, board, options, progress)
+    if model is None:
+        detection, labelled, model = _with_found_camera(files, folder, target, board, options, progress)
+    else:
+        detection, labelled = labelled_images(files, model, folder, target, board, options, progress)
     with overlays_beside(detection, labelled, target, folder.stage, progress):
         return _solved(detection, labelled, model, folder, target, board, options, progress)
+
+
+def _with_found_camera(
+    files: ImageFiles,
+    folder: RunFolder,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    progress: Progress,
+) -> tuple[DetectionResult, list[LabelledImage], CameraModel]:
+    """Finds the camera by the printed faces of the target, and labels the images with it."""
+    printed = target.with_faces(printed=True)
+    guesses = guessed_cameras(files[0])
+    detection, labelled = _labelled(files, model_of(guesses[0], PHOTOGRAPHS), folder, printed, None, options, progress)
+    observations = [image.observations for image in labelled]
+    found = place_and_find_camera(observations, printed.faces, guesses).camera
+    model = model_of(found, PHOTOGRAPHS)
+    if board.rows or len(printed.faces) < len(target.faces):
+        return *labelled_images(files, model, folder, target, board, options, progress), model
+    detection = seen_by(detection, found)
+    labelled = label_images(detection, target, None, options.ellipses, folder.cache, options.workers)
+    save(folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
+    return detection, labelled, model
+
+
+def guessed_cameras(files: Sequence[ImageFile]) -> list[CalibratedCamera]:
+    """Returns cameras at which the search for an unknown one begins: that of the EXIF of the first photograph that
+    states one, or one of medium focal length."""
+    (width, height), _ = require_common_size(list(files))
+    for file in files:
+        try:
+            camera = camera_of_photograph(file.path).camera
+        except InputError:
+            continue
+        if (camera.width, camera.height) == (width, height):
+            return [camera]
+    return [CalibratedCamera.of(start_camera(width, height, LENS), LENS)]
+
+
+def assumed_camera(files: Sequence[ImageFile], target: TargetDesign) -> CameraModel:
+    """Returns the camera with which corners of printed faces are detected where none is given: it moves none of them.
+
+    Raises
+    ------
+    InputError
+        The target has other faces, whose circles need a camera.
+    """
+    if len(target.with_faces(printed=True).faces) < len(target.faces):
+        require_printed(target.with_faces(printed=False))
+    return model_of(guessed_cameras(files)[0], PHOTOGRAPHS)
+
+
+def _require_for_printed(options: RunOptions) -> None:
+    """Refuses options that a target with boards or tags on its faces has no use for.
+
+    Raises
+    ------
+    InputError
+        One of them is given.
+    """
+    given = {
+        "--solve paper": options.solve == "paper",
+        "--compare paper": options.compare is not None,
+        "--board-only": options.board_only,
+    }
+    for name in (name for name, is_given in given.items() if is_given):
+        raise InputError(
+            "E-OPTION-CONFLICT",
+            f"{name}: for targets of circles alone, and faces here have boards or tags; leave it out",
+        )
+
+
+def require_printed(target: TargetDesign) -> None:
+    """Refuses a target without a face that a camera could be found from.
+
+    Raises
+    ------
+    InputError
+        There is none.
+    """
+    if not target.with_faces(printed=True).faces:
+        raise InputError(
+            "E-CAMERA-NEEDED",
+            "missing option '--camera': circles need a camera file, which `stcal-sfm calibrate-camera` makes; only "
+            "faces with a board or tags tell the camera (see `stcal-sfm run --help`)",
+        )
 
 
 def _on_surface(result: RunResult) -> Calibration:
@@ -126,7 +251,7 @@ def _on_surface(result: RunResult) -> Calibration:
 
 
 def _published(
-    images: str | Path,
+    files: ImageFiles,
     model: CameraModel,
     folder: RunFolder,
     target: TargetDesign,
@@ -143,7 +268,7 @@ def _published(
         progress(f"{stage}, as published", done, total)
 
     try:
-        detection, labelled = _labelled(images, model, folder, target, board, published_options, told)
+        detection, labelled = _labelled(files, model, folder, target, board, published_options, told)
         return _solved(detection, labelled, model, folder, target, board, published_options, told)
     except StcalError as error:
         return error
@@ -162,18 +287,30 @@ def _solved(
     load_in_processes(*DRAWN_WITH)
     calibrated_camera = model.calibrated(detection.camera.width, detection.camera.height)
     calibrated_camera = refinable(calibrated_camera) if options.refine_camera else calibrated_camera
+    if not board.rows:
+        labelled = as_one_group(labelled)
     observations = [image.observations for image in labelled]
     board_alone = options.board_only or is_board_alone(detection)
     if board_alone and options.solve == "joint":  # which adjusts faces, and there are none
         options = replace(options, solve="chain", refine_camera=False)
-    groups, unusable = usable_groups(by_group(observations), detection.skipped, board_alone)
+    board = with_edge_sigma(board, observations)
+    known = faces_of_known_shape(board)
+    groups, unusable = usable_groups(
+        by_group(observations), detection.skipped, board_alone, needs_board=not target.has_scale
+    )
 
     progress("map", 0, len(groups))
     graph = image_graph(observations, board, options.graph)
-    scratch = folder.stage / "scratch"
-    solutions, unsolved = solve_groups(
-        observations, graph, scratch, folder.cache, calibrated_camera, target, board, options, progress, groups
-    )
+    if known and not board_alone:
+        usable = [image for image in observations if image.group in groups]
+        body = place_with_camera(usable, known, calibrated_camera)
+        solutions, unsolved = solve_body(usable, body, calibrated_camera, target, board, options.eccentricity, progress)
+        unsolved += unlinked_notes(body)
+    else:
+        scratch = folder.stage / "scratch"
+        solutions, unsolved = solve_groups(
+            observations, graph, scratch, folder.cache, calibrated_camera, target, board, options, progress, groups
+        )
     models, adjust_options = [s.model for s in solutions], options.adjustment(target)
     if board_alone:
         progress("faces", 0, 1)
@@ -196,7 +333,7 @@ def _solved(
         calibration=calibration,
         chains=measure_chains(calibration.faces, calibration.target),
         notes=(
-            *ungrouped(labelled),
+            *(ungrouped(labelled) if board.rows else ()),
             *unusable,
             *unsolved,
             *calibration.notes,
@@ -205,8 +342,22 @@ def _solved(
     )
 
 
+def as_one_group(labelled: Sequence[LabelledImage]) -> list[LabelledImage]:
+    """Returns the images as one group: without a board nothing but the body is used, whatever stands beside it."""
+    return [replace(image, observations=replace(image.observations, group=TOP_GROUP)) for image in labelled]
+
+
+def unlinked_notes(body: PlacedBody) -> list[str]:
+    """Returns a note for each face of known shape that no image shows together with one that is placed."""
+    return [
+        f"face {face}: left out, no image shows it with a face that is linked to the others, by {MIN_CORNERS} corners "
+        "each; add one that does"
+        for face in body.unlinked
+    ]
+
+
 def detect(
-    images: str | Path,
+    files: ImageFiles,
     camera: CameraModel,
     folder: RunFolder,
     target: TargetDesign,
@@ -215,13 +366,13 @@ def detect(
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detects and labels the images, and writes ``detections.csv`` and overlays into a claimed folder."""
-    detection, labelled = labelled_images(images, camera, folder, target, board, options, progress)
+    detection, labelled = labelled_images(files, camera, folder, target, board, options, progress)
     with overlays_beside(detection, labelled, target, folder.stage, progress):
         return detection, labelled
 
 
 def labelled_images(
-    images: str | Path,
+    files: ImageFiles,
     camera: CameraModel,
     folder: RunFolder,
     target: TargetDesign,
@@ -230,13 +381,13 @@ def labelled_images(
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detects and labels the images, and writes ``detections.csv`` into a claimed folder."""
-    detection, labelled = _labelled(images, camera, folder, target, board, options, progress)
+    detection, labelled = _labelled(files, camera, folder, target, board, options, progress)
     save(folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
     return detection, labelled
 
 
 def _labelled(
-    images: str | Path,
+    files: ImageFiles,
     camera: CameraModel,
     folder: RunFolder,
     target: TargetDesign,
@@ -245,19 +396,20 @@ def _labelled(
     progress: Progress,
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detects and labels the images by the rules that the options ask for."""
-    files, skipped = chosen_images(images, options.exclude)
-    step = counted(progress, "detect", len(files))
+    chosen, skipped = files
+    step = counted(progress, "detect", len(chosen))
+    dots = board if board is not None and board.rows else None
     published = options.solve == "paper"
     if published:
         PublishedPattern.of(target)
     detector = detect_published if published else None
     detection = detect_files(
-        files, camera, target, board, options.ellipses, folder.cache, options.workers, step, detector
+        chosen, camera, target, dots, options.ellipses, folder.cache, options.workers, step, detector
     )
     detection = replace(detection, skipped=(*skipped, *detection.skipped))
     require_upright(detection.images)
-    if board is not None and (options.board_only or is_board_alone(detection)):
-        return detection, label_boards(detection, target, board)
+    if dots is not None and (options.board_only or is_board_alone(detection)):
+        return detection, label_boards(detection, target, dots)
     if published:
-        return detection, label_once(detection, target, board)
-    return detection, label_images(detection, target, board, options.ellipses, folder.cache, options.workers)
+        return detection, label_once(detection, target, dots)
+    return detection, label_images(detection, target, dots, options.ellipses, folder.cache, options.workers)

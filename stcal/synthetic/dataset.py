@@ -9,9 +9,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from stcal.boards.file import save_run_board
+from stcal.boards.target import save_body
 from stcal.errors import InputError
-from stcal.io.cameras.model import write_cameras_txt
-from stcal.io.design import board_toml, target_toml
+from stcal.io.cameras.write import save_camera
 from stcal.io.json import ByFace, ByGroup, ByImage, ByLabel, Pair, Part, Points, Pose, ResultFile, Vector3
 from stcal.labels import BOARD, Label
 from stcal.parallel import run_parallel
@@ -173,9 +174,9 @@ def write_dataset(
         truth = json.dumps(TruthFile.of(scene, image_format, options).content())
         for group in scene.groups:
             (folder / "images" / group).mkdir(parents=True, exist_ok=True)
-        write_cameras_txt(folder / "cameras.txt", scene.camera)
-        (folder / "target.toml").write_text(target_toml(scene.target), encoding="utf-8")
-        (folder / "board.toml").write_text(board_toml(scene.board), encoding="utf-8")
+        save_camera(folder / "cameras.txt", scene.camera)
+        save_body(folder / "target.toml", scene.target)
+        save_run_board(folder / "board.toml", scene.board)
         (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(

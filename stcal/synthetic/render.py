@@ -1,5 +1,6 @@
 """Synthesis of photographs of a scene: circles by exact area coverage, rims, lens blur, vignetting, background."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -21,6 +22,8 @@ WALL_REACH = 3.0
 """Half the side of the wall, in widths of the view. An oblique view reaches far; cells out of view cost little."""
 LAMP_REACH_MM = 1000.0
 TABLE_BELOW_MM = 50.0
+FAINT = 0.12
+"""Reflectance of the table that clutter has, which shows circles alone."""
 SHIFT = 4
 """Fractional bits of cv2's fixed-point pixels."""
 
@@ -48,12 +51,19 @@ def look_of(polarity: Polarity) -> Look:
 
 
 def draw_background(
-    scene: Scene, group: str, image: int, clutter: bool, scenery_seed: int, lens: ThinLens | None = None
+    scene: Scene,
+    group: str,
+    image: int,
+    clutter: bool,
+    scenery_seed: int,
+    lens: ThinLens | None = None,
+    reflectance: float | None = None,
 ) -> np.ndarray:
     """Draws the image without the circles, (height, width) uint8.
 
     The scenery belongs to the group: all images of the group show the same scenery from different places. A thin lens
-    blurs the wall by the circle of confusion at its middle, and target and plate by that at theirs.
+    blurs the wall by the circle of confusion at its middle, and target and plate by that at theirs. A table of the
+    given ``reflectance`` shows target and board as a mirror below them does.
     """
     g, look = scene.groups[group], look_of(scene.target.polarity)
     painter = _Painter(scene.camera, g.camera_from_target[image], look.wall)
@@ -63,7 +73,8 @@ def draw_background(
         wall = _wall(scene, g, rng)
         _draw_checker(painter, wall, look)
         _draw_lamps(painter, wall, look, rng)
-        _draw_reflections(painter, scene, g, look)
+    if clutter or reflectance is not None:
+        _draw_reflections(painter, scene, g, reflectance)
     outlines = [*(scene.face_outline(face) for face in g.faces), scene.board_outline(group)]
     near_px = 0.0
     if lens is not None:
@@ -80,15 +91,35 @@ def draw_background(
 
 
 class _Painter:
-    """Canvas in the image of a camera, for polygons in the target frame."""
+    """Canvas in the image of a camera, for polygons in the target frame, perhaps as a mirror shows them.
 
-    def __init__(self, camera: Camera, camera_from_target: Rigid, level: float):
+    ``centre`` : where the eye stands, target frame: the camera's centre, or its mirror image. ``mirror`` : unit normal
+    and distance of the mirror from the origin. ``tone`` : the canvas's grey level of a thing's.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        camera_from_target: Rigid,
+        level: float,
+        canvas: np.ndarray | None = None,
+        mirror: tuple[np.ndarray, float] | None = None,
+        tone: Callable[[float], float] = lambda level: level,
+    ):
         self.camera, self.camera_from_target = camera, camera_from_target
-        self.canvas = np.full((camera.height, camera.width), round(level), np.uint8)
+        self.canvas = np.full((camera.height, camera.width), round(level), np.uint8) if canvas is None else canvas
+        self.mirror, self.tone = mirror, tone
+        self.centre = self._mirrored(camera_from_target.inverse().translation)
+
+    def _mirrored(self, xyz: np.ndarray) -> np.ndarray:
+        if self.mirror is None:
+            return xyz
+        normal, at = self.mirror
+        return xyz - 2 * (xyz @ normal - at)[..., None] * normal
 
     def pixels(self, polygons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the pixels (n, k, 2) of polygons (n, k, 3), and which polygons are near the field of view, (n,)."""
-        xyz = self.camera_from_target @ polygons
+        xyz = self.camera_from_target @ self._mirrored(polygons)
         xy = xyz[..., :2] / np.maximum(xyz[..., 2:], 1.0)
         size = np.array([self.camera.width, self.camera.height])
         # Beyond this reach the distortion may fold points back into the image.
@@ -102,9 +133,19 @@ class _Painter:
     def polygons(self, polygons: np.ndarray, levels) -> None:
         """Fills polygons (n, k, 3), later ones on top."""
         pixel, near = self.pixels(polygons)
-        fixed = np.rint(pixel * 2**SHIFT).astype(np.int32)
-        for outline, level in zip(fixed[near], np.broadcast_to(levels, len(near))[near], strict=True):
-            cv2.fillPoly(self.canvas, [outline], float(level), cv2.LINE_AA, SHIFT)
+        for outline, level in zip(pixel[near], np.broadcast_to(levels, len(near))[near], strict=True):
+            self.fill(outline, level)
+
+    def circles(self, xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, level: float) -> None:
+        """Fills the circles (n, 3) of a plane that face the eye."""
+        shown = (self.centre - xyz) @ normal > 0
+        if shown.any():
+            self.polygons(rim_points(xyz[shown], np.tile(normal, (shown.sum(), 1)), radius[shown], 48), level)
+
+    def fill(self, outline: np.ndarray, level: float) -> None:
+        """Fills a polygon (k, 2) px."""
+        fixed = np.rint(outline * 2**SHIFT).astype(np.int32)
+        cv2.fillPoly(self.canvas, [fixed], float(self.tone(level)), cv2.LINE_AA, SHIFT)
 
 
 def _edges(corners: np.ndarray, pieces: int = 12) -> np.ndarray:
@@ -157,26 +198,35 @@ def _draw_lamps(painter: _Painter, wall: Rigid, look: Look, rng) -> None:
     painter.polygons((wall @ (centre[:, None] + rim))[order], level[order])
 
 
-def _draw_reflections(painter: _Painter, scene: Scene, g: Group, look: Look) -> None:
-    """Draws faint mirror images of the circles in a glossy table under the target."""
-    up = g.axes[1]
-    circles = [
-        (scene.face_circles(f.id), scene.target_from_face[f.id].rotation[:, 2], f.radius_mm) for f in scene.target.faces
-    ]
-    circles.append((g.board_circles_target, -g.target_from_board.rotation[:, 2], scene.board.radii_mm()))
+def _draw_reflections(painter: _Painter, scene: Scene, g: Group, reflectance: float | None) -> None:
+    """Draws the mirror image of target and board in a table below; faintly, and of the circles alone, if None.
+
+    What the table adds is ``reflectance`` times the brightness above its own.
+    """
+    whole, share, up = reflectance is not None, FAINT if reflectance is None else reflectance, g.axes[1]
     outlines = np.vstack([*(scene.face_outline(f.id) for f in scene.target.faces), scene.board_outline(g.name)])
-    table = (outlines @ up).min() - TABLE_BELOW_MM
-    camera_centre = painter.camera_from_target.inverse().translation
-    for xyz, normal, radius in circles:
-        mirrored = xyz - 2 * np.outer(xyz @ up - table, up)
-        mirrored_normal = normal - 2 * (normal @ up) * up
-        reflected = (camera_centre - mirrored) @ mirrored_normal > 0
-        # Only light from the front of a circle above the table is reflected to a camera above the table.
-        if reflected.any() and camera_centre @ up > table:
-            rims = rim_points(
-                mirrored[reflected], np.tile(mirrored_normal, (reflected.sum(), 1)), radius[reflected], 48
-            )
-            painter.polygons(rims, look.checker[1] + 0.12 * (look.circle - look.checker[1]))
+    at = (outlines @ up).min() - TABLE_BELOW_MM
+    if painter.centre @ up <= at:
+        return
+    own = look_of(scene.target.polarity).checker[1]
+    mirror = _Painter(
+        painter.camera,
+        painter.camera_from_target,
+        own,
+        canvas=painter.canvas,
+        mirror=(up, at),
+        tone=lambda level: own + share * (level - own),
+    )
+    board = scene.board
+    if whole:
+        _draw_body(mirror, scene, look_of(scene.target.polarity))
+    for face in scene.target.faces:
+        normal, level = scene.target_from_face[face.id].rotation[:, 2], look_of(scene.target.polarity).circle
+        mirror.circles(scene.face_circles(face.id), normal, face.radius_mm, level)
+    if whole:
+        mirror.polygons(_edges(scene.board_outline(g.name)), look_of(board.polarity).plate)
+    normal = -g.target_from_board.rotation[:, 2]
+    mirror.circles(g.board_circles_target, normal, board.radii_mm(), look_of(board.polarity).circle)
 
 
 def _draw_body(painter: _Painter, scene: Scene, look: Look) -> None:
@@ -184,11 +234,9 @@ def _draw_body(painter: _Painter, scene: Scene, look: Look) -> None:
     outlines = {face.id: scene.face_outline(face.id) for face in scene.target.faces}
     pixel, _ = painter.pixels(np.concatenate([_edges(outline) for outline in outlines.values()]))
     points = pixel.reshape(-1, 2)
-    hull = np.rint(points[ConvexHull(points).vertices] * 2**SHIFT).astype(np.int32)
-    cv2.fillPoly(painter.canvas, [hull], float(look.body), cv2.LINE_AA, SHIFT)
-    camera_centre = painter.camera_from_target.inverse().translation
-    for face_id in sorted(outlines, key=lambda face: -np.linalg.norm(outlines[face].mean(0) - camera_centre)):
-        ray = camera_centre - outlines[face_id].mean(0)
+    painter.fill(points[ConvexHull(points).vertices], look.body)
+    for face_id in sorted(outlines, key=lambda face: -np.linalg.norm(outlines[face].mean(0) - painter.centre)):
+        ray = painter.centre - outlines[face_id].mean(0)
         cosine = scene.target_from_face[face_id].rotation[:, 2] @ ray / np.linalg.norm(ray)
         if cosine > 0:
             painter.polygons(_edges(outlines[face_id]), look.face * (0.8 + 0.2 * cosine))
@@ -225,6 +273,9 @@ class RenderOptions:
         Factor on all brightness. Circles saturate above 1.4 on a bright design; the default stays clear of it.
     clutter : bool
         Whether there are a checkered wall with discs and ellipses, and reflections; else a plain wall.
+    reflectance : float, optional
+        Reflectance of a table below target and board, which shows all of them as a mirror does. Clutter has a table
+        that shows their circles faintly.
     bit_depth : int
         8 or 16.
     seed : int
@@ -245,6 +296,7 @@ class RenderOptions:
     spread: float = 0.02
     exposure: float = 1.0
     clutter: bool = False
+    reflectance: float | None = None
     bit_depth: int = 8
     seed: int = 0
     lens: ThinLens | None = None
@@ -258,6 +310,8 @@ class RenderOptions:
                 )
         if self.bit_depth not in (8, 16):
             raise InputError("E-SIMULATE-OPTIONS", f"rendering: bit depth {self.bit_depth}, 8 or 16 needed")
+        if self.reflectance is not None and not 0 <= self.reflectance <= 1:
+            raise InputError("E-SIMULATE-OPTIONS", f"rendering: reflectance {self.reflectance:g}, 0 to 1 needed")
         if not np.isfinite(self.rim_mm):
             raise InputError("E-SIMULATE-OPTIONS", f"rendering: rim_mm {self.rim_mm:g}, a finite number needed")
 
@@ -294,7 +348,7 @@ def render(scene: Scene, group: str, image: int, options: RenderOptions | None =
     options = options or RenderOptions()
     rng = np.random.default_rng([scene.seed, options.seed, 1 + list(scene.groups).index(group), image])
     circles = image_circles(scene, group, image)
-    picture = draw_background(scene, group, image, options.clutter, options.seed, options.lens)
+    picture = draw_background(scene, group, image, options.clutter, options.seed, options.lens, options.reflectance)
     picture = picture.astype(np.float32)
     board, face = look_of(scene.board.polarity).circle, look_of(scene.target.polarity).circle
     dot = np.array([isinstance(label, DotLabel) for label in circles.labels], bool)

@@ -252,7 +252,7 @@ def _made_group(pair, target, board, camera, target_from_face, circles, options,
     labels = [target.face(face).labels() for face in pair]
     normals = [target_from_face[face].rotation[:, 2] for face in pair]
     axes = viewing_axes(normals[0], normals[1], f"group {name}")
-    dots = np.column_stack([board.xy_mm(), np.zeros(board.rows * board.columns)])
+    dots = np.pad(board.xy_mm(), ((0, 0), (0, 1)))
     shape = GroupShape(
         f"group {name}",
         np.array([circles[label] for row in labels for label in row]),

@@ -368,9 +368,11 @@ def _detect_board(
     dictionaries: tuple[str, ...],
 ) -> BoardDetection | Skipped:
     try:
-        image = decode(file.read(), file.name, size)
+        data = file.read()
     except OSError as error:
         return Skipped(file.name, f"cannot be read: {error.strerror or error}")
+    try:
+        image = decode(data, file.name, size)
     except InputError as error:
         return Skipped(file.name, str(error).removeprefix(f"{file.name}: "))
     height, width = image.shape

@@ -17,13 +17,14 @@ from stcal.boards.design import (
     TagLayout,
     UnevenGrid,
 )
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.forms import kalibr_chain
 from stcal.io.cameras.model import CalibratedCamera, CameraModel, cameras_txt
+from stcal.io.cameras.write import require_camera_written
 from stcal.io.files import json_text
 from stcal.io.images import ImageFile, Skipped, find_images, name_fault, require_common_size
-from stcal.io.json import ResultFile
+from stcal.io.json import ResultFile, require_result_written
 from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress, one_thread
 from stcal.sfm.camera.calibrate import (
@@ -51,10 +52,8 @@ LEAST_CORNERS = 6
 """Smallest number of corners of a view of which others were left out: they still check one another."""
 LEAST_SHARE = 0.5
 """Smallest share of the corners of a view that are no gross errors; with fewer of them the view is not used."""
-POINT_RADIUS_MM = 1e-6
 PLACE_DIGITS = 6
 """Decimals, mm, to which the places of points are the same row or column."""
-"""Radius of a corner as a circle: it has no extent and therefore no eccentricity."""
 
 
 @one_thread()
@@ -211,13 +210,13 @@ def point_grid(board: FlatBoard) -> PointGrid:
     xy = np.round(board.xy_mm(), PLACE_DIGITS)
     (x, column), (y, row) = (np.unique(values, return_inverse=True) for values in xy.T)
     cells = np.column_stack([row, column])
-    common = POINT_RADIUS_MM, "bright", board.sigma_mm
+    common = {"radius_mm": POINT_RADIUS_MM, "polarity": "bright", "sigma_mm": board.sigma_mm, "unusual_size": True}
     if isinstance(board, AprilGridDesign):
         pitch = float(np.ptp(x) / (len(x) - 1))
-        return PointGrid(UnevenGrid(len(y), len(x), pitch, *common, y_mm=tuple(y), x_mm=tuple(x)), cells)
+        return PointGrid(UnevenGrid(len(y), len(x), pitch, **common, y_mm=tuple(y), x_mm=tuple(x)), cells)
     if isinstance(board, AsymmetricCirclesDesign):
-        return PointGrid(LatticePart(len(y), len(x), board.spacing_mm, *common, taken=cells), cells)
-    return PointGrid(BoardDesign(len(y), len(x), board.square_mm, *common), cells)
+        return PointGrid(LatticePart(len(y), len(x), board.spacing_mm, **common, taken=cells), cells)
+    return PointGrid(BoardDesign(len(y), len(x), board.square_mm, **common), cells)
 
 
 def corner_grid(board: FlatBoard) -> BoardDesign:
@@ -393,3 +392,12 @@ def files_of(rig: RigCalibration) -> tuple[dict[str, str], list[str]]:
     except InputError as error:
         missing.append(f"no {CHAIN_FILE}: {error}")
     return files, missing
+
+
+def require_rig_written(out: Path, files: Mapping[str, str], rig: RigCalibration) -> None:
+    """Read the camera files among ``files`` of :func:`files_of` in folder ``out`` again, and require the cameras."""
+    for number, (name, calibration) in enumerate(zip(rig.names, rig.cameras, strict=True)):
+        require_camera_written(out / f"{name}.txt", calibration.intrinsics.camera)
+        if CHAIN_FILE in files:
+            require_camera_written(out / CHAIN_FILE, calibration.intrinsics.camera, f"cam{number}")
+    require_result_written(out / RIG_FILE, RigCalibrationFile.of(rig))

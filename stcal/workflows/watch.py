@@ -7,17 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.file import run_board_of as board_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
-from stcal.io.design import board_of, target_of
+from stcal.io.design import target_of
 from stcal.io.files import CACHE
-from stcal.io.images import ImageFile, Skipped, find_images
+from stcal.io.images import Skipped, chosen_images, find_images
 from stcal.parallel import Progress
 from stcal.sfm.detect.files import detect_files
 from stcal.sfm.detect.labels import LabelledImage, label_images
-from stcal.sfm.pipeline import run
+from stcal.sfm.pipeline import ImageFiles, run_on_files
 from stcal.sfm.planning.advise import Advice, advise, known_of
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.result import RunResult
@@ -110,12 +111,20 @@ class Growing:
         return cls(Path(images), given, Path(out), *designs, options.views, settled)
 
     def update(
-        self, images: int, came: Collection[str], gone: Sequence[str], progress: Progress | None = None
+        self,
+        images: int,
+        came: Collection[str],
+        gone: Sequence[str],
+        progress: Progress | None = None,
+        complete: Collection[str] | None = None,
     ) -> Update:
-        """Returns the state after a run over all photographs. Detections of earlier photographs are kept."""
+        """Returns the state after a run over all photographs, or the ``complete`` ones alone. Detections of earlier
+        photographs are kept."""
         result, reason, advice = None, "", None
         try:
-            result = run(self.images, self.camera, self.out, self.target, self.board, self.options, progress, RELOAD_S)
+            files = self._files(complete)
+            given = self.images, self.camera, self.out, self.target, self.board, self.options
+            result = run_on_files(files, *given, progress, RELOAD_S)
         except StcalError as error:
             if not (self.out / CACHE).is_dir():  # the run refused the folder itself
                 raise
@@ -125,20 +134,24 @@ class Growing:
                 advice = advise(known_of(load_run(self.out)), self.views, progress)
             except StcalError as error:
                 reason = str(error)
-        new, left_out, blur_px = self._found(came, result)
+        new, left_out, blur_px = self._found(came, result, complete)
         return Update(images, new, left_out, tuple(gone), result, reason, advice, blur_px)
 
-    def _found(self, came: Collection[str], result: RunResult | None):
+    def _files(self, complete: Collection[str] | None) -> ImageFiles:
+        """Returns the photographs of which nothing is written any more."""
+        files, skipped = chosen_images(self.images, self.options.exclude)
+        return [file for file in files if complete is None or file.name in complete], skipped
+
+    def _found(self, came: Collection[str], result: RunResult | None, complete: Collection[str] | None):
         """Returns labelled images, skipped images and blur of the added photographs, from the run, or from its
         cache."""
         if result is not None:
             detection, labelled, skipped = result.detection, result.labelled, result.detection.skipped
         else:
-            files: list[ImageFile] = []
             model = self.camera if isinstance(self.camera, CameraModel) else read_camera(self.camera)
             cache, ellipses, workers = self.out / CACHE, self.options.ellipses, self.options.workers
             try:
-                files, skipped_files = find_images(self.images)
+                files, skipped_files = self._files(complete)
                 detection = detect_files(files, model, self.target, self.board, ellipses, cache, workers)
                 labelled = label_images(detection, self.target, self.board, ellipses, cache, workers)
                 skipped = (*skipped_files, *detection.skipped)
@@ -188,7 +201,8 @@ def watch(
     Raises
     ------
     InputError
-        There is no such folder, a file is not of the kind that is expected, or the output folder is not a run's.
+        There is no such folder, or it is gone while it is watched; a file is not of the kind that is expected, or the
+        output folder is not a run's.
     """
     options = options or WatchOptions()
     growing = Growing.of(images, camera, out, target, board, options)
@@ -201,6 +215,10 @@ def watch(
     last_stamps: dict[str, tuple] = {}
     idle_s = 0.0
     while options.idle_s is None or idle_s < options.idle_s:
+        if not images.is_dir():
+            raise InputError(
+                "E-IMAGES-FOLDER", f"image folder {images}: gone while it was watched; put it back, and watch it again"
+            )
         stamps = _stamps(images)
         complete = {name: stamp for name, stamp in stamps.items() if last_stamps.get(name) == stamp}
         last_stamps = stamps
@@ -211,11 +229,14 @@ def watch(
         removed = tuple(name for name in processed if name not in stamps)
         added = {name for name, stamp in complete.items() if processed.get(name) != stamp}
         processed, idle_s = complete, 0.0
-        yield growing.update(len(complete), added, removed, progress)
+        yield growing.update(len(complete), added, removed, progress, complete)
 
 
 def _stamps(images: Path) -> dict[str, tuple]:
-    """Returns size and time of each image file; empty if there are no images yet."""
+    """Returns size and times of each image file; empty if there are no images yet.
+
+    The time of a change of its inode is among them, so that a file that was renamed counts as new.
+    """
     stamps = {}
     try:
         files, _ = find_images(images)
@@ -226,5 +247,5 @@ def _stamps(images: Path) -> dict[str, tuple]:
             stat = file.path.stat()
         except OSError:
             continue  # removed meanwhile
-        stamps[file.name] = stat.st_size, stat.st_mtime_ns
+        stamps[file.name] = stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino
     return stamps

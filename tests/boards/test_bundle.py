@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.boards.file import known_dictionary, load_flat_board
+from stcal.boards.dictionaries import known_dictionary
+from stcal.boards.file import load_flat_board
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.locate.data.exposures import find_scenes

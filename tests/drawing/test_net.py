@@ -85,13 +85,13 @@ def test_all_faces_are_read_from_the_net(target):
 
 def test_plates_that_run_the_same_way_along_an_edge_do_not_share_it():
     """Two pages of a book: one would cover the other."""
-    page = replace(reference_target().faces[0], outline_mm=[[-50, -50], [150, -50], [150, 150], [-50, 150]])
+    outline = [[-50, -50], [150, -50], [150, 150], [-50, 150]]
     pages = []
     for number in range(2):
         angle = np.radians(30 * number)
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
         pose = Rigid(turn, turn @ [50.0, 0, 0])
-        pages.append(replace(page, id=f"p{number}", rough_target_from_face=pose))
+        pages.append(replace(reference_target().faces[number], outline_mm=outline, rough_target_from_face=pose))
     with fails_with("E-DRAW-NET"):
         net_parts(TargetDesign("book", "dark", tuple(pages)))
 

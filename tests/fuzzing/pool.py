@@ -15,7 +15,8 @@ from pathlib import Path
 from stcal.parallel import ONE_THREAD
 from tests.commands import Call
 from tests.fuzzing.cases import Judged, judged, judged_option
-from tests.fuzzing.judged import LONGEST_S, Outcome, failures, hashes, in_process, lay_out
+from tests.fuzzing.judged import LONGEST_S, OUT, Outcome, failures, hashes, in_process, lay_out
+from tests.fuzzing.writers import unchecked, watched
 
 LONGEST_WAIT_S = 4 * LONGEST_S + 20
 MOST_MEMORY = 8 << 30
@@ -45,8 +46,11 @@ def went_through(stock: Path, folder: Path, number: int) -> Judged:
     call = CALLS[number]
     lay_out(stock, folder, call, earlier=True)
     before = hashes(folder)
-    outcome = in_process(call, "stcal", folder)
+    with watched() as (checked, blind):
+        outcome = in_process(call, "stcal", folder)
     found = failures(call, folder, outcome, before, refused=False)
+    found += [("not read again", name) for name in unchecked(call, folder / OUT, checked, before, hashes(folder / OUT))]
+    found += [("check is blind", name) for name in blind]
     if outcome.code != call.code:
         found.append(("exit code", f"{outcome.code}, {call.code} needed: {outcome.err[-300:]}"))
     return Judged(

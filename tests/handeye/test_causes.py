@@ -29,6 +29,7 @@ def told(given: HandEyeInput) -> tuple[str, ...]:
     return lag_tried(given, "eye-in-hand", HandEyeOptions(), handeye(given.pairs))[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset_s", [0.004, -0.02, 0.1])
 def test_a_lag_is_told_with_what_it_explains(offset_s):
     given = given_of(11, offset_s)
@@ -44,6 +45,7 @@ def test_clocks_that_agree_are_not_blamed(seed):
     assert told(given_of(seed, 0.0)) == ()
 
 
+@pytest.mark.slow
 def test_a_doubt_of_the_size_ends_with_the_lag():
     given = given_of(19, 0.05)
     doubted = replace(result := handeye(given.pairs), notes=(*result.notes, SizeDoubt("the board is larger")))

@@ -19,6 +19,7 @@ from stcal.handeye.judge.remarks import of_size
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods.noise import Noise
 from stcal.io.quaternions import INVERTED
+from stcal.workflows.handeye.inputs import HandEyeInput, without_flips
 from tests.outcome import fails_with
 from tests.support.handeye import (
     BASE_FROM_BOARD,
@@ -314,6 +315,64 @@ def test_a_board_that_was_moved_half_way_is_said(moved, sets):
         notes = handeye(HandEyePoses(pairs.base_from_flange, Poses.of(board))).notes
         said += any("the poses fall into two groups" in note for note in notes)
     assert said >= 0.9 * sets if moved else said == 0
+
+
+@pytest.mark.parametrize(("what", "row"), [("camera", 12), ("board", 8)])
+def test_what_moved_between_two_poses_is_located(what, row):
+    pairs = simulated(np.random.default_rng(31), 24, **NOISE).pairs
+    away = Rigid.exp([0.02, 0.03, 0.0, 5, -5, 3])
+    later = [away @ p if what == "camera" else p @ away for p in pairs.camera_from_board]
+    seen = [*list(pairs.camera_from_board)[:row], *later[row:]]
+    notes = handeye(HandEyePoses(pairs.base_from_flange, Poses.of(seen))).notes
+    [note] = [note for note in notes if "moved before" in note]
+    assert note.startswith(f"the {what} moved before pose {row + 1}")
+
+
+def with_flips(rng, pairs: HandEyePoses, count: int) -> tuple[HandEyePoses, list[int]]:
+    """Some poses replaced by the other pose of the board's plane: tilts about the line of sight with opposite sign."""
+    poses, rows = list(pairs.camera_from_board), sorted(rng.choice(len(pairs.names), count, replace=False).tolist())
+    for row in rows:
+        pose = poses[row]
+        sight = pose.translation / np.linalg.norm(pose.translation)
+        mirror = np.eye(3) - 2 * np.outer(sight, sight)
+        poses[row] = Rigid(mirror @ pose.rotation @ np.diag([1, 1, -1.0]), pose.translation)
+    return HandEyePoses(pairs.base_from_flange, Poses.of(poses)), rows
+
+
+def test_flips_are_named_and_undone_where_asked():
+    rng = np.random.default_rng(41)
+    truth = simulated(rng, 20, **NOISE)
+    pairs, rows = with_flips(rng, truth.pairs, 5)
+    found = handeye(pairs)
+    [note] = [note for note in found.notes if "tilted the other way" in note]
+    assert [int(word) - 1 for word in re.findall(r"pose (\d+)", note)] == rows
+    assert not any("tilted" in note for note in handeye(truth.pairs).notes)
+    mended, said = without_flips(HandEyeInput("poses", pairs), "eye-in-hand", HandEyeOptions())
+    assert said.startswith("tilted the other way, as --undo-flips asks, 5 of 20 poses")
+    again = handeye(mended.pairs)
+    assert not again.outliers.any()
+    off = np.linalg.norm((again.mount_from_camera.inverse() @ FLANGE_FROM_CAMERA).translation)
+    assert off < 4 * np.sqrt(np.trace(again.covariance[3:, 3:]))
+
+
+def test_other_wrong_poses_are_no_flips():
+    """Turned by 20° about random axes; of a hundred one may seem to be a flip."""
+    rng = np.random.default_rng(42)
+    pairs = simulated(rng, 20, **NOISE).pairs
+    for _ in range(3):
+        poses = list(pairs.camera_from_board)
+        for row in (2, 7, 11):
+            axis = rng.normal(size=3)
+            poses[row] = poses[row] @ Rigid.exp([*(0.35 * axis / np.linalg.norm(axis)), 0, 0, 0])
+        notes = handeye(HandEyePoses(pairs.base_from_flange, Poses.of(poses))).notes
+        assert not any("tilted the other way" in note for note in notes)
+
+
+@pytest.mark.parametrize(("sets", "most"), [(4, 0), pytest.param(200, 6, marks=pytest.mark.full)])
+def test_sound_poses_do_not_move(sets, most):
+    """In the order of their rows; at 1 %, of 200 sets seven or more once in 200 runs."""
+    notes = [handeye(simulated(np.random.default_rng(seed), 20, **NOISE).pairs).notes for seed in range(sets)]
+    assert sum(any("moved before" in note or "drifts" in note for note in each) for each in notes) <= most
 
 
 @pytest.mark.slow

@@ -1,12 +1,14 @@
-"""What is kept is read back bit by bit; what is damaged counts as absent."""
+"""What is kept is read back bit by bit; what is damaged, edited or another's counts as absent, with a note."""
 
 import os
 import tracemalloc
+import warnings
 import zipfile
 
 import numpy as np
 import pytest
 
+from stcal.errors import InputNote
 from stcal.io.cache import keep, kept
 from stcal.io.files import TABLE_BYTES
 
@@ -29,10 +31,36 @@ def test_kept_and_read_back(tmp_path):
 @pytest.mark.parametrize("end", [0, 10, 200, -1])
 def test_a_damaged_or_absent_file_is_none(tmp_path, end):
     path = tmp_path / "key.npz"
-    assert kept(path, together) is None
+    with warnings.catch_warnings(action="error"):  # a file that never was is nothing to note
+        assert kept(path, together) is None
     keep(path, ARRAYS, META)
     path.write_bytes(path.read_bytes()[:end])
-    assert kept(path, together) is None
+    with pytest.warns(InputNote, match=r"key\.npz is damaged"):
+        assert kept(path, together) is None
+
+
+def test_an_edited_file_and_that_of_another_are_none(tmp_path):
+    """The edit is one that NumPy can read."""
+    path, other = tmp_path / "key.npz", tmp_path / "other.npz"
+    keep(path, ARRAYS, META)
+    keep(other, ARRAYS, META)
+    assert kept(other, together) is not None
+    other.write_bytes(path.read_bytes())
+    with pytest.warns(InputNote, match=r"other\.npz is made from other inputs"):
+        assert kept(other, together) is None
+    with np.load(path) as stored:
+        np.savez(path, **dict(stored) | {"xyz": ARRAYS["xyz"] + 1e-6})
+    with pytest.warns(InputNote, match=r"key\.npz is edited"):
+        assert kept(path, together) is None
+
+
+def test_a_folder_in_its_place_makes_room(tmp_path):
+    path = tmp_path / "key.npz"
+    (path / "deeper").mkdir(parents=True)
+    with pytest.warns(InputNote, match=r"key\.npz is damaged"):
+        assert kept(path, together) is None
+    keep(path, ARRAYS, META)
+    assert kept(path, together) is not None
 
 
 def test_a_file_of_another_form_is_none(tmp_path):

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
-from stcal.io.design import MIN_SINE, board_toml, load_board, load_target, target_toml
+from stcal.design import MIN_SINE, BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
+from stcal.io.design import board_toml, load_board, load_target, target_toml
 from tests.outcome import fails_with
 
 ROUNDED_MM = 1e-9
@@ -114,6 +114,7 @@ def test_board_arrays():
     assert board.radius_of() == dict(zip(board.labels(), [2.0, 2, 2, 2, 2, 3], strict=True))
 
 
+@pytest.mark.slow
 @given(st.floats(-np.pi, np.pi), st.floats(-500, 500), st.floats(-500, 500))
 def test_any_right_handed_drawing_frame_gives_the_same_face(tmp_path_factory, angle, x, y):
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -134,6 +135,7 @@ identifiers = st.text(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(identifiers, min_size=4, max_size=4, unique=True), st.text(st.characters(codec="utf-8")))
 def test_any_allowed_id_and_any_name_survive(tmp_path_factory, ids, name):
     xy = [[0, 0], [40, 0], [0, 40], [40, 40]]
@@ -197,7 +199,9 @@ def test_mirror_images_and_small_likenesses_are_taken(tmp_path):
 
 
 def test_no_negative_zero_is_written():
-    face = FaceDesign("f", ("1", "2", "3", "4"), [[-0.0, 0], [40, -1e-12], [0, 40], [40, 40]], [5.0] * 4, "1", "2", "3")
+    face = FaceDesign(
+        "f", ("1", "2", "3", "4"), [[-0.0, 0], [40, -1e-12], [0, 40], [40, 40]], [5.0, 5, 5, 8], "1", "2", "3"
+    )
     assert "-0.0" not in target_toml(TargetDesign("t", "dark", (face,)))
 
 

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image, ImageOps
 
 from stcal.errors import InputError
+from stcal.io import images
 from stcal.io.files import RUN_MARKER
 from stcal.io.images import (
     TOP_GROUP,
@@ -213,12 +214,15 @@ def test_white_is_zero(dtype):
     np.testing.assert_array_equal(decode(tiff_of(grey, True), "a.tif"), np.iinfo(dtype).max - grey)
 
 
-def test_photographs_of_other_kinds_are_named_with_what_to_do(tmp_path):
+def test_photographs_of_other_kinds_are_named_with_what_to_do(tmp_path, monkeypatch):
+    """As where the packages that read them are not installed."""
+    monkeypatch.setattr(images, "SUFFIXES", images.USUAL)
     for name in ("a.HEIC", "b.dng", "c.txt"):
         (tmp_path / name).write_bytes(b"x")
-    with fails_with("E-IMAGES-NONE … a.HEIC: a HEIC photograph … export it as JPEG"):
+    with fails_with("E-IMAGES-NONE … a.HEIC: a HEIC photograph … pip install 'stcal[heic]' … export it as JPEG"):
         find_images(tmp_path)
     cv2.imwrite(str(tmp_path / "d.png"), np.zeros((4, 4), np.uint8))
     reasons = {each.name: each.reason for each in find_images(tmp_path)[1]}
+    assert "stcal[raw]" in reasons["b.dng"]
     assert "develop it to TIFF" in reasons["b.dng"]
     assert reasons["c.txt"] == "not an image file"

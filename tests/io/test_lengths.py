@@ -90,7 +90,7 @@ def test_robots_in_metres(tmp_path):
 
 def test_a_robot_without_links_comes_back(tmp_path):
     rows = (DHRow(0.02, np.pi / 2, 0.0, 0.0), DHRow(0.0, 0.0, 0.01, 0.0))
-    robot = Robot("gimbal", "standard", rows, (Joint(), Joint()), tools={"": Rigid()})
+    robot = Robot("gimbal", "standard", rows, (Joint(), Joint()), tools={"": Rigid()}, unusual_size=True)
     assert load_robot(written(tmp_path, robot_toml(robot))).rows[0].a == 0.02
 
 

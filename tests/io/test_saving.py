@@ -78,6 +78,7 @@ VALUES = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(st.dictionaries(st.text(), VALUES))
 def test_json_is_that_of_the_standard_library(content):
     """Whose writer takes a number at a time: of a hundred thousand rows seconds."""

@@ -128,3 +128,22 @@ def test_both_files_with_a_map(tmp_path):
     maps = {"columns": tmp_path / "b.toml", "columns_a": tmp_path / "a.toml"}
     found = join(tmp_path / "a.csv", tmp_path / "b.csv", "image", **maps).table
     assert (found.numbers("q1_deg")[0], found.quantity("x", LENGTHS)[0]) == (10.5, 1500.0)
+
+
+@pytest.mark.parametrize("units", ["mm", "[mm]", "(mm)", " mm "])
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_a_row_of_units_below_the_header(tmp_path, units, separator):
+    text = f"name,x,y,z\n,{units},{units},{units}\nA,1.5,2,3\nB,4,5,6\n".replace(",", separator)
+    np.testing.assert_array_equal(table(tmp_path, text).points(), [[1.5, 2, 3], [4, 5, 6]])
+
+
+def test_units_behind_a_slash(tmp_path):
+    found = table(tmp_path, "% exported\nPunkt;X/mm;Y/mm;Z/mm\nA;1,5;2;3\nB;2,5;2;3\n")
+    np.testing.assert_array_equal(found.points(), [[1.5, 2, 3], [2.5, 2, 3]])
+
+
+def test_a_line_that_is_no_header_is_named(tmp_path):
+    with fails_with("E-TABLE-HEADER … line 1 … skip_lines … --columns"):
+        table(tmp_path, "My measurement\nname,x_mm,y_mm\nA,1,2\n")
+    with fails_with("E-TABLE-HEADER … line 1 … header = false … --columns"):
+        table(tmp_path, "P1 1.5 2.5 3.5\nP2 4 5 6\n")

@@ -80,6 +80,7 @@ def test_nothing_accepted_is_exit_code_3(stcal, files):
     assert "no pose accepted in 1 scene" in shown
 
 
+@pytest.mark.slow
 def test_limits_are_options(stcal, files):
     target = ["--layout", files / "layout.toml", "--camera", files / "cameras.txt"]
     image = files / "scenes" / "good" / "1.png"

@@ -134,7 +134,7 @@ def test_tools_and_base_of_the_nominal_arm_stay():
     ("text", "given", "error"),
     [
         (CONF, None, "E-ROBOT-NOMINAL … --nominal"),
-        (CONF, Robot("two", "standard", (DHRow(9, 0, 0, 0),) * 2, (Joint(),) * 2), "E-ROBOT-NOMINAL … 2 joints"),
+        (CONF, Robot("two", "standard", (DHRow(90, 0, 0, 0),) * 2, (Joint(),) * 2), "E-ROBOT-NOMINAL … 2 joints"),
         (CONF.replace("-0.00013]", "]"), nominal(), "E-ROBOT-ENTRIES … delta_d"),
         (CONF.replace("delta_alpha", "delta_beta"), nominal(), "E-ROBOT-ENTRIES … delta_alpha"),
     ],

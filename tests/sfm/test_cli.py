@@ -45,6 +45,7 @@ def test_the_umbrella_command_is_the_same_thing(command, tmp_path):
     assert out.strip().count(".") == 2
 
 
+@pytest.mark.slow
 def test_simulate_and_compare(command, small_dataset, small_run, tmp_path):
     code, text, _ = command("simulate", tmp_path, "--width", 324, "--images", 2, "--second-design", "--workers", 1)
     assert code == 0
@@ -160,6 +161,7 @@ def test_simulate_with_the_camera_of_a_file(command, wedge, tmp_path):
     assert "two cameras" in err
 
 
+@pytest.mark.slow
 def test_simulate_with_lens_and_rim(command, tmp_path):
     small = "--width", 324, "--images", 2, "--workers", 1
     lens = "--f-number", 4, "--focus-mm", 900, "--rim-mm", 0.2

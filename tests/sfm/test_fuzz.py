@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from stcal.cli.main import MESSAGE_CHARACTERS
+from stcal.io.files import require_written
 from tests.commands import CALLS, COMMANDS, options_of
 from tests.fuzzing.cases import BRIEF_S, Judged, chosen, judged
 from tests.fuzzing.judged import EARLIER, OUT, Outcome, failures, hashes, in_process, lay_out
@@ -41,6 +42,7 @@ def shortest_first() -> list[tuple[int, str]]:
     return [(n, calls[n].command) for n in sorted(range(CASES), key=lambda n: calls[n].seconds)]
 
 
+@pytest.mark.slow
 def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, tmp_path):
     cases = shortest_first()
     first = {command: n for n, command in reversed(cases)}
@@ -75,6 +77,7 @@ QUICK = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_a_mistake_is_told(stock, tmp_path, name):
     assert name in MISTAKES
@@ -93,6 +96,22 @@ FIRST = [n for n, call in enumerate(CALLS) if call.command not in {before.comman
 )
 def test_calls_go_through(stock, tmp_path, number):
     assert went_through(stock, tmp_path / "case", number).failures == ()
+
+
+INIT = next(n for n, call in enumerate(CALLS) if call.command == "robot init")
+
+
+@pytest.mark.parametrize(
+    ("kind", "instead"),
+    [
+        ("not read again", lambda path, robot: None),
+        ("check is blind", lambda path, robot: require_written(path, lambda: 0.0, 0.0, 0.0, "mm")),
+    ],
+)
+def test_a_writer_without_a_check_is_found(stock, tmp_path, monkeypatch, kind, instead):
+    """Every file that a call writes is read again (`test_calls_go_through`), and its check sees another number."""
+    monkeypatch.setattr("stcal.robot.kinematics.file.require_robot_written", instead)
+    assert went_through(stock, tmp_path / "case", INIT).failures == ((kind, "robot.toml"),)
 
 
 @pytest.fixture

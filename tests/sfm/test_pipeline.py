@@ -52,6 +52,17 @@ def test_errors_are_those_that_sigma_predicts(calibrated):
     assert result.calibration.joint.sigma0 == pytest.approx(1.0, abs=0.15)
 
 
+def test_a_result_shows_itself_in_a_line_and_in_a_notebook(small_result):
+    text, page = repr(small_result), small_result._repr_html_()
+    assert len(text) < 500
+    assert "\n" not in text
+    assert small_result.judgement.use in text
+    reference = small_result.target.reference_face
+    for face in small_result.target.target_from_face:
+        assert f"{face}, {'reference' if face == reference else ''}" in text
+        assert f"<tr><td>{face}</td>" in page
+
+
 def test_every_promised_file_is_there_and_agrees(small_result):
     result, out = small_result, small_result.out
     faces = json.loads((out / "faces.json").read_text())

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.boards.tags import Tags, corners_by_edges
+from stcal.boards.edges import corners_by_edges
+from stcal.boards.tags import Tags
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.locate.data.layout import TargetLayout, square

@@ -65,6 +65,7 @@ def _moments(share, box):
     return np.array([share.sum(), (share * x).sum() / share.sum(), (share * y).sum() / share.sum()])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lens", "rim_mm"),
     [
@@ -183,6 +184,7 @@ def test_all_in_focus_through_a_pinhole(scene, clutter):
     np.testing.assert_array_equal(render(scene, "12", 0, options), render(scene, "12", 0, closed))
 
 
+@pytest.mark.slow
 def test_scenery_is_out_of_focus_too(scene):
     def steepest(lens):
         picture = render(scene, "12", 0, replace(PLAIN, clutter=True, blur_px=0, bit_depth=8, lens=lens))

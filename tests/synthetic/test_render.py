@@ -109,6 +109,25 @@ def test_clutter_adds_objects_behind_but_leaves_circles_alone(scene):
     np.testing.assert_array_equal(plain[y, x], full[y, x])
 
 
+def test_a_table_shows_dots_where_a_mirror_does_and_as_bright_as_its_reflectance(scene):
+    """The dots of the board: each is seen at its place mirrored at the table, 50 mm below all; nothing else changes."""
+    plain = render(scene, "12", 0, PLAIN)
+    shiny = render(scene, "12", 0, replace(PLAIN, reflectance=0.6))
+    group = scene.groups["12"]
+    up = group.axes[1]
+    outlines = np.vstack([*(scene.face_outline(face.id) for face in scene.target.faces), scene.board_outline("12")])
+    height = group.board_circles_target @ up - (outlines @ up).min() + 50
+    mirrored = group.camera_from_target[0] @ (group.board_circles_target - 2 * height[:, None] * up)
+    x, y = np.rint(scene.camera.project(mirrored)).astype(int).T
+    shown = (x > 2) & (x < 645) & (y > 2) & (y < 429)
+    new = shown & (plain[y.clip(0, 431), x.clip(0, 647)] < 4)  # the rest is hidden by target or board
+    assert new.sum() >= 9
+    assert 100 < np.median(shiny[y[new], x[new]]) < 125  # 27 + 0.6 · (180 − 27) = 119, less what blur takes off
+    near_circles = np.abs(shiny.astype(int) - plain) > 0
+    seen = np.rint(image_circles(scene, "12", 0).centre_px).astype(int)
+    assert not near_circles[seen[:, 1], seen[:, 0]].any()
+
+
 @pytest.mark.slow
 def test_vignetting_gradient_blur_and_exposure(second):
     def picture(**changes):
@@ -127,5 +146,7 @@ def test_vignetting_gradient_blur_and_exposure(second):
 def test_options_are_checked():
     with fails_with("E-SIMULATE-OPTIONS … 12"):
         RenderOptions(bit_depth=12)
+    with fails_with("E-SIMULATE-OPTIONS … reflectance 1.2"):
+        RenderOptions(reflectance=1.2)
     with fails_with("E-SIMULATE-OPTIONS … noise … -1"):
         RenderOptions(noise=-1)

@@ -124,6 +124,14 @@ def handeye(
             "--robot-out", writable=True, help="Write the robot of --with-kinematics to this file, as adjusted (TOML)."
         ),
     ] = None,
+    undo_flips: Annotated[
+        bool,
+        typer.Option(
+            "--undo-flips",
+            help="Replace poses of a flat target by the second pose of its plane, tilted the other way, where only "
+            "that agrees with the others; not with images.",
+        ),
+    ] = False,
     four_dof: Annotated[
         bool,
         typer.Option("--four-dof", help="Solve for what a flange that turns about one axis only (SCARA) tells."),
@@ -151,6 +159,10 @@ def handeye(
             "--image-times",
             help="Read the times of the images from this file: image, time_s (CSV); their names if not given.",
         ),
+    ] = None,
+    times_columns: Annotated[
+        Path | None,
+        typer.Option("--times-columns", help="Read --image-times with the columns, delimiter … of this file (TOML)."),
     ] = None,
     time_tolerance: TimeTolerance = 0.02,
     motions_held_out: Annotated[
@@ -253,21 +265,31 @@ def handeye(
     """Find where a camera sits on a robot's flange, or in its base, and how well that is known."""
     from stcal.handeye import HandEyeOptions, Noise
     from stcal.handeye.data.formats.record import Said
-    from stcal.handeye.report.export import exported, opencv_yaml, require_form, ros_yaml, urdf_joint
+    from stcal.handeye.report.export import (
+        exported,
+        opencv_yaml,
+        require_export_written,
+        require_form,
+        ros_yaml,
+        urdf_joint,
+    )
     from stcal.handeye.report.file import HandEyeFile
     from stcal.handeye.report.outcome import judged
     from stcal.handeye.report.page import outcome_report
+    from stcal.io.files import require_same
     from stcal.robot import load_robot, save_robot
     from stcal.workflows.handeye.calibrate import AUTO, Splits, calibrate
     from stcal.workflows.handeye.inputs import dry_run as understood
-    from stcal.workflows.handeye.inputs import read_input, setup_of
+    from stcal.workflows.handeye.inputs import read_input, setup_of, without_flips
     from stcal.workflows.handeye.offset import at_offset, with_offset
     from stcal.workflows.handeye.times import Timing
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
     statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
-    timing = Timing(time_tolerance, image_times, time_offset)
+    if times_columns is not None and image_times is None:
+        raise InputError("E-OPTION-NEEDS", f"--times-columns {times_columns}: of times of images; give --image-times")
+    timing = Timing(time_tolerance, image_times, time_offset, times_columns)
     pairs = source_of(source, first, second, key, statements, quaternions.value, timing, columns, columns_a)
     folder = isinstance(pairs, Path) and pairs.is_dir()
     statements = replace(statements, columns=columns) if folder else statements
@@ -279,7 +301,7 @@ def handeye(
     written |= {"--robot-out": robot_out}
     written |= {"--json": json_file, "--report": report}
     read = {"source": source, "--poses": poses, "--camera": camera, "--board": board, "--a": first, "--b": second}
-    read |= {"--with-kinematics": with_kinematics, "--image-times": image_times}
+    read |= {"--with-kinematics": with_kinematics, "--image-times": image_times, "--times-columns": times_columns}
     keep_apart(
         [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
         [(name, path) for name, path in read.items() if path],
@@ -325,6 +347,9 @@ def handeye(
         chosen, offset = setup_of(statements, inputs.setup, inputs.where), None
         if statements.setup:
             inputs = replace(inputs, setup=chosen)
+        if undo_flips:
+            inputs, undone = without_flips(inputs, chosen, options)
+            say(undone)
         if time_offset:
             inputs, options, offset = at_offset(inputs, chosen, options)
         outcome = with_offset(calibrate(inputs, chosen, method, options, validation, progress, time_offset), offset)
@@ -341,9 +366,13 @@ def handeye(
     write_if(ros, lambda: ros_yaml(result, parent, child, camera_frame.value))
     write_if(urdf, lambda: urdf_joint(result, parent, child, camera_frame.value))
     write_if(opencv, lambda: opencv_yaml(result))
+    for path, kind in ((out, "json"), (ros, "ros"), (urdf, "urdf"), (opencv, "opencv")):
+        if path:
+            require_export_written(path, kind, result, parent, child, camera_frame.value)
     write_if(report, document.page)
     for form, path in exports:
-        write(path, exported(result, form, path.stem, parent, child, camera_frame.value))
+        write(path, text := exported(result, form, path.stem, parent, child, camera_frame.value))
+        require_same(path, path.read_text, text)  # which gave the transform back
     if camera_out:
         _save_camera(camera_out, outcome)
     if robot_out and inputs.arm is not None and result.reprojection is not None and result.reprojection.arm is not None:
@@ -445,7 +474,8 @@ def _evolution(method: str | None, **given) -> "EvolutionOptions":
 
 
 def _save_camera(path: Path, outcome: "Outcome") -> None:
-    from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+    from stcal.io.cameras.model import CalibratedCamera
+    from stcal.io.cameras.write import save_camera
 
     reprojection = outcome.result.reprojection
     if reprojection is None:
@@ -453,9 +483,7 @@ def _save_camera(path: Path, outcome: "Outcome") -> None:
             "E-OPTION-METHOD", f"--camera-out: {outcome.result.method} does not adjust the camera; leave --method out"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_cameras_txt(
-        path, CalibratedCamera.of(reprojection.camera, outcome.colmap_model, reprojection.camera_covariance)
-    )
+    save_camera(path, CalibratedCamera.of(reprojection.camera, outcome.colmap_model, reprojection.camera_covariance))
     say(f"written: {path}")
 
 

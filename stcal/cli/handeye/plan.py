@@ -65,6 +65,7 @@ def plan(
     """Name the robot poses that would lower the worst σ at the board most, after those of a hand-eye calibration."""
     from stcal.handeye.data.formats.record import Said
     from stcal.handeye.report.planned import planned_csv, planned_file, planned_report
+    from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
     from stcal.workflows.handeye.inputs import read_input, setup_of
     from stcal.workflows.handeye.plan import plan_next
@@ -83,4 +84,7 @@ def plan(
         say(f"left out {name}: {reason}")
     print_each("note", planned.notes)
     write_if(out, lambda: planned_csv(planned.poses, planned.joints))
+    if out:
+        frames = ("base_from_flange", "camera_from_board")
+        require_pose_table_written(out, {f"{name}_": getattr(planned.poses, name) for name in frames})
     write_if(json_file, lambda: planned_file(planned.result, planned.poses, planned.joints))

@@ -60,7 +60,7 @@ def axes(
     from stcal.robot.axes.model import robot_from_sweeps
     from stcal.robot.axes.report import axes_file, axes_report
     from stcal.robot.axes.sweeps import ring
-    from stcal.robot.kinematics.file import load_robot, robot_toml
+    from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
@@ -81,6 +81,8 @@ def axes(
         say("orientations: not used; state σ (cov_… columns), or give --orientations a length")
     print_each(f"warning: {data.where}", result.notes)
     write_if(out, lambda: robot_toml(result.robot, [f"Identified by the axis method from {name_of(source)}."]))
+    if out:
+        require_robot_written(out, result.robot, result.chain)
     write_if(json_file, lambda: axes_file(result))
     write_if(report, document.page)
 

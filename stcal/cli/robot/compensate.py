@@ -84,6 +84,7 @@ def compensate(
     report: ReportFile = None,
 ) -> None:
     """Compute joint values that really reach commanded poses, beside the nominal ones."""
+    from stcal.io.files import require_same
     from stcal.robot.export import exported, require_form
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import compensation as stage
@@ -109,11 +110,14 @@ def compensate(
     print_each(f"note: {wanted.where}", wanted.notes)
     print_each(f"warning: {wanted.where}", result.notes())
     write_if(out, lambda: stage.compensated_csv(result, identified))
+    if out:
+        stage.require_compensated_written(out, result, identified)
     write_if(json_file, lambda: stage.compensation_file(result, identified))
     write_if(report, document.page)
     for form, path in exports if result.found.usable.any() else ():
         exported_file = exported(result, identified, form, path, export_as.value, pulses)
         write(path, exported_file.text)
+        require_same(path, path.read_text, exported_file.text)  # which gave the points back
         print_each("note", exported_file.notes)
     if not result.found.usable.any():
         raise DegenerateError(

@@ -58,9 +58,9 @@ def convert(
     ] = None,
 ) -> None:
     """Write a robot file as URDF, or the joints of a URDF or an arm of Universal Robots as a robot file."""
-    from stcal.robot.kinematics.file import load_robot, robot_toml
+    from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
     from stcal.robot.urdf.read import load_urdf
-    from stcal.robot.urdf.write import coupled, require_same_poses, robot_urdf
+    from stcal.robot.urdf.write import coupled, require_urdf_written, robot_urdf
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
@@ -74,11 +74,11 @@ def convert(
         say(f"robot {robot.name}: {len(robot.rows)} joints, of Universal Robots")
         print_each(f"note: {source}", said)
         if out.suffix.lower() in XML:
-            text = robot_urdf(robot)
-            require_same_poses(robot, text)
+            write(out, robot_urdf(robot))
+            require_urdf_written(out, robot)
         else:
-            text = robot_toml(robot, [f"From {source.name}, calibration of Universal Robots."])
-        write(out, text)
+            write(out, robot_toml(robot, [f"From {source.name}, calibration of Universal Robots."]))
+            require_robot_written(out, robot)
         return
     if _is_xml(source) == (out.suffix.lower() in XML):
         raise InputError(
@@ -91,6 +91,7 @@ def convert(
         say(f"robot {urdf.robot.name}: {len(urdf.joints)} joints from {urdf.from_link} to {urdf.to_link}: {joints}")
         print_each(f"note: {source}", urdf.notes)
         write(out, robot_toml(urdf.robot, [f"From {source.name}, {urdf.from_link} to {urdf.to_link}: {joints}."]))
+        require_robot_written(out, urdf.robot)
         return
     if from_link or to_link or convention is not ConventionName.standard:
         raise InputError(
@@ -98,22 +99,22 @@ def convert(
         )
     robot = load_robot(source)
     text = robot_urdf(robot)
-    require_same_poses(robot, text)
     ends = f"flange, and {len(robot.tools)} tools" if robot.tree is None else f"{len(robot.tools)} tools on branches"
     say(f"robot {robot.name}: {len(robot.rows)} joints from base_link to {ends}")
     if coupled(robot):
         say("note: URDF has no coupling; its joint values are the coupling times the controller's, with wider limits")
     write(out, text)
+    require_urdf_written(out, robot)
 
 
 def _of_universal(source: Path, nominal: Path | None, convention: "Convention") -> "tuple[Robot, list[str]] | None":
     """The arm of a file of Universal Robots, with notes; None for any other file."""
-    from stcal.io.files import SETTINGS_BYTES, read_bytes
+    from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.urdf.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
 
     try:
-        text = read_bytes(source, SETTINGS_BYTES).decode("utf-8-sig")
+        text = text_of(read_bytes(source, SETTINGS_BYTES))
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{source}: {error.strerror or error}; check the path") from error
     except UnicodeDecodeError:
@@ -148,7 +149,7 @@ def init(
     file: Annotated[Path, typer.Argument(writable=True, help="Write the robot file here.")] = Path("robot.toml"),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
-    from stcal.robot.kinematics.file import robot_toml
+    from stcal.robot.kinematics.file import require_robot_written, robot_toml
     from stcal.robot.kinematics.model import mh80
 
     comments = (
@@ -156,4 +157,5 @@ def init(
         "Optional: min_deg, max_deg, beta_deg, base, tool, [[target]] for more tools, and coupling, which makes",
         "kinematic joint values of the controller's (Fanuc: its third row is [0, 1, 1, 0, 0, 0]).",
     )
-    write(file, robot_toml(mh80(), comments))
+    write(file, robot_toml(robot := mh80(), comments))
+    require_robot_written(file, robot)

@@ -57,6 +57,8 @@ def design(
     also = f" and {sigma_rad:g} rad" if observe is ObservedKind.pose else ""
     say(f"for an instrument whose {observe.value}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
     write_if(out, lambda: stage.design_csv(result, robot))
+    if out:
+        stage.require_design_written(out, result, robot, target)
     write_if(json_file, lambda: stage.design_file(result))
     write_if(report, document.page)
 

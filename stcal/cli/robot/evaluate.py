@@ -76,6 +76,8 @@ def evaluate(
     say(document.text())
     print_each("note", data[0].notes)
     write_if(out, lambda: shown.evaluated_csv(result))
+    if out:
+        shown.require_evaluated_written(out, result)
     write_if(json_file, lambda: shown.evaluation_file(result))
     write_if(report, document.page)
 

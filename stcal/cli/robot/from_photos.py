@@ -62,7 +62,7 @@ def from_photos(
     from stcal.robot.kinematics.file import load_robot
     from stcal.sfm.measurement.images import MeasureOptions
     from stcal.sfm.measurement.target import read_target
-    from stcal.workflows.from_photos.result import files_of, story
+    from stcal.workflows.from_photos.result import files_of, require_files_written, story
     from stcal.workflows.from_photos.run import from_photos
 
     require_new_folder(out, images)
@@ -87,4 +87,5 @@ def from_photos(
     for line in story(result):
         say(line)
     save_folder(out, files_of(result))
+    require_files_written(out, result)
     say(f"report: {out / 'report.html'}")

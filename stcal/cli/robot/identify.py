@@ -116,7 +116,7 @@ def identify(
     """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
     from stcal.robot.identification.prior import adjusted
     from stcal.robot.identification.report import identified_file, identified_report
-    from stcal.robot.identification.result import IdentifyOptions, require_written
+    from stcal.robot.identification.result import IdentifyOptions, require_identified_written
     from stcal.robot.identification.solve import identify as identified_from
     from stcal.robot.kinematics.file import load_robot, robot_toml
     from stcal.robot.kinematics.measurements import read_measurements
@@ -138,10 +138,11 @@ def identify(
             out,
             robot_toml(result.robot, [f"Identified from {name_of(source)}: {result.rank} parameters."]),
         )
-        require_written(out, result)
+        require_identified_written(out, result)
     if offsets:
-        from stcal.robot.export.files import offsets_csv
+        from stcal.robot.export.files import offsets_csv, require_offsets_written
 
         write(offsets, offsets_csv(result, nominal))
+        require_offsets_written(offsets, result, nominal)
     write_if(json_file, lambda: identified_file(result, nominal))
     write_if(report, document.page)

@@ -38,6 +38,10 @@ def budget(
             "sigma_mm).",
         ),
     ] = None,
+    columns: Annotated[
+        Path | None,
+        typer.Option("--columns", help="Read --check-lengths with the columns, delimiter … of this file (TOML)."),
+    ] = None,
     lengths: Annotated[
         Path | None,
         typer.Option("--lengths", help="Compare the longest distances with the second calibration in this folder."),
@@ -60,6 +64,8 @@ def budget(
     from stcal.sfm.runs.saved import load_run
     from stcal.sfm.runs.verify import verify
 
+    if columns is not None and check_lengths is None:
+        raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of lengths; give it with --check-lengths")
     saved = load_run(run)
     stated = statement_of(saved.board.stated, statement, field or ())
     if pdf:
@@ -71,7 +77,7 @@ def budget(
         )
     computed, tests = budget_of_run(saved, stated), []
     if check_lengths is not None:
-        tests.append(against_stated(computed, check_lengths))
+        tests.append(against_stated(computed, check_lengths, columns))
     if lengths is not None:
         second = load_run(lengths)
         statement_of_second = statement_of(second.board.stated, lengths_statement or statement)

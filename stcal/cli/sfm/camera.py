@@ -97,7 +97,8 @@ def calibrate_camera(
 def _one(images: Path, out: Path, target, board, model: str, json_file, report, workers) -> list[str]:
     """Calibrates one camera, and returns the failed checks."""
     from stcal.design import BoardDesign
-    from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+    from stcal.io.cameras.model import CalibratedCamera
+    from stcal.io.cameras.write import save_camera
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.file import CalibrationFile
     from stcal.sfm.camera.report import calibration_report
@@ -111,7 +112,7 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
         else:
             result = calibrate_camera_by_corners(images, board, model, workers, progress)
     intrinsics = result.intrinsics
-    write_cameras_txt(out, CalibratedCamera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance))
+    save_camera(out, CalibratedCamera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance))
     summary = CalibrationFile.of(result)
     document = calibration_report(result, summary, str(images))
     say(document.text())
@@ -127,13 +128,14 @@ def _rig(images: Path, out: Path, target, board, models, json_file, report, work
     from stcal.io.files import require_new_folder, save_folder
     from stcal.sfm.camera.file import RigCalibrationFile
     from stcal.sfm.camera.report import rig_report
-    from stcal.workflows.calibrate_camera import calibrate_rig_from_photographs, files_of
+    from stcal.workflows.calibrate_camera import calibrate_rig_from_photographs, files_of, require_rig_written
 
     require_new_folder(out, images)
     with StageProgress() as progress:
         calibration = calibrate_rig_from_photographs(images, target, board, models, workers, progress)
     files, missing = files_of(calibration)
     save_folder(out, files)
+    require_rig_written(out, files, calibration)
     document = rig_report(calibration, str(images))
     say(document.text())
     print_each("warning", calibration.warnings)

@@ -10,7 +10,7 @@ import typer
 from stcal.cli.options import MOST_SEED
 from stcal.cli.terminal import StageProgress, print_each, say
 from stcal.errors import InputError
-from stcal.io.files import BOARD, TARGET, save
+from stcal.io.files import BOARD, TARGET
 
 app = typer.Typer()
 
@@ -84,7 +84,7 @@ def design(
 ) -> None:
     """Make a target for a box: circles on five sides that name each face with any three hidden; and forecast its σ."""
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import board_toml, load_board, target_toml
+    from stcal.io.design import load_board, save_design
     from stcal.sfm.detect.sightings import likeness_notes
     from stcal.sfm.make.box import size_of
     from stcal.sfm.make.design import MakeOptions, made_text, make_target
@@ -104,10 +104,10 @@ def design(
     noise, source = expected_noise()
     planned = PlanOptions(images=images, distance_mm=distance, width=width, camera=model, noise=noise, seed=seed)
     forecast = plan(planned, target, board or product.board, target.rough_poses())
-    save(target_file, target_toml(target))
+    save_design(target_file, target)
     print_each("note", likeness_notes(target))
     say(f"{made_text(product)}\n{target_file}")
     if board is None:
-        save(board_file, board_toml(product.board))
+        save_design(board_file, product.board)
         say(board_file)
     say(f"\n{plan_text(forecast, source)}")

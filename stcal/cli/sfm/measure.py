@@ -58,6 +58,10 @@ def measure(
             help="Add to the table the columns of this file, joint values say; it needs a column image (CSV).",
         ),
     ] = None,
+    columns: Annotated[
+        Path | None,
+        typer.Option("--columns", help="Read --joints with the columns, delimiter … of this file (TOML)."),
+    ] = None,
     board: Annotated[
         Path | None,
         typer.Option("--board", help="Tell the dots of the board of this board.toml apart, if it is in view."),
@@ -104,10 +108,16 @@ def measure(
         float,
         typer.Option("--max-megabytes", min=0.01, max=2000, help="Accept image files up to this size with --serve."),
     ] = 64.0,
+    token: Annotated[
+        str,
+        typer.Option(
+            envvar="STCAL_TOKEN", help="Answer with --serve only requests with `Authorization: Bearer` and this word."
+        ),
+    ] = "",
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
     if serve:
-        alone = {"IMAGES": images, "--json": json_file, "--report": report, "--joints": joints}
+        alone = {"IMAGES": images, "--json": json_file, "--report": report, "--joints": joints, "--columns": columns}
         alone |= {
             "--previous": previous,
             "--sequence": sequence,
@@ -121,14 +131,17 @@ def measure(
                 f"--serve and {conflicting[0]}: images come over HTTP, one answer each; leave {conflicting[0]} out",
             )
         ellipses = ellipse_options(min_diameter, max_diameter)
-        _serve(camera, faces, target, board, sigma_factor, ellipses, (host, port, max_megabytes, workers))
+        _serve(camera, faces, target, board, sigma_factor, ellipses, (host, port, max_megabytes, token), workers)
         return
     if images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, or --serve")
+    if columns is not None and joints is None:
+        raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of joint values; give it with --joints")
     load_ahead(workers)
+    from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import load_board, target_of
-    from stcal.io.table import read_table
+    from stcal.io.design import load_board
+    from stcal.io.join import table_of
     from stcal.sfm.measurement import images as work
     from stcal.sfm.measurement import report as output
     from stcal.sfm.measurement.pose import PoseOptions, fit_verdict
@@ -137,9 +150,9 @@ def measure(
     for path in (out, json_file, report):
         if path is not None and not path.parent.is_dir():
             raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
-    design = target_of(target)
+    design = body_of(target)
     circles = read_target(faces, design)
-    table = read_table(joints, "joints") if joints else None
+    table = table_of(joints, columns, "joints") if joints else None
     options = work.MeasureOptions(
         PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipse_options(min_diameter, max_diameter), workers
     )
@@ -153,22 +166,24 @@ def measure(
     say(document.text())
     print_each("not joined", apart)
     write(out, text, "poses")
+    output.require_table_written(out, result, table)
     write_if(json_file, lambda: output.poses_file(result), "as JSON")
     write_if(report, document.page, "report")
     failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
     require_passed(strict, [f"χ² of {name}" for name in failed], report)
 
 
-def _serve(camera, faces, target, board, sigma_factor, ellipses, listen) -> None:
+def _serve(camera, faces, target, board, sigma_factor, ellipses, listen, workers) -> None:
+    from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import load_board, target_of
+    from stcal.io.design import load_board
     from stcal.sfm.measurement.pose import PoseOptions
     from stcal.sfm.measurement.serve import MeasureServer, MeasureService, ServeOptions, Setting, counts_text, serve
     from stcal.sfm.measurement.target import read_target
 
-    host, port, max_megabytes, workers = listen
+    options = ServeOptions(*listen)
     workers = workers or os.cpu_count() or 1
-    circles = replace(read_target(faces, design := target_of(target)), design=design)
+    circles = replace(read_target(faces, design := body_of(target)), design=design)
     setting = Setting(
         circles,
         read_camera(camera),
@@ -181,12 +196,14 @@ def _serve(camera, faces, target, board, sigma_factor, ellipses, listen) -> None
     def ready(server: MeasureServer) -> None:
         servers.append(server)
         if not server.local:
-            say(f"warning: every machine that reaches {host} can send images; nothing is encrypted")
-        say(f"answering POST {server.url}/measure, {workers} processes, files up to {max_megabytes:g} MB")
+            who = "that knows the token" if options.token else f"that reaches {options.host}"
+            remedy = "" if options.token else "; give a --token"
+            print_each("warning", [f"every machine {who} can send images; nothing is encrypted{remedy}"])
+        say(f"answering POST {server.url}/measure, {workers} processes, files up to {options.max_megabytes:g} MB")
         sys.stdout.flush()
 
     try:
-        serve(MeasureService(setting, workers), ServeOptions(host, port, max_megabytes), ready)
+        serve(MeasureService(setting, workers), options, ready)
     finally:
         for server in servers:
             say(counts_text(server.counts))

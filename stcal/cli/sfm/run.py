@@ -8,12 +8,12 @@ import typer
 
 from stcal.cli.options import (
     BoardFile,
-    CameraFile,
     Exclude,
     Images,
     JsonFile,
     MaxDiameter,
     MinDiameter,
+    OptionalCamera,
     Run,
     Scheduler,
     SendImages,
@@ -62,8 +62,8 @@ class Solve(StrEnum):
 @app.command()
 def run(
     images: Images,
-    camera: CameraFile,
     out: Annotated[Path, typer.Option("--out", help="Write the run to this folder: new, empty, or of an earlier run.")],
+    camera: OptionalCamera = None,
     target: TargetFile = None,
     board: BoardFile = None,
     solve: Annotated[
@@ -197,7 +197,7 @@ def run(
 @app.command()
 def detect(
     images: Images,
-    camera: CameraFile,
+    camera: OptionalCamera = None,
     out: Annotated[Path, typer.Option("--out", help="Write detections.csv and overlays/ to this folder.")] = Path(
         "detect"
     ),
@@ -215,17 +215,17 @@ def detect(
 ) -> None:
     """Detect circles alone: detections.csv and an overlay picture of every image."""
     load_ahead(workers)
+    from stcal.boards.file import run_board_of as board_of
+    from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import board_of, target_of
     from stcal.io.images import chosen_images
     from stcal.sfm import pipeline
     from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.text import detection_text
     from stcal.sfm.runs.transaction import MarkerFile, run_folder
 
-    model = read_camera(camera)
-    target_design = target_of(target)
-    board_design = board_of(board)
+    target_design = body_of(target)
+    board_design = None if board is None and target_design.has_scale else board_of(board)
     options = RunOptions(
         solve=solve.value if solve is not None else None,
         ellipses=ellipse_options(min_diameter, max_diameter),
@@ -236,7 +236,8 @@ def detect(
         raise InputError(
             "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
         )
-    chosen_images(images, options.exclude)
+    files = chosen_images(images, options.exclude)
+    model = pipeline.assumed_camera(files[0], target_design) if camera is None else read_camera(camera)
     inputs = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with (
         designs_told(target, board),
@@ -244,7 +245,7 @@ def detect(
         run_folder(out, MarkerFile.of(images, None), inputs) as folder,
         StageProgress() as progress,
     ):
-        detection, labelled = pipeline.detect(images, model, folder, target_design, board_design, options, progress)
+        detection, labelled = pipeline.detect(files, model, folder, target_design, board_design, options, progress)
     say(detection_text(detection, labelled))
     say(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
 

@@ -15,6 +15,7 @@ from stcal.io.files import RUN_MARKER, json_text, real_place, save
 
 if TYPE_CHECKING:
     from stcal.design import BoardDesign, TargetDesign
+    from stcal.synthetic.body import BodyOptions
     from stcal.synthetic.optics import ThinLens
     from stcal.synthetic.scene import Scene, SceneOptions
 
@@ -25,15 +26,15 @@ app = typer.Typer()
 def init(folder: Annotated[Path, typer.Argument(help="Write the two files to this folder.")]) -> None:
     """Write target.toml and board.toml of the reference design, commented, to edit."""
     from stcal.design import reference_board, reference_target
-    from stcal.io.design import board_toml, target_toml
+    from stcal.io.design import save_design
 
     folder.mkdir(parents=True, exist_ok=True)
-    texts = {"target.toml": target_toml(reference_target()), "board.toml": board_toml(reference_board())}
-    for name in texts:
+    designs = {"target.toml": reference_target(), "board.toml": reference_board()}
+    for name in designs:
         if (folder / name).exists():
             raise InputError("E-OUTPUT-EXISTS", f"{folder / name}: exists; move it away, or give another folder")
-    for name, text in texts.items():
-        save(folder / name, text)
+    for name, design in designs.items():
+        save_design(folder / name, design)
         say(folder / name)
 
 
@@ -85,6 +86,12 @@ def simulate(
         ),
     ] = 0.0,
     clutter: Annotated[bool, typer.Option("--clutter/--clean", help="Add lamps, discs and a checkered wall.")] = False,
+    reflectance: Annotated[
+        float | None,
+        typer.Option(
+            "--table-reflectance", min=0, max=1, help="Add a table below that mirrors all of target and board."
+        ),
+    ] = None,
     target: TargetFile = None,
     board: BoardFile = None,
     groups: Annotated[
@@ -104,6 +111,8 @@ def simulate(
 ) -> None:
     """Write a simulated data set with known truth, of the reference design or one's own: images, cameras.txt,
     target.toml, board.toml, truth.json."""
+    from stcal.boards.target import body_of
+    from stcal.synthetic.body import BodyOptions
     from stcal.synthetic.dataset import write_dataset
     from stcal.synthetic.render import RenderOptions
     from stcal.synthetic.scene import SceneOptions
@@ -116,6 +125,18 @@ def simulate(
         spread_deg=spread,
         images_per_group=images,
     )
+    kind = "png" if png or sixteen_bit else "jpg"
+    if target is not None and (body := body_of(target)).with_faces(printed=True).faces:
+        others = {"--groups": groups, "--fisheye": fisheye, "--f-number": f_number, "--rim-mm": rim, "--board": board}
+        others |= {"--second-design": second_design, "--clutter": clutter, "--16-bit": sixteen_bit}
+        if unfit := [name for name, value in others.items() if value]:
+            raise InputError(
+                "E-OPTION-CONFLICT",
+                f"{unfit[0]}: not for photographs of a body with boards or tags on its faces; leave it out",
+            )
+        _body(folder, body, camera, BodyOptions(images, distance, noise=noise, blur_px=blur, seed=seed), width, kind,
+              workers)  # fmt: skip
+        return
     if second_design and (target or board):
         raise InputError("E-OPTION-CONFLICT", "--second-design and --target or --board: two designs; give one of them")
     one_given = (target is None) != (board is None)  # both are the reference's if neither is given
@@ -125,16 +146,47 @@ def simulate(
         noise=noise,
         blur_px=blur,
         clutter=clutter,
+        reflectance=reflectance,
         bit_depth=16 if sixteen_bit else 8,
         seed=seed,
         lens=_lens(scene, f_number, focus, focal, distance, camera),
         rim_mm=rim,
     )
-    kind = "png" if png or sixteen_bit else "jpg"
     with StageProgress() as progress:
         step = partial(progress, "render")
         paths = write_dataset(folder, scene, rendering, image_format=kind, workers=workers, progress=step)
     say(f"{len(paths)} images in {len(scene.groups)} groups: {folder}")
+
+
+def _body(
+    folder: Path,
+    target: "TargetDesign",
+    camera: Path | None,
+    options: "BodyOptions",
+    width: int,
+    kind: str,
+    workers: int | None,
+) -> None:
+    """Writes photographs of a body that is held before a camera in changing poses."""
+    from stcal.io.cameras.read import read_camera
+    from stcal.synthetic.body import body_camera, make_body_scene, write_body
+
+    if camera is None:
+        seen_by = body_camera(width)
+    else:
+        file = read_camera(camera)
+        if not (file.width and file.height):
+            raise InputError("E-CAMERA-SIZE", f"camera file {camera} states no image size; add it to the file")
+        seen_by = file.calibrated(0, 0)
+    with StageProgress() as progress:
+        paths = write_body(
+            folder,
+            make_body_scene(target, seen_by, options),
+            kind,
+            workers=workers,
+            progress=partial(progress, "render"),
+        )
+    say(f"{len(paths)} images: {folder}")
 
 
 def _lens(
@@ -168,7 +220,8 @@ def _lens(
 
 def _designs(target: Path | None, board: Path | None, second_design: bool) -> "tuple[TargetDesign, BoardDesign]":
     """Returns the designs of the files, the reference designs, or the second designs."""
-    from stcal.io.design import board_of, target_of
+    from stcal.boards.file import run_board_of as board_of
+    from stcal.io.design import target_of
     from stcal.synthetic.scene import second_design as other
 
     return other()[:2] if second_design else (target_of(target), board_of(board))

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stcal.errors import InputError
+from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.judge.remarks import Grave
@@ -59,7 +59,7 @@ def check_conventions(
         size = f"{np.degrees(as_read[0]):.3g}° and {as_read[1]:.3g} mm (median)"
         contradict = f"{pairs.where}: the poses contradict each other by {size}"
         typical_of_variant = {
-            convention: _typical(variant, guess, with_scale)
+            convention: _typical_or_far(variant, guess, with_scale)
             for convention, variant in _variants(loop, setup, by_images).items()
         }
         gain = {
@@ -157,3 +157,11 @@ def _typical(loop: Loop, guess: Guess, with_scale: bool) -> tuple[float, float]:
     residuals = loop.residuals(*guess(loop, with_scale)).reshape(-1, 2, 3)
     turn, shift = np.median(np.linalg.norm(residuals, axis=2), axis=0)
     return float(turn), float(shift)
+
+
+def _typical_or_far(loop: Loop, guess: Guess, with_scale: bool) -> tuple[float, float]:
+    """Returns :func:`_typical`, infinite where the poses give no solution."""
+    try:
+        return _typical(loop, guess, with_scale)
+    except DegenerateError:
+        return np.inf, np.inf

@@ -85,8 +85,8 @@ class Observability:
         turns, first = np.degrees(self.turns_rad), in_words(self.axes[0])
         if self.one_axis and self.turns_rad[0] > LEAST_TURN:
             return (
-                f"all rotations of the flange are about its axis {first}, only {turns[1]:.2g}° (RMS) about others; "
-                f"rotate the flange about {in_words(self.axes[1])} too, by {WANTED_DEG}° or more"
+                f"all rotations of the flange are about its axis {first}, only {_list(turns[1:2])}° (RMS) about "
+                f"others; rotate the flange about {in_words(self.axes[1])} too, by {WANTED_DEG}° or more"
             )
         return (
             f"the flange turns by {np.linalg.norm(turns):.2g}° (RMS) between poses; "
@@ -121,10 +121,13 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
             raise DegenerateError(
                 "E-HANDEYE-AXES",
                 f"{where}: the flange turns by {turns}° (RMS) about its principal axes, "
-                "that of a robot of four axes about one only; leave four_dof out",
+                "that of a robot of four axes about one only; leave --four-dof (in Python four_dof) out",
             )
     elif observability.useless:
-        slides = f"; a robot of four axes cannot: with four_dof all but {FRAMES[setup].camera} along that axis is found"
+        slides = (
+            f"; a robot of four axes cannot: with --four-dof (in Python four_dof) all but {FRAMES[setup].camera} along "
+            "that axis is found"
+        )
         raise DegenerateError(
             "E-HANDEYE-AXES", f"{where}: {observability.missing()}{slides if observability.one_axis else ''}"
         )

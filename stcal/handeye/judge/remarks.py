@@ -12,6 +12,7 @@ from stcal.handeye.judge.observability import LEAST_POSES, LEAST_TURN, Observabi
 from stcal.handeye.methods.closed_form import robust
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, adjust_poses
+from stcal.row_order import change_along
 
 
 class Grave(str):
@@ -42,6 +43,8 @@ MANY = 0.25
 LEAST_IN_GROUPS, APART = 10, 0.9
 """Least number of poses, and the share of their scatter along its main direction that two groups must explain. Two
 halves of normal errors explain 0.64 (2/π), and at most 0.8 of a dozen of them."""
+MOVED_LEVEL, MOVED_SHARE = 0.01, 0.5
+"""Probability that a move along the order of sound poses is named, and least share of the squares that it explains."""
 NEAR_MM = 20.0
 """Distance, in mm, below which no camera sees a board."""
 
@@ -84,6 +87,36 @@ def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:
                 "moved in between? solve each by itself",
             )
     return ()
+
+
+def of_order(names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray) -> tuple[str, ...]:
+    """Returns a note if camera or board moved between two poses, or drifts along them.
+
+    ``residuals`` : (m, 6) in the order of the poses, outliers too; ``jacobian`` : (m, 6, 12) by X and Z. A move is
+    named where it explains most of the residuals: errors of robot and camera go with the poses' order, too.
+    """
+    parts = residuals.reshape(-1, 2, 3)
+    sigma = np.repeat(np.median(np.linalg.norm(parts, axis=2), axis=0), 3)
+    if not (sigma > 0).all():
+        return ()
+    white = jacobian / sigma[:, None]
+    moves = {"the camera": white[:, :, :6], "the board": white[:, :, 6:]}
+    changes = [(what, change_along(residuals / sigma, white, motions)) for what, motions in moves.items()]
+    found = [(what, change) for what, change in changes if change is not None]
+    if not found:
+        return ()
+    what, change = min(found, key=lambda each: each[1].log_p)
+    if len(moves) * change.p > MOVED_LEVEL or change.share < MOVED_SHARE:
+        return ()
+    turn, shift = np.degrees(np.linalg.norm(change.motion[:3])), np.linalg.norm(change.motion[3:])
+    size = f"{shift:.2g} mm and {turn:.2g}° ({change.share:.0%} of the squared residuals)"
+    if change.kind == "drift":
+        return (f"{what} drifts from the first pose to the last, by {size}: fasten it, and take the poses again",)
+    likely = f" ({names[change.first]} to {names[change.last]} as likely)" if change.first < change.last else ""
+    return (
+        f"{what} moved before {names[change.row]}{likely}, by {size}: solve the poses before and from there on each by "
+        "themselves",
+    )
 
 
 def of_size(loop: Loop, hint: tuple[float, float], noise: Noise) -> tuple[str, ...]:

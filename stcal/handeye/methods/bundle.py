@@ -1,18 +1,20 @@
 """Unknowns and residuals of a hand-eye adjustment with one camera or with several."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
+from operator import add
 
 import numpy as np
-from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import NormalEquations, perturbed
+from stcal.geometry.least_squares import perturbed
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.geometry.robust import length_limit
+from stcal.geometry.robust import huber_cost, huber_weights, length_limit
 from stcal.handeye.data.views import project_jacobian
 from stcal.handeye.methods.arm import LinearArm
-from stcal.handeye.methods.noise import Knowledge
+from stcal.handeye.methods.equations import Equations, Part
 
 CORNER, POSE = length_limit(2, 0.001), length_limit(6, 0.001)
 """Huber's limits: one good corner, and one good pose, in a thousand has a weight below one."""
@@ -68,9 +70,9 @@ class Corners:
         """Returns the places of the unknowns in a step; the slice of what is not solved for is empty."""
         sizes = {"x": 6, "z": 6, "camera": self.basis.shape[1], "scale": int(self.with_scale)}
         sizes["arm"] = 0 if self.arm is None else len(self.arm.parameters)
-        sizes["board"] = self.xyz_board.size if self.sigma["board_mm"] else 0
         exact = self.robot is None and not self.sigma["robot_mm"]
         sizes["robot"] = 0 if exact else 6 * len(self.base_from_flange)
+        sizes["board"] = self.xyz_board.size if self.sigma["board_mm"] else 0
         ends = np.cumsum([0, *sizes.values()])
         return {name: slice(int(i), int(j)) for name, i, j in zip(sizes, ends[:-1], ends[1:], strict=True)}
 
@@ -151,6 +153,20 @@ class Corners:
             derivatives["arm"] = derivatives["robot"] @ self.arm.slope_after(state.arm)[self.view]
         return np.einsum("nab,nb->na", self.weight, px - self.xy_px) / self.sigma["corner_px"], derivatives
 
+    def only(self, keep: np.ndarray) -> "Corners":
+        """Returns the problem of the poses ``keep``, a mask (m,)."""
+        rows = np.flatnonzero(keep[self.view])
+        return replace(
+            self,
+            base_from_flange=self.base_from_flange[keep],
+            view=(np.cumsum(keep) - 1)[self.view[rows]],
+            corner=self.corner[rows],
+            xy_px=self.xy_px[rows],
+            weight=self.weight[rows],
+            robot=None if self.robot is None else self.robot[keep],
+            arm=None if self.arm is None else self.arm[keep],
+        )
+
     def with_sigma(self, sigma: dict[str, float]) -> "Corners":
         """Returns the same problem with other σ."""
         return replace(self, sigma=sigma)
@@ -169,59 +185,122 @@ class Corners:
         """Returns a factor of 1 for each kind of the intrinsics solved for."""
         return dict.fromkeys((name for name, _ in self.camera_parts()), 1.0)
 
-    def groups(self, state: Bundle) -> list[Knowledge]:
+    def kept(self) -> int:
+        """Returns the number of unknowns besides the corners of the board, which come last."""
+        return self.places()["board"].start
+
+    def parts(self, state: Bundle) -> dict[str, Part]:
+        """Returns all observations by the name of their σ: the corners seen, and the prior knowledge."""
+        return {name: part for group in self.groups(state) for name, part in group.parts.items()}
+
+    def groups(self, state: Bundle) -> "list[Group]":
         """Returns all observations: the corners seen, and the prior knowledge."""
         return [*self.own_groups(state), *self.shared_groups(state)]
 
-    def own_groups(self, state: Bundle) -> list[Knowledge]:
+    def own_groups(self, state: Bundle) -> "list[Group]":
         """Returns the observations of this camera: the corners seen, and the prior knowledge of its intrinsics."""
-        at, count = self.places(), self.count()
-        white, derivatives = self.seen(state)
-        groups = [
-            Knowledge(
-                ("corner_px",),
-                white,
-                _sparse(derivatives, at, count, {"board": self.corner, "robot": self.view}),
-                CORNER,
-            )
-        ]
+        groups, place = [self._seen_group(state)], self.places()["camera"]
         if self.basis.shape[1]:
             deviation = np.linalg.pinv(self.basis) @ (state.camera.parameters() - self.camera.parameters())
             for name, rows in self.camera_parts():
                 root = np.linalg.cholesky(self.information[rows][:, rows]).T / self.sigma[name]
-                whole = np.zeros((len(rows), len(deviation)))
-                whole[:, rows] = root
-                jacobian = _sparse({"camera": whole[None]}, at, count, {})
-                groups.append(Knowledge((name,), (whole @ deviation)[None], jacobian, np.inf))
+                groups.append(self._prior(name, root @ deviation[rows], root, place.start + rows))
         return groups
 
-    def shared_groups(self, state: Bundle) -> list[Knowledge]:
+    def shared_groups(self, state: Bundle) -> "list[Group]":
         """Returns the observations that all cameras share: the board as designed, and the robot's poses as reported."""
-        at, count, groups = self.places(), self.count(), []
+        at, groups = self.places(), []
         if at["board"].stop > at["board"].start:
-            deviation = (state.corners - self.xyz_board) / self.sigma["board_mm"]
-            jacobian = np.tile(np.eye(3) / self.sigma["board_mm"], (len(deviation), 1, 1))
-            jacobian = _sparse({"board": jacobian}, at, count, {"board": np.arange(len(deviation))})
-            groups.append(Knowledge(("board_mm",), deviation, jacobian, np.inf))
+            nothing, information = self._nothing(), 1 / self.sigma["board_mm"] ** 2
+            deviation = state.corners - self.xyz_board
+            cost, k = information * float((deviation**2).sum()), len(deviation)
+            block = np.tile(information * np.eye(3), (k, 1, 1))
+            own = replace(nothing, cost=cost, block=block, slope=information * deviation)
+            groups.append(Group(cost, {"board_mm": Part(3 * k, own)}))
         if at["robot"].stop > at["robot"].start:
-            weight = self.robot_weight()
-            deviation = np.einsum("mab,mb->ma", weight, state.base_from_flange.difference(self.by_arm(state.arm)))
-            jacobian = _sparse({"robot": weight}, at, count, {"robot": np.arange(len(deviation))})
-            names = ("robot_rad", "robot_mm") if self.robot is None else ()
-            groups.append(Knowledge(names, deviation, jacobian, POSE))
+            groups.append(self._robot_group(state))
         if self.arm is not None:
             for name, rows in self.arm.parts().items():
-                root = np.eye(len(state.arm))[rows] / self.sigma[name]
-                deviation = (root @ (self.arm.parameters + state.arm))[None]
-                groups.append(Knowledge((name,), deviation, _sparse({"arm": root[None]}, at, count, {}), np.inf))
+                root = np.eye(len(rows)) / self.sigma[name]
+                white = root @ (self.arm.parameters + state.arm)[rows]
+                groups.append(self._prior(name, white, root, at["arm"].start + rows))
         return groups
 
-    def linear(self, state: Bundle) -> NormalEquations:
+    def linear(self, state: Bundle) -> Equations:
         """Returns cost and normal equations; the cost is infinite where a corner lies behind the camera."""
         if not self.in_front(state):
-            return NormalEquations.impossible(self.count())
-        first, *others = (group.linear() for group in self.groups(state))
-        return sum(others, first)
+            return Equations.impossible(self.kept(), self._corners())
+        return summed(self.groups(state))
+
+    def _corners(self) -> int:
+        """Returns the number of corners that are unknowns."""
+        return len(self.xyz_board) if self.sigma["board_mm"] else 0
+
+    def _nothing(self) -> Equations:
+        """Returns the equations of no observation."""
+        s, k = self.kept(), self._corners()
+        return Equations(0.0, np.zeros((s, s)), np.zeros(s), np.zeros((k, 3, 3)), np.zeros((k, 3)), None)
+
+    def _prior(self, name: str, white: np.ndarray, root: np.ndarray, places: np.ndarray) -> "Group":
+        """Returns the prior knowledge of the kept unknowns at ``places``, with residuals ``white`` and their derivative
+        ``root``."""
+        own, cost = self._nothing(), float(white @ white)
+        own.normal[np.ix_(places, places)] = root.T @ root
+        own.gradient[places] = root.T @ white
+        return Group(cost, {name: Part(len(white), replace(own, cost=cost))})
+
+    def _robot_group(self, state: Bundle) -> "Group":
+        """Returns the observations of the robot's poses. Rotation and translation have a σ each, unless covariances are
+        stated."""
+        first, weight = self.places()["robot"].start, self.robot_weight()
+        white = np.einsum("mab,mb->ma", weight, state.base_from_flange.difference(self.by_arm(state.arm)))
+        length = np.linalg.norm(white, axis=1)
+        share = huber_weights(length, POSE)
+        halves = {"robot_rad": slice(0, 3), "robot_mm": slice(3, 6)} if self.robot is None else {"": slice(0, 6)}
+        m, parts = len(white), {}
+        columns = first + np.arange(6 * m).reshape(m, 6)
+        for name, rows in halves.items():
+            own, root = self._nothing(), weight[:, rows]
+            pulled = np.swapaxes(root, 1, 2) * share[:, None, None]
+            own.normal[columns[:, :, None], columns[:, None]] = pulled @ root
+            own.gradient[columns] = np.einsum("mab,mb->ma", pulled, white[:, rows])
+            cost = float(share @ (white[:, rows] ** 2).sum(1))
+            parts[name] = Part(white[:, rows].size, replace(own, cost=cost))
+        return Group(float(huber_cost(length, POSE).sum()), parts)
+
+    def _seen_group(self, state: Bundle) -> "Group":
+        """Returns the observations of the corners in the images."""
+        white, derivatives = self.seen(state)
+        length = np.linalg.norm(white, axis=1)
+        root = np.sqrt(huber_weights(length, CORNER))
+        at, own, white = self.places(), self._nothing(), white * root[:, None]
+        everywhere = [name for name in ("x", "z", "camera", "scale", "arm") if at[name].stop > at[name].start]
+        places = np.concatenate([np.arange(at[name].start, at[name].stop) for name in everywhere])
+        by_kept = np.concatenate([derivatives[name] for name in everywhere], axis=2)
+        robot = at["robot"].stop > at["robot"].start
+        if robot:
+            by_kept = np.concatenate([by_kept, derivatives["robot"]], axis=2)
+        by_kept *= root[:, None, None]
+        by_corner = np.swapaxes(derivatives["board"] * root[:, None, None], 1, 2)
+        k = self._corners()
+        cross = np.zeros((k, 3, len(own.gradient))) if k else None
+        for rows in np.split(np.arange(len(white)), np.flatnonzero(np.diff(self.view)) + 1):
+            view, jacobian = self.view[rows[0]], by_kept[rows].reshape(2 * len(rows), -1)
+            columns = np.concatenate([places, at["robot"].start + 6 * view + np.arange(6)]) if robot else places
+            own.normal[np.ix_(columns, columns)] += jacobian.T @ jacobian
+            own.gradient[columns] += jacobian.T @ white[rows].ravel()
+            if cross is not None:
+                index, mixed = np.ix_(self.corner[rows], np.arange(3), columns), by_corner[rows] @ by_kept[rows]
+                if len(set(self.corner[rows].tolist())) == len(rows):  # ten times as fast
+                    cross[index] += mixed
+                else:
+                    np.add.at(cross, index, mixed)
+        if k:
+            np.add.at(own.block, self.corner, by_corner @ np.swapaxes(by_corner, 1, 2))
+            np.add.at(own.slope, self.corner, np.einsum("nab,nb->na", by_corner, white))
+        cost = float((white**2).sum())
+        part = Part(white.size, replace(own, cost=cost, cross=cross))
+        return Group(float(huber_cost(length, CORNER).sum()), {"corner_px": part})
 
     def in_front(self, state: Bundle) -> bool:
         """True if all corners lie in front of the camera."""
@@ -244,24 +323,23 @@ def camera_parts(basis: np.ndarray, information: np.ndarray) -> list[tuple[str, 
     return [(name, rows) for name, rows in parts if len(rows)]
 
 
-def _sparse(by: dict, at: dict[str, slice], count: int, own: dict[str, np.ndarray]) -> csr_matrix:
-    """Returns the derivatives by kind of unknown, (g, d, ·) each, as a matrix (g d, count). ``own`` : (g,) block
-    number, for kinds that have many blocks."""
-    columns, values = [], []
-    for name, value in by.items():
-        if at[name].stop > at[name].start:
-            first = at[name].start + value.shape[2] * own.get(name, np.zeros(len(value), int))
-            place = first[:, None, None] + np.arange(value.shape[2])
-            columns.append(np.broadcast_to(place, value.shape))
-            values.append(value)
-    columns, values = np.concatenate(columns, axis=2), np.concatenate(values, axis=2)
-    rows, width = values.shape[0] * values.shape[1], values.shape[2]
-    return csr_matrix((values.ravel(), columns.ravel(), np.arange(rows + 1) * width), shape=(rows, count))
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """Observations of one kind: their ``cost``, Huber's where they are robust, and ``parts`` by the name of their σ."""
+
+    cost: float
+    parts: dict[str, Part]
+
+
+def summed(groups: Sequence[Group]) -> Equations:
+    """Returns the sum of all equations, with Huber's cost."""
+    equations = reduce(add, (part.equations for group in groups for part in group.parts.values()))
+    return replace(equations, cost=sum(group.cost for group in groups))
 
 
 POSE_PARAMETERS = 6
 """Number of unknowns of a pose."""
-SHARED = ("scale", "arm", "board", "robot")
+SHARED = ("scale", "arm", "robot", "board")
 """Unknowns of all cameras together, in their order. Those of an arm are empty here."""
 OWN = ("corner_px", "camera")
 """First parts of the names of the groups that each camera has of its own."""
@@ -368,28 +446,34 @@ class RigCorners:
             tuple(x), first.stand_from_board, first.base_from_flange, first.corners, tuple(cameras), first.scale
         )
 
-    def groups(self, state: RigBundle) -> list[Knowledge]:
-        """Returns all observations: what each camera saw, and the prior knowledge."""
-        count, observations = self.count(), []
-        for i, (name, corners) in enumerate(zip(self.names, self.each, strict=True)):
-            observations += [_among(group, self.columns(i), count, name) for group in corners.own_groups(state.of(i))]
-        shared = self.each[0].shared_groups(state.of(0))
-        return observations + [_among(group, self.columns(0), count, "") for group in shared]
+    def parts(self, state: RigBundle) -> dict[str, Part]:
+        """Returns all observations by the name of their σ: what each camera saw, and the prior knowledge."""
+        return {name: part for group in self.groups(state) for name, part in group.parts.items()}
 
-    def linear(self, state: RigBundle) -> NormalEquations:
+    def groups(self, state: RigBundle) -> list[Group]:
+        """Returns all observations: what each camera saw, and the prior knowledge."""
+        count, observations = self.places()["board"].start, []
+        for i, (name, corners) in enumerate(zip(self.names, self.each, strict=True)):
+            columns = self.columns(i)[: corners.kept()]
+            observations += [_among(group, columns, count, name) for group in corners.own_groups(state.of(i))]
+        columns = self.columns(0)[: self.each[0].kept()]
+        return observations + [_among(group, columns, count, "") for group in self.each[0].shared_groups(state.of(0))]
+
+    def linear(self, state: RigBundle) -> Equations:
         """Returns cost and normal equations; the cost is infinite where a corner lies behind its camera."""
         if not all(own.in_front(state.of(i)) for i, own in enumerate(self.each)):
-            return NormalEquations.impossible(self.count())
-        first, *others = (group.linear() for group in self.groups(state))
-        return sum(others, first)
+            at = self.places()["board"]
+            return Equations.impossible(at.start, (at.stop - at.start) // 3)
+        return summed(self.groups(state))
 
 
 def _renamed(key: str, name: str) -> str:
     return f"{key}:{name}" if key.startswith(OWN) else key
 
 
-def _among(group: Knowledge, columns: np.ndarray, count: int, name: str) -> Knowledge:
-    """Returns one camera's group with its columns among all unknowns."""
-    narrow = group.jacobian
-    jacobian = csr_matrix((narrow.data, columns[narrow.indices], narrow.indptr), shape=(len(narrow.indptr) - 1, count))
-    return replace(group, names=tuple(_renamed(key, name) for key in group.names), jacobian=jacobian)
+def _among(group: Group, columns: np.ndarray, count: int, name: str) -> Group:
+    """Returns one camera's group with its columns among all unknowns that are kept."""
+    parts = {
+        _renamed(key, name): Part(part.count, part.equations.among(columns, count)) for key, part in group.parts.items()
+    }
+    return Group(group.cost, parts)

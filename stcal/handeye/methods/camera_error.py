@@ -5,6 +5,8 @@ Methods for Discrete Sequential Estimation", 1977, ch. VIII): their prior covari
 """
 
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -54,27 +56,32 @@ def considered(wider: Problem, state: Any, free: tuple[str, ...]) -> CameraError
     """
     factors, poses = wider.factors(), wider.places()["z"].stop
     sigma = wider.sigma | estimated(wider, state, (*free, *factors))
-    at, linear = wider.places(), wider.with_sigma(sigma).linear(state)
-    camera = np.arange(at["camera"].start, at["camera"].stop)
-    others = np.setdiff1d(np.arange(wider.count()), camera)
-    covariance = generalised_inverse(linear.normal)
-    error = -covariance[camera] @ linear.gradient
-    # Normal matrix and gradient noise of all other observations, in units of the σ that weighted the solution.
-    normal, noise = np.zeros((2, wider.count(), wider.count()))
-    for group in wider.groups(state):
-        for name, (_, equations) in group.by_name().items():
-            if name not in factors:
-                normal += equations.normal
-                noise += equations.normal * (sigma[name] / wider.sigma[name]) ** 2 if name in free else equations.normal
-    eliminated = others[poses:]
+    camera = np.arange(wider.places()["camera"].start, wider.places()["camera"].stop)
+    left = wider.with_sigma(sigma).linear(state).eliminated()
+    covariance = generalised_inverse(left.normal)
+    error = -covariance[camera] @ left.gradient
+    # Equations and gradient noise of all other observations, in units of the σ that weighted the solution.
+    parts = {name: part.equations for name, part in wider.parts(state).items() if name not in factors}
+    scatter = {name: (sigma[name] / wider.sigma[name]) ** 2 if name in free else 1.0 for name in parts}
+    known = reduce(add, parts.values())
+    noise = reduce(add, (own.times(scatter[name]) for name, own in parts.items()))
+    without_board = known.eliminated()
+    others = np.setdiff1d(np.arange(len(known.gradient)), camera)
+    eliminated, normal = others[poses:], without_board.normal
     reduced = np.eye(poses, len(others))
     reduced[:, poses:] = -normal[np.ix_(others[:poses], eliminated)] @ generalised_inverse(
         normal[np.ix_(eliminated, eliminated)]
     )
+    scattered = noise.normal
+    if known.cross is not None and without_board.from_kept is not None and noise.cross is not None:
+        by_corner = without_board.from_kept  # what the gradient of the others takes over from that of the corners
+        mixed = np.tensordot(by_corner, noise.cross, ((0, 1), (0, 1)))
+        scattered = scattered - mixed - mixed.T
+        scattered = scattered + np.tensordot(by_corner, noise.block @ by_corner, ((0, 1), (0, 1)))
     return CameraError(
         slope=reduced @ normal[np.ix_(others, camera)],
         moment=covariance[np.ix_(camera, camera)] + np.outer(error, error),
-        noise=reduced @ noise[np.ix_(others, others)] @ reduced.T,
+        noise=reduced @ scattered[np.ix_(others, others)] @ reduced.T,
     )
 
 

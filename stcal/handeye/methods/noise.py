@@ -1,17 +1,19 @@
 """Errors of robot and camera: σ as stated, or estimated in rounds as variance components."""
 
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
-from scipy.sparse import csr_matrix
 
 from stcal.errors import InputError
-from stcal.geometry.least_squares import NormalEquations, minimise
+from stcal.geometry.least_squares import minimise
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.geometry.robust import huber_cost, huber_weights, robust_sigma
-from stcal.geometry.variances import Parts, component_variances
+from stcal.geometry.robust import robust_sigma
+from stcal.geometry.variances import component_variances
 from stcal.handeye.data.pairs import Loop
+from stcal.handeye.methods.equations import Components, Equations, Part
 
 LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
 """Lower limits of estimated σ, by kind: exact data would give 0."""
@@ -195,45 +197,6 @@ HELD = 1e-10
 WORST = "check the poses that fit worst"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Knowledge:
-    """Observations of one kind.
-
-    ``names`` : names of the σ of its columns, each of an equal share of the columns; ``white`` : (g, d) residuals in
-    units of σ; ``jacobian`` : (g d, k) their derivative; ``limit`` : Huber's limit of the length of a row.
-    """
-
-    names: tuple[str, ...]
-    white: np.ndarray
-    jacobian: csr_matrix
-    limit: float
-
-    def weight(self) -> np.ndarray:
-        """Returns Huber's weights (g,)."""
-        return huber_weights(np.linalg.norm(self.white, axis=1), self.limit)
-
-    def linear(self) -> NormalEquations:
-        """Returns the group's contribution to the cost and to the normal equations."""
-        cost = float(huber_cost(np.linalg.norm(self.white, axis=1), self.limit).sum())
-        pulled = self.jacobian.multiply(np.repeat(self.weight(), self.white.shape[1])[:, None]).tocsr().T
-        return NormalEquations(cost, (pulled @ self.jacobian).toarray(), pulled @ self.white.ravel())
-
-    def by_name(self) -> dict[str, tuple[int, NormalEquations]]:
-        """Returns, for each of ``names`` or for the empty name, the number of residuals and their quadratic part of the
-        cost."""
-        g, d = self.white.shape
-        width = d // max(len(self.names), 1)
-        weight = np.repeat(self.weight(), d)
-        parts = {}
-        for i, name in enumerate(self.names or ("",)):
-            rows = np.flatnonzero(np.arange(g * d) % d // width == i)
-            jacobian, white = self.jacobian[rows], self.white.ravel()[rows]
-            pulled = jacobian.multiply(weight[rows, None]).tocsr().T
-            linear = NormalEquations(float(weight[rows] @ white**2), (pulled @ jacobian).toarray(), pulled @ white)
-            parts[name] = len(rows), linear
-        return parts
-
-
 class Problem(Protocol):
     """An adjustment problem: the corners of one camera, or of several cameras about the same board."""
 
@@ -275,11 +238,12 @@ class Problem(Protocol):
         """Returns a state after a step of all unknowns."""
         ...
 
-    def groups(self, state: Any) -> list[Knowledge]:
-        """Returns all observations: the corners seen, and the prior knowledge."""
+    def parts(self, state: Any) -> dict[str, Part]:
+        """Returns all observations by the name of their σ: the corners seen, and the prior knowledge. The name of a
+        part without a σ is empty."""
         ...
 
-    def linear(self, state: Any) -> NormalEquations:
+    def linear(self, state: Any) -> Equations:
         """Returns cost and normal equations."""
         ...
 
@@ -290,12 +254,12 @@ S = TypeVar("S")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleSolution(Generic[P, S]):
-    """``corners`` : problem with the estimated σ; ``state``; ``normal`` : normal matrix about the state; ``settled`` :
-    whether the σ settled within :data:`ROUNDS`."""
+    """``corners`` : problem with the estimated σ; ``state``, and the normal equations about it, ``linear``; ``settled``
+    : whether the σ settled within :data:`ROUNDS`."""
 
     corners: P
     state: S
-    normal: np.ndarray
+    linear: Equations
     settled: bool
 
 
@@ -317,32 +281,24 @@ def adjust(corners: P, start: S, free: tuple[str, ...]) -> BundleSolution[P, S]:
         if settled:
             break
     minimum = minimise(state, corners.linear, corners.moved).required("hand-eye", WORST)
-    return BundleSolution(corners, minimum.state, minimum.linear.normal, settled)
+    return BundleSolution(corners, minimum.state, minimum.linear, settled)
 
 
 def estimated(corners: Problem, state: Any, free: tuple[str, ...]) -> dict[str, float]:
     """Returns restricted maximum-likelihood σ of the ``free`` groups, with all else linear about a state (like
     :func:`~stcal.handeye.methods.noise.variance_components`)."""
-    unknowns = corners.count()
-    nothing = NormalEquations(0.0, np.zeros((unknowns, unknowns)), np.zeros(unknowns))
-    parts: dict[str, tuple[int, NormalEquations]] = {}
-    for group in corners.groups(state):
-        for name, (count, linear) in group.by_name().items():
-            key = name if name in free else ""
-            old_count, old = parts.get(key, (0, nothing))
-            parts[key] = old_count + count, old + linear
-    fixed = parts.pop("", (0, nothing))[1]
-    names = tuple(parts)
-    likelihood = Parts(
-        each=NormalEquations.stacked([linear for _, linear in parts.values()]),
-        count=np.array([count for count, _ in parts.values()]),
-        fixed=fixed,
-        caution=np.array([CAUTION if kind(name) in LEAST_SIGMA else 0.0 for name in names]),
-        held=HELD,
+    parts = corners.parts(state)
+    names = tuple(name for name in parts if name in free)
+    fixed = [part.equations for name, part in parts.items() if name not in free]
+    likelihood = Components(
+        [parts[name] for name in names],
+        reduce(add, fixed) if fixed else None,
+        np.array([CAUTION if kind(name) in LEAST_SIGMA else 0.0 for name in names]),
+        HELD,
     )
     least = np.log([LEAST_SIGMA.get(kind(name), 1.0) / corners.sigma[name] for name in names])
     farthest = np.full(len(names), FARTHEST)
-    best = likelihood.best(np.maximum(least, -farthest), farthest, [np.zeros(len(names))])
+    best = likelihood.best(np.maximum(least, -farthest), farthest)
     return {name: float(corners.sigma[name] * np.exp(x)) for name, x in zip(names, best, strict=True)}
 
 

@@ -56,6 +56,11 @@ class PoseSolution:
     scale_hint: tuple[float, float]
     settled: bool
 
+    def without(self, loop: Loop, out: np.ndarray) -> LoopState:
+        """Returns the solution of the same ``loop`` without the poses ``out``, with the σ of the solution of all."""
+        used = ~self.outliers & ~np.isin(np.arange(len(loop)), out)
+        return _solved(loop[used], self.state, self.covariance[used], len(self.normal))[0]
+
 
 def adjust_poses(
     loop: Loop, start: LoopState, noise: Noise, with_scale: bool = False, robust: bool = True

@@ -35,6 +35,9 @@ CAMERA_GAIN = 5.0
 """Gain in cost per intrinsic above which intrinsics are wrong. Eight right ones gain 8 ± 4 together, 1 ± 0.5 each."""
 SAME_DIGITS = 6
 """Decimals of a millimetre to which two places on the board agree that are one corner."""
+INFLUENCE_STEPS, LEAST_DAMPING = 2, 1e-9
+"""Number of steps from the solution of all poses to one without some of them, and their damping, which only keeps
+directions that nothing determines."""
 SEEN = 1e-3
 """Share of the robot's variance below which the corners tell nothing about the robot's error."""
 FIRST = {"corner_px": 0.3, "robot_rad": 1e-3, "robot_mm": 0.5, "board_mm": 0.1, "arm_rad": 1e-3, "arm_mm": 0.5}
@@ -96,13 +99,15 @@ class Reprojection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedViews:
-    """``loop`` : the adjusted loop; ``state`` : of the poses used; ``outliers`` : (m,); ``normal`` : (12, 12) of X and
-    Z, all other unknowns eliminated; ``covariance`` : its inverse; ``sigma_scale``; ``sigma`` : by group; ``estimated``
-    : groups whose σ were estimated; ``scale_hint`` : the scale if it were solved for, and its σ; ``camera_gain`` : fall
-    of the cost per parameter if intrinsics were solved for; ``camera_error`` : error of the intrinsics as filed, where
-    their prior is known; ``found``; ``settled`` : whether the estimated σ settled."""
+    """``loop`` : the adjusted loop; ``corners`` : problem of the poses used, and ``state`` : its solution; ``outliers``
+    : (m,); ``normal`` : (12, 12) of X and Z, all other unknowns eliminated; ``covariance`` : its inverse;
+    ``sigma_scale``; ``sigma`` : by group; ``estimated`` : groups whose σ were estimated; ``scale_hint`` : the scale if
+    it were solved for, and its σ; ``camera_gain`` : fall of the cost per parameter if intrinsics were solved for;
+    ``camera_error`` : error of the intrinsics as filed, where their prior is known; ``found``; ``settled`` : whether
+    the estimated σ settled."""
 
     loop: Loop
+    corners: Corners
     state: Bundle
     outliers: np.ndarray
     normal: np.ndarray
@@ -115,6 +120,19 @@ class AdjustedViews:
     camera_error: CameraError | None
     found: Reprojection
     settled: bool
+
+    def without(self, out: np.ndarray) -> Bundle:
+        """Returns the solution without the poses ``out``, rows among all: by steps from the solution of all, with its
+        σ. Errors of a step from so near are squares of small moves (influence: Cook & Weisberg 1982)."""
+        keep = ~np.isin(np.flatnonzero(~self.outliers), out)
+        corners, state = self.corners.only(keep), self.state
+        state = replace(state, base_from_flange=state.base_from_flange[keep])
+        for _ in range(INFLUENCE_STEPS):
+            linear = corners.linear(state)
+            if not np.isfinite(linear.cost):
+                break
+            state = corners.moved(state, linear.step(LEAST_DAMPING)[0])
+        return state
 
 
 def adjust_views(
@@ -190,8 +208,8 @@ def _adjusted(
         corners, free = problem(*given, arm=arm_used, first=sigma)
         begin = Bundle(x, z, corners.base_from_flange, corners.xyz_board, views.camera, scale, corners.no_step())
         solution = adjust(corners, begin, free)
-        corners, state, normal = solution.corners, solution.state, solution.normal
-        inverse = generalised_inverse(normal)
+        corners, state = solution.corners, solution.state
+        inverse = solution.linear.inverse()
         bad = contradicting(corners, state, inverse)
         if not bad.any() or used.sum() - bad.sum() < LEAST_POSES:
             break
@@ -200,13 +218,14 @@ def _adjusted(
     sigma_scale = float(np.sqrt(inverse[at["scale"], at["scale"]].item())) if with_scale else None
     sigma = {name: float(value) for name, value in corners.sigma.items() if value}
     results = found_of(corners, state, inverse, base_from_flange, rows, intrinsics is not None)
-    rest_inverse = generalised_inverse(normal[12:, 12:])
-    arm_used = normal[:12, :12] - normal[:12, 12:] @ rest_inverse @ normal[12:, :12]
+    normal = solution.linear.eliminated().normal
+    of_poses = normal[:12, :12] - normal[:12, 12:] @ generalised_inverse(normal[12:, 12:]) @ normal[12:, :12]
     return AdjustedViews(
         loop=loop,
+        corners=corners,
         state=state,
         outliers=~used,
-        normal=arm_used,
+        normal=of_poses,
         covariance=inverse[:12, :12],
         sigma_scale=sigma_scale,
         sigma=sigma,
@@ -304,7 +323,7 @@ def contradicting(corners: Problem, state: Any, inverse: np.ndarray) -> np.ndarr
     value, vector = np.linalg.eigh(np.eye(6) - weight @ covariance @ np.swapaxes(weight, 1, 2))
     turned = np.einsum("mab,ma->mb", vector, white)
     squared = np.where(value > SEEN, turned**2 / np.maximum(value, SEEN), 0).sum(1)
-    redundancy = max(6 * (m - 1) - corners.places()["board"].start, 6)
+    redundancy = max(6 * (m - 1) - at.start, 6)
     return squared > 6 * f.ppf(1 - FALSE_ALARM / m, 6, redundancy)
 
 
@@ -312,9 +331,9 @@ def scale_hint(corners: Problem, state: Any) -> tuple[float, float]:
     """Returns the scale if it were solved for, and its σ: one step from the solution with the scale among the
     unknowns."""
     wider = corners.with_board_scale()
-    linear, at = wider.linear(state), wider.places()["scale"].start
-    inverse = generalised_inverse(linear.normal)
-    return state.scale - float(inverse[at] @ linear.gradient), float(np.sqrt(inverse[at, at]))
+    left, at = wider.linear(state).eliminated(), wider.places()["scale"].start
+    inverse = generalised_inverse(left.normal)
+    return state.scale - float(inverse[at] @ left.gradient), float(np.sqrt(inverse[at, at]))
 
 
 def _camera_gain(corners: Corners, state: Bundle) -> float:
@@ -326,8 +345,7 @@ def _camera_gain(corners: Corners, state: Bundle) -> float:
 def camera_gain(wider: Problem, state: Any) -> float:
     """Returns the fall of the cost, per parameter of one camera, with intrinsics among the unknowns as in
     :data:`UNKNOWN_LENS`. It is predicted by one step from the solution, and about 1 where the camera is right."""
-    linear = wider.linear(state)
-    return float(linear.gradient @ generalised_inverse(linear.normal) @ linear.gradient) / UNKNOWN_LENS[0].shape[1]
+    return wider.linear(state).gain() / UNKNOWN_LENS[0].shape[1]
 
 
 def found_of(

@@ -91,7 +91,7 @@ def adjust_rig(
         )
         solution = adjust(corners, begin, free)
         corners, state = solution.corners, solution.state
-        inverse = generalised_inverse(solution.normal)
+        inverse = solution.linear.inverse()
         bad = contradicting(corners, state, inverse)
         if bad.any() and len(rows) - bad.sum() >= LEAST_POSES:
             outliers[rows[bad]] = True
@@ -106,7 +106,7 @@ def adjust_rig(
     poses = inverse[: at["z"].stop, : at["z"].stop]
     results = []
     for i, camera in enumerate(given.cameras):
-        columns, view = corners.columns(i), np.full(len(given), -1)
+        columns, view = corners.columns(i)[: corners.each[i].kept()], np.full(len(given), -1)
         view[camera.rows[used[i]]] = np.flatnonzero(used[i])
         own, reported = inverse[np.ix_(columns, columns)], given.base_from_flange[camera.rows]
         results.append(found_of(corners.each[i], state.of(i), own, reported, view[rows], refine))

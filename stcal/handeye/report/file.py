@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 import stcal
-from stcal.handeye.choose import Choice, Tried
+from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.methods.noise import kind
@@ -205,7 +205,7 @@ class HandEyeFile(ResultFile):
         None,
         description="where no method was named: the way of solving that was `chosen` by errors on poses held out, a "
         "`sentence` on it, and all that were `tried`: `way` (method, with camera and scale solved for), `splits`, mean "
-        "`error_mm` (3-D at the board; of poses, of the board's origin), `reason` why it was given up or fails",
+        "`error_mm` (3-D at the board; of poses, of the board's origin), `reason` why it fails",
     )
     time_offset: TimeOffsetPart | None = Field(
         None,
@@ -334,7 +334,7 @@ def _choice(found: Choice) -> ChoicePart:
             way=candidate.candidate.name,
             splits=len(candidate.error_mm),
             error_mm=candidate.mean_mm() if candidate.error_mm.size else None,
-            reason=why_out(candidate) or None,
+            reason=candidate.reason or None,
         )
         for candidate in found.tried
     ]
@@ -348,13 +348,6 @@ def _arm(found: ArmFound) -> ArmPart:
         sigma=dict(zip(found.names, found.sigma.tolist(), strict=True)),
         plain=_held_out(found.plain, np.zeros(0, bool)),
     )
-
-
-def why_out(each: Tried) -> str:
-    """Returns why a way of solving was not tried to the end, or an empty string if it was."""
-    if each.reason or not each.out:
-        return each.reason
-    return f"surely worse after {each.out} splits, of which the best has {each.best_mm:.3g} mm"
 
 
 def _splits(found: HeldOutPoses | None, names: tuple[str, ...]) -> list[SplitErrors]:

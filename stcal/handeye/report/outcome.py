@@ -290,6 +290,11 @@ def _of_motions(outcome: Outcome) -> Finding | None:
     ratio = observability.sigma_mm / COMMON_MM
     word = _word(ratio, AS_ONE, AS_THREE)
     first, second, _ = np.degrees(observability.turns_rad)
+    if not np.isfinite(ratio):
+        said = f"the flange turns by {first:.0f}° (RMS) about one axis: the camera's place along this axis is not found"
+        return Finding(
+            "Motions of the flange", word, said, "one axis", f"{AS_ONE:g} × σ of a pose", observability.missing()
+        )
     said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
     if word != GOOD:
         said = f"by these motions the camera's place has {ratio:.2f} times the σ of one pose, in its worst direction"

@@ -22,7 +22,6 @@ from stcal.handeye.report.figures import (
     turns_between,
     turns_figure,
 )
-from stcal.handeye.report.file import why_out
 from stcal.handeye.report.outcome import ArmFound, Outcome, RigOutcome, Verdict, asides, judged, rig_judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
@@ -187,7 +186,7 @@ def _choice_cells(outcome: Outcome) -> list[list[str]]:
         return []
     rows = [["<solved by", "held out mm", "splits", "<"]]
     for each in choice.tried:
-        outcome_of_way = "taken" if each.candidate == choice.chosen else why_out(each)
+        outcome_of_way = "taken" if each.candidate == choice.chosen else each.reason
         rows.append([each.candidate.name, number(each.mean_mm(), 3), str(len(each.error_mm)), outcome_of_way])
     return rows
 
@@ -289,9 +288,9 @@ def _tried(outcome: Outcome) -> list[Block]:
         [
             _rows(_choice_cells(outcome)),
             page_only(
-                "Each way solves with the other poses and predicts where the board is in those held out; what is "
-                "surely worse after the first splits is given up. Of ways as good within a standard error the one is "
-                "taken that trusts the files most. The errors above are those of the choice as a whole: in each split "
+                "Each way solves with the other poses and predicts where the board is in those held out. The best "
+                "is taken, unless one that trusts the files more, or knows its σ, is behind it by no more than chance. "
+                "The errors above are those of the choice as a whole: in each split "
                 "of the way that the errors on all other poses name"
             ),
         ]

@@ -8,12 +8,10 @@ import numpy as np
 
 from stcal.errors import DegenerateError, StcalError
 from stcal.geometry.arrays import frozen
-from stcal.geometry.normal_equations import generalised_inverse
-from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import Setup
 from stcal.handeye.data.rig import RigPoses
 from stcal.handeye.rig.solve import POSE, Rig, RigOptions, alone, handeye_rig
-from stcal.handeye.validate import SCATTERED, HeldOutPoses, predicted
+from stcal.handeye.validate import HeldOutPoses, predicted, scatter_notes, scatter_of
 from stcal.parallel import one_thread, run_parallel
 
 ERRORS = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
@@ -161,19 +159,13 @@ def _errors_without(
 def rig_scatter(rig: Rig, held_out: RigHeldOut) -> float:
     """Returns the scatter of solutions without some of the robot's poses, relative to what σ predict.
 
-    The formula is that of :func:`~stcal.handeye.validate.scatter`, applied to all cameras at once.
+    It is :func:`~stcal.handeye.validate.scatter` of all cameras at once.
     """
-    (s, k), c = held_out.rows.shape, len(rig.names)
-    differences = []
-    for i, camera in enumerate(rig.cameras):
-        matrices = held_out.mount_from_camera[:, i]
-        solutions = Poses(matrices[:, :3, :3], matrices[:, :3, 3])
-        differences.append(solutions.difference(Poses.of([camera.mount_from_camera] * s)))
-    flat, size = np.concatenate(differences, axis=1), POSE * c
-    squared = np.einsum("sa,ab,sb->s", flat, generalised_inverse(rig.covariance[:size, :size]), flat)
-    images = sum(len(camera.names) for camera in rig.cameras)
-    dof = POSE * images * (1 - k / len(rig.poses)) - len(rig.covariance) - 1
-    return float(np.sqrt(squared.mean() / size * dof / (POSE * images * k / len(rig.poses))))
+    images, size = sum(len(camera.names) for camera in rig.cameras), POSE * len(rig.names)
+    found = [camera.mount_from_camera for camera in rig.cameras]
+    out = held_out.rows.shape[1] / len(rig.poses)
+    covariance = rig.covariance[:size, :size]
+    return scatter_of(found, held_out.mount_from_camera, covariance, images, out, len(rig.covariance))
 
 
 def widened_by_scatter(rig: Rig, held_out: RigHeldOut) -> tuple[Rig, float]:
@@ -181,10 +173,4 @@ def widened_by_scatter(rig: Rig, held_out: RigHeldOut) -> tuple[Rig, float]:
     factor = rig_scatter(rig, held_out)
     if not factor > 1:
         return rig, 1.0
-    notes = rig.notes
-    if factor > SCATTERED:
-        notes += (
-            f"solutions of parts of the poses scatter {factor:.2g} times as much as σ say, so that poses do not err "
-            "independently and alike: σ of all transforms are widened by that",
-        )
-    return replace(rig.widened(factor), notes=notes), factor
+    return replace(rig.widened(factor), notes=(*rig.notes, *scatter_notes(factor, "all"))), factor

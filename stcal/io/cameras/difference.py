@@ -296,7 +296,7 @@ def _fitted(
                 derivatives = np.concatenate([derivatives, np.stack(by_turn, axis=2)], axis=2)
         return np.nan_to_num((weight[:, :, None] * derivatives).reshape(-1, len(x)), posinf=0, neginf=0)
 
-    lowest = np.concatenate([np.where(scale == 1, -np.inf, -HALF), [-np.inf] * 3 * turn])
+    lowest = np.array([-HALF if name in ("fx", "fy") else -np.inf for name in names] + [-np.inf] * 3 * turn)
     solution = least_squares(
         off,
         np.zeros(len(lowest)),

@@ -1,22 +1,19 @@
-"""Camera files of keys and values: YAML, JSON, XML, INI, and lines of many programs, by one table of their keys.
+"""Camera files of keys and values, of many programs, by one table of their keys.
 
-A program is read by what its keys are called: :data:`ROLES` has the names in use, and :data:`TABLES` those that mean
-something else in one program. What is left goes through :func:`stcal.io.cameras.keys.require_known`.
+A program is read by what its keys are called: ``ROLES`` of :mod:`stcal.io.cameras.keys` has the names in use, and
+:data:`TABLES` those that mean something else in one program. What is left goes through
+:func:`stcal.io.cameras.keys.require_known`.
 """
 
-import json
-import re
-import warnings
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from stcal.errors import InputError, InputNote
+from stcal.errors import InputError
 from stcal.io.cameras.foreign import SQUARE, ForeignLens, of_kalibr, of_opencv, of_parts, one_of
-from stcal.io.cameras.keys import is_neutral, leaves, plain, require_known
+from stcal.io.cameras.keys import CONTAINERS, ROLES, is_neutral, leaves, numbers_of, plain, require_known
 from stcal.io.cameras.model import (
     COLMAP_PIXEL_ORIGIN,
     EQUIDISTANT,
@@ -25,59 +22,29 @@ from stcal.io.cameras.model import (
     camera_from_opencv,
     camera_model,
 )
-from stcal.io.plain_yaml import load_documents
+from stcal.io.cameras.several import NEAR, cameras_of, is_fundamental, shallow
 
-ROLES: Mapping[str, str] = {
-    name: role
-    for role, names in {
-        "matrix": "cameramatrix k m mtx cammtx cammatrix kmatrix intrinsicmatrix intrinsicsmatrix "
-        "cameraintrinsicmatrix",
-        "distortion": "distortioncoefficients d distcoeffs distcoeff distcoefs distortioncoeffs distortioncoefs coeffs "
-        "distortion dist distortionvector",
-        "lens": "intrinsics",
-        "f": "f focal focallength",
-        "fx": "fx flx focalx gamma1",
-        "fy": "fy fly focaly gamma2",
-        "cx": "cx ppx u0",
-        "cy": "cy ppy v0",
-        "skew": "skew",
-        "xi": "xi",
-        "width": "imagewidth width w imgwidth imwidth",
-        "height": "imageheight height h imgheight imheight",
-        "size": "imagesize resolution cameraresolution imgsize s",
-        "camera model": "cameramodel modeltype projectionmodel projectiontype cameratype type",
-        "model": "distortionmodel model lensmodel distortiontype",
-        "fisheye": "fisheyemodel fisheye isfisheye usefisheye",
-        **{k: k for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")},
-    }.items()
-    for name in names.split()
-}
-"""What a key holds, by its name in small letters and digits."""
-CONTAINERS = re.compile(
-    r"(camera|cam|camerainfo|cameraparameters|cameramatrix|distortion|intrinsics?|projectionparameters|calibration"
-    r"|d|distortioncoefficients|distortioncoeffs|distcoeffs|distortionparameters|mirrorparameters|intrinsicparameters|image|opencvstorage|value0)\d*$"
-)
-"""Keys that hold others and add nothing to their meaning."""
 RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 PERSPECTIVE = {
     *("plumbbob", "rationalpolynomial", "radtan", "radialtangential", "brown", "brownconrady", "opencv", "fullopencv"),
-    *("distortionbrownconrady", "thinprism", "tilted"),
+    *("distortionbrownconrady", "thinprism", "tilted", "opencvstandard", "pinholeradtan", "standard"),
 }
 """Values of a model that mean OpenCV's perspective lens."""
-UNDISTORTED = frozenset(["none", "", "pinhole", "simplepinhole", "perspective", "distortionnone", "null", "false"])
+UNDISTORTED = frozenset(
+    ["none", "", "pinhole", "simplepinhole", "perspective", "distortionnone", "null", "false", "opengl"]
+    + [f"perspectiveprojwith{out}distortion" for out in ("", "out")]
+)
 """Values of a model that say nothing of distortion."""
 FISHEYE = frozenset([*map(plain, EQUIDISTANT), "kannalabrandt8", "kannalabrandt4", "kb4", "opencvfisheye"])
 FISHEYE_ALSO = frozenset(["distortionkannalabrandt4", "fisheyeopencv", "pinholeequi", "equi"])
 UNIFIED = frozenset(["omni", "omnidir", "omnidirectional", "mei", "unified"])
 INVERSE = frozenset(["inversebrownconrady", "distortioninversebrownconrady", "modifiedbrownconrady"])
 """Models of which zeros alone are read: their polynomials are other ones than OpenCV's."""
+BY_COLUMNS = "intrinsicmatrix"
+"""Key of Open3D and MATLAB, whose matrices stand column by column."""
 OTHER_WAY = "its coefficients are those of another formula, and under another name they make a wrong camera"
-NUMBERED = re.compile(r"(.*?)[ _]?(\d+|left|right|l|r)$|(left|right|cam\d+)[ _.](.*)$", re.IGNORECASE)
-"""A key with the number or the side of its camera, behind or in front."""
-TAB = 4
-"""Spaces in place of a tab, which YAML does not allow."""
-NEAR = 0.25
-"""Share of the image's size within which the principal point is from the middle of the image."""
+IGNORED = "label"
+"""Role of keys that name a camera or a lens in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,116 +92,31 @@ TABLES = (
             *("scalelocked", "offsetlocked", "intrinsicid"),
         ),
     ),
+    Table("DepthAI", frozenset(["spechfovdeg"]), {"cameratype": "fisheye"}, harmless=("spechfovdeg", "lensposition")),
+    Table(
+        "MC-Calib",
+        frozenset(["distortiontype", "cameragroup"]),
+        {"distortiontype": "fisheye"},
+        harmless=("cameragroup", "cameraposematrix"),
+    ),
+    Table(
+        "Gyroflow",
+        frozenset(["calibratorversion"]),
+        {"cameramodel": IGNORED, "lensmodel": IGNORED, "w": "width", "h": "height"},
+        model="equidistant",
+        harmless=("origdimension*", "outputdimension*", "rmserror", "cameramodel", "lensmodel"),
+    ),
+    Table("ViSP", frozenset(["px", "py", "u0"]), {"px": "fx", "py": "fy", "kud": "k1"}, harmless=("kdu",)),
     Table("OpenSfM", frozenset(["projectiontype"]), {"focal": "f"}, relative=True, harmless=("focalprior*",)),
     Table("a file", frozenset()),
 )
 SLAM_SETTINGS = ("camerabf", "cameranew*", "camerargb", "thdepth", "depthmapfactor", "cameraimagescale", "rgbd*")
 """Settings of ORB-SLAM: its images are resized after reading, and its intrinsics are of the images as they are."""
-NEUTRAL = {"binningx": (0, 1), "binningy": (0, 1), "binning": (0, 1)}
+NEUTRAL = {
+    **dict.fromkeys(("binningx", "binningy", "binning"), (0, 1)),
+    **dict.fromkeys(("inputhorizontalstretch", "inputverticalstretch"), (1,)),
+}
 """Keys of ROS that are harmless with these values alone: the image is not the one that the intrinsics are for."""
-
-
-def values_of(text: str) -> dict:
-    """Return the keys and values of a text in JSON, XML, INI, Bouguet's ``.m``, or YAML.
-
-    Raises
-    ------
-    ValueError, yaml.YAMLError, ElementTree.ParseError
-        The text is none of these, or holds several documents that differ.
-    """
-    if text.lstrip().startswith("<"):
-        return _xml_values(ElementTree.fromstring(text))
-    if text.lstrip().startswith("{"):
-        try:
-            values = json.loads(text, strict=False, object_pairs_hook=_once)
-        except json.JSONDecodeError:  # YAML has braces, too
-            values = load_documents(text)[0]
-    elif sections := _ini_values(text):
-        return sections
-    else:
-        documents = [each for each in load_documents(text.replace("\t", " " * TAB)) if each is not None]
-        if not documents:
-            raise ValueError("no keys")
-        values, *more = documents
-        if any(_without_header(each) != _without_header(values) for each in more):
-            raise ValueError(f"{len(documents)} documents that differ; leave one in")
-    if not isinstance(values, dict):
-        raise ValueError("no keys")
-    return _with_data(values)
-
-
-def _once(pairs: list) -> dict:
-    """Return an object of JSON; refuse a repeated key, of which readers take the last one without a word."""
-    made = dict(pairs)
-    if len(made) < len(pairs):
-        keys = [key for key, _ in pairs]
-        raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)[:40]} twice")
-    return made
-
-
-def _without_header(document: object) -> object:
-    return {k: v for k, v in document.items() if k != "header"} if isinstance(document, dict) else document
-
-
-def _with_data(values):
-    """Return values with the content of OpenCV's and ROS's matrices in place of their rows, columns and type."""
-    if isinstance(values, dict):
-        if "data" in values and values.keys() & {"rows", "cols"}:
-            return values["data"]
-        return {key: _with_data(value) for key, value in values.items()}
-    return values
-
-
-def _xml_values(root: ElementTree.Element) -> dict:
-    values: dict = {}
-    for node in root:
-        data = node.find("data")
-        if data is not None:
-            value = [float(word) for word in (data.text or "").split()]
-        elif len(node):
-            value = _xml_values(node)
-        else:
-            value = (node.text or "").strip().strip('"')
-        if node.tag in values:
-            raise ValueError(f"the key {node.tag[:40]} twice")
-        values[node.tag] = value
-    return values
-
-
-def _ini_values(text: str) -> dict:
-    """Return sections, keys and numbers of ROS's ``.ini``: each key in a line of its own, then lines of numbers."""
-    lines = [line.split("#")[0].strip() for line in text.splitlines()]
-    lines = [line for line in lines if line and not line.startswith(";")]
-    if not lines or not re.fullmatch(r"\[[A-Za-z_][\w /.-]*\]", lines[0]):
-        return {}
-    values: dict = {}
-    section = numbers = None
-    for line in lines:
-        if match := re.fullmatch(r"\[(.+)\]", line):
-            section = values.setdefault(match[1], {})
-        elif section is not None:
-            key, equals, rest = (word.strip() for word in line.partition("="))
-            words = rest.split() if equals else line.split()
-            if key in ("projection", "rectification"):  # the words elsewhere name a lens
-                key = f"{key}_matrix"
-            if equals or not _are_numbers(words):
-                numbers = section.setdefault(key, [])
-            if equals and not _are_numbers(words):
-                section[key] = rest
-            elif numbers is not None and _are_numbers(words):
-                numbers += [float(word) for word in words]
-    for section in values.values():
-        for key, value in section.items():
-            if isinstance(value, list) and len(value) == 1:
-                section[key] = value[0]
-    return values
-
-
-def _are_numbers(words: list[str]) -> bool:
-    try:
-        return [float(word) for word in words] != []
-    except ValueError:
-        return False
 
 
 def from_keys(values: dict, choice: str, source: str) -> CameraModel | ForeignLens:
@@ -246,7 +128,7 @@ def from_keys(values: dict, choice: str, source: str) -> CameraModel | ForeignLe
         There is no camera, several and no choice, an unsupported lens, a key that may change the projection, or a value
         is impossible.
     """
-    cameras = _cameras(values)
+    cameras = cameras_of(values)
     if not cameras:
         raise InputError(
             "E-CAMERA-CONTENT",
@@ -263,150 +145,10 @@ def _role_of(path: tuple[str, ...], table: Table) -> str | None:
     parts = [part for key in path for part in key.split(".")]
     while len(parts) > 1 and CONTAINERS.match(plain(parts[0])):
         parts = parts[1:]
+    if len(path) > 1 and (joined := plain("".join(path[-2:]))) in ROLES:  # distortion: {type: …, parameters: …}
+        return table.roles.get(joined) or ROLES[joined]
     name = plain(parts[0]) if len(parts) == 1 else ""
     return table.roles.get(name) or (ROLES.get(name) if name not in table.needs or name in ROLES else None)
-
-
-def _holds_lens(values: object) -> bool:
-    if not isinstance(values, dict):
-        return False
-    names = {plain(key.split(".")[-1]) for path, _ in _shallow(values) for key in path[-1:]}
-    roles = {ROLES.get(name) for name in names}
-    return bool({"matrix", "lens", "fx", "f"} & roles) or "mu" in names
-
-
-def _shallow(values: dict):
-    """Yield the leaves of a camera's own keys, and of containers among them."""
-    for key, value in values.items():
-        if isinstance(value, dict) and CONTAINERS.match(plain(key)):
-            yield from (((key, *path), inner) for path, inner in _shallow(value))
-        elif not isinstance(value, dict):
-            yield (key,), value
-
-
-def _cameras(values: dict) -> dict[str, dict]:
-    """Return the cameras of a file by name, each with the keys that all share; a single one may have no name."""
-    frames = values.get("frames")
-    if isinstance(frames, list) and any(_holds_lens(frame) for frame in frames):
-        shared = {key: value for key, value in values.items() if key != "frames"}
-        kept = [{k: v for k, v in f.items() if plain(k) in ROLES} for f in frames if isinstance(f, dict)]
-        if all(each == kept[0] for each in kept):
-            return {"": shared | kept[0]}
-        names = [str(frame.get("file_path", i)) for i, frame in enumerate(frames) if isinstance(frame, dict)]
-        return {name: shared | own for name, own in zip(names, kept, strict=True)}
-    if isinstance(values.get("intrinsics"), list) and any(isinstance(each, dict) for each in values["intrinsics"]):
-        own = [_of_meshroom(each) for each in values["intrinsics"] if isinstance(each, dict)]
-        return {str(each.get("intrinsicId", i)): each for i, each in enumerate(own)}
-    if numbered := _numbered(values):
-        return numbered
-    inner = {str(key): value for key, value in values.items() if _holds_lens(value)}
-    own = {key: value for key, value in values.items() if str(key) not in inner}
-    containers = [key for key in inner if CONTAINERS.match(plain(key)) and not plain(key)[-1:].isdigit()]
-    if _holds_lens(own) or (len(inner) == 1 and containers and "camera_model" not in inner[containers[0]]):
-        return {"": values}
-    if inner:
-        return {name: own | value for name, value in inner.items()}
-    for value in values.values():  # a list or a mapping of cameras, one level down
-        if isinstance(value, list) and any(_holds_lens(each) for each in value):
-            named = {
-                str(next((each[k] for k in ("name", "id", "camera_name") if k in each), i)): each
-                for i, each in enumerate(value)
-                if isinstance(each, dict)
-            }
-            return named if len(named) == len(value) else {str(i): each for i, each in enumerate(value)}
-        if isinstance(value, dict) and any(_holds_lens(each) for each in value.values()):
-            return _cameras(value)
-    return {}
-
-
-MESHROOM = {
-    "pinhole": ("pinhole", ""),
-    "none": ("pinhole", ""),
-    "radial1": ("opencv", "k1"),
-    "radialk1": ("opencv", "k1"),
-    "radial3": ("opencv", "k1 k2 k3"),
-    "radialk3": ("opencv", "k1 k2 k3"),
-    "brown": ("opencv", "k1 k2 k3 p1 p2"),
-    "fisheye4": ("fisheye", "k1 k2 k3 k4"),
-}
-"""Meshroom's lenses: the model, and its parameters in their order (AliceVision, ``camera/Distortion*.hpp``)."""
-
-
-def _of_meshroom(stated: dict) -> dict:
-    """Return an entry of ``intrinsics`` with lengths in px: Meshroom's are in mm, its centre is an offset or absolute.
-
-    Raises
-    ------
-    ValueError
-        The lens is another one, or a number is missing.
-    """
-    kind = plain(stated.get("distortionType", stated.get("type", "")))
-    kind = plain(stated.get("type", "")) if kind == "none" and "distortionType" in stated else kind
-    if kind not in MESHROOM:
-        raise ValueError(f"lens {kind[:40]!r} of Meshroom; {', '.join(MESHROOM)} are read")
-    model, names = MESHROOM[kind]
-    size = np.array([float(stated["width"]), float(stated["height"])])
-    if "pxFocalLength" in stated:
-        focal = np.broadcast_to(_numbers(stated["pxFocalLength"]), 2)
-    else:
-        focal = np.full(2, float(stated["focalLength"]) / float(stated["sensorWidth"]) * size[0])
-        focal = focal * [1, float(stated.get("pixelRatio", 1))]
-    point = _numbers(stated["principalPoint"])
-    if (np.abs(point) < NEAR * size).all():
-        point = point + size / 2
-    elif not (np.abs(point - size / 2) < NEAR * size).all():
-        raise ValueError(f"principalPoint {point.tolist()} is neither in nor relative to the middle of the image")
-    given = _numbers(stated.get("distortionParams", []))
-    names_given = names.split()
-    if len(given) != len(names_given) and given.any():
-        raise ValueError(f"{len(given)} distortionParams of {kind}; {len(names_given)} needed")
-    taken = ("type", "distortionType", "focalLength", "pxFocalLength", "principalPoint", "distortionParams")
-    others = {key: value for key, value in stated.items() if key not in taken}
-    lens = {"fx": focal[0], "fy": focal[1], "cx": point[0], "cy": point[1], "model": model}
-    return others | lens | (dict(zip(names_given, given.tolist(), strict=True)) if given.any() else {})
-
-
-def _numbered(values: dict) -> dict[str, dict]:
-    """Return the cameras of keys that are numbered, as ``M1``, ``D1``, ``K_00``, ``camera_matrix_left``."""
-    split = {}
-    for key in values:
-        match = NUMBERED.match(str(key))
-        if match:
-            split[key] = (match[1], match[2]) if match[2] else (match[4], match[3])
-        elif slam := re.fullmatch(r"(Camera)(\d)\.(.+)", str(key)):
-            split[key] = (f"Camera.{slam[3]}", slam[2])
-    wanted = "matrix" if any(_is_matrix(values[key], base, "matrix") for key, (base, _) in split.items()) else "p"
-    sides = [side for key, (base, side) in split.items() if _is_matrix(values[key], base, wanted)]
-    sides = sides or list(dict.fromkeys(side for base, side in split.values() if base == "Camera.fx"))
-    if not sides:
-        return {}
-    shared = {key: value for key, value in values.items() if key not in split or split[key][1] not in sides}
-    whole = shared
-    if wanted == "matrix" and _holds_lens(shared):  # ORB-SLAM's rectified camera beside LEFT.K and RIGHT.K
-        shared = {key: value for key, value in shared.items() if not str(key).startswith("Camera.")}
-    cameras = {
-        side: shared | {base: values[key] for key, (base, own) in split.items() if own == side} for side in sides
-    }
-    if wanted == "p":  # KITTI's odometry: the left 3×3 of P is K of the rectified images
-        for camera in cameras.values():
-            if "P" in camera:
-                camera["K"] = np.reshape(_numbers(camera.pop("P")), (3, 4))[:, :3].ravel().tolist()
-        warnings.warn("the camera is that of P, which is for rectified images", InputNote, stacklevel=2)
-    return cameras | ({"Camera": whole} if whole is not shared else {})
-
-
-def _is_matrix(value: object, base: str, role: str) -> bool:
-    if role == "p":
-        return plain(base) == "p" and _numbers(value).size == 12
-    return ROLES.get(plain(base)) == role and _numbers(value).size == 9
-
-
-def _numbers(value: object) -> np.ndarray:
-    """Return the numbers of a list or of a text of them, flat; empty if it is neither."""
-    try:
-        return np.asarray(value.replace(",", " ").split() if isinstance(value, str) else value, float).ravel()
-    except (TypeError, ValueError):
-        return np.zeros(0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -421,14 +163,18 @@ class _Reading:
 
     @classmethod
     def of(cls, values: dict, source: str) -> "_Reading":
-        names = {plain(path[-1].split(".")[-1]) for path, _ in _shallow(values)}
+        names = {plain(path[-1].split(".")[-1]) for path, _ in shallow(values)}
         table = next(each for each in TABLES if each.needs <= names)
         known, keys, unread = {}, {}, {}
         for path, value in leaves(values):
             role, key = _role_of(path, table), ".".join(path)
+            if role == "lens" and numbers_of(value).size == 9:
+                role = "matrix"
+            if is_fundamental(plain(path[-1]), value):
+                continue
             if role is None:
                 unread[key] = value
-            elif role in known and known[role] != value:
+            elif role in known and known[role] != value and role != IGNORED:
                 raise InputError(
                     "E-CAMERA-REPEATED",
                     f"camera file {source}: {keys[role]} and {key} differ and mean the same; leave one in",
@@ -465,6 +211,13 @@ class _Reading:
         if numbers.size != 1:
             raise self.fault("E-CAMERA-COEFFICIENTS", f"{self.keys[role]} of {numbers.size} numbers; 1 needed")
         return float(numbers[0])
+
+    def pair(self, role: str) -> tuple[float, float]:
+        """Return two numbers; one stands for both."""
+        numbers = numbers_of(self.known[role])
+        if numbers.size not in (1, 2):
+            raise self.fault("E-CAMERA-COEFFICIENTS", f"{self.keys[role]} of {numbers.size} numbers; 2 needed")
+        return float(numbers[0]), float(numbers[-1])
 
     def size(self) -> tuple[float, float]:
         """Return width and height, px; 0 if the file states none."""
@@ -503,10 +256,12 @@ class _Reading:
         if "matrix" in self.known:
             return self._of_matrix()
         if "f" in self.known and "fx" not in self.known:
-            fx = fy = self.number("f")
+            fx, fy = self.pair("f")
         else:
             fx = self.number("fx")
             fy = self.number("fy") if "fy" in self.known or self.table.called != "Nerfstudio" else fx
+        if "centre" in self.known:
+            return [fx, fy, *self.pair("centre")], self.number("skew")
         wanted = ["cx", "cy"] if "f" in self.known and "fx" not in self.known else ["fx", "fy", "cx", "cy"]
         missing = [] if self.table.relative else [role for role in wanted if role not in self.known]
         if self.table.called == "Nerfstudio":
@@ -536,6 +291,8 @@ class _Reading:
             )
         if (matrix[[1, 2, 2, 2], [0, 0, 1, 2]] != [0, 0, 0, 1]).any():
             turned = (matrix.T[[1, 2, 2, 2], [0, 0, 1, 2]] == [0, 0, 0, 1]).all()
+            if turned and plain(self.keys["matrix"]) == BY_COLUMNS:
+                return [matrix[0, 0], matrix[1, 1], matrix[2, 0], matrix[2, 1]], float(matrix[1, 0])
             raise self.fault(
                 "E-CAMERA-MATRIX",
                 "camera_matrix is not [fx 0 cx; 0 fy cy; 0 0 1]; "
@@ -597,7 +354,7 @@ class _Reading:
             kinds[self.keys["fisheye"]] = "equidistant" if yes else "perspective"
         if "xi" in self.known and self.number("xi") and "unified" not in kinds.values():
             kinds[self.keys["xi"]] = "unified"
-        if self.table.model:
+        if self.table.model and not kinds:
             kinds[self.table.called] = self.table.model
         both = set(kinds.values())
         if {"unified", "perspective"} == both or {"eucm", "perspective"} == both or {"ds", "perspective"} == both:
@@ -677,7 +434,7 @@ class _Reading:
         return of_parts(flat, skew, given, "unified", width, height, self.source, values["xi"])
 
     def _of_kalibr(self) -> CameraModel | ForeignLens:
-        numbers = _numbers(self.known["lens"])
+        numbers = numbers_of(self.known["lens"])
         for role in ("matrix", "f", "fx", "fy", "cx", "cy", "skew", "xi", "fisheye"):
             if role in self.known and not is_neutral(self.known[role]):
                 raise self.fault(

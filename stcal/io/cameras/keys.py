@@ -5,14 +5,18 @@ import re
 import warnings
 from collections.abc import Collection, Iterator, Mapping
 
+import numpy as np
+
 from stcal.errors import InputError, InputNote
 
 _HARMLESS = """
-alphacerror boardheight boardsize boardwidth calibdate calibrationdate calibrationtime calibtime cameraid cameraindex
-cameraname cameraserial camoverlaps comment cornerdist createdate createdby data date description fileversion flags fps
-frameid framescount framescounter generatedon header hostname id imagename imagetopic label make name nframes notes
-nrofframes nrofimages p pattern patternsize projectionmatrix r ratehz rectificationmatrix rms rostopic sensortype serial
-serialnumber source squaresize stamp t target tbs tcamimu tcncnm1 time timeshiftcamimu timestamp topic units version
+alphacerror appliedtransform boardheight boardsize boardwidth calibdate calibrationdate calibrationtime calibtime
+cameraid cameraindex cameraname cameraserial camoverlaps comment cornerdist createdate createdby data date depthscale
+description fileversion flags fps frameid framescount framescounter generatedon header hostname id imagename
+imagetopic label localtransform make name nbcamera nframes notes nrofframes nrofimages p pattern patternsize
+projectionmatrix r ratehz rectificationmatrix ret rms rostopic sensortype serial serialnumber source squaresize stamp
+t target tbs tcamimu tcncnm1 testfilenames time timeshiftcamimu timestamp topic trainfilenames units valfilenames
+version
 """
 HARMLESS = frozenset(_HARMLESS.split())
 """Keys, in small letters and digits alone, that say nothing of how a ray becomes a pixel of the photograph. ``R`` and
@@ -41,14 +45,50 @@ HARMLESS_BEGINNINGS = (
 HARMLESS_ENDS = ("stddev", "std", "error", "errors", "sigma", "uncertainty", "covariance", "rms", "topic")
 """Ends of such keys: uncertainties."""
 SUSPECT = re.compile(
-    r"(xi|alpha|alphac|beta|gamma[12]?|skew|shear|tau[xy]?|[kpsbt]\d\d?|mu|mv|mx|my|f|fx|fy|cx|cy|u0|v0|ppx|ppy)"
+    r"(xi|alpha|alphac|beta|gamma[12]?|skew|shear|tau[xy]?|[kpsb]\d\d?|t\d|sk[xy]|mu|mv|mx|my|f|fx|fy|cx|cy|u0|v0|ppx|ppy)"
 )
 """Names of parameters of lenses, of which a reader takes those of its format."""
 SUSPECT_PART = re.compile(
     r"model|distort|fisheye|omni|mirror|radial|tangent|prism|tilt|rational|coef|projecti|intrinsic|focal|principal"
-    r"|crop|binning|roi|scal|flip|zoom|resiz|affin|poly|cameratype|lens(type|param)|cameramatrix|undist"
+    r"|stretch|crop|binning|roi|scal|flip|zoom|resiz|affin|poly|cameratype|lens(type|param)|cameramatrix|undist"
 )
 """Parts of names of keys that may change the projection."""
+ROLES: Mapping[str, str] = {
+    name: role
+    for role, names in {
+        "matrix": "cameramatrix k m mtx cammtx cammatrix kmatrix intrinsicmatrix intrinsicsmatrix "
+        "cameraintrinsicmatrix intrinsic intrinsicmat cameramat cammat matrix",
+        "distortion": "distortioncoefficients d distcoeffs distcoeff distcoefs distortioncoeffs distortioncoefs coeffs "
+        "distortion dist distortionvector distortions distortioncoeff distortioncoef distcoef distcoefficients "
+        "distortionparams distortionparameters",
+        "lens": "intrinsics",
+        "f": "f focal focallength",
+        "fx": "fx flx focalx gamma1 focallengthx",
+        "fy": "fy fly focaly gamma2 focallengthy",
+        "centre": "principalpoint opticalcenter",
+        "cx": "cx ppx u0 principalpointx",
+        "cy": "cy ppy v0 principalpointy",
+        "skew": "skew skx",
+        "xi": "xi",
+        "width": "imagewidth width w imgwidth imwidth",
+        "height": "imageheight height h imgheight imheight",
+        "size": "imagesize resolution cameraresolution imgsize imagedimension imagedimensions size s",
+        "camera model": "cameramodel modeltype projectionmodel projectiontype cameratype type",
+        "model": "distortionmodel model lensmodel distortiontype",
+        "fisheye": "fisheyemodel fisheye isfisheye usefisheye",
+        **{k: k for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")},
+    }.items()
+    for name in names.split()
+}
+"""What a key holds, by its name in small letters and digits."""
+CONTAINERS = re.compile(
+    r"(camera|cam|camerainfo|cameraparameters|cameramatrix|distortion|intrinsics?|projectionparameters|calibration|d"
+    r"|distortioncoefficients|distortioncoeffs|distcoeffs|distortionparameters|mirrorparameters|intrinsicparameters"
+    r"|image|imagesize|resolution|calibdimension|fisheyeparams|focallength|principalpoint|opencvstorage|value0)\d*$"
+)
+"""Keys that hold others and add nothing to their meaning."""
+OF_DISTORTION = re.compile(r"distort|dist|mirror|^d$")
+"""Containers whose every key is a parameter of the lens."""
 SHOWN = 6
 """Largest number of keys that a message names."""
 
@@ -56,6 +96,14 @@ SHOWN = 6
 def plain(key: object) -> str:
     """Return a key in small letters and digits alone: programs differ in capitals, dots and underscores."""
     return re.sub(r"[^a-z0-9]", "", str(key).lower())
+
+
+def numbers_of(value: object) -> np.ndarray:
+    """Return the numbers of a list or of a text of them, flat; empty if it is neither."""
+    try:
+        return np.asarray(value.replace(",", " ").split() if isinstance(value, str) else value, float).ravel()
+    except (TypeError, ValueError):
+        return np.zeros(0)
 
 
 def is_neutral(value: object) -> bool:
@@ -111,12 +159,14 @@ def require_known(unread: Mapping, source: str, harmless: Collection[str] = ()) 
     for keys, value in leaves(unread):
         path = [part for key in keys for part in key.split(".")]
         names = [*map(plain, path), plain("".join(path))]
+        held = [key for key in path[:-1] if not CONTAINERS.match(plain(key)) or OF_DISTORTION.search(plain(key))]
+        named = [*map(plain, [*held, path[-1]]), plain("".join([*held, path[-1]]))]
         if not (HARMLESS | set(harmless)).isdisjoint(names):
             continue
         of_a_lens = bool(SUSPECT.fullmatch(plain(path[-1])))
         if not of_a_lens and (plain(path[-1]).endswith(HARMLESS_ENDS) or any(n.startswith(beginnings) for n in names)):
             continue
-        if not of_a_lens and not any(SUSPECT_PART.search(name) for name in names):
+        if not of_a_lens and not any(SUSPECT_PART.search(name) for name in named):
             unknown.append(".".join(path))
         elif not is_neutral(value):
             raise InputError(

@@ -60,6 +60,12 @@ def from_calibration(root: ElementTree.Element, source: str) -> CameraModel | Fo
     if kind not in KINDS:
         raise InputError("E-CAMERA-MODEL", f"camera file {source}: projection {kind}; frame and fisheye are read")
     names = (*NAMES, *MORE_NAMES)
+    if "fx" in texts:
+        raise InputError(
+            "E-CAMERA-MODEL",
+            f"camera file {source}: fx and fy, as PhotoScan before version 1.2 and Agisoft Lens wrote them, whose "
+            "other terms mean something else; open the project in Metashape and export the calibration anew",
+        )
     require_known(
         {key: text for key, text in (texts | root.attrib).items() if key not in (*names, *OTHER_KEYS)}, source, HARMLESS
     )

@@ -121,6 +121,16 @@ class CalibratedCamera(Camera):
         return [float(flat[p[0] if isinstance(p, tuple) else p]) for p in _COLMAP_LAYOUT[self.colmap_model]]
 
 
+def model_of(camera: Camera, source: str = "camera") -> CameraModel:
+    """Return a camera of known size as a file would state it; ``source`` : where it is from, for messages."""
+    colmap_model = "THIN_PRISM_FISHEYE" if camera.fisheye else "FULL_OPENCV"
+    covariance = None
+    if isinstance(camera, CalibratedCamera):
+        colmap_model, covariance = camera.colmap_model, camera.covariance
+    lens = camera.focal, camera.centre, camera.distortion
+    return CameraModel(*lens, colmap_model, camera.width, camera.height, source, covariance)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPrior:
     """A prior of the intrinsics: ``covariance`` (q, q) of the parameters of ``colmap_model``, in its order."""

@@ -1,6 +1,7 @@
 """Approximate camera from a photograph's EXIF, as the start of a refinement."""
 
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,8 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 
 from stcal.errors import InputError
 from stcal.io.cameras.model import CalibratedCamera, camera_from_opencv
+from stcal.io.files import IMAGE_BYTES, read_bytes
+from stcal.io.photographs.extras import heic_turns, is_heic, require_heic
 
 HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")
 """First bytes of JPEG, TIFF and PNG."""
@@ -40,7 +43,8 @@ def is_photograph(path: str | Path) -> bool:
     """Return True if a file begins with the bytes of an image."""
     try:
         with open(path, "rb") as stream:
-            return stream.read(4).startswith(HEADS)
+            head = stream.read(12)
+            return head.startswith(HEADS) or is_heic(head)
     except (OSError, ValueError):
         return False
 
@@ -59,8 +63,13 @@ def camera_of_photograph(path: str | Path) -> Photograph:
         The file is unreadable, or states no focal length.
     """
     try:
-        with Image.open(path) as image:
+        data = read_bytes(path, IMAGE_BYTES)
+        if is_heic(data):
+            require_heic(f"camera file {path}").register_heif_opener()
+        with Image.open(BytesIO(data)) as image:
             (width, height), exif = image.size, image.getexif().get_ifd(ExifTags.IFD.Exif)
+        if is_heic(data) and heic_turns(data) % 2:
+            width, height = height, width
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         reason = " ".join(str(error).split())[:100]
         raise InputError(

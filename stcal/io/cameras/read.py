@@ -1,6 +1,5 @@
 """Reading of camera files of any kind, which is recognised by the content."""
 
-import codecs
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -15,7 +14,7 @@ import yaml
 from stcal.errors import InputError
 from stcal.io.cameras import forms, matlab, metashape
 from stcal.io.cameras.foreign import ForeignLens, numbered, of_colmap, of_database, one_of
-from stcal.io.cameras.keyed import from_keys, values_of
+from stcal.io.cameras.keyed import from_keys
 from stcal.io.cameras.model import (
     COLMAP_MODELS,
     CORRELATION,
@@ -25,11 +24,15 @@ from stcal.io.cameras.model import (
     CameraModel,
     parameter_names,
 )
+from stcal.io.cameras.photograph import is_photograph
+from stcal.io.cameras.texts import values_of, values_of_archive
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.files import SETTINGS_BYTES, read_bytes
+from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 
 SQLITE = b"SQLite format 3\0"
 """First bytes of an SQLite database."""
+ARCHIVE, PICKLE = b"PK\x03\x04", (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
+"""First bytes of NumPy's archives, and of Python's pickles."""
 
 
 _chosen: ContextVar[str] = ContextVar("_chosen", default="")
@@ -90,10 +93,18 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
     if forms.is_colmap_binary(content):
         return forms.from_colmap_binary(content, name, str(path))
     try:
+        if content.startswith(ARCHIVE):
+            return from_keys(values_of_archive(content), name, str(path))
         return _of_text(text_of(content), name, path)
     except InputError:
         raise
     except UnicodeDecodeError as error:
+        if content.startswith(PICKLE):
+            raise InputError(
+                "E-CAMERA-UNREADABLE",
+                f"camera file {path}: a pickle, which may hold a program and is not opened; write its arrays by "
+                "numpy.savez, or as JSON",
+            ) from error
         raise _no_text(path) from error
     except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:150]
@@ -103,7 +114,17 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
         ) from error
 
 
+REALITY_CAPTURE = ("capturingreality.com", "#name,x,y,alt,heading,pitch,roll,f,px,py")
+"""What tells the XMP and the table of RealityCapture."""
+
+
 def _of_text(text: str, name: str, path: Path) -> CameraModel | ForeignLens:
+    if any(word in text for word in REALITY_CAPTURE):
+        raise InputError(
+            "E-CAMERA-MODEL",
+            f"camera file {path}: of RealityCapture, relative to an image whose size it does not state; export the "
+            "registration as COLMAP, and give its cameras.txt",
+        )
     if text.lstrip().startswith("<"):
         root = ElementTree.fromstring(text)
         if root.tag == "calibration":
@@ -129,20 +150,13 @@ def _of_text(text: str, name: str, path: Path) -> CameraModel | ForeignLens:
     return from_keys(values, name, str(path))
 
 
-def text_of(content: bytes) -> str:
-    """Return the text of a file in UTF-8, or in UTF-16 with a byte-order mark; each line ends in a line feed.
-
-    Raises
-    ------
-    UnicodeDecodeError
-        It is neither.
-    """
-    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    text = content.decode("utf-16" if wide else "utf-8-sig")
-    return text.replace("\r\n", "\n").replace("\r", "\n")
-
-
 def _no_text(path: Path) -> InputError:
+    if is_photograph(path):
+        return InputError(
+            "E-CAMERA-UNREADABLE",
+            f"camera file {path}: a photograph; `stcal camera convert {path.name} cameras.txt` makes a start for "
+            "--refine-camera of its EXIF",
+        )
     return InputError(
         "E-CAMERA-UNREADABLE", f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML"
     )

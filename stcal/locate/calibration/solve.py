@@ -8,7 +8,8 @@ from scipy.linalg import null_space
 from scipy.optimize import root_scalar
 
 from stcal.boards.design import BoardView
-from stcal.boards.tags import Tags, corners_by_edges
+from stcal.boards.edges import corners_by_edges
+from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import minimise
@@ -434,13 +435,10 @@ def _normalised(covariance_px2: np.ndarray, ideal: np.ndarray, camera: Camera) -
 
 
 def _tag_covariances(found: Tags, own: list[int]) -> np.ndarray:
-    """Returns the covariance of each tag's corners, (k, 8, 8) px²: single corners, and the edges' common shift."""
+    """Returns the covariance of each tag's corners, (k, 8, 8) px²: as measured, and of the edges' common shift."""
     direction = corners_by_edges(found.corners_px[own]).reshape(-1, 8)
-    full = found.edge_sigma_px()[own, None, None] ** 2 * direction[:, :, None] * direction[:, None, :]
-    for corner in range(4):
-        coordinates = slice(2 * corner, 2 * corner + 2)
-        full[:, coordinates, coordinates] += found.covariance_px2[own, corner]
-    return full
+    shift = found.edge_sigma_px()[own, None, None] ** 2 * direction[:, :, None] * direction[:, None, :]
+    return shift + np.asarray(found.joint_px2)[own]
 
 
 def plane_points(camera_from_plane: Rigid, seen: np.ndarray) -> np.ndarray:

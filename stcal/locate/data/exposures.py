@@ -13,9 +13,9 @@ import stcal
 from stcal.boards.tags import Tags, find_tags
 from stcal.errors import InputError
 from stcal.io.device import DARK, SATURATED, Source, checked_name, png
-from stcal.io.files import IMAGE_BYTES, json_text, read_bytes, real_place, save
-from stcal.io.images import SUFFIXES, TOP_GROUP, ImageFile, decode, find_images, grey_8bit
-from stcal.io.json import Part, ResultFile
+from stcal.io.files import json_text, real_place, save
+from stcal.io.images import SUFFIXES, TOP_GROUP, USUAL, ImageFile, decode, find_images, grey_8bit, image_file
+from stcal.io.json import Part, ResultFile, require_result_written
 from stcal.locate.data.layout import TargetLayout
 
 
@@ -113,9 +113,9 @@ def find_scenes(path: str | Path) -> list[SceneFiles]:
     if path.is_file():
         if path.suffix.lower() not in SUFFIXES:
             raise InputError(
-                "E-IMAGE-UNREADABLE", f"exposures {path}: not an image; a folder or one of {', '.join(SUFFIXES)} needed"
+                "E-IMAGE-UNREADABLE", f"exposures {path}: not an image; a folder or one of {', '.join(USUAL)} needed"
             )
-        return [SceneFiles(path.stem, (ImageFile(path, path.name, TOP_GROUP),))]
+        return [SceneFiles(path.stem, (image_file(path),))]
     files, skipped = find_images(path)
     scenes = []
     for group in dict.fromkeys(file.group for file in files):
@@ -146,7 +146,7 @@ def _begin(
 ) -> Callable[[], Exposure | Unreadable]:
     """Starts the search for tags, and returns a function that waits for its result."""
     try:
-        image = grey_8bit(decode(read_bytes(file.path, IMAGE_BYTES), file.name))
+        image = grey_8bit(decode(file.read(), file.name))
     except (InputError, OSError) as error:
         trouble = Unreadable(file.name, " ".join(str(error).split()))
         return lambda: trouble
@@ -265,4 +265,5 @@ def capture(
     for row, image in zip(rows, images, strict=True):
         save(folder / row.image, png(image))
     save(folder / CAPTURED, json_text(content.content()))
+    require_result_written(folder / CAPTURED, content)
     return content

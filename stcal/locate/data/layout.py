@@ -6,12 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.design import UNIT_SQUARE, TagLayout
+from stcal.boards.dictionaries import known_tags
 from stcal.boards.file import TagsFile, load_tags, require_sizes
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
-from stcal.io.toml import side, stated_unusual, toml_string
+from stcal.io.files import require_written
+from stcal.io.toml import toml_string
+from stcal.lengths import side, stated_unusual
 
 WHAT = "layout file"
+WRITTEN_MM = 1e-6
+"""Largest difference of a written corner, mm: its last decimal."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +43,9 @@ class LayoutPlan:
     size_mm: np.ndarray
     origin: int
     corners_mm: np.ndarray
+
+    def __post_init__(self):
+        object.__setattr__(self, "tags", known_tags(self.tags, "target layout"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,8 +81,15 @@ class TargetLayout:
 
     def __post_init__(self):
         n = len(self.tags)
+        object.__setattr__(self, "tags", known_tags(self.tags, "target layout"))
         object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (n, 4, 2), "tags' corners"))
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (8 * n, 8 * n), "corners' covariance"))
+
+    @classmethod
+    def of(cls, layout: TagLayout, name: str = "") -> "TargetLayout":
+        """Returns tags with known places as a target. The middle of the first tag is the origin of {obj}."""
+        corners = _in_obj(layout.corners_mm, 0)
+        return cls(name, layout.tags, corners, layout.sigma_mm**2 * np.eye(corners.size), 0)
 
     def dictionaries(self) -> tuple[str, ...]:
         """Returns each dictionary of the tags once."""
@@ -160,9 +176,14 @@ def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
     return "\n".join(lines) + "\n"
 
 
+def require_layout_written(path: str | Path, layout: TargetLayout) -> None:
+    """Read a written layout again, and require the corners that were reported."""
+    require_written(path, lambda: load_layout(path).corners_mm, layout.corners_mm, WRITTEN_MM, "mm")
+
+
 def square(size_mm: float) -> np.ndarray:
     """Returns the corners (4, 2) of a tag about its middle."""
-    return size_mm / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], float)
+    return size_mm * UNIT_SQUARE
 
 
 def obj_from_plane(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 from scipy.linalg import block_diag
 
-from stcal.boards.tags import corners_by_edges
+from stcal.boards.edges import corners_by_edges
 from stcal.errors import DegenerateError
 from stcal.geometry import least_squares
 from stcal.geometry.arrays import frozen
@@ -48,7 +48,7 @@ corners share, such as those of the intrinsics, can move a pose by many σ due t
 class PlanarProblem:
     """Measurements of n corners of a plane with their noise model, in normalised coordinates without distortion.
 
-    ``xy`` : (n, 2) corners in {obj}, mm; ``seen`` : (n, 2) their normalised coordinates; ``noise`` : (n, 2, 2)
+    ``xy`` : (n, 2) corners in {obj}, mm; ``seen`` : (n, 2) their normalised coordinates; ``noise`` : (2n, 2n)
     covariance of ``seen``; ``px_by_seen`` : (n, 2, 2) jacobian of the lens; ``shape`` : (2n, 2n) covariance of ``xy``,
     mm²; ``common`` : (n, 2, q) derivative of ``seen`` by parameters that several corners share: shifts of each tag's
     edges and of each tag, and the intrinsics if they are not exact; ``prior`` : (q, q) covariance of these parameters.
@@ -65,7 +65,7 @@ class PlanarProblem:
     def select(self, keep: np.ndarray) -> "PlanarProblem":
         """Returns the selected corners."""
         rows = (2 * keep[:, None] + np.arange(2)).ravel()
-        points = (self.xy[keep], self.seen[keep], self.noise[keep], self.px_by_seen[keep])
+        points = (self.xy[keep], self.seen[keep], self.noise[np.ix_(rows, rows)], self.px_by_seen[keep])
         return PlanarProblem(*points, self.shape[np.ix_(rows, rows)], self.common[keep], self.prior)
 
     def in_px(self, residual: np.ndarray) -> np.ndarray:
@@ -107,9 +107,11 @@ def descent_near(problem: PlanarProblem, pose: PoseStack) -> Descend:
     """Returns the descent with residuals of single corners whitened near a pose by noise, shared and layout errors."""
     by_corner = project(problem, pose).by_corner[0]
     n = len(problem.xy)
-    shape_of_corner = problem.shape.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
+    noise, shape_of_corner = (
+        matrix.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)] for matrix in (problem.noise, problem.shape)
+    )
     shared = problem.common @ problem.prior @ np.swapaxes(problem.common, 1, 2)
-    full = problem.noise + shared + by_corner @ shape_of_corner @ np.swapaxes(by_corner, 1, 2)
+    full = noise + shared + by_corner @ shape_of_corner @ np.swapaxes(by_corner, 1, 2)
     return partial(_descend, problem, np.linalg.inv(np.linalg.cholesky(full)))
 
 
@@ -129,7 +131,8 @@ def weighed(problem: PlanarProblem, pose: PoseStack, weights: np.ndarray) -> Wei
     The covariance is the sum of image noise (divided by Huber's ``weights`` (n,)), shared errors, and the layout's
     covariance.
     """
-    noise = block_diagonal(problem.noise / weights[:, None, None])
+    root = np.repeat(np.sqrt(weights), 2)
+    noise = problem.noise / (root[:, None] * root)
     common = problem.common.reshape(2 * len(problem.xy), -1)
     noise += common @ problem.prior @ common.T
     by_corner = block_diagonal(project(problem, pose).by_corner[0])
@@ -165,8 +168,8 @@ class SeenTags:
         Rows of the tags in the layout.
     corners_px : (k, 4, 2) array
         Corners in the image, with distortion.
-    covariance_px2 : (k, 4, 2, 2) array
-        Covariances of the corners, including the layout's additional σ of single corners.
+    covariance_px2 : (k, 8, 8) array
+        Covariances of the four corners of each tag, including the layout's additional σ of single corners.
     edge_sigma_px : (k,) array
         σ of the common shift of all edges of a tag.
     """
@@ -180,7 +183,7 @@ class SeenTags:
         k = len(self.rows)
         object.__setattr__(self, "rows", frozen(self.rows, (k,), "rows", int))
         object.__setattr__(self, "corners_px", frozen(self.corners_px, (k, 4, 2), "tags' corners"))
-        object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (k, 4, 2, 2), "corners' covariances"))
+        object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (k, 8, 8), "corners' covariances"))
         object.__setattr__(self, "edge_sigma_px", frozen(self.edge_sigma_px, (k,), "edges' σ"))
 
     def __len__(self) -> int:
@@ -325,7 +328,8 @@ def problem_of(seen: SeenTags, layout: TargetLayout, camera: Camera, prior: Came
         by_camera = seen_by_px @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
         common = np.concatenate([common, by_camera], axis=2)
         common_covariance = np.asarray(block_diag(common_covariance, prior.covariance))
-    noise = seen_by_px @ seen.covariance_px2.reshape(-1, 2, 2) @ np.swapaxes(seen_by_px, 1, 2)
+    of_tags = block_diagonal(seen_by_px.reshape(-1, 4, 2, 2))
+    noise = block_diagonal(of_tags @ seen.covariance_px2 @ np.swapaxes(of_tags, 1, 2))
     xy = layout.corners_mm[seen.rows].reshape(-1, 2)
     return PlanarProblem(
         xy, ideal, noise, px_by_seen, layout.covariance_mm2[np.ix_(rows, rows)], common, common_covariance

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.boards.tags import Tags, corners_by_edges
+from stcal.boards.edges import corners_by_edges
+from stcal.boards.tags import Tags
 from stcal.locate.data.layout import TargetLayout
 from stcal.locate.pose.estimate import SeenTags
 
@@ -55,7 +56,7 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
     rows = layout.rows()
     places = [{rows[tag]: k for k, tag in enumerate(tags.tags) if tag in rows} for tags in exposures]
     used = np.array(sorted({row for place in places for row in place}), int)
-    corners, covariance, edge = _stacked(exposures, places, used)
+    corners, covariance, joint, edge = _stacked(exposures, places, used)
     visible = np.isfinite(corners[..., 0, 0])
     # At a right angle, a corner shifts by √2 times the shift of its edges.
     variance = np.trace(covariance, axis1=-2, axis2=-1) + 2 * edge[..., None] ** 2
@@ -64,10 +65,10 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
     mean = (weight_share[..., None] * np.where(visible[..., None, None], corners, 0)).sum(0)
     share = _differing_share(corners, covariance, mean, visible)
     growth, differing = max(share, 1.0), min(share, 1.0)
-    root = weight_share[..., None, None] * np.linalg.cholesky(covariance)
-    independent = np.einsum("enkij,enklj->nkil", root, root)
-    common = np.einsum("enkij,fnklj->nkil", root, root)
-    merged = growth * (differing * independent + (1 - differing) * common) + layout.sigma_px**2 * np.eye(2)
+    root = np.repeat(weight_share, 2, axis=2)[..., None] * np.linalg.cholesky(joint)
+    independent = np.einsum("enij,enlj->nil", root, root)
+    common = np.einsum("enij,fnlj->nil", root, root)
+    merged = growth * (differing * independent + (1 - differing) * common) + layout.sigma_px**2 * np.eye(8)
     names = names or [str(k + 1) for k in range(len(exposures))]
     repeated = {tag for tags in exposures for tag in tags.repeated if tag in rows}
     unknown = {tag for tags in exposures for tag in tags.tags if tag not in rows}
@@ -82,20 +83,22 @@ def merge(exposures: Sequence[Tags], layout: TargetLayout, names: Sequence[str] 
 
 
 def _stacked(exposures, places, used: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Returns corners (e, n, 4, 2), their covariances, and σ of the edges' common shift, (e, n).
+    """Returns corners (e, n, 4, 2), covariances of each and of a tag's four, and σ of the edges' common shift, (e, n).
 
     For tags that are not seen these are NaN, 1 px² and 0.
     """
     corners = np.full((len(exposures), len(used), 4, 2), np.nan)
     edge = np.zeros(corners.shape[:2])
     covariance = np.tile(np.eye(2), (len(exposures), len(used), 4, 1, 1))
+    joint = np.tile(np.eye(8), (len(exposures), len(used), 1, 1))
     for e, (tags, place) in enumerate(zip(exposures, places, strict=True)):
         visible = [k for k, row in enumerate(used) if row in place]
         columns = [place[used[k]] for k in visible]
         corners[e, visible] = tags.corners_px[columns]
         covariance[e, visible] = tags.covariance_px2[columns]
+        joint[e, visible] = tags.joint_px2[columns]
         edge[e, visible] = tags.edge_sigma_px()[columns]
-    return corners, covariance, edge
+    return corners, covariance, joint, edge
 
 
 def _differing_share(corners, covariance, mean, there) -> float:

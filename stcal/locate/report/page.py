@@ -12,7 +12,6 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.cameras.model import CameraModel
-from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import ImageFile, decode, grey_8bit, thumbnail
 from stcal.io.table import COVARIANCE, POSE, pose_cells
 from stcal.locate.data.exposures import Exposure, SceneFiles
@@ -205,7 +204,7 @@ def _picture(
     exposure: Exposure, file: ImageFile, each: Located | None, layout: TargetLayout, model: CameraModel, width_px: int
 ) -> dict:
     """Returns the image with the outlines of its tags; with axes of {obj} and names of tags if ``each`` is given."""
-    grey = grey_8bit(decode(read_bytes(file.path, IMAGE_BYTES), file.name))
+    grey = grey_8bit(decode(file.read(), file.name))
     width, height = exposure.size
     rows = layout.rows()
     tags = []

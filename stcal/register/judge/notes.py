@@ -16,6 +16,7 @@ from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, 
 from stcal.register.judge.degeneracy import WIDER_THAN, row_name, single_supports, spreads, symmetry, symmetry_note
 from stcal.register.judge.groups import Shifted
 from stcal.register.judge.mistakes import SHOWN, UNIT_WITHIN, UNITS, Wider, neighbours_alike, outlier_notes
+from stcal.register.judge.order import moved_meanwhile, order_note
 
 LOW_REDUNDANCY = 6
 """Degrees of freedom below which the relative uncertainty of σ exceeds 30 %."""
@@ -123,6 +124,9 @@ def _noise(subject: Subject, other: Wider | None) -> list[str]:
             "the residuals are not noise: neighbours are off alike, so that the frames are bent against each other and "
             "a transform holds only where its points are; see the residual field"
         )
+    if other is None and subject.method != "liu2017":
+        change = moved_meanwhile(subject.problem, transform)
+        notes += [] if change is None else [order_note(change, subject.name)]
     if subject.shifted is not None:
         notes.append(_two_groups(subject, subject.shifted))
     if subject.factor is not None and subject.covariance.scaled:

@@ -1,13 +1,16 @@
 """Result file of a registration: the keys of ``data_layout.md``."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from stcal.geometry.rigid import Affine, Rigid
-from stcal.io.json import Finite, Matrix, Matrix4, Part, Points, Pose, ResultFile, Vector, Vector3
+from stcal.io.files import require_written
+from stcal.io.json import Finite, Matrix, Matrix4, Part, Points, Pose, ResultFile, Vector, Vector3, read_result
+from stcal.io.table import POSE_MM
 from stcal.register.core.models import Transform, parts
 from stcal.register.core.result import Alternative, ErrorFigures, HeldOutPoints
 from stcal.register.workspace.field import Cubes
@@ -304,3 +307,13 @@ def _cubes(cubes: Cubes) -> CubesPart:
         sides_mm=cubes.sides_mm,
         fitted_in=[CubeRow(side_mm=side, errors=list(errors)) for side, errors in rows],
     )
+
+
+def require_registration_written(path: str | Path, found: Findings) -> None:
+    """Read a written registration again, and require that it maps the points as was reported."""
+
+    def again() -> np.ndarray:
+        read = read_result(path, RegistrationFile, "registration file", "report this with its data")
+        return found.xyz_a @ read.b_from_a[:3, :3].T + read.b_from_a[:3, 3]
+
+    require_written(path, again, found.registration.b_from_a @ found.xyz_a, POSE_MM, "mm")

@@ -10,6 +10,8 @@ from stcal.geometry.rigid import Rigid
 from stcal.robot.axes.fit import GROSS, REWEIGHTINGS, AxisFit, refit_axis, unwound_by
 from stcal.robot.axes.pairs import jacobian_by_axes, pair_values
 from stcal.robot.axes.sweeps import called
+from stcal.robot.identification.residuals import State, observed
+from stcal.robot.identification.unexplained import moved_meanwhile
 from stcal.robot.kinematics.dh import PARALLEL_RAD
 from stcal.robot.kinematics.forward import joint_frames
 from stcal.robot.kinematics.measurements import Measurements
@@ -23,6 +25,8 @@ LIKE_SIZE = 2.0
 AGREES_RAD = np.radians(10.0)
 """Largest difference of axes and joint zeros from a nominal robot; beyond it the robot is another one, or counts
 otherwise."""
+MOVED_SHARE = 0.5
+"""Share of the squared residuals beyond which a move along the order of the rows is named."""
 
 
 def _shape(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -159,6 +163,16 @@ def remarks(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robo
                 "file: its zero position is elsewhere"
             )
     return notes
+
+
+def of_order(data: Measurements, robot: Robot) -> list[str]:
+    """Returns a note if the instrument, the base or a reflector moved between two rows, or a joint lost its zero.
+
+    Errors of gears follow a sweep, and so the order of its rows; a move is named where it explains most of what is
+    left.
+    """
+    moved = moved_meanwhile(State(robot.chain(), dict(robot.tools)), observed(data, "position"), MOVED_SHARE)
+    return [] if moved is None else [moved.sentence()]
 
 
 def _alone(data: Measurements, fits: list[AxisFit]) -> list[str]:

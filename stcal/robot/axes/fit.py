@@ -216,7 +216,7 @@ class _AxisFitting:
         points, values = (np.arange(n) % min(n, STARTS) for n in (count, value.max() + 1))
         sets = [np.ones(count), *(points != out for out in np.unique(points))]
         sets += [values[value] != out for out in np.unique(values) if value.max() > 1]
-        least = np.inf
+        least, best = np.inf, None
         for i, subset in enumerate(sets):
             self.weights = np.asarray(subset, float)
             self.frame = self.linear_start()
@@ -226,6 +226,12 @@ class _AxisFitting:
             quiet = length.max() <= min(GROSS * self.robust_sigma(length), QUIET * self.size)
             if i == 0 and quiet:
                 break
+        if best is None:
+            raise DegenerateError(
+                "E-AXES-UNDETERMINED",
+                f"{self.where}: no axis follows from any {count - 1} of its {count} positions; check them, or measure "
+                "the sweep again",
+            )
         self.frame, self.weights = best
 
     def linear_start(self) -> Rigid:

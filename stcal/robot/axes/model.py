@@ -9,7 +9,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze
 from stcal.geometry.rigid import Rigid
 from stcal.parallel import one_thread
-from stcal.robot.axes.checks import LeaveOneOut, leave_one_out, off_mm, remarks, require_like_nominal
+from stcal.robot.axes.checks import LeaveOneOut, leave_one_out, of_order, off_mm, remarks, require_like_nominal
 from stcal.robot.axes.fit import TINY, AxisFit, fit_axes
 from stcal.robot.axes.pairs import Pair, chain_through, jacobian_by_axes, pairs_of, sigma_of
 from stcal.robot.axes.sweeps import STILL_RAD, find_arcs, virtual_reflectors
@@ -93,7 +93,7 @@ def robot_from_sweeps(
     Ginés, "Uncertainty estimation in robot kinematic calibration", Robotics and Computer-Integrated Manufacturing 29,
     2013.
     """
-    virtual = None if places is None else virtual_reflectors(data, places)
+    measured, virtual = data, None if places is None else virtual_reflectors(data, places)
     data = data if virtual is None else virtual.data
     if nominal.tree is not None:
         raise InputError(
@@ -117,7 +117,7 @@ def robot_from_sweeps(
         -1, 5
     )
     pairs = pairs_of(frames, covariance, robot)
-    notes += remarks(data, fits, robot, nominal)
+    notes += [*remarks(data, fits, robot, nominal), *of_order(measured, robot)]
     notes += [
         f"joints {p.joint + 1} and {p.joint + 2}: {p.refused}; their row is Denavit and Hartenberg's all the same, as "
         f"they are not within {np.degrees(PARALLEL_RAD):g}° of parallel"

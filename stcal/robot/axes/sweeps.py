@@ -62,7 +62,7 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
         arc_count = 0
         for (target, *_), rows in groups.items():
             values = kinematic[rows, j]
-            places = values if robot.prismatic[j] else np.mod(values + STILL_RAD, 2 * np.pi)
+            places = values if robot.prismatic[j] else _within_a_turn(values)
             distinct = len(set(_clusters(places, still[j])))
             if distinct >= DISTINCT[joint.type]:
                 arcs.append(Arc(j, target, rows))
@@ -101,6 +101,14 @@ def _require_motion(data: Measurements) -> None:
                 f"{np.quantile(moved, 0.9):.3g} mm while the joints move; a reflector on the flange, and each "
                 "row's own measurement needed",
             )
+
+
+def _within_a_turn(values: np.ndarray) -> np.ndarray:
+    """Returns angles in 0 to 2π from the middle of the widest gap between them, so that no cluster lies across 0."""
+    around = np.sort(np.mod(values, 2 * np.pi))
+    gaps = np.diff(around, append=around[0] + 2 * np.pi)
+    widest = int(gaps.argmax())
+    return np.mod(values - around[widest] - gaps[widest] / 2, 2 * np.pi)
 
 
 def _clusters(values: np.ndarray, still: float) -> np.ndarray:

@@ -6,12 +6,15 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 
 from stcal.geometry.rigid import Poses
+from stcal.io.files import require_written
 from stcal.io.poses.columns import fixed, joined, without_comments
 from stcal.io.poses.controllers import ABB, DEG_DIGITS, FANUC, KUKA, NUMBER, UNIT_DIGITS, UR, YASKAWA, PoseText
+from stcal.io.table import read_table
 from stcal.robot.identification.prior import dh_values
 from stcal.robot.identification.report import DH, SHOWN, UNITS
 from stcal.robot.identification.result import Identified
@@ -261,3 +264,16 @@ def offsets_csv(result: Identified, nominal: Robot) -> str:
         factor, unit = (1.0, "mm") if slides else (float(np.degrees(1.0)), "deg")
         row(i + 1, ZERO, 0.0, factor * change[i], factor * change_sigma[i], unit, bool(known[i]))
     return stream.getvalue()
+
+
+def require_offsets_written(path: str | Path, result: Identified, nominal: Robot) -> None:
+    """Read a written table of offsets again, and require the identified D-H values and offsets of zeros."""
+    values, change = dh_values(result.robot) * SHOWN, zeros(result, nominal)[0]
+    change = np.where(nominal.prismatic, change, np.degrees(change))
+    require_written(
+        path,
+        lambda: read_table(path, "offsets").numbers("identified").reshape(len(values), -1),
+        np.column_stack([values, change]),
+        10.0 ** -DIGITS["mm"],
+        "mm or deg",
+    )

@@ -103,6 +103,7 @@ class FoundLeft(Part):
     effect_rad: float
     share: float
     p: float
+    line: int | None
 
 
 class IdentifiedFile(ResultFile):
@@ -186,7 +187,8 @@ class IdentifiedFile(ResultFile):
     left: list[FoundLeft] | None = Field(
         description="what the residuals go with, the strongest first: `what` in words, `joint` and `turns` (0: none), "
         "`effect_mm`, `effect_rad` (amplitude where it turns, else RMS), `share` of their squares, `p` times the "
-        "number of tests; null where rows are too few to tell"
+        "number of tests, `line` of the first row after a jump along their order (null: no jump); null where rows are "
+        "too few to tell"
     )
     outliers: list[OutlierMeasurementRow] = Field(
         description="those of less than half weight: `line`, `place`, `error_mm`"

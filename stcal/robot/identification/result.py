@@ -6,8 +6,9 @@ from typing import Literal
 
 import numpy as np
 
-from stcal.errors import ConvergenceError, InputError
-from stcal.geometry.arrays import Array, freeze
+from stcal.errors import InputError
+from stcal.geometry.arrays import Array, freeze, require_choices
+from stcal.io.files import require_written
 from stcal.robot.identification.adjustment import (
     Solution,
     Weighting,
@@ -23,12 +24,9 @@ from stcal.robot.identification.residuals import (
 )
 from stcal.robot.identification.unexplained import Finding
 from stcal.robot.identification.variances import Components
-from stcal.robot.kinematics.file import load_robot
+from stcal.robot.kinematics.file import WRITTEN_MM, load_robot
 from stcal.robot.kinematics.model import Elasticity, Robot
 
-WRITTEN_MM = 1e-5
-"""Largest difference of one residual, mm (or 1e-5 rad), between a written robot file and what was reported: decimals of
-angles in degrees move a tool by 1e-11 mm, and a chain of 60 joints by less than 1e-7 mm."""
 Model = Literal["rigid", "elastic", "auto"]
 LEAST_FOLDS = 2
 BEYOND_CHANCE = 2.5
@@ -70,7 +68,8 @@ class IdentifyOptions:
     Raises
     ------
     InputError
-        A σ that is not positive, or beyond 1 m or 1 rad; ``auto`` with fewer than two folds.
+        A choice that does not exist; a σ that is not positive, or beyond 1 m or 1 rad; ``auto`` with fewer than two
+        folds.
     """
 
     observe: Kind | None = None
@@ -85,6 +84,7 @@ class IdentifyOptions:
     adjust: Adjusted = "all"
 
     def __post_init__(self):
+        require_choices(self, "identification")
         for name, value, most in (("sigma_mm", self.sigma_mm, 1e3), ("sigma_rad", self.sigma_rad, 1.0)):
             if value is not None and not 1e-12 <= value <= most:
                 raise InputError("E-OPTION-RANGE", f"{name} is {value:g}; a number above 0, up to {most:g}, needed")
@@ -262,22 +262,18 @@ def position_errors(found: np.ndarray) -> np.ndarray:
     return np.linalg.norm(found[:, -3:], axis=1) if found.shape[1] > 1 else np.abs(found[:, 0])
 
 
-def require_written(path: Path | str, result: Identified) -> None:
-    """Read a written robot file again, and require that it predicts what was reported.
+def require_identified_written(path: Path | str, result: Identified) -> None:
+    """Read a written robot file again, and require that it predicts the residuals that were reported.
 
     Raises
     ------
     ConvergenceError
-        Residuals of the measurements by the file differ from those of the result.
+        The file cannot be read again, or residuals of the measurements by it differ from those of the result.
     """
-    robot = load_robot(path)
-    tools = {name: robot.tool(name) for name in result.state.tools}
-    again = residuals(State(robot.chain(), tools, stations=result.state.stations), result.seen)
-    differ = float(np.abs(again - result.residuals).max())
-    if not differ < WRITTEN_MM:
-        before, after = (float(position_errors(each).mean()) for each in (result.residuals, again))
-        raise ConvergenceError(
-            "E-WRITTEN-DIFFERS",
-            f"{path}: by the file the robot errs by {after:.4g} mm (mean), {before:.4g} mm reported, residuals differ "
-            f"by up to {differ:.2g} mm, {WRITTEN_MM:g} allowed; do not use the file, and report this with its data",
-        )
+
+    def again() -> np.ndarray:
+        robot = load_robot(path)
+        tools = {name: robot.tool(name) for name in result.state.tools}
+        return residuals(State(robot.chain(), tools, stations=result.state.stations), result.seen)
+
+    require_written(path, again, result.residuals, WRITTEN_MM, "mm or rad")

@@ -141,6 +141,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         solution.weights,
     )
     wider, remarks = widened(prediction, findings or ())
+    of_arm = any(not each.advice for each in findings or ())
     tested = held_out is not None or options.folds < LEAST_FOLDS
     return Identified(
         robot=identified,
@@ -168,7 +169,7 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
         + doubts(prediction, observations, solution.units[named], covariance, names, tested)
         + tuple(each.sentence() for each in findings or ())
         + remarks
-        + ((TRY_ELASTIC,) if remarks and not solution.state.elastic else ())
+        + ((TRY_ELASTIC,) if remarks and of_arm and not solution.state.elastic else ())
         + (data.conditions.ignored("the arm as identified") if identified.elasticity is None else ()),
     )
 

@@ -3,7 +3,7 @@ made."""
 
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import combinations, product
+from itertools import chain, combinations, product
 from typing import Literal
 
 import numpy as np
@@ -34,6 +34,14 @@ to the data, the valley is flat, and the misfit shows it."""
 STILL_MM = 0.01
 QUARTERS_DEG = (90, -90, 180)
 """Errors of a joint's zero that conventions of a robot's home position cause."""
+FAR, TRIMS, MOSTLY_NEAR = 4.0, 4, 0.7
+"""Error in median errors from which a row is far off, largest number of fits without such rows, and least share of the
+other rows. Of a wrong robot's errors few are so much larger than their median."""
+ALIKE, MOST_NAMED = 1.05, 3
+"""Ratio of misfits up to which reasons explain the data equally, as a joint's zero off by 180° and another joint's sign
+may, and largest number of them that is named."""
+SHOWN = 6
+"""Number of lines that a message names."""
 GUESS_ROWS = 60
 """Largest number of rows by which mistakes in the rows are tried: far more than the nine numbers of base and tool."""
 MOST_JOINTS = 8
@@ -275,35 +283,57 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
     says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
     says += f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; "
     thinned = data if data.positions is None else data[np.unique(np.linspace(0, len(data) - 1, GUESS_ROWS).astype(int))]
-    for guesses in (_guesses(robot, data, tools), _arms(robot, thinned), _pairs_of_mistakes(robot, thinned)):
-        misfits = {}
+    singles = chain([("", robot, data)], _guesses(robot, thinned), _arms(robot, thinned))
+    for guesses in (singles, _pairs_of_mistakes(robot, thinned)):
+        fitting = []
         for reason, variant, guess in guesses:
             try:
-                misfits[reason] = _placed(variant, guess, tools)[1] / _extent(guess)
+                share, far = _fitting(variant, guess, tools)
             except (DegenerateError, ConvergenceError):  # this guess leaves too few data, or explains nothing
                 continue
-        reason = min(misfits, key=lambda guess: misfits[guess], default="")
-        if reason and misfits[reason] < min(EXPLAINS * misfit / extent, FITS):
-            raise InputError("E-IDENTIFY-MISFIT", f"{says}it would fit if {reason}")
+            if share < min(EXPLAINS * misfit / extent, FITS):
+                fitting.append((share, ", and ".join(each for each in (reason, _not_there(guess, far)) if each)))
+                if not reason:
+                    break  # all fits but some rows
+        if fitting:
+            least = min(fitting)[0]
+            alike = [reason for share, reason in sorted(fitting) if share <= ALIKE * least]
+            raise InputError("E-IDENTIFY-MISFIT", f"{says}it would fit if {', or if '.join(alike[:MOST_NAMED])}")
     raise InputError(
         "E-IDENTIFY-MISFIT", f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units"
     )
 
 
+def _fitting(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[float, np.ndarray]:
+    """Returns the RMS misfit as a share of the spread, and a mask (m,) of rows that are far off and take no part."""
+    near = np.ones(len(data), bool)
+    for _ in range(TRIMS):
+        state, misfit = _placed(robot, data[near], tools)
+        share = misfit / _extent(data[near])
+        if data.positions is None:
+            break
+        errors = np.linalg.norm(residuals(state, observed(data, "position")), axis=1)
+        limit = max(FAR * float(np.median(errors[near])), FITS * _extent(data[near]))
+        before, near = near, errors <= limit
+        if share < FITS or (near == before).all() or near.mean() < MOSTLY_NEAR:
+            break
+    return share, ~near
+
+
+def _not_there(data: Measurements, far: np.ndarray) -> str:
+    """Returns the reason that rows (m,) are far off; empty if there are none."""
+    if not far.any():
+        return ""
+    lines = [str(line) for line, off in zip(data.lines, far, strict=True) if off]
+    shown = ", ".join(lines[:SHOWN]) + (", …" if len(lines) > SHOWN else "")
+    return f"line{'s' * (len(lines) > 1)} {shown} were not there, by far the worst; correct or remove them"
+
+
 def _arms(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
     """Yields frequent mistakes in the rows: convention, zeros of joints, order of joints and of rows."""
     n = len(robot.rows)
-    other = "standard" if robot.convention == "modified" else "modified"
-    reason = f'rows were of the {other} convention; give convention = "{other}" in the robot file'
-    yield reason, replace(robot, convention=other), data
-    for i in _inner(robot):
-        for turn in QUARTERS_DEG:
-            rows = _turned(robot.rows, {i: turn})
-            yield (
-                f"theta of joint {i + 1} were larger by {turn:+d}°; correct theta_deg",
-                replace(robot, rows=rows),
-                data,
-            )
+    yield from _other_convention(robot, data)
+    yield from _zeros(robot, data)
     for i, k in combinations(range(n), 2):
         if n > MOST_JOINTS or robot.joints[i].type != robot.joints[k].type:
             continue
@@ -319,7 +349,8 @@ def _arms(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measur
 
 
 def _pairs_of_mistakes(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
-    """Yields zeros of two joints that are off, and signs of several joints."""
+    """Yields two mistakes of different kinds among convention, zero, sign and coupling; zeros of two joints that are
+    off, and signs of several joints."""
     n, inner = len(robot.rows), _inner(robot)
     if n > MOST_JOINTS:
         return
@@ -334,6 +365,43 @@ def _pairs_of_mistakes(robot: Robot, data: Measurements) -> Iterator[tuple[str, 
             named = ", ".join(str(i + 1) for i in group)
             reason = f"joints {named} had the opposite sign; check their directions in the rows, or the signs of q"
             yield reason, robot, replace(data, q=data.q * np.where(np.isin(np.arange(n), group), -1, 1))
+    for first, second in combinations((_other_convention, _zeros, _signs, _couplings), 2):
+        for reason, variant, guess in first(robot, data):
+            for more, both, changed in second(variant, guess):
+                yield f"{reason.split('; ')[0]} and {more}", both, changed
+
+
+def _other_convention(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
+    other = "standard" if robot.convention == "modified" else "modified"
+    reason = f'rows were of the {other} convention; give convention = "{other}" in the robot file'
+    yield reason, replace(robot, convention=other), data
+
+
+def _zeros(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
+    for i in _inner(robot):
+        for turn in QUARTERS_DEG:
+            reason = f"theta of joint {i + 1} were larger by {turn:+d}°; correct theta_deg"
+            yield reason, replace(robot, rows=_turned(robot.rows, {i: turn})), data
+
+
+def _signs(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
+    for i in range(n := len(robot.rows)):
+        reason = f"joint {i + 1} had the opposite sign; check its direction in the rows, or the sign of q{i + 1}"
+        yield reason, robot, replace(data, q=data.q * np.where(np.arange(n) == i, -1, 1))
+
+
+def _couplings(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
+    n = len(robot.rows)
+    if (robot.coupling != np.eye(n)).any():
+        yield "the joints were not coupled; take coupling out of the robot file", replace(robot, coupling=None), data
+        reason = "the joints were coupled with the other sign; change the signs of coupling off its diagonal"
+        yield reason, replace(robot, coupling=2 * np.diag(np.diag(robot.coupling)) - robot.coupling), data
+    elif n >= 3:
+        for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
+            coupling = np.eye(n)
+            coupling[2, 1] = sign
+            reason = f"joint 3 were coupled to joint 2 by {sign:+.0f}, {makers}; give coupling in the robot file"
+            yield reason, replace(robot, coupling=coupling), data
 
 
 def _inner(robot: Robot) -> list[int]:
@@ -353,9 +421,9 @@ def _exchanged(n: int, i: int, k: int) -> list[int]:
     return order
 
 
-def _guesses(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Iterator[tuple[str, Robot, Measurements]]:
+def _guesses(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
     """Yields frequent mistakes: in words, with the robot and the data as they would be without the mistake."""
-    turning, n = ~robot.prismatic, len(robot.rows)
+    turning = ~robot.prismatic
     q, angle = data.q, np.where(turning, 180 / np.pi, 1.0)
     scaled = {"distances": data.distances, "positions": data.positions}
     scaled = {name: 1e3 * values for name, values in scaled.items() if values is not None}
@@ -364,25 +432,12 @@ def _guesses(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> Itera
     yield "lengths are metres in columns of mm; call the columns x_m … or distance_m", robot, replace(data, **scaled)
     reason = "all joint values had the opposite sign; check the rows and the joints' directions"
     yield reason, robot, replace(data, q=np.where(turning, -q, q))
-    for i in range(n):
-        reason = f"joint {i + 1} had the opposite sign; check its direction in the rows, or the sign of q{i + 1}"
-        yield reason, robot, replace(data, q=q * np.where(np.arange(n) == i, -1, 1))
-    if (robot.coupling != np.eye(n)).any():
-        yield "the joints were not coupled; take coupling out of the robot file", replace(robot, coupling=None), data
-    elif n >= 3:
-        for sign, makers in ((1.0, "as Fanuc's are"), (-1.0, "as those of parallel linkages are")):
-            coupling = np.eye(n)
-            coupling[2, 1] = sign
-            reason = f"joint 3 were coupled to joint 2 by {sign:+.0f}, {makers}; give coupling in the robot file"
-            yield reason, replace(robot, coupling=coupling), data
+    yield from _signs(robot, data)
+    yield from _couplings(robot, data)
     if data.positions is None:
         return
     mirrored = replace(data, positions=data.positions * [1, 1, -1], rotations=None, covariance=None)
     yield "positions are mirrored (a left-handed frame); change the sign of one axis", robot, mirrored
-    error = np.linalg.norm(residuals(_placed(robot, data, tools)[0], observed(data, "position")), axis=1)
-    worst = int(error.argmax())
-    reason = f"line {data.lines[worst]} were not there, by far the worst; correct or remove it"
-    yield reason, robot, data[np.arange(len(data)) != worst]
     if data.rotations is not None:
         inverse = data.poses().inverse()
         reason = "poses are inverse (instrument seen from the tool); give the tool in the instrument's frame"

@@ -1,15 +1,16 @@
-"""F tests of what a model leaves unexplained: residuals that go with a joint's angle, gravity or place."""
+"""F tests of what a model leaves unexplained: residuals that go with a joint's angle, gravity, place or order."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Rigid, skew
 from stcal.robot.identification.adjustment import Weighting
-from stcal.robot.identification.residuals import WIDTH, Observed, State, as_seen, residuals, tips_of
+from stcal.robot.identification.residuals import WIDTH, Observed, State, as_seen, jacobian, residuals, tips_of
 from stcal.robot.identification.variances import GROSS
 from stcal.robot.kinematics.forward import joint_frames
+from stcal.row_order import Change, changes_along
 
 LEVEL = 0.01
 """Probability that anything is reported of a clean set; it is divided among the tests (Bonferroni)."""
@@ -44,6 +45,10 @@ class Finding:
         Share of the squared residuals (weighted as in the fit) that the effect explains.
     p : float
         Probability of such an effect by chance, times the number of tests.
+    line : int, optional
+        Line of the first row after a jump along the order of the rows; ``effect_mm`` and ``effect_rad`` are its size.
+    advice : str
+        What to do about it; empty for effects of the robot.
     """
 
     what: str
@@ -53,13 +58,16 @@ class Finding:
     effect_rad: float
     share: float
     p: float
+    line: int | None = None
+    advice: str = ""
 
     def sentence(self) -> str:
         """Returns the finding as a sentence."""
         size = f"{self.effect_mm:.2g} mm" + (f" and {np.degrees(self.effect_rad):.2g}°" if self.effect_rad else "")
-        size = f"amplitude {size}" if self.turns else f"{size} RMS"
+        size = size if self.advice else f"amplitude {size}" if self.turns else f"{size} RMS"
         chance = "p < 0.001" if self.p < 1e-3 else f"p = {self.p:.2g}"
-        return f"residuals go with {self.what}: {size}, {self.share:.0%} of their squares, {chance}"
+        advice = f"; {self.advice}" if self.advice else ""
+        return f"residuals go with {self.what}: {size}, {self.share:.0%} of their squares, {chance}{advice}"
 
 
 def left(
@@ -75,7 +83,9 @@ def left(
     Candidates of a revolute joint are its zero; its angle, once and twice a turn, as a motion of that joint (an error
     of its gear or encoder) and as one of the tool along the base's axes; the direction from which it came; and the
     torque about it of a load at the tool, where z of the base is up. A prismatic joint has its value. Candidates of
-    place are scale, linear terms, and the distance from the base's axis.
+    place are scale, linear terms, and the distance from the base's axis. Along the order of the rows, which is that of
+    the measurements, the instrument or the base may have moved, a target slipped, or a joint lost its zero: a jump at
+    any row, or a drift. These are tried with all rows, since half of them may seem to be errors.
 
     Parameters
     ----------
@@ -98,51 +108,116 @@ def left(
         The strongest first, at most three; None if the observations are too few to tell.
     """
     errors = residuals(state, seen)
-    good = np.ones(len(errors), bool) if weights is None else weights >= GROSS
-    root = np.sqrt(np.ones(len(errors)) if weights is None else weights)[:, None, None] * good[:, None, None]
-
-    def white(values: np.ndarray) -> np.ndarray:
-        return root * weighting.whiten(values, seen)
-
+    candidates, order = _candidates(state, seen, world_from_base), _order(state, seen)
     explained = np.concatenate([explained, _shared(state, seen)], axis=2)
-    fitted = _basis(_unit(white(explained).reshape(errors.size, -1)), SAME)
-    before = white(errors[..., None]).ravel()
-    remaining = before - fitted @ (fitted.T @ before)
-    freedom = int(good.sum()) * errors.shape[1] - fitted.shape[1]
-    if freedom < LEAST_FREEDOM:
-        return None
-
-    def effect(takes: np.ndarray, part: slice) -> float:
-        """Returns the RMS of ``takes``, rad or mm."""
-        unit, size, taken = (
-            float((each[..., part] ** 2).sum()) for each in (errors[good], by_row(before), by_row(takes))
-        )
-        return float(np.sqrt(unit / int(good.sum()) / max(size, 1e-300) * taken))
-
-    def by_row(flat: np.ndarray) -> np.ndarray:
-        return flat.reshape(errors.shape)
-
-    candidates = [
-        (each, white(each.motions).reshape(errors.size, -1)) for each in _candidates(state, seen, world_from_base)
-    ]
-    square = float(remaining @ remaining)
+    good = np.ones(len(errors), bool) if weights is None else weights >= GROSS
+    root = np.sqrt(np.ones(len(errors)) if weights is None else weights) * good
+    rest = _Rest.of(errors, explained, candidates, weighting, seen, root)
     findings: list[Finding] = []
     while len(findings) < MOST:
-        tests = [(each, test) for each, values in candidates if (test := _tested(remaining, fitted, values, freedom))]
-        if not tests:
+        moved = _moved_meanwhile(order, errors, explained, weighting, seen, len(candidates) + len(order))
+        found = rest.strongest(len(order))
+        if moved is not None and (found is None or moved.log_p < found[0].log_p):
+            findings.append(moved.finding)
+            explained = np.concatenate([explained, moved.motions], axis=2)
+            rest = _Rest.of(errors, explained, candidates, weighting, seen, moved.good.astype(float))
+        elif found is not None:
+            findings.append(found[0].finding)
+            explained = np.concatenate([explained, found[1].motions], axis=2)
+            rest = found[2]
+        else:
             break
-        candidate, best = min(tests, key=lambda each: each[1].p)
+    return tuple(findings) if findings or rest.freedom >= LEAST_FREEDOM else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """A finding with the logarithm of its probability by chance."""
+
+    finding: Finding
+    log_p: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rest:
+    """What is left of whitened residuals (N,) beside the fitted parameters.
+
+    ``errors`` : (r, w) as they are; ``before`` : (N,) whitened; ``fitted`` : (N, k) basis; ``remaining`` : (N,);
+    ``square`` : squared length of the remaining residuals at first; ``freedom`` : degrees of freedom; ``rows`` : number
+    of rows used; ``effects`` : candidates with their whitened motions (N, c).
+    """
+
+    errors: np.ndarray
+    before: np.ndarray
+    fitted: np.ndarray
+    remaining: np.ndarray
+    square: float
+    freedom: int
+    rows: int
+    effects: list[tuple["_Candidate", np.ndarray]]
+
+    @classmethod
+    def of(
+        cls,
+        errors: np.ndarray,
+        explained: np.ndarray,
+        candidates: list["_Candidate"],
+        weighting: Weighting,
+        seen: Observed,
+        root: np.ndarray,
+    ) -> "_Rest":
+        """Returns what is left of ``errors`` (r, w); ``root`` : (r,) roots of the weights, 0 for rows left out."""
+
+        def white(values: np.ndarray) -> np.ndarray:
+            return (root[:, None, None] * weighting.whiten(values, seen)).reshape(errors.size, -1)
+
+        good = root > 0
+        fitted = _basis(_unit(white(explained)), SAME)
+        before = white(errors[..., None]).ravel()
+        remaining = before - fitted @ (fitted.T @ before)
+        freedom = int(good.sum()) * errors.shape[1] - fitted.shape[1]
+        effects = [(each, white(each.motions)) for each in candidates] if freedom >= LEAST_FREEDOM else []
+        square = float(remaining @ remaining)
+        return cls(errors[good], before, fitted, remaining, square, freedom, int(good.sum()), effects)
+
+    def _effect(self, takes: np.ndarray, part: slice) -> float:
+        """Returns the RMS of ``takes`` (N,), rad or mm."""
+        width = self.errors.shape[1]
+        unit, size, taken = (
+            float((each.reshape(-1, width)[:, part] ** 2).sum()) for each in (self.errors, self.before, takes)
+        )
+        return float(np.sqrt(unit / self.rows / max(size, 1e-300) * taken))
+
+    def strongest(self, others: int) -> tuple[_Found, "_Candidate", "_Rest"] | None:
+        """Returns the candidate that explains most beyond chance, and the rest without it; ``others`` : number of
+        further tests."""
+        tried = [
+            (each, test)
+            for each, values in self.effects
+            if (test := _tested(self.remaining, self.fitted, values, self.freedom))
+        ]
+        if not tried:
+            return None
+        candidate, best = min(tried, key=lambda each: each[1].log_p)
         amplitude = np.sqrt(2) if candidate.turns else 1.0
-        mm = float(amplitude * effect(best.takes, slice(-3, None)))
-        rad = float(amplitude * effect(best.takes, slice(0, 3))) if errors.shape[1] == 6 else 0.0
-        share = float(best.takes @ best.takes) / max(square, 1e-300)
-        p = min(1.0, len(tests) * best.p)
-        if p > LEVEL or share < LEAST_SHARE or (mm < LEAST_MM and rad < LEAST_RAD):
-            break
-        findings.append(Finding(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p))
-        fitted, remaining = np.hstack([fitted, best.new]), remaining - best.takes
-        freedom -= best.new.shape[1]
-    return tuple(findings)
+        mm = float(amplitude * self._effect(best.takes, slice(-3, None)))
+        rad = float(amplitude * self._effect(best.takes, slice(0, 3))) if self.errors.shape[1] == 6 else 0.0
+        share = float(best.takes @ best.takes) / max(self.square, 1e-300)
+        log_p = best.log_p + float(np.log(len(tried) + others))
+        if log_p > np.log(LEVEL) or share < LEAST_SHARE or (mm < LEAST_MM and rad < LEAST_RAD):
+            return None
+        p = float(np.exp(min(log_p, 0.0)))
+        rest = replace(
+            self,
+            fitted=np.hstack([self.fitted, best.new]),
+            remaining=self.remaining - best.takes,
+            freedom=self.freedom - best.new.shape[1],
+        )
+        return (
+            _Found(Finding(candidate.what, candidate.joint, candidate.turns, mm, rad, share, p), log_p),
+            candidate,
+            rest,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,10 +232,10 @@ class _Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Test:
-    """An F test. ``takes`` : (N,) part of the residuals that the candidate explains; ``new`` : (N, c) basis of what it
-    adds."""
+    """An F test. ``log_p`` : logarithm of the probability by chance; ``takes`` : (N,) part of the residuals that the
+    candidate explains; ``new`` : (N, c) basis of what it adds."""
 
-    p: float
+    log_p: float
     takes: np.ndarray
     new: np.ndarray
 
@@ -176,7 +251,7 @@ def _tested(rest: np.ndarray, known: np.ndarray, values: np.ndarray, freedom: in
     takes = new @ (new.T @ rest)
     left_over = rest - takes
     ratio = float(takes @ takes) / c / max(float(left_over @ left_over) / (freedom - c), 1e-300)
-    return _Test(float(f_distribution.sf(ratio, c, freedom - c)), takes, new)
+    return _Test(float(f_distribution.logsf(ratio, c, freedom - c)), takes, new)
 
 
 def _unit(values: np.ndarray) -> np.ndarray:
@@ -202,6 +277,101 @@ def _shared(state: State, seen: Observed) -> np.ndarray:
     away = place[seen.first] - place[seen.second]
     away /= np.maximum(np.linalg.norm(away, axis=1), 1e-12)[:, None]
     return np.concatenate([away * (seen.second == row)[:, None] for row in starts], axis=1)[:, None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Order:
+    """What may have moved between two rows. ``motions`` : (r, w, c) as observed, rad over mm where c is 6; ``advice`` :
+    what to do about a jump."""
+
+    what: str
+    joint: int
+    motions: np.ndarray
+    advice: str
+
+
+DRIFTS = "let the instrument warm up, and measure a fixed point now and then"
+
+
+def _order(state: State, seen: Observed) -> list[_Order]:
+    """Returns what may move during the measurements; none for distances, which no frame enters."""
+    if seen.used == "distance":
+        return []
+    tip, data = tips_of(state, seen.data), seen.data
+    frame = np.zeros((len(tip), 6, 6))
+    frame[:, :3, :3] = frame[:, 3:, 3:] = np.eye(3)
+    frame[:, 3:, :3] = -skew(tip.translation - tip.translation.mean(0))
+    advice = "name these rows another station (column station), or measure again"
+    order = [_Order("the instrument or the robot's base elsewhere", 0, as_seen(state, seen, tip, frame), advice)]
+    for name in dict.fromkeys(data.targets):
+        on_flange = np.zeros((len(tip), 6, 6))
+        on_flange[:, :3, :3] = on_flange[:, 3:, 3:] = tip.rotation
+        on_flange *= np.array([each == name for each in data.targets])[:, None, None]
+        on_flange = on_flange if seen.kind == "pose" else on_flange[..., 3:]
+        what = f"target {name} elsewhere on its flange" if name else "the target elsewhere on its flange"
+        advice = "name these rows another target (column target), or measure again"
+        order.append(_Order(what, 0, as_seen(state, seen, tip, on_flange), advice))
+    turned, origins = joint_frames(state.chain, data.q, data.conditions)
+    carries = state.chain.carries(data.targets)
+    for i, (z, origin) in enumerate(zip(turned[..., 2], origins, strict=True)):
+        turn, shift = (0 * z, z) if state.chain.prismatic[i] else (z, np.cross(z, tip.translation - origin))
+        motions = np.hstack([turn, shift])[:, :, None] * carries[i, :, None, None]
+        what, advice = f"the zero of joint {i + 1} another one", "look whether it slipped, and measure again"
+        order.append(_Order(what, i + 1, as_seen(state, seen, tip, motions), advice))
+    return order
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Moved(_Found):
+    """A finding along the order of the rows, with its effects (r, w, c) for each motion, and a mask (r,) of rows that
+    are no errors."""
+
+    motions: np.ndarray
+    good: np.ndarray
+
+
+def _moved_meanwhile(
+    order: list[_Order], errors: np.ndarray, explained: np.ndarray, weighting: Weighting, seen: Observed, tests: int
+) -> _Moved | None:
+    """Returns the jump or the drift along the order of the rows; None if there is none beyond chance."""
+    white = weighting.whiten(errors, seen), weighting.whiten(explained, seen)
+    changes = changes_along(*white, [weighting.whiten(each.motions, seen) for each in order])
+    found = [(each, change) for each, change in zip(order, changes, strict=True) if change is not None]
+    if not found:
+        return None
+    moved, change = min(found, key=lambda each: each[1].log_p)
+    log_p = change.log_p + float(np.log(tests))
+    mm, rad = _size(moved, change)
+    if log_p > np.log(LEVEL) or change.share < LEAST_SHARE or (mm < LEAST_MM and rad < LEAST_RAD):
+        return None
+    lines = [int(seen.data.lines[row]) for row in seen.first]
+    if change.kind == "drift":
+        what, line, advice = f"the order of the rows, {moved.what} by and by", None, DRIFTS
+    else:
+        line, advice = lines[change.row], moved.advice
+        likely = f"{lines[change.first]} to {lines[change.last]}"
+        where = f"line {line}" + (f" ({likely} as likely)" if change.first < change.last else "")
+        what = f"the order of the rows, {moved.what} from {where} on"
+    p = float(np.exp(min(log_p, 0.0)))
+    finding = Finding(what, moved.joint, 0, mm, rad, change.share, p, line, advice)
+    return _Moved(finding, log_p, change.moves[:, None, None] * moved.motions, change.good)
+
+
+def moved_meanwhile(state: State, seen: Observed, share: float = 0.0) -> Finding | None:
+    """Returns the jump or the drift along the order of the rows beside all parameters of an arm, each row of the same
+    σ; None if there is none beyond chance, or it explains no more than ``share`` of the squares."""
+    order, one = _order(state, seen), Weighting(1.0, 1.0)
+    found = _moved_meanwhile(order, residuals(state, seen), jacobian(state, seen), one, seen, len(order))
+    return found.finding if found is not None and found.finding.share > share else None
+
+
+def _size(moved: _Order, change: Change) -> tuple[float, float]:
+    """Returns the size of a change, mm and rad: of frames at the middle of the places, of joints as seen."""
+    if moved.motions.shape[2] == 6:
+        return float(np.linalg.norm(change.motion[3:])), float(np.linalg.norm(change.motion[:3]))
+    as_measured = np.linalg.norm((moved.motions @ change.motion)[:, -3:], axis=1)
+    turned = float(abs(change.motion[0])) if moved.joint and len(change.motion) == 1 else 0.0
+    return float(np.sqrt((as_measured**2).mean())), turned
 
 
 def _candidates(state: State, seen: Observed, world_from_base: Rigid) -> list[_Candidate]:

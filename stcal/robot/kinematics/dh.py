@@ -165,7 +165,7 @@ def robot_between(
     Its first row begins at the chain's base, and its last row ends at the chain's flange, where a row without β can;
     otherwise the base and the tools absorb the remaining transform.
     """
-    bare = Robot(name, convention, (DHRow(0.0, 0.0, 0.0, 0.0),) * len(chain), joints, chain.coupling)
+    bare = Robot(name, convention, (DHRow(0.0, 0.0, 0.0, 0.0),) * len(chain), joints, chain.coupling, unusual_size=True)
     hints = list(bare.rows)
     robot = _with_ends(chain, tools, bare)
     for i in range(

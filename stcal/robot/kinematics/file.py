@@ -9,22 +9,23 @@ from pydantic import Field
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.files import save
-from stcal.io.toml import (
-    LEAST_LINK_MM,
-    MOST_LINK_MM,
-    Finite,
-    Length,
-    PoseEntry,
-    Sized,
-    Strict,
-    load_toml,
-    require_millimetres,
-    stated_unusual,
-    toml_string,
-)
+from stcal.io.files import require_written, save
+from stcal.io.table import LEVER_MM, pose_values
+from stcal.io.toml import Finite, PoseEntry, Sized, Strict, load_toml, toml_string
+from stcal.lengths import require_millimetres, stated_unusual
 from stcal.robot.kinematics.conditions import MOST_KG
-from stcal.robot.kinematics.model import Convention, DHRow, Elasticity, Joint, JointType, Robot, Tree
+from stcal.robot.kinematics.forward import carried_poses, fixed_values, joint_frames
+from stcal.robot.kinematics.model import (
+    Chain,
+    Convention,
+    DHRow,
+    Elasticity,
+    Joint,
+    JointType,
+    Robot,
+    Tree,
+    longest_link,
+)
 
 WHAT = "robot file"
 REMEDY = "`stcal robot init FILE` writes one to edit"
@@ -33,6 +34,9 @@ OTHERS = (".urdf", ".xml", ".yaml", ".yml", ".conf")
 POSE_KEYS = ("x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
 MOST_JOINTS = 60
 """Largest number of joints, that of a humanoid with hands."""
+WRITTEN_MM = 1e-5
+"""Largest difference of a place, mm, between a written robot file and what was reported: decimals of angles in degrees
+move a tool by 1e-11 mm, and a chain of 60 joints by less than 1e-7 mm."""
 LIMIT_DIGITS = 9
 """Decimals of joint limits, degrees or mm: 125°, not 125.00000000000001."""
 
@@ -135,7 +139,7 @@ def load_robot(path: str | Path) -> Robot:
         alpha, theta, beta = np.radians([j.alpha_deg, j.theta_deg, j.beta_deg]).tolist()
         rows.append(DHRow(j.a_mm, alpha, j.d_mm, theta, beta))
         joints.append(_joint(j, f"{where}: joint {i}"))
-    require_millimetres(_longest_link(rows), data.unusual_size, where)
+    require_millimetres(longest_link(rows), data.unusual_size, where)
     n = len(rows)
     coupling = np.eye(n).tolist() if data.coupling is None else data.coupling
     if len(coupling) != n or any(len(row) != n for row in coupling):
@@ -150,17 +154,7 @@ def load_robot(path: str | Path) -> Robot:
     elasticity = data.elasticity and data.elasticity.elasticity(n, f"{where}: elasticity")
     tree = _tree(data, where)
     arm = tuple(rows), tuple(joints), np.array(coupling)
-    return Robot(data.name, data.convention, *arm, base, tools, elasticity, tree)
-
-
-def _longest_link(rows: Sequence[DHRow]) -> list[Length]:
-    """Returns the longest ``a`` or ``d`` of the rows, and the longest ``a``, by which the unit of all is judged."""
-    longest = []
-    for names, least, most in (("ad", LEAST_LINK_MM, np.inf), ("a", 0.0, MOST_LINK_MM)):
-        links = [(i, name, getattr(row, name)) for i, row in enumerate(rows, 1) for name in names]
-        number, name, value = max(links, key=lambda link: abs(link[2]))
-        longest.append(Length(f"the longest link, {name}_mm of joint {number},", value, least, most))
-    return longest
+    return Robot(data.name, data.convention, *arm, base, tools, elasticity, tree, data.unusual_size)
 
 
 def _tree(data: _RobotFile, where: str) -> Tree | None:
@@ -232,7 +226,7 @@ def robot_toml(robot: Robot, comments: Sequence[str] = ()) -> str:
     lines += [
         f"name = {toml_string(robot.name)}",
         f'convention = "{robot.convention}"  # {_FORM[robot.convention]}; angles in degrees, lengths in mm',
-        *stated_unusual(_longest_link(robot.rows)),
+        *stated_unusual(longest_link(robot.rows)),
     ]
     if (robot.coupling != np.eye(len(robot.rows))).any():
         rows = ", ".join(_numbers(row) for row in robot.coupling)
@@ -314,6 +308,34 @@ def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> 
         It cannot be written.
     """
     save(Path(path), robot_toml(robot, comments))
+    require_robot_written(path, robot)
+
+
+def require_robot_written(path: str | Path, robot: Robot, chain: Chain | None = None) -> None:
+    """Read a written robot file again, and require that it turns about the axes of ``chain``, and leads its tools where
+    ``robot`` does.
+
+    ``chain`` : axes as identified; those of ``robot`` if None.
+
+    Raises
+    ------
+    ConvergenceError
+        The file cannot be read again, or an axis or a pose of a tool differs.
+    """
+    q = fixed_values(len(robot.rows))
+
+    def values(robot: Robot, chain: Chain) -> np.ndarray:
+        poses = [carried_poses(robot.chain(), q, [name] * len(q)) @ robot.tool(name) for name in robot.tools]
+        rotation, origin = joint_frames(chain, q)
+        along = rotation[..., 2]
+        lines = np.concatenate([LEVER_MM * along, np.cross(origin, along)])
+        return np.concatenate([lines.ravel(), *(pose_values(each).ravel() for each in poses)])
+
+    def again() -> np.ndarray:
+        found = load_robot(path)
+        return values(found, found.chain())
+
+    require_written(path, again, values(robot, chain or robot.chain()), WRITTEN_MM, "mm")
 
 
 _FORM = {

@@ -110,6 +110,11 @@ def carried_poses(chain: Chain, q: np.ndarray, targets: Sequence[str], condition
     return Poses(rotation, translation)
 
 
+def fixed_values(n: int) -> np.ndarray:
+    """Returns (8, n) pseudo-random joint values, rad or mm, the same every time."""
+    return np.random.default_rng(0).uniform(-3, 3, (8, n))
+
+
 def joint_frames(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> tuple[np.ndarray, np.ndarray]:
     """Returns world_from_joint of each joint before its own motion: rotations (n, m, 3, 3) and origins (n, m, 3)."""
     n, m = len(chain), len(q)

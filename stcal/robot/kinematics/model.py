@@ -1,5 +1,6 @@
 """The model of a robot arm: Denavit-Hartenberg rows, joints, elasticity, tools; and an example."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -7,8 +8,9 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import frozen, require_choices
 from stcal.geometry.rigid import Rigid
+from stcal.lengths import LEAST_LINK_MM, MOST_LINK_MM, Length, require_millimetres
 from stcal.robot.kinematics.conditions import loaded
 
 Convention = Literal["standard", "modified"]
@@ -35,6 +37,11 @@ class DHRow:
     beta : float
         Second twist, about y, rad; 0 in rows of Denavit and Hartenberg proper.
 
+    Raises
+    ------
+    InputError
+        A value that is no finite number.
+
     References
     ----------
     J. Denavit, R. S. Hartenberg, "A kinematic notation for lower-pair mechanisms based on matrices", J. Appl. Mech. 22,
@@ -47,6 +54,12 @@ class DHRow:
     d: float
     theta: float
     beta: float = 0.0
+
+    def __post_init__(self):
+        for name in ("a", "alpha", "d", "theta", "beta"):
+            value = getattr(self, name)
+            if isinstance(value, str) or not math.isfinite(value):
+                raise InputError("E-ROBOT-ROW", f"row: {name} is {value!r}; a finite number needed")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +74,30 @@ class Joint:
         Limits of the controller's value, rad or mm; unlimited where not given.
     fixed : mapping of str to str
         Dimensions of the joint's row, by the names of :class:`DHRow`, that no identification changes, and why.
+
+    Raises
+    ------
+    InputError
+        Another type, limits that are swapped or no numbers, a dimension that no row has.
     """
 
     type: JointType = "revolute"
     lower: float = -np.inf
     upper: float = np.inf
     fixed: Mapping[str, str] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self):
+        require_choices(self, "joint")
+        if not self.lower < self.upper:
+            raise InputError(
+                "E-ROBOT-LIMITS",
+                f"joint: lower {self.lower:g} is not below upper {self.upper:g}; swap or correct them",
+            )
+        unknown = [name for name in self.fixed if name not in DHRow.__dataclass_fields__]
+        if unknown:
+            raise InputError(
+                "E-ROBOT-FIXED", f"joint: fixed {unknown[0]}: no dimension of a row; use {', '.join(DHRow.__slots__)}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,12 +237,14 @@ class Robot:
         Rigid if not given.
     tree : Tree, optional
         Every joint is carried by the one before it, and tools by the last one, if not given.
+    unusual_size : bool
+        Whether links that no arm has in mm are meant as they stand.
 
     Raises
     ------
     InputError
-        Rows and joints differ in number, or there are none; a coupling matrix of another shape, or a singular one;
-        elasticity of another number of joints.
+        Another convention; rows and joints of other types, or of different numbers, or none; lengths that are not mm; a
+        coupling matrix of another shape, or a singular one; elasticity of another number of joints.
     """
 
     name: str
@@ -223,14 +256,23 @@ class Robot:
     tools: Mapping[str, Rigid] = field(default_factory=lambda: {"": Rigid()})
     elasticity: Elasticity | None = None
     tree: Tree | None = None
+    unusual_size: bool = False
 
     def __post_init__(self):
+        require_choices(self, f"robot {self.name}")
+        for kind, parts in ((DHRow, self.rows), (Joint, self.joints), (Rigid, self.tools.values())):
+            for part in parts:
+                if not isinstance(part, kind):
+                    raise InputError(
+                        "E-ROBOT-ENTRIES", f"robot {self.name}: {part!r} is no {kind.__name__}; one of that type needed"
+                    )
         n = len(self.rows)
         if len(self.joints) != n or n == 0:
             raise InputError(
                 "E-ROBOT-ENTRIES",
                 f"robot {self.name}: {n} rows and {len(self.joints)} joints, one row for each joint needed",
             )
+        require_millimetres(longest_link(self.rows), self.unusual_size, f"robot {self.name}")
         coupling = np.eye(n) if self.coupling is None else self.coupling  # None: not given
         object.__setattr__(self, "coupling", frozen(coupling, (n, n), f"robot {self.name}: coupling"))
         if np.linalg.cond(self.coupling) > 1e6:
@@ -301,6 +343,16 @@ class Robot:
         """The joint, from 0, that carries another (−1: the base), and where the other's row begins behind its row."""
         found = None if self.tree is None else self.tree.mounts.get(joint)
         return found or (joint - 1, Rigid())
+
+
+def longest_link(rows: Sequence[DHRow]) -> list[Length]:
+    """Returns the longest ``a`` or ``d`` of the rows, and the longest ``a``, by which the unit of all is judged."""
+    longest = []
+    for names, least, most in (("ad", LEAST_LINK_MM, np.inf), ("a", 0.0, MOST_LINK_MM)):
+        links = [(i, name, getattr(row, name)) for i, row in enumerate(rows, 1) for name in names]
+        number, name, value = max(links, key=lambda link: abs(link[2]))
+        longest.append(Length(f"the longest link, {name}_mm of joint {number},", value, least, most))
+    return longest
 
 
 @dataclass(frozen=True, slots=True, eq=False)

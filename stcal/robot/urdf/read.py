@@ -11,9 +11,9 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
-from stcal.io.toml import MOST_LINK_MM
+from stcal.lengths import MOST_LINK_MM
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain
-from stcal.robot.kinematics.forward import carried_poses, flange_poses, forward
+from stcal.robot.kinematics.forward import carried_poses, fixed_values, flange_poses, forward
 from stcal.robot.kinematics.model import Chain, Convention, DHRow, Grown, Joint, JointType, Robot, Tree
 
 WHAT = "URDF"
@@ -153,11 +153,6 @@ def read_urdf(
     notes = tuple(f"joint {j.name} has no limits" for j in moving if j.limit is None and j.kind != "continuous")
     robot = replace(robot, world_from_base=world @ robot.world_from_base)
     return UrdfRobot(robot, tuple(j.name for j in moving), start, ", ".join(ends.values()), notes)
-
-
-def fixed_values(n: int) -> np.ndarray:
-    """Returns (8, n) pseudo-random joint values, rad or mm, the same every time."""
-    return np.random.default_rng(0).uniform(-3, 3, (8, n))
 
 
 def require_near(found: Poses, wanted: Poses) -> None:

@@ -16,9 +16,9 @@ from stcal.io.plain_yaml import load_yaml
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
 from stcal.io.toml import Strict, validated
 from stcal.robot.kinematics.dh import robot_between
-from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.forward import fixed_values, forward
 from stcal.robot.kinematics.model import Convention, DHRow, Joint, Robot
-from stcal.robot.urdf.read import UrdfJoint, fixed_values, require_near, robot_of
+from stcal.robot.urdf.read import UrdfJoint, require_near, robot_of
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 JOINTS = 6

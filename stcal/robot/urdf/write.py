@@ -1,26 +1,29 @@
 """The text of a URDF, and that it leads where the robot does."""
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.files import SETTINGS_BYTES, read_bytes, require_written
 from stcal.io.poses.controllers import METRE_MM, roll_pitch_yaw
-from stcal.robot.kinematics.forward import flange_poses, forward
+from stcal.io.table import pose_values
+from stcal.robot.kinematics.forward import fixed_values, flange_poses, forward
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.urdf.read import (
     BASE,
     FLANGE,
+    SAME_MM,
     UNLIMITED,
     WHAT,
     WORLD,
-    fixed_values,
     joint_name,
     link_of,
     read_urdf,
-    require_near,
 )
 
 
@@ -115,26 +118,31 @@ def _fixed(root: ElementTree.Element, parent: str, child: str, pose: Rigid) -> N
     _joint(root, f"{parent}_to_{child}", "fixed", parent, child, pose)
 
 
-def require_same_poses(robot: Robot, text: str) -> None:
-    """Refuse a text of :func:`robot_urdf` that does not lead every tool where the robot does.
+def require_urdf_written(path: str | Path, robot: Robot) -> None:
+    """Read a written URDF again, and require that it leads every tool where the robot does.
 
     Raises
     ------
-    StcalError
-        By how much it does not.
+    ConvergenceError
+        The file cannot be read again, or the poses of a tool differ.
     """
     q = fixed_values(len(robot.rows))
-    if robot.tree is not None:
-        links = [link_of(name) for name in robot.tools]
-        read = read_urdf(text.encode(), WHAT, BASE, links, robot.convention)
-        found, names = read.robot, [joint_name(i) for i in range(len(robot.rows))]
+
+    def again() -> np.ndarray:
+        content = read_bytes(path, SETTINGS_BYTES)
+        if robot.tree is None:
+            found = read_urdf(content, WHAT, convention=robot.convention).robot
+            chain, kinematic = found.chain(), q @ robot.coupling.T
+            return tips(lambda name: flange_poses(chain, kinematic) @ found.tool(name))
+        read = read_urdf(content, WHAT, BASE, [link_of(name) for name in robot.tools], robot.convention)
+        names = [joint_name(i) for i in range(len(robot.rows))]
         kinematic = (q @ robot.coupling.T)[:, [names.index(name) for name in read.joints]]
-        for name in robot.tools:
-            require_near(found.world_from_base @ forward(found, kinematic, link_of(name)), forward(robot, q, name))
-        return
-    found = read_urdf(text.encode(), WHAT, convention=robot.convention).robot
-    for name, tool in robot.tools.items():
-        chain, other = robot.chain(), found.chain()
-        wanted = flange_poses(replace(chain, last_from_flange=chain.last_from_flange @ tool), q)
-        end = other.last_from_flange @ found.tool(name)
-        require_near(flange_poses(replace(other, last_from_flange=end), q @ robot.coupling.T), wanted)
+        return tips(lambda name: read.robot.world_from_base @ forward(read.robot, kinematic, link_of(name)))
+
+    def tips(pose: Callable[[str], Poses]) -> np.ndarray:
+        return np.array([pose_values(pose(name)) for name in robot.tools])
+
+    base = robot.world_from_base if robot.tree is None else Rigid()  # a tree is read from its base
+    wanted = tips(lambda name: base @ forward(robot, q, name))
+    far = max(SAME_MM, 1e-12 * float(np.abs(wanted).max()))
+    require_written(path, again, wanted, far, "mm")

@@ -3,12 +3,16 @@
 import csv
 import io
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
+from stcal.io.files import require_written
+from stcal.io.table import pose_values, read_table
 from stcal.parallel import one_thread
+from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.inverse import (
     LIMIT,
     ORIENTATION,
@@ -367,6 +371,24 @@ def compensated_csv(result: Compensated, robot: Robot) -> str:
             row += [f"{result.before_mm[i]:.6f}", f"{np.degrees(result.before_rad[i]):.6f}"] if usable else ["", ""]
         writer.writerow(row)
     return stream.getvalue()
+
+
+def require_compensated_written(path: str | Path, result: Compensated, robot: Robot) -> None:
+    """Read a written table of compensated joint values again, and require that ``robot`` reaches the poses with them.
+
+    Compared are the errors at the commanded poses, of rows that are reached.
+    """
+    usable = result.found.usable
+    targets = result.targets[np.flatnonzero(usable)]
+
+    def again() -> np.ndarray:
+        table, q = read_table(path, "joint values"), np.full(result.found.q.shape, np.nan)
+        for i, column in enumerate(joint_columns(robot)):
+            cells = np.array(table.text(column), object)[usable].astype(float)
+            q[usable, i] = cells if robot.prismatic[i] else np.radians(cells)
+        return pose_values(poses_of(robot, targets, q[usable]))
+
+    require_written(path, again, pose_values(poses_of(robot, targets, result.found.q[usable])), WRITTEN_MM, "mm")
 
 
 def compensation_file(result: Compensated, robot: Robot) -> CompensationFile:

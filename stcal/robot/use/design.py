@@ -7,14 +7,16 @@ inverse information matrix by the few rows of a pose (Sherman, Morrison & Woodbu
 import csv
 import io
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Array, freeze
+from stcal.geometry.arrays import Array, freeze, require_choices
 from stcal.geometry.rigid import Poses
-from stcal.io.table import POSE, pose_cells
+from stcal.io.files import require_written
+from stcal.io.table import POSE, pose_cells, pose_values, read_table, require_pose_table_written
 from stcal.parallel import one_thread
 from stcal.robot.identification.observability import (
     SEEN,
@@ -22,7 +24,9 @@ from stcal.robot.identification.observability import (
     identification_jacobian,
     parameter_scale,
 )
+from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.measurements import joint_values
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import joint_cells, joint_columns
 from stcal.robot.use.files import DesignFile
@@ -103,7 +107,7 @@ class DesignOptions:
     Raises
     ------
     InputError
-        No more candidates than poses, a σ that is not positive, or a box that is empty.
+        A choice that does not exist, no more candidates than poses, a σ that is not positive, or a box that is empty.
     """
 
     count: int = 40
@@ -116,6 +120,7 @@ class DesignOptions:
     tool: str = ""
 
     def __post_init__(self):
+        require_choices(self, "design")
         if self.count < 1 or self.candidates <= self.count:
             raise InputError(
                 "E-DESIGN-OPTIONS",
@@ -313,6 +318,16 @@ def design_csv(result: PoseDesign, robot: Robot) -> str:
     for i, (q, pose) in enumerate(zip(result.q, result.poses, strict=True), 1):
         writer.writerow([i, *joint_cells(robot, q), *pose_cells(pose)])
     return stream.getvalue()
+
+
+def require_design_written(path: str | Path, result: PoseDesign, robot: Robot, tool: str = "") -> None:
+    """Read a written table of poses again, and require them, and that its joint values lead the robot to them."""
+    require_pose_table_written(path, {"nominal_": result.poses})
+
+    def again() -> np.ndarray:
+        return pose_values(forward(robot, joint_values(read_table(path, "poses"), robot), tool))
+
+    require_written(path, again, pose_values(result.poses), WRITTEN_MM, "mm")
 
 
 def design_file(result: PoseDesign) -> DesignFile:

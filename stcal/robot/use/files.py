@@ -29,11 +29,11 @@ class EvaluatedRobot(Part):
     left: list[FoundLeft] | None = Field(
         description="what the residuals go with, the strongest first: `what` in words, `joint` and `turns` (0: none), "
         "`effect_mm`, `effect_rad` (amplitude where it turns, else RMS), `share` of their squares, `p` times the "
-        "number of tests; null where rows are too few to tell"
+        "number of tests, `line` after a jump; null where rows are too few to tell"
     )
     beyond: list[FoundLeft] | None = Field(
-        description="the same (`what`, `joint`, `turns`, `effect_mm`, `effect_rad`, `share`, `p`) of what parameters "
-        "identified from these rows would leave"
+        description="the same (`what`, `joint`, `turns`, `effect_mm`, `effect_rad`, `share`, `p`, `line`) of what "
+        "parameters identified from these rows would leave"
     )
     residuals: list[Vector] = Field(
         description="of each row: measured minus modelled position, mm, in the axes of the robot's base; or of the "

@@ -10,7 +10,9 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
+from stcal.io.files import require_written
 from stcal.io.quaternions import COLUMNS
+from stcal.io.table import read_table
 from stcal.report.document import Block, Document, Section, Table, alarms, bullets, page_only, plot, plots, subheading
 from stcal.report.figure import COLOURS, INK, SMALL, calm, locator, new_figure, plane
 from stcal.report.text import NONE, number
@@ -18,6 +20,7 @@ from stcal.robot.identification.drawings import Drawn, residual_plots
 from stcal.robot.identification.observability import MEANING
 from stcal.robot.identification.report import placed_parts, placed_table
 from stcal.robot.identification.residuals import tips_of
+from stcal.robot.kinematics.file import WRITTEN_MM
 from stcal.robot.kinematics.inverse import Inverse
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import Compensated, compensated_summary, joint_cells, joint_columns
@@ -411,6 +414,18 @@ def evaluated_csv(result: Evaluation) -> str:
             cells += _cells(np.degrees(each.rotation_rad[[row]])) if turned else []
         writer.writerow(cells)
     return stream.getvalue()
+
+
+def require_evaluated_written(path: str | Path, result: Evaluation) -> None:
+    """Read a written table of residuals again, and require the errors of each robot."""
+
+    def again() -> np.ndarray:
+        table = read_table(path, "residuals")
+        names = [column for column in table.columns if column.endswith("_error_mm")]
+        return np.array([[float(cell) for cell in table.text(name)] for name in names])[:, result.seen.first]
+
+    reported = np.array([np.linalg.norm(each.residuals[:, -3:], axis=1) for each in result.robots])
+    require_written(path, again, reported, WRITTEN_MM, "mm")
 
 
 def _cells(values) -> list[str]:

@@ -51,7 +51,7 @@ class Calibration:
     ``models`` : models that the result rests on, mm, target frame, without groups that are not linked to it;
     ``camera`` : refined camera if it was refined, else the given one; ``notes`` : faces without a frame and the
     reasons, and an adjustment that did not settle; ``rim_mm`` : heights of the rims behind which circles lie, if the
-    result is of the luminous surface, empty if it is of what is seen.
+    result is of the luminous surface, empty if it is of what is seen; ``rim_sigma_mm`` : σ of all of them together.
     """
 
     target: CalibratedTarget
@@ -63,6 +63,7 @@ class Calibration:
     camera: Camera
     notes: tuple[str, ...]
     rim_mm: Mapping[CircleLabel, float] = field(default_factory=dict)
+    rim_sigma_mm: float = 0.0
 
 
 def calibrate(
@@ -173,15 +174,24 @@ def on_luminous_surface(
         raise InputError("E-RIM-SOLVE", "rims are corrected by the joint adjustment alone; use --solve joint")
     outward = _outward(joint, calibration.target.target_from_face)
     height = np.array([rim_mm.get(label, 0.0) for label in joint.labels])
-    common = np.where(height != 0, -0.5, 0.0)[:, None] * outward
     moved = replace(
         joint,
         xyz_model=joint.xyz_model - 0.5 * height[:, None] * outward,
-        covariance_mm2=joint.covariance_mm2 + sigma_mm**2 * np.outer(common, common),
+        covariance_mm2=joint.covariance_mm2
+        + rim_covariance_mm2(joint, calibration.target.target_from_face, rim_mm, sigma_mm),
     )
     surface = calibrated_target(moved, calibration.target, target, frame)
     models = tuple(m.moved(surface.target_from_group[m.group]) for m in joint.models)
-    return replace(calibration, target=surface, models=models, rim_mm=dict(rim_mm))
+    return replace(calibration, target=surface, models=models, rim_mm=dict(rim_mm), rim_sigma_mm=sigma_mm)
+
+
+def rim_covariance_mm2(
+    joint: JointResult, target_from_face: Mapping[str, Rigid], rim_mm: Mapping[CircleLabel, float], sigma_mm: float
+) -> np.ndarray:
+    """Returns the covariance (3c, 3c) of the circles from σ of the heights of all rims together."""
+    behind = np.array([rim_mm.get(label, 0.0) != 0 for label in joint.labels])
+    common = (-0.5 * sigma_mm * behind[:, None] * _outward(joint, target_from_face)).ravel()
+    return np.outer(common, common)
 
 
 def _outward(joint: JointResult, target_from_face: Mapping[str, Rigid]) -> np.ndarray:
@@ -263,12 +273,13 @@ def _adjust_all(
     covariances = [m.covariance_px2 for m in models]
     rounds = _joint_rounds(options, prior)
     prior = prior if options.refine_camera else None
-    current = camera
+    current, shape_factors = camera, (1.0, 1.0)
     for _ in range(rounds):
         if options.eccentricity:
             models = [replace(m, shift_px=eccentricity_px(m, current, radius, 1.0)) for m in models]
         models = [with_sigma(replace(m, covariance_px2=c), factors) for m, c in zip(models, covariances, strict=True)]
-        result = adjust_jointly(models, board, camera, options.flatness_mm, prior, current)
+        result = adjust_jointly(models, board, camera, options.flatness_mm, prior, current, shape_factors)
+        shape_factors = result.print_factor, result.bend_factor
         models, current = list(result.models), result.camera
         step(None)
         if prior is not None:

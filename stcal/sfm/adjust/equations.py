@@ -1,19 +1,22 @@
 """Normal equations: of one group, reduced to the unknowns that all groups share, and of the joint adjustment."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stcal.design import BoardDesign
+from stcal.design import BoardDesign, faces_of_known_shape, known_distances
+from stcal.errors import DegenerateError
+from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import perturbed
-from stcal.geometry.normal_equations import Reduction, blocks_of, free_motions, reduce
+from stcal.geometry.normal_equations import Reduction, blocks_of, free_motions, generalised_inverse, reduce
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import huber_cost, huber_weights
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.refine import moved_poses, projection_jacobians
+from stcal.sfm.adjust.scale import known_points
 from stcal.sfm.data.model import GroupModel, MetricModel
 
 
@@ -212,7 +215,7 @@ def _with_board(block: Block, shared: Shared, normal: np.ndarray, right: np.ndar
     full[dot_index, pose] += weight * by_pose
     full[pose, dot_index.ravel()] = full[dot_index.ravel(), pose].T
     flat = by_pose.reshape(3 * d, 6)
-    full[pose, pose] += weight * flat.T @ flat
+    full[pose, pose] += weight * flat.T @ flat if d else np.eye(6)  # without a board its pose stays
     full_right[pose] -= weight * gap.ravel() @ flat
     if s:
         place = size + 6 + np.arange(s).reshape(d, 3)
@@ -265,7 +268,10 @@ class Places:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setting:
-    """Constants of one minimisation; ``flatness_mm`` is infinite if it is unknown."""
+    """Constants of one minimisation; ``flatness_mm`` is infinite if it is unknown.
+
+    ``print_factor``, ``bend_factor`` : factors on the stated σ of faces of known shape, in their plane and off it.
+    """
 
     labels: tuple[CircleLabel, ...]
     board: BoardDesign
@@ -274,6 +280,8 @@ class Setting:
     given: Camera
     prior: np.ndarray
     huber: float
+    print_factor: float = 1.0
+    bend_factor: float = 1.0
 
     def places(self, shared: Shared) -> "Places":
         """Returns the places of the shared unknowns."""
@@ -389,17 +397,31 @@ def add_knowledge(
         if right is not None:
             distance = across @ (shared.xyz_model[members] @ normal_model)
             right[place] -= flat.T @ distance / setting.flatness_mm**2
+    for shape in shapes(shared, setting):
+        place = (3 * shape.members[:, None] + np.arange(3)).ravel()
+        normal[np.ix_(place, place)] += shape.normal()
+        if right is not None:
+            right[place] -= shape.slope()
+    for members, along, off, sigma in bars(shared, setting):
+        place = (3 * members[:, None] + np.arange(3)).ravel()
+        row = np.concatenate([along, -along]) / sigma
+        normal[np.ix_(place, place)] += np.outer(row, row)
+        if right is not None:
+            right[place] -= row * off / sigma
 
 
 def planes(shared: Shared, setting: Setting):
     """Yields the circles of each face, the projector from heights to distances from the best plane, and its normal.
 
-    Faces with three circles or fewer have no such distances and are left out.
+    Faces with three circles or fewer have no such distances and are left out, as are faces of known shape.
     """
     if not np.isfinite(setting.flatness_mm):
         return
+    known = {face.id for face in faces_of_known_shape(setting.board)}
     faces: dict[str, list[int]] = {}
     for i, label in enumerate(setting.labels):
+        if label.face in known:
+            continue
         faces.setdefault(label.face, []).append(i)
     for indices in faces.values():
         if len(indices) > 3:
@@ -409,6 +431,124 @@ def planes(shared: Shared, setting: Setting):
             base = np.linalg.svd(np.eye(3) - np.outer(normal, normal))[0][:, :2]
             design = np.column_stack([np.ones(len(indices)), (xyz - xyz.mean(0)) @ base])
             yield members, np.eye(len(indices)) - design @ np.linalg.pinv(design), normal
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shape:
+    """The n points of a face of known shape against its design, laid over them with their weights.
+
+    ``members`` : (n,) places among the circles; ``rotation`` : (3, 3) model_from_face; ``off_mm`` : (n, 3) points minus
+    design, face frame; ``weight`` : (n, 3) 1/σ²; ``by_pose`` : (3n, 7) derivative of ``off_mm`` by the pose and the
+    relative size of the print; ``size`` : that size less 1, of weight ``size_weight``, infinite if it is exact.
+    """
+
+    members: np.ndarray
+    rotation: np.ndarray
+    off_mm: np.ndarray
+    weight: np.ndarray
+    by_pose: np.ndarray
+    size: float
+    size_weight: float
+
+    @classmethod
+    def of(
+        cls, members: np.ndarray, design: np.ndarray, xyz: np.ndarray, weight: np.ndarray, size_sigma: float
+    ) -> "Shape":
+        """Lays the design (n, 3) over points (n, 3); ``size_sigma`` : relative σ of its size."""
+        pose, size = align_rigid(xyz, design), 0.0
+        size_weight = size_sigma**-2 if size_sigma else np.inf
+        free = 7 if size_sigma else 6
+        for _ in range(SHAPE_STEPS):
+            in_face = (xyz - pose.translation) @ pose.rotation
+            off = in_face - (1 + size) * design
+            unit = np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
+            by_pose = np.concatenate([skew(in_face), -unit, -design[:, :, None]], axis=2).reshape(-1, 7)[:, :free]
+            weighted = weight.reshape(-1, 1) * by_pose
+            normal, right = by_pose.T @ weighted, weighted.T @ off.ravel()
+            if size_sigma:
+                normal[6, 6] += size_weight
+                right[6] += size_weight * size
+            step = -np.linalg.lstsq(normal, right, rcond=1e-12)[0]
+            if np.abs(step).max() < SHAPE_SETTLED:
+                break
+            pose, size = pose @ Rigid.exp(step[:6]), size + float(step[6]) if size_sigma else 0.0
+        return cls(members, pose.rotation, off, weight, by_pose, size, size_weight)
+
+    def cost(self) -> float:
+        """Returns the squared deviations over σ²."""
+        own = self.size_weight * self.size**2 if np.isfinite(self.size_weight) else 0.0
+        return float((self.weight * self.off_mm**2).sum()) + own
+
+    def _to_pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the derivative (6, 3n) of the pose by the deviations, and the covariance (6, 6) of the pose; a row
+        more where the size is free."""
+        weighted = self.weight.reshape(-1, 1) * self.by_pose
+        normal = self.by_pose.T @ weighted
+        if np.isfinite(self.size_weight):
+            normal[6, 6] += self.size_weight
+        inverse = generalised_inverse(normal)
+        return inverse @ weighted.T, inverse
+
+    def slope(self) -> np.ndarray:
+        """Returns half the gradient of the cost by the points, (3n,), model frame."""
+        return ((self.weight * self.off_mm) @ self.rotation.T).ravel()
+
+    def normal(self) -> np.ndarray:
+        """Returns the normal matrix (3n, 3n) over the points, model frame, with the pose eliminated."""
+        n = len(self.members)
+        weighted = self.weight.reshape(-1, 1) * self.by_pose
+        inner = np.diag(self.weight.ravel()) - weighted @ self._to_pose()[0]
+        blocks = inner.reshape(n, 3, n, 3)
+        return np.einsum("ai,minj,bj->manb", self.rotation, blocks, self.rotation, optimize=True).reshape(3 * n, 3 * n)
+
+    def leverage(self, covariance_mm2: np.ndarray) -> np.ndarray:
+        """Returns what the adjustment takes of each deviation's variance, (n, 3), of 1, from the covariance (3n, 3n)
+        of the points."""
+        n = len(self.members)
+        turned = covariance_mm2.reshape(n, 3, n, 3)
+        turned = np.einsum("ai,manb,bj->minj", self.rotation, turned, self.rotation, optimize=True)
+        turned = turned.reshape(3 * n, 3 * n)
+        to_pose, of_pose = self._to_pose()
+        left = np.eye(3 * n) - self.by_pose @ to_pose
+        variance = np.einsum("ij,jk,ik->i", left, turned, left, optimize=True)
+        variance = variance + np.einsum("ij,jk,ik->i", self.by_pose, of_pose, self.by_pose)
+        return self.weight * variance.reshape(n, 3)
+
+
+SHAPE_STEPS, SHAPE_SETTLED = 20, 1e-13
+"""Most steps of a design that is laid over points, and the step (rad, mm) at which they end."""
+
+
+def shapes(shared: Shared, setting: Setting) -> Iterator[Shape]:
+    """Yields the faces of known shape, with their stated σ in the plane and the flatness off it.
+
+    None of a state that a step has sent to infinity, whose images have no finite cost either.
+    """
+    if not np.isfinite(shared.xyz_model).all():
+        return
+    off, known = setting.bend_factor * setting.flatness_mm, known_points(setting.labels, setting.board)
+    # What the sizes of all prints have in common counts once: each alone may be off by more.
+    alone = float(np.sqrt(len(known)))
+    for face, members in known:
+        design = face.places_mm(setting.labels[i].circle for i in members)
+        within = setting.print_factor * (face.sigma_mm or 1.0)
+        weight = np.tile([within**-2, within**-2, 0.0 if np.isinf(off) else off**-2], (len(members), 1))
+        try:
+            yield Shape.of(members, design, shared.xyz_model[members], weight, alone * face.size_sigma)
+        except DegenerateError:  # corners on a line
+            continue
+
+
+def bars(shared: Shared, setting: Setting) -> Iterator[tuple[np.ndarray, np.ndarray, float, float]]:
+    """Yields the known distances: places of both points, the direction from the second to the first, how much longer
+    than stated it is, and σ, mm."""
+    place = {label: i for i, label in enumerate(setting.labels)}
+    for known in known_distances(setting.board):
+        if known.first in place and known.second in place:
+            members = np.array([place[known.first], place[known.second]])
+            apart = shared.xyz_model[members[0]] - shared.xyz_model[members[1]]
+            length = float(np.linalg.norm(apart))
+            yield members, apart / length, length - known.mm, known.sigma_mm
 
 
 def _away(shared: Shared, setting: Setting) -> np.ndarray:
@@ -425,7 +565,8 @@ def cost_of(blocks: Sequence[Block], shared: Shared, setting: Setting) -> float:
         cost += float(away @ setting.prior @ away)
     for members, across, normal in planes(shared, setting):
         cost += float(((across @ (shared.xyz_model[members] @ normal)) ** 2).sum()) / setting.flatness_mm**2
-    return cost
+    cost += sum(shape.cost() for shape in shapes(shared, setting))
+    return cost + sum((off / sigma) ** 2 for _, _, off, sigma in bars(shared, setting))
 
 
 def free_directions(count: int, shared: Shared) -> np.ndarray:
@@ -504,7 +645,7 @@ def _add_group(block: Block, shared: Shared, setting: Setting, start: int, norma
     turned = block.expected_dots(shared) @ rotation.T
     by_board = np.concatenate([skew(turned), -np.broadcast_to(np.eye(3), (d, 3, 3))], axis=2)
     pose = slice(6 * m, 6 * m + 6)
-    local[pose, pose] += weight * by_board.reshape(3 * d, 6).T @ by_board.reshape(3 * d, 6)
+    local[pose, pose] += weight * by_board.reshape(3 * d, 6).T @ by_board.reshape(3 * d, 6) if d else np.eye(6)
     inner, outer = points[block.dots] + weight * np.eye(3), cross[block.dots]
     outer[:, :, pose] += weight * by_board
     from_outer = np.linalg.solve(inner, outer)

@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DegenerateError
-from stcal.geometry.align import align_rigid
+from stcal.geometry.align import align_rigid, best_rotations
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_planes
@@ -18,6 +18,8 @@ from stcal.sfm.adjust.refine import projection_jacobians
 from stcal.sfm.data.model import MetricModel
 
 FrameKind = Literal["plane", "three-point"]
+MIN_KNOWN = 3
+"""Smallest number of points of a face of known shape that place it."""
 MIN_PLACING = 4
 """Smallest number of mapped circles that can place the others of their face. Three determine the placement, a fourth
 shows how good it is."""
@@ -47,7 +49,12 @@ class FaceInGroup:
 
 
 def missing_frame_circles(face: FaceDesign, mapped: Collection[str]) -> tuple[str, ...]:
-    """Returns the ids of the circles that define the frame of the face but are not mapped."""
+    """Returns the ids of the circles that define the frame of the face but are not mapped.
+
+    None are missing of a face of known shape, whose frame is that of its whole design.
+    """
+    if face.sigma_mm is not None:
+        return ()
     return tuple(circle for circle in (face.origin, face.x, face.y) if circle not in mapped)
 
 
@@ -136,8 +143,11 @@ def face_frames(
 ) -> Poses:
     """Returns the result of :func:`face_frame` for k sets of centres, (k, n, 3), of the same ``circles``.
 
-    The circles of the frame must be among them.
+    The circles of the frame must be among them. The frame of a face of known shape is that of the design, laid over
+    all of its points by least squares.
     """
+    if face.sigma_mm is not None:
+        return _fitted(face, circles, xyz)
     corners = np.stack([xyz[:, list(circles).index(circle)] for circle in (face.origin, face.x, face.y)])
     if kind == "plane":
         normal, offset, _ = fit_planes(xyz, towards)
@@ -152,6 +162,20 @@ def face_frames(
         )
     axis_y = across / length
     return Poses(np.stack([axis_x, axis_y, np.cross(axis_x, axis_y)], axis=2), origin)
+
+
+def _fitted(face: FaceDesign, circles: Sequence[str], xyz: np.ndarray) -> Poses:
+    design = face.places_mm(circles)
+    spread = np.linalg.svd(design - design.mean(0), compute_uv=False) if len(design) >= MIN_KNOWN else np.zeros(2)
+    if spread[1] <= 1e-6 * spread[0]:
+        raise DegenerateError(
+            "E-FACE-FRAME-CIRCLES",
+            f"face {face.id}: {len(design)} of its corners mapped, {MIN_KNOWN} off one line needed; add views that "
+            "show it",
+        )
+    middle = xyz.mean(1)
+    rotation, _ = best_rotations(np.einsum("kni,nj->kij", xyz - middle[:, None], design - design.mean(0)))
+    return Poses(rotation, middle - rotation @ design.mean(0))
 
 
 def faces_of_group(

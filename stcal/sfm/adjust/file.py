@@ -1,6 +1,7 @@
 """``faces.json``: the calibrated target as a file."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -10,6 +11,7 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.covariance import Rows, require_covariance
+from stcal.io.files import require_written
 from stcal.io.json import (
     ByFace,
     ByLabel,
@@ -22,7 +24,9 @@ from stcal.io.json import (
     Vector,
     Vector3,
     mistake,
+    read_result,
 )
+from stcal.io.table import POSE_MM, pose_values
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.faces import FrameKind
@@ -159,3 +163,16 @@ class FacesFile(ResultFile):
     def poses(self) -> dict[str, Rigid]:
         """Returns target_from_face of every face, by face."""
         return {face: Rigid.from_matrix(matrix) for face, matrix in self.target_from_face.items()}
+
+
+def require_faces_written(path: str | Path, target: CalibratedTarget) -> None:
+    """Read a written ``faces.json`` again, and require the faces and circles that were reported."""
+
+    def values(poses: Mapping[str, Rigid], circles: Iterable[np.ndarray]) -> np.ndarray:
+        return np.concatenate([pose_values(poses).ravel(), np.ravel(list(circles))])
+
+    def again() -> np.ndarray:
+        faces = read_result(path, FacesFile, "faces", "report this with its data")
+        return values(faces.poses(), faces.circles.values())
+
+    require_written(path, again, values(target.target_from_face, target.circles.values()), POSE_MM, "mm")

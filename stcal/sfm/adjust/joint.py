@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stcal.design import BoardDesign
+from stcal.design import BoardDesign, faces_of_known_shape, known_distances
 from stcal.errors import ConvergenceError, ScaleError
 from stcal.geometry.align import align_rigid
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
-from stcal.geometry.least_squares import minimise
+from stcal.geometry.least_squares import Minimum, minimise
 from stcal.geometry.normal_equations import constrained_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
@@ -29,6 +29,7 @@ from stcal.sfm.adjust.equations import (
     Setting,
     Shared,
     SharedEquations,
+    bars,
     cost_of,
     free_directions,
     normal_equations,
@@ -36,6 +37,7 @@ from stcal.sfm.adjust.equations import (
     planes,
     robust_weights,
     rows_of_view,
+    shapes,
     without_cameras,
 )
 from stcal.sfm.adjust.scale import MIN_DOTS
@@ -69,7 +71,8 @@ class JointResult:
     ``board_common`` : share of the board's variance that all groups have in common; ``camera`` : adjusted if requested;
     ``camera_covariance`` : (q, q) of the parameters of its COLMAP model, else empty; ``weights`` : by group, (n,)
     Huber's; ``redundancy`` : degrees of freedom; ``last_move_px`` : largest move of a projection by the last whole
-    step.
+    step; ``print_factor``, ``bend_factor`` : deviations of faces of known shape from their design over the stated σ, in
+    their plane and off it, which multiply these σ.
     """
 
     models: tuple[MetricModel, ...]
@@ -85,6 +88,8 @@ class JointResult:
     weights: dict[str, np.ndarray]
     redundancy: int
     last_move_px: float
+    print_factor: float = 1.0
+    bend_factor: float = 1.0
 
     def __post_init__(self):
         c = len(self.labels)
@@ -131,9 +136,10 @@ def adjust_jointly(
     flatness_mm: float | None = None,
     prior: CameraPrior | None = None,
     start: Camera | None = None,
+    factors: tuple[float, float] = (1.0, 1.0),
 ) -> JointResult:
     """Returns the result of :func:`adjusted` with the covariances at its minimum."""
-    return adjusted(models, board, camera, flatness_mm, prior, start).result()
+    return adjusted(models, board, camera, flatness_mm, prior, start, None, factors).result()
 
 
 def adjusted(
@@ -144,13 +150,15 @@ def adjusted(
     prior: CameraPrior | None = None,
     start: Camera | None = None,
     common: float | None = None,
+    factors: tuple[float, float] = (1.0, 1.0),
 ) -> Adjusted:
     """Adjusts metric models that share one frame, with all observations weighted by their σ.
 
     ``flatness_mm`` : σ of a circle's distance from the plane of its face, None if it is unknown; ``prior`` : the
     intrinsics of ``camera`` are observations with this covariance and are adjusted, beginning at ``start``; they are
     fixed if None; ``common`` : share of the board's variance that all groups have in common. If it is given, no
-    residual is down-weighted, so that the result is linear in the observations.
+    residual is down-weighted, so that the result is linear in the observations; ``factors`` : on the σ of faces of
+    known shape, ``print_factor`` and ``bend_factor`` of an earlier result, from which their estimation starts.
 
     If ``common`` is None, the dots tell whether the board kept its shape between the groups (one plate) or not
     (a film, a screen). First every group has its own deviations from the design. If these deviations agree, a common
@@ -165,12 +173,57 @@ def adjusted(
     shared = replace(shared, camera=start or camera)
     if common is None:
         setting = replace(setting, huber=HUBER * _robust_sigma(blocks, shared.camera))
+    if common is None and faces_of_known_shape(board):
+        blocks, shared, setting = _with_shape_factors(blocks, shared, setting, factors)
     blocks, shared, move = _minimise(blocks, shared, setting)
     share = _common_share(blocks, board) if common is None else 0.0
     if share > 0:
         blocks, setting = _with_common(blocks, setting, share)
         blocks, shared, move = _minimise(blocks, shared, setting)
     return Adjusted(tuple(blocks), shared, setting, move)
+
+
+SHAPE_ROUNDS, SETTLED_FACTOR, NEARLY = 6, 0.03, 1e-6
+"""Most rounds of the factors on the σ of faces of known shape, the change at which they end, and the share of χ² by
+which a round may still fall."""
+PRIOR_FREEDOM = 4.0
+"""Degrees of freedom that the stated σ of such faces stand for beside their deviations."""
+LEAST_FACTOR = 0.1
+"""Smallest such factor: print may be better than stated, but is never exact."""
+
+
+def _with_shape_factors(
+    blocks: list[Block], shared: Shared, setting: Setting, factors: tuple[float, float]
+) -> tuple[list[Block], Shared, Setting]:
+    """Returns the state near its minimum with the factors on the σ of faces of known shape that belong to it."""
+    setting = replace(setting, print_factor=factors[0], bend_factor=factors[1])
+    for _ in range(SHAPE_ROUNDS):
+        state = _descent(blocks, shared, setting, NEARLY).state
+        blocks, shared = list(state.blocks), state.shared
+        within, off = _shape_factors(blocks, shared, setting)
+        change = max(abs(within / setting.print_factor - 1), abs(off / setting.bend_factor - 1))
+        setting = replace(setting, print_factor=within, bend_factor=off)
+        if change < SETTLED_FACTOR:
+            break
+    return blocks, shared, setting
+
+
+def _shape_factors(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[float, float]:
+    """Returns the factors on the σ of faces of known shape in their plane and off it: variance components (Förstner
+    1979), with the stated σ as a weak prior."""
+    normal, _, _ = normal_equations(blocks, shared, setting)
+    inverse = constrained_inverse(normal, free_directions(len(normal), shared))
+    square, freedom = np.zeros(2), np.zeros(2)
+    for shape in equations.shapes(shared, setting):
+        place = (3 * shape.members[:, None] + np.arange(3)).ravel()
+        left = np.where(shape.weight > 0, 1 - shape.leverage(inverse[np.ix_(place, place)]), 0.0)
+        normalised_square = shape.weight * shape.off_mm**2
+        square += [normalised_square[:, :2].sum(), normalised_square[:, 2].sum()]
+        freedom += [left[:, :2].sum(), left[:, 2].sum()]
+    before = np.array([setting.print_factor, setting.bend_factor])
+    variance = (before**2 * square + PRIOR_FREEDOM) / (np.maximum(freedom, 0) + PRIOR_FREEDOM)
+    within, off = np.maximum(np.sqrt(variance), LEAST_FACTOR).tolist()
+    return within, off
 
 
 def covariance_of(
@@ -310,16 +363,7 @@ def _with_common(blocks: list[Block], setting: Setting, common: float) -> tuple[
 
 def _minimise(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[list[Block], Shared, float]:
     """Returns the state of least cost, and the largest move of a projection by the next whole step, px."""
-    minimum = minimise(
-        JointState(tuple(blocks), shared),
-        lambda state: SharedEquations.of(state, setting),
-        lambda state, step: state.moved(step, setting),
-        cost=lambda state: cost_of(state.blocks, state.shared, setting),
-        damping=DAMPING,
-        least_damping=DAMPING,
-        settled=EXACTLY,
-        max_steps=MAX_STEPS,
-    )
+    minimum = _descent(blocks, shared, setting, EXACTLY)
     last, beyond = minimum.state, minimum.state.moved(minimum.linear.step(DAMPING)[0], setting)
     move = max(_largest_move(a, last.shared, b, beyond.shared) for a, b in zip(last.blocks, beyond.blocks, strict=True))
     if not move <= MAX_MOVE_PX:  # true of NaN, too
@@ -331,20 +375,37 @@ def _minimise(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[li
     return list(last.blocks), last.shared, float(move)
 
 
+def _descent(
+    blocks: list[Block], shared: Shared, setting: Setting, settled: float
+) -> Minimum[JointState, SharedEquations]:
+    return minimise(
+        JointState(tuple(blocks), shared),
+        lambda state: SharedEquations.of(state, setting),
+        lambda state, step: state.moved(step, setting),
+        cost=lambda state: cost_of(state.blocks, state.shared, setting),
+        damping=DAMPING,
+        least_damping=DAMPING,
+        settled=settled,
+        max_steps=MAX_STEPS,
+    )
+
+
 def _block(model: MetricModel, board: BoardDesign, labels: tuple[CircleLabel, ...]) -> Block:
     place = {label: i for i, label in enumerate(labels)}
-    dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)])
+    dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)], int)
     circles = np.array([i for i, label in enumerate(model.labels) if isinstance(label, CircleLabel)], int)
-    if len(dots) < MIN_DOTS:
+    if len(dots) < MIN_DOTS and not (faces_of_known_shape(board) or known_distances(board)):
         raise ScaleError(
             "E-SCALE-FEW-DOTS",
             f"group {model.group}: {len(dots)} board dots in the joint adjustment, {MIN_DOTS} needed; "
             "photograph the board with the faces",
         )
+    if 0 < len(dots) < MIN_DOTS:  # the scale is then from the target itself
+        return _block(model.without(np.isin(model.point_index, dots)), board, labels)
     design = board.places_mm(model.labels[i] for i in dots)
     return Block(
         model,
-        align_rigid(model.xyz_model[dots], design),
+        align_rigid(model.xyz_model[dots], design) if len(dots) else Rigid(),
         design,
         board.sigma_mm,
         dots,
@@ -428,8 +489,11 @@ def _result(
     inverse = constrained_inverse(normal, free_directions(len(normal), shared))
     c = circles.stop
     flat = sum(len(members) - 3 for members, _, _ in planes(shared, setting))
+    for shape in shapes(shared, setting):
+        flat += int((shape.weight > 0).sum()) - (6 if (shape.weight[:, 2] > 0).any() else 3)
+    flat += sum(1 for _ in bars(shared, setting))
     observations = sum(2 * len(b.model.image_index) + 3 * len(b.dots) for b in blocks) + flat
-    unknowns = c + sum(6 * len(b.model.images) + 3 * len(b.dots) + 6 for b in blocks)
+    unknowns = c + sum(6 * len(b.model.images) + 3 * len(b.dots) + 6 * bool(len(b.dots)) for b in blocks)
     redundancy = observations - unknowns + FREE_DIRECTIONS
     if sigma0 is None:
         sigma0 = float(np.sqrt(cost_of(blocks, shared, setting) / max(redundancy, 1)))
@@ -448,4 +512,6 @@ def _result(
         {b.model.group: robust_weights(b.model, shared.camera, setting.huber) for b in blocks},
         redundancy,
         move_px,
+        setting.print_factor,
+        setting.bend_factor,
     )

@@ -1,9 +1,10 @@
 """Options of the adjustment."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_choices
 from stcal.io.toml import LEAST
 from stcal.sfm.adjust.faces import FrameKind
 
@@ -38,12 +39,7 @@ class AdjustOptions:
     refine_camera: bool = False
 
     def __post_init__(self):
-        for option, value, choices in (
-            ("solve", self.solve, get_args(Solve)),
-            ("frame", self.frame, get_args(FrameKind)),
-        ):
-            if value not in choices:
-                raise InputError("E-OPTION-VALUE", f"{option} {value!r}: not a choice; use {' or '.join(choices)}")
+        require_choices(self, "options")
         if self.flatness_mm is not None and not LEAST <= self.flatness_mm <= MOST_FLATNESS_MM:
             raise InputError(
                 "E-OPTION-RANGE",

@@ -7,7 +7,7 @@ from numpy.linalg import LinAlgError
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, MappingError
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
@@ -238,6 +238,8 @@ def eccentricity_px(model: GroupModel, camera: Camera, radius_mm: dict[Label, fl
     """
     normal = np.zeros((len(model.labels), 3))
     for key, members in model.points_by_face().items():
+        if max(radius_mm[model.labels[i]] for i in members) <= POINT_RADIUS_MM:
+            continue  # corners have no eccentricity
         try:
             normal[members] = fit_plane(model.xyz_model[members]).normal
         except DegenerateError as error:

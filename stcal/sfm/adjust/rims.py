@@ -67,7 +67,8 @@ def radius_views(
     shape = np.concatenate([image.shape[keypoint] for image, keypoint in seen])
     blur = np.concatenate([image.blur_px[keypoint] for image, keypoint in seen])
     point = model.point_index[order]
-    radius = np.array([design_mm[label] for label in model.labels])[point]
+    is_circle = np.array([label in design_mm for label in model.labels])[point]  # corners have no radius
+    radius = np.array([design_mm.get(label, 1.0) for label in model.labels])[point]
     normal = np.zeros((len(model.labels), 3))
     for members in model.points_by_face().values():
         normal[members] = fit_plane(model.xyz_model[members]).normal
@@ -84,7 +85,7 @@ def radius_views(
     return RadiusViews(
         point,
         radius,
-        (measured + lost) / size,
+        np.where(is_circle, (measured + lost) / size, np.nan),
         size,
         lost / size * radius,
         np.sqrt(np.maximum(1 - cosine**2, 0)) / cosine,
@@ -108,7 +109,7 @@ def find_rims(
         views = radius_views(model, by_name, design_mm, camera)
         is_dot = np.array([isinstance(label, DotLabel) for label in model.labels])[views.point_index]
         short = (views.ratio - 1) * views.design_mm
-        near = (views.tan_tilt < MAX_TAN) & (views.ratio > 0)
+        near = (views.tan_tilt < MAX_TAN) & (views.ratio > 0)  # not of corners, whose ratio is not a number
         for kind, own in (("circles", ~is_dot & near), ("dots", is_dot & near)):
             parts[kind].append((short[own], views.tan_tilt[own], views.design_mm[own], views.blur_mm[own]))
     rims = {}

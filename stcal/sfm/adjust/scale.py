@@ -1,18 +1,25 @@
 """Scale of a model: λ in mm per unit of the model's world, from the board."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from stcal.design import BoardDesign
+from stcal.design import BoardDesign, FaceDesign, ScaleReference, faces_of_known_shape, known_distances
 from stcal.errors import DegenerateError, ScaleError
 from stcal.geometry.align import align_rigid, align_similarity
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.labels import DotLabel, dot_cells
-from stcal.sfm.data.model import WorldModel
+from stcal.labels import CircleLabel, Label, dot_cells
+from stcal.sfm.data.model import ImageObservations, WorldModel
 
 MIN_DOTS = 4
+EDGE_SIGMA_PX = 0.1
+"""σ of the shift that all edges of all tags share."""
+MIN_CORNERS = 3
+"""Smallest number of corners of a face of known shape that tell anything of it."""
+ScaleSource = Literal["board", "faces", "distances"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,15 +29,17 @@ class Scale:
     ``board_from_world`` : similarity over all dots by least squares, unless λ by rows was requested; its scale is λ
     (mm per unit); ``rows_mm_per_unit`` : λ as in Zhang & Wei (2017) (first and last row, all pairs); ``rows`` : these
     two rows; ``labels`` : (n,) the dots; ``residuals_mm`` : (n, 3) reconstructed minus design, board frame;
-    ``sigma_mm_per_unit`` : σ of λ, from the stated σ of the dots' positions.
+    ``sigma_mm_per_unit`` : σ of λ, from the stated σ of the dots' positions; ``source`` : what λ is from, ``board``,
+    ``faces`` of known shape (then ``labels`` and ``residuals_mm`` are of their corners, face frames) or ``distances``.
     """
 
     board_from_world: Similarity
     rows_mm_per_unit: float
     rows: tuple[int, int]
-    labels: tuple[DotLabel, ...]
+    labels: tuple[Label, ...]
     residuals_mm: np.ndarray
     sigma_mm_per_unit: float
+    source: ScaleSource = "board"
 
     def __post_init__(self):
         object.__setattr__(self, "residuals_mm", frozen(self.residuals_mm, (len(self.labels), 3), "residuals"))
@@ -70,6 +79,8 @@ def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> 
     """
     members = model.points_by_face().get("board", np.zeros(0, int))
     where = f"group {model.group}: scale"
+    if len(members) < MIN_DOTS and (own := _of_faces(model, board) or _of_distances(model, board)) is not None:
+        return own
     if len(members) < MIN_DOTS:
         raise ScaleError(
             "E-SCALE-FEW-DOTS",
@@ -98,6 +109,81 @@ def find_scale(model: WorldModel, board: BoardDesign, by_rows: bool = False) -> 
         board_from_world @ xyz_world - xyz_board,
         float(board_from_world.scale * board.sigma_mm / spread),
     )
+
+
+def _of_faces(model: WorldModel, board: BoardDesign) -> Scale | None:
+    """Returns the scale from the corners of faces of known shape, None if there are none."""
+    labels: list[Label] = []
+    scales, weights, parts = [], [], []
+    for face, members in known_points(model.labels, board):
+        design, xyz = face.places_mm(model.labels[i].circle for i in members), model.xyz_model[members]
+        try:
+            scales.append(align_similarity(design, xyz).scale)
+        except DegenerateError:
+            continue
+        weights.append(((design - design.mean(0)) ** 2).sum() / (face.sigma_mm or 1.0) ** 2)
+        parts.append((design, xyz))
+        labels += [model.labels[i] for i in members]
+    if not scales:
+        return None
+    scale = float(np.exp(np.average(np.log(scales), weights=weights)))
+    residuals = [align_rigid(design, scale * xyz) @ (scale * xyz) - design for design, xyz in parts]
+    sigma = scale / float(np.sqrt(np.sum(weights)))
+    whole = Similarity(scale, Rigid())
+    return Scale(whole, scale, (0, 0), tuple(labels), np.concatenate(residuals), sigma, "faces")
+
+
+def _of_distances(model: WorldModel, board: BoardDesign) -> Scale | None:
+    """Returns the scale from known distances, None if there are none."""
+    place = {label: i for i, label in enumerate(model.labels)}
+    known = [d for d in known_distances(board) if d.first in place and d.second in place]
+    if not known:
+        return None
+    units = [np.linalg.norm(model.xyz_model[place[d.first]] - model.xyz_model[place[d.second]]) for d in known]
+    weights = np.array([(d.mm / d.sigma_mm) ** 2 for d in known])
+    ratios = np.array([d.mm for d in known]) / units
+    scale = float(np.average(ratios, weights=weights))
+    away = np.array([[scale * unit - d.mm, 0.0, 0.0] for d, unit in zip(known, units, strict=True)])
+    labels = tuple(d.first for d in known)
+    sigma = scale / float(np.sqrt(weights.sum()))
+    return Scale(Similarity(scale, Rigid()), scale, (0, 0), labels, away, sigma, "distances")
+
+
+def with_edge_sigma(board: BoardDesign, observations: Sequence[ImageObservations]) -> BoardDesign:
+    """Returns what the scale is taken from with the σ of printed sizes enlarged by what moves the edges of tags.
+
+    Light, ink and the camera's response make all tags look larger or smaller alike, which no residual shows.
+    """
+    if not isinstance(board, ScaleReference) or not any(face.of_tags for face in board.faces):
+        return board
+    sides: dict[CircleLabel, CircleLabel] = {}
+    for face in board.faces:
+        labels = face.labels()
+        if face.of_tags:
+            sides |= {labels[k]: labels[k + 1] for k in range(0, len(labels), 4)}
+    lengths: dict[str, list[float]] = {}
+    for image in observations:
+        place = dict(zip(image.labels, image.centre_px, strict=True))
+        for first, second in sides.items():
+            if first in place and second in place:
+                length = float(np.linalg.norm(place[first] - place[second]))
+                lengths.setdefault(first.face, []).append(length)
+    faces = []
+    for face in board.faces:
+        moved = 2 * EDGE_SIGMA_PX / float(np.median(lengths[face.id])) if face.id in lengths else 0.0
+        faces.append(replace(face, size_sigma=float(np.hypot(face.size_sigma, moved))))
+    return replace(board, faces=tuple(faces))
+
+
+def known_points(labels: Sequence[Label], board: BoardDesign) -> list[tuple[FaceDesign, np.ndarray]]:
+    """Returns the faces of known shape with the indices of their points among ``labels``, of faces with three and
+    more."""
+    faces = {face.id: face for face in faces_of_known_shape(board)}
+    members: dict[str, list[int]] = {}
+    for i, label in enumerate(labels):
+        if isinstance(label, CircleLabel) and label.face in faces:
+            members.setdefault(label.face, []).append(i)
+    return [(faces[face], np.array(rows)) for face, rows in members.items() if len(rows) >= MIN_CORNERS]
 
 
 def _by_rows(xyz_board, xyz_world, row) -> tuple[float, tuple[int, int]]:

@@ -11,6 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.io.cameras.model import CalibratedCamera
 from stcal.labels import CircleLabel
+from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.uncertainty import Contributions, Derivatives, contributions_of, derivatives
 from stcal.sfm.budget.sources import Source, Statement, correction, sources_of, statement_of
@@ -132,6 +133,7 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
     contributions = contributions_of(adjusted.state)
     derivatives_of_run = derivatives(contributions.joint, adjusted.start, run.target, run.faces.frame)
     rows = statement or statement_of(run.board.stated)
+    rim = _rims(run, contributions, derivatives_of_run)
     camera, refined = run.camera, run.options.refine_camera
     return budget(
         contributions,
@@ -142,7 +144,20 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
         refined,
         rows,
         run.faces.reference_face,
+        rim,
     )
+
+
+def _rims(run: SavedRun, found: Contributions, own: Derivatives) -> tuple[Source, ...]:
+    """Returns the row of the rims in front of the circles, none if the faces are as seen."""
+    if not run.faces.rim_mm:
+        return ()
+    sigma_mm = run.report["summary"].get("rim_sigma_mm")
+    heights = {label: run.faces.rim_mm[label] for label in found.joint.labels if label in run.faces.rim_mm}
+    covariance = rim_covariance_mm2(found.joint, own.target_from_face, heights, sigma_mm or 0.0)
+    origin, words = ("estimated", "from radii by tilt, --rim") if sigma_mm else ("not stated", "rim_mm of target.toml")
+    sigma_um = 1e3 * sigma_mm if sigma_mm else None
+    return (Source("rims", "rims before the circles", "A", origin, words, sigma_um, "µm", covariance),)
 
 
 def budget(
@@ -154,9 +169,13 @@ def budget(
     refined: bool,
     statement: Statement,
     reference_face: str,
+    more: tuple[Source, ...] = (),
 ) -> Budget:
-    """Returns the budget of an adjustment. Arguments are as in :func:`stcal.sfm.budget.sources.sources_of`."""
-    sources = sources_of(found, camera, board, flatness_mm, refined, statement)
+    """Returns the budget of an adjustment. Arguments are as in :func:`stcal.sfm.budget.sources.sources_of`.
+
+    ``more`` : further rows.
+    """
+    sources = sources_of(found, camera, board, flatness_mm, refined, statement) + more
     if own.circles_designed.shape[2]:
         sources += (_placed(own),)
     rng = np.random.default_rng(0)

@@ -13,7 +13,8 @@ from scipy.stats import norm
 
 from stcal.design import BoardDesign
 from stcal.errors import InputError
-from stcal.io.table import LENGTHS, read_table
+from stcal.io.join import table_of
+from stcal.io.table import LENGTHS
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, distance, longest_of
@@ -74,18 +75,19 @@ class LengthTest:
         return all(abs(length.e_n) <= self.limit * (1 + 1e-9) for length in self.lengths)
 
 
-def against_stated(budget: Budget, path: Path) -> LengthTest:
+def against_stated(budget: Budget, path: Path, columns: Path | None = None) -> LengthTest:
     """Tests the run against lengths of a CSV file.
 
     Its columns are ``from``, ``to`` (circles as ``face:circle``), ``length_mm``, and ``sigma_mm``, the standard
-    uncertainty of the lengths. Without ``sigma_mm`` they are taken as exact.
+    uncertainty of the lengths. Without ``sigma_mm`` they are taken as exact. ``columns`` : map of the columns, see
+    :func:`~stcal.io.poses.columns.read_mapped`.
 
     Raises
     ------
     InputError
         If the file is not a table of lengths, a circle is not in the run, or a length or σ is invalid.
     """
-    table = read_table(path, WHAT)
+    table = table_of(path, columns, WHAT)
     ends = list(zip(table.text("from"), table.text("to"), strict=True))
     length = table.quantity("length", LENGTHS)
     known = table.has("sigma", LENGTHS)

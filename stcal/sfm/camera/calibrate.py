@@ -200,7 +200,7 @@ def judged(
     unseen = unseen_lines((label for view in views for label in view.labels), board.rows, board.columns)
     warnings = [*unseen, *_of_rounds(result, settled), *_warnings(result, projection, split, board)]
     try:
-        of_held_out = held_out(views, board, result.camera, result.colmap_model)
+        of_held_out = held_out(result, views, board)
     except StcalError as error:
         of_held_out = None
         warnings.append(f"no views could be held out, as the others alone are too few: {error}")

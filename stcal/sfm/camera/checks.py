@@ -23,6 +23,8 @@ from stcal.sfm.camera.intrinsics import (
     closed_form,
     model_of_views,
     model_parameters,
+    of_some_views,
+    of_two_halves,
     start_camera,
 )
 from stcal.sfm.data.model import ImageObservations, by_group
@@ -126,8 +128,7 @@ def split_half(result: Intrinsics, views: Sequence[ImageObservations], board: Bo
     """
     if len(views) < 2 * MIN_HALF:
         return None
-    half = [i % 2 for i in range(len(views))]
-    both = adjust_intrinsics(views, board, result.camera, result.colmap_model, half, result.factors)
+    both = of_two_halves(result, views, board)
     q = len(both.covariance) // 2
     difference = np.subtract(*(model_parameters(camera, result.colmap_model) for camera in reversed(both.cameras)))
     subtract = np.hstack([-np.eye(q), np.eye(q)])
@@ -213,9 +214,9 @@ class Candidate:
 
 
 def held_out(
-    views: Sequence[ImageObservations], board: BoardDesign, start: Camera, colmap_model: str, folds: int = FOLDS
+    result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign, folds: int = FOLDS
 ) -> HeldOut | None:
-    """Returns the residuals of all views, each held out once; None with too few views.
+    """Returns the residuals of all ``views`` of a ``result``, each held out once; None with too few views.
 
     The places of the dots are those estimated from the other views of the folder, or design places if there are none.
 
@@ -232,9 +233,9 @@ def held_out(
     for fold in range(folds):
         excluded = [view for i, view in enumerate(views) if i % folds == fold]
         training = [view for i, view in enumerate(views) if i % folds != fold]
-        result = adjust_intrinsics(training, board, start, colmap_model)
-        factors.append(result.factors.centres)
-        residuals_of_view |= {view.name: foretold(view, board, result) for view in excluded}
+        without = of_some_views(result, training, board)
+        factors.append(without.factors.centres)
+        residuals_of_view |= {view.name: foretold(view, board, without) for view in excluded}
     residuals_px, in_sigma = zip(*(residuals_of_view[view.name] for view in views), strict=True)
     return HeldOut(residuals_px, in_sigma, float(np.median(factors)), folds)
 
@@ -268,11 +269,7 @@ def choose_model(
     for model, factor in factors.items():
         if factor > HOPELESS * factors[least]:
             why[model] = f"residuals {factor / factors[least]:.3g} times those of {least}"
-    jobs = {
-        m: (views, board, entry.camera, m)
-        for m, entry in fitted.items()
-        if isinstance(entry, Intrinsics) and m not in why
-    }
+    jobs = {m: (views, board, entry) for m, entry in fitted.items() if isinstance(entry, Intrinsics) and m not in why}
     fared: dict[str, HeldOut] = {}
     for model, outcome in zip(jobs, _all(_tried, list(jobs.values()), workers), strict=True):
         if isinstance(outcome, HeldOut):
@@ -322,9 +319,9 @@ def _fitted(views, board: BoardDesign, known: Camera, model: str) -> Intrinsics 
         return error
 
 
-def _tried(views, board: BoardDesign, start: Camera, model: str) -> HeldOut | StcalError | None:
+def _tried(views, board: BoardDesign, result: Intrinsics) -> HeldOut | StcalError | None:
     try:
-        return held_out(views, board, start, model)
+        return held_out(result, views, board)
     except StcalError as error:
         return error
 

@@ -121,6 +121,41 @@ class State:
             members.setdefault(folder, []).append(i)
         return members
 
+    def only(self, names: set[str]) -> "State":
+        """Returns the state with the images of these ``names`` alone, of cameras that are on no rig."""
+        kept = [(i, part) for i, model in enumerate(self.models) if (part := _of_images(model, names)).images]
+        return self._of(
+            [part for _, part in kept], [self.folder[i] for i, _ in kept], [self.camera_of[i] for i, _ in kept]
+        )
+
+    def in_two(self, half: dict[str, int]) -> "State":
+        """Returns the state of one camera as that of two, of which each took the images of one ``half``, 0 or 1."""
+        models, folders, cameras = [], [], []
+        for model, folder in zip(self.models, self.folder, strict=True):
+            for k in (0, 1):
+                part = _of_images(model, {name for name, own in half.items() if own == k})
+                if part.images:
+                    models.append(part)
+                    folders.append(folder)
+                    cameras.append(k)
+        return replace(self._of(models, folders, cameras), cameras=self.cameras * 2)
+
+    def _of(self, models: list[MetricModel], folders: list[str], cameras: list[int]) -> "State":
+        poses: dict[str, tuple[Rigid, ...]] = {}
+        instants = []
+        for model, folder in zip(models, folders, strict=True):
+            before = poses.get(folder, ())
+            instants.append(len(before) + np.arange(len(model.images)))
+            poses[folder] = before + model.camera_from_model
+        return replace(
+            self,
+            models=tuple(models),
+            folder=tuple(folders),
+            camera_of=tuple(cameras),
+            instant_of=tuple(instants),
+            first_from_board=poses,
+        )
+
     def seen(self) -> "State":
         """Returns the state with the views' poses computed from those of instants and cameras."""
         return replace(
@@ -151,6 +186,22 @@ class State:
         """
         poses = sum(len(each) for each in self.first_from_board.values())
         return sum(2 * len(m.image_index) for m in self.models) - 6 * poses - kept
+
+
+def _of_images(model: MetricModel, names: set[str]) -> MetricModel:
+    """Returns the model with the images of these names alone, and with all its points."""
+    keep = np.array([name in names for name in model.images])
+    rows = np.flatnonzero(keep[model.image_index])
+    return replace(
+        model,
+        images=tuple(name for name in model.images if name in names),
+        camera_from_model=tuple(pose for pose, own in zip(model.camera_from_model, keep, strict=True) if own),
+        image_index=(np.cumsum(keep) - 1)[model.image_index[rows]],
+        **{name: getattr(model, name)[rows] for name in OF_OBSERVATIONS},
+    )
+
+
+OF_OBSERVATIONS = ("point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

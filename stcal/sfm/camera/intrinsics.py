@@ -15,7 +15,7 @@ from stcal.io.cameras.model import FISHEYE, intrinsic_basis
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.equations import robust_weights
 from stcal.sfm.adjust.refine import eccentricity_px
-from stcal.sfm.camera.equations import BoardShape, Normal, Setting, State, dots_costs, minimum
+from stcal.sfm.camera.equations import BoardShape, Normal, Setting, State, dots_costs, minimum, moved
 from stcal.sfm.data.model import ImageObservations, MetricModel, by_group
 from stcal.sfm.detect.files import DetectedImage
 
@@ -23,6 +23,9 @@ START_FOCAL, FISHEYE_FOCAL = 1.2, 0.45
 """Approximate focal lengths over the longer image side: between wide-angle and portrait; equidistant lens of 127°."""
 FOCAL_LIMITS = (0.2, 50.0)
 """Limits of the focal length over the longer image side. Results of the closed form outside of them are noise."""
+TRIED_FOCALS, TRIED_VIEWS = tuple(np.geomspace(0.4, 12.8, 11).tolist()), 12
+"""Focal lengths over the longer side that are tried where the closed form gives none, a factor of √2 apart, and the
+number of views, those of most dots, by which they are judged."""
 SETTLING_PASSES = 3
 
 
@@ -36,8 +39,9 @@ def start_camera(width: int, height: int, colmap_model: str) -> Camera:
 def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, camera: Camera) -> Camera:
     """Returns ``camera`` with the focal length estimated from the homographies of the boards.
 
-    The camera is unchanged if the homographies give no plausible focal length, and for equidistant lenses, as their
-    rays depend on the focal length.
+    If the homographies give no plausible focal length, as those of a few corners or of boards that face the camera do,
+    it is the one of :data:`TRIED_FOCALS` with which the boards fit best. The camera is unchanged for equidistant
+    lenses, as their rays depend on the focal length.
 
     Zhang (2000), sec. 3.1, with square pixels and known principal point: the two axes of each board are orthogonal
     and equally long, which is linear in 1/f². Lens distortion of ``camera`` is removed first.
@@ -55,8 +59,25 @@ def closed_form(observations: Sequence[ImageObservations], board: BoardDesign, c
     inverse = float(np.dot(coefficients, constants)) / square if square else 0.0  # (assumed focal / focal)²
     low, high = FOCAL_LIMITS * np.array(max(camera.width, camera.height)) / camera.focal[0]
     if not high**-2 < inverse < low**-2:
-        return camera
+        return _best_of_several(observations, board, camera)
     return replace(camera, focal=camera.focal / np.sqrt(inverse))
+
+
+def _best_of_several(observations: Sequence[ImageObservations], board: BoardDesign, camera: Camera) -> Camera:
+    """Returns ``camera`` with the focal length, of several, with which the boards fit best: by the mean over views of
+    the RMS distance from their dots, so that no view outweighs the others."""
+    largest = sorted(observations, key=len)[-TRIED_VIEWS:]
+    cameras = [replace(camera, focal=np.full(2, share * max(camera.width, camera.height))) for share in TRIED_FOCALS]
+
+    def misfit_px(tried: Camera) -> float:
+        off = 0.0
+        for image in largest:
+            pose = start_pose(image, board, tried)
+            seen = tried.project(pose @ board.places_mm(image.labels))
+            off += float(np.sqrt(((seen - image.centre_px) ** 2).sum(1).mean()))
+        return off
+
+    return min(cameras, key=misfit_px)
 
 
 def start_pose(image: ImageObservations, board: BoardDesign, camera: Camera) -> Rigid:
@@ -163,7 +184,8 @@ class Intrinsics:
     ``covariance`` : (cq, cq) of the parameters of ``colmap_model``, camera by camera; ``models`` : views of one
     folder's board by one camera, mm, board frame; ``camera_of`` : camera of each model; ``huber`` : length of a
     normalised residual beyond which its weight decreases; ``settled`` : whether σ and eccentricities converged within
-    :data:`MAX_ROUNDS`.
+    :data:`MAX_ROUNDS`; ``solution`` : state and setting from which solutions of some of the views start, None for the
+    intrinsics of a rig.
     """
 
     cameras: tuple[Camera, ...]
@@ -175,6 +197,7 @@ class Intrinsics:
     huber: float
     redundancy: int
     settled: bool
+    solution: tuple[State, Setting] | None = None
 
     @property
     def camera(self) -> Camera:
@@ -254,18 +277,83 @@ def adjust_intrinsics(
         huber=np.inf,
     )
     adjustment = adjusted(state, setting, board, factors)
-    covariance = np.linalg.inv(adjustment.last.normal)
+    return _intrinsics(adjustment.last, colmap_model, adjustment.factors, adjustment.settled)
+
+
+def _intrinsics(last: Normal, colmap_model: str, factors: SigmaFactors, settled: bool) -> Intrinsics:
+    """Returns the intrinsics of an adjustment, from its ``last`` normal equations."""
+    state, setting = last.state, last.setting
+    covariance = np.linalg.inv(last.normal)
     return Intrinsics(
-        cameras=adjustment.state.cameras,
+        cameras=state.cameras,
         colmap_model=colmap_model,
         covariance=(covariance + covariance.T) / 2,
-        models=adjustment.state.models,
-        camera_of=adjustment.state.camera_of,
-        factors=adjustment.factors,
-        huber=adjustment.setting.huber,
-        redundancy=adjustment.state.redundancy(setting.kept),
-        settled=adjustment.settled,
+        models=state.models,
+        camera_of=state.camera_of,
+        factors=factors,
+        huber=setting.huber,
+        redundancy=state.redundancy(setting.kept),
+        settled=settled,
+        solution=(state, setting),
     )
+
+
+MOST_STEPS, NO_GAIN = 10, 0.1
+"""Most steps from the solution of all views to that of some of them, and the predicted decrease of the cost at which
+they end, in σ²: no parameter is then off by more than a third of its σ."""
+
+
+def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> Intrinsics:
+    """Returns the intrinsics from some of the views of ``result``: by steps from the solution of all, with its weights,
+    and the factors of σ by one step of their own.
+
+    Raises
+    ------
+    ConvergenceError, DegenerateError
+        As :func:`adjust_intrinsics`, which solves where the steps do not settle.
+    """
+    state, setting = _solution(result)
+    last = _stepped(state.only({view.name for view in views}), setting)
+    if last is None:
+        return adjust_intrinsics(views, board, result.camera, result.colmap_model)
+    return _intrinsics(last, result.colmap_model, _updated_factors(last, result.factors), True)
+
+
+def of_two_halves(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> Intrinsics:
+    """Returns the intrinsics of two cameras, of which each took every second view of the same boards.
+
+    Raises
+    ------
+    ConvergenceError, DegenerateError
+        As :func:`of_some_views`.
+    """
+    state, setting = _solution(result)
+    half = [i % 2 for i in range(len(views))]
+    halves = state.in_two({view.name: k for view, k in zip(views, half, strict=True)})
+    last = _stepped(
+        halves, replace(setting, basis=setting.basis * 2, weight=setting.weight * 2, start=setting.start * 2)
+    )
+    if last is None:
+        return adjust_intrinsics(views, board, result.camera, result.colmap_model, half, result.factors)
+    return _intrinsics(last, result.colmap_model, result.factors, True)
+
+
+def _solution(result: Intrinsics) -> tuple[State, Setting]:
+    assert result.solution is not None, "intrinsics of one camera"
+    return result.solution
+
+
+def _stepped(state: State, setting: Setting) -> Normal | None:
+    """Returns the normal equations where steps from ``state`` settle, or None if they do not."""
+    for _ in range(MOST_STEPS):
+        normal = Normal.of(state, setting)
+        step, gain = normal.step(0.0)
+        if gain < NO_GAIN:
+            return normal
+        state = moved(state, setting, step)
+        if not np.isfinite(state.cost(setting.huber)):
+            return None
+    return None
 
 
 def design_shapes(state: State, board: BoardDesign) -> dict[str, BoardShape]:

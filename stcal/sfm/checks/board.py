@@ -76,6 +76,8 @@ def measure_radii(
     for network in networks:
         views = radius_views(network.model, by_name, design_mm, camera)
         for k, label in enumerate(network.model.labels):
+            if label not in design_mm:  # a corner
+                continue
             ratio.setdefault(label, []).append(views.ratio[views.point_index == k])
             size.setdefault(label, []).append(views.size_px[views.point_index == k])
     return Radii(
@@ -169,7 +171,7 @@ def size_by_radii(radii: Radii) -> Size | None:
 
     The result is None if all radii are alike, or if there are fewer than ``MIN_PEERS`` circles.
     """
-    is_circle = np.array([isinstance(label, CircleLabel) for label in radii.labels])
+    is_circle = np.array([isinstance(label, CircleLabel) for label in radii.labels], bool)
     size = radii.size_px[is_circle]
     design = radii.design_mm[is_circle]
     if len(size) < MIN_PEERS or np.ptp(design) == 0:
@@ -290,7 +292,7 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
 
 def _size_by_positions(calibrated: CalibratedTarget, target: TargetDesign) -> Size | None:
     weighted, weight, square, freedom = 0.0, 0.0, 0.0, 0
-    for face in target.faces:
+    for face in target.with_faces(printed=False).faces:  # the others have told the scale
         indices = [i for i, label in enumerate(face.labels()) if label in calibrated.circles]
         if len(indices) < MIN_DOTS:
             continue

@@ -49,7 +49,6 @@ class _Cause:
     columns: Callable[[Network], np.ndarray]
     scope: str = "all"
     whole: bool = False
-    nameable: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,25 +60,27 @@ class _Fitted:
     left: float
 
 
-def whole_set_cause(networks: Sequence[Network], camera: Camera) -> Check | None:
+def whole_set_cause(networks: Sequence[Network], camera: Camera, moved: bool = False) -> Check | None:
     """Returns a failed check that names the cause of the whole set; None if none explains most of the residuals.
 
     The residuals beyond chance are those that the most flexible hypothesis explains. Of all hypotheses that explain
     ``EXPLAINS`` of it the one with fewest parameters is named.
+
+    ``moved`` : whether the target seems to have moved, and no few images are the culprits.
     """
     fitted = [f for cause in _hypotheses(camera) if (f := _fit(cause, networks)) is not None]
     most = max((f.explained for f in fitted), default=0.0)
     named = [
         f
         for f in fitted
-        if f.cause.nameable
+        if (moved or f.cause.columns is not _by_motion)
         and f.probability * len(fitted) < FAILED
         and f.explained > EXPLAINS * most
         and _applies(f, networks)
     ]
     if not named:
         return None
-    best = min(named, key=lambda f: (f.test.freedom, -f.explained))
+    best = min(named, key=lambda f: (f.cause.columns is _by_motion, f.test.freedom, -f.explained))
     if best.cause.scope == "image" and _explained_by_one(networks, best.left) > EXPLAINS * most:
         return None  # its checks name that image
     size = best.cause.size(best.test.estimate, np.sqrt(np.maximum(np.diag(best.test.covariance), 0)))
@@ -156,7 +157,7 @@ def _applies(fitted: _Fitted, networks: Sequence[Network]) -> bool:
     if fitted.cause.scope == "group":
         away = (estimate - np.median(estimate)) ** 2 / np.maximum(np.diag(fitted.test.covariance), 1e-300)
         return len(networks) > 1 and bool((away > fitted.left * chdtri(1, FAILED)).any())
-    if fitted.cause.scope == "image":
+    if fitted.cause.scope == "image" and fitted.cause.columns is not _by_motion:
         few = _explained_by_few(fitted, networks)
         return few < ALONE * fitted.test.statistic
     return True
@@ -218,7 +219,6 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
     unit = np.eye(len(camera.parameters()))
     focal = fx * unit[:, [0]] + fy * unit[:, [1]]
     scaled = focal + (cx + 0.5) * unit[:, [2]] + (cy + 0.5) * unit[:, [3]]
-    turned = (camera.width - 1 - 2 * cx) * unit[:, [2]] + (camera.height - 1 - 2 * cy) * unit[:, [3]]
     removed = -camera.parameters()[:, None] * (np.arange(len(unit)) > 3)[:, None]
 
     def by(direction: np.ndarray) -> Callable[[Network], np.ndarray]:
@@ -248,7 +248,8 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
                "image"),
         _Cause("the camera moved while its rows were read (rolling shutter)", "use a camera with a global shutter, or "
                "stand still for each photograph", lambda value, _: "in most images", _by_row, "image"),
-        _Cause("the target moved against the board", "", lambda value, _: "", _by_motion, "image", nameable=False),
+        _Cause("the target moved against the board", "sort the images into groups between which nothing moved, or take "
+               "them again", lambda value, _: "in more than one image", _by_motion, "image"),
     ]  # fmt: skip
     if np.abs(removed).max() > 0:
         found.append(
@@ -257,13 +258,31 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
                    "not in them", by(removed), whole=True)
         )  # fmt: skip
-    if np.abs(turned).max() > LEAST_SHIFT_PX:
         found.append(
-            _Cause("the photographs are turned by 180° against the camera file", "turn them back, as the sensor has "
-                   "them, without the rotation that a viewer or converter applied",
-                   lambda value, _: f"principal point {100 * value[0]:.0f} % of the way", by(turned), whole=True)
+            _Cause("the distortion of the camera file has its sign reversed", "its program undistorts where this one "
+                   "distorts: change the signs of all coefficients in the camera file",
+                   lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the way",
+                   by(2 * removed), whole=True)
         )  # fmt: skip
+    for quarters in (1, 2, 3) if camera.width == camera.height else (2,):
+        turned = _turned(camera, quarters)[:, None] - camera.parameters()[:, None]
+        if np.abs(turned[2:4]).max() > LEAST_SHIFT_PX:
+            found.append(
+                _Cause(f"the photographs are turned by {90 * quarters}° against the camera file", "turn them back, as "
+                       "the sensor has them, without the rotation that a viewer or converter applied",
+                       lambda value, _: f"principal point {100 * value[0]:.0f} % of the way", by(turned), whole=True)
+            )  # fmt: skip
     return found
+
+
+def _turned(camera: Camera, quarters: int) -> np.ndarray:
+    """Returns the parameters of a camera whose photographs are turned counterclockwise by quarter turns."""
+    parameters, size = camera.parameters().copy(), (camera.width, camera.height)
+    for _ in range(quarters):
+        (fx, fy, cx, cy), (p1, p2) = parameters[:4], parameters[6:8]
+        parameters[:4], parameters[6:8] = (fy, fx, cy, size[0] - 1 - cx), (-p2, p1)
+        size = size[::-1]
+    return parameters
 
 
 def _by_parameters(network: Network, camera: Camera) -> np.ndarray:

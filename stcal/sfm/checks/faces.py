@@ -1,12 +1,13 @@
 """Checks of the faces: parts of the images against one another, groups against groups, circles against their plane."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
+from scipy.special import fdtrc
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, StcalError
@@ -19,7 +20,8 @@ from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.uncertainty import calibrated_target
-from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
+from stcal.sfm.checks.culprits import Guilt
+from stcal.sfm.checks.verdict import SUSPICIOUS, Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import MetricModel
 
 MIN_HALF = 2
@@ -42,7 +44,8 @@ class Again:
     def adjust(self, parts: Sequence[Sequence[MetricModel]]) -> list[JointResult | StcalError]:
         """Adjusts parts of the models as the run did; returns the error of a part that has no result."""
         camera, flatness_mm = self.calibration.camera, self.options.flatness_mm
-        return run_briefly(_adjusted, [(models, self.board, camera, flatness_mm) for models in parts])
+        factors = self.joint.print_factor, self.joint.bend_factor
+        return run_briefly(_adjusted, [(models, self.board, camera, flatness_mm, factors) for models in parts])
 
     def posed(self, joint: JointResult | StcalError, faces: Sequence[str]) -> tuple[CalibratedTarget, JointResult]:
         """Returns the poses of ``faces`` by the adjustment of a part of the models, and that adjustment.
@@ -64,9 +67,9 @@ class Again:
             raise _unfixed(joint.models) from error
 
 
-def _adjusted(models: Sequence[MetricModel], board, camera, flatness_mm) -> JointResult | StcalError:
+def _adjusted(models: Sequence[MetricModel], board, camera, flatness_mm, factors) -> JointResult | StcalError:
     try:
-        return adjust_jointly(models, board, camera, flatness_mm)
+        return adjust_jointly(models, board, camera, flatness_mm, factors=factors)
     except StcalError as error:
         return error
     except np.linalg.LinAlgError:
@@ -118,10 +121,11 @@ def _face_trial(name: str, apart: np.ndarray, covariance: np.ndarray, redundancy
     return Trial(name, MICRO * float(np.linalg.norm(apart[3:])), "µm", statistic, 6, redundancy)
 
 
-def groups_check(again: Again) -> Check:
+def groups_check(again: Again, networks: Sequence[Network]) -> Check:
     """Compares the result without one group with the whole result, for each group that all faces can spare.
 
-    The covariance of the change is the difference of the two covariances, as of a nested adjustment.
+    The covariance of the change is the difference of the two covariances, as of a nested adjustment. A group is named
+    only if the others agree without it, and do not if another one is left out instead.
     """
     key, title = "groups", "The result without each group"
     calibration = again.calibration
@@ -134,8 +138,12 @@ def groups_check(again: Again) -> Check:
         for g in members
         if len(members) > 1 and _linked([s for other, s in members.items() if other != g], reference) >= set(faces)
     ]
-    trials = []
+    trials: list[Trial] = []
     joints = again.adjust([[m for m in models if m.group != group] for group in removable])
+    cures = [
+        not isinstance(joint, StcalError) and _agree(joint, [n for n in networks if n.model.group != group])
+        for group, joint in zip(removable, joints, strict=True)
+    ]
     for group, adjustment in zip(removable, joints, strict=True):
         try:
             without, joint = again.posed(adjustment, faces)
@@ -150,8 +158,33 @@ def groups_check(again: Again) -> Check:
     if not trials:
         reason = "every group holds a face that no other links"
         return impossible(key, title, reason, "to be able to make it, add a group that closes a loop of faces")
-    remedy = "one group contradicts the others: was the target or the board moved in it, or the focus changed?"
-    return judge(key, title, [t for t in trials if t.freedom], "faces", remedy)
+    check = judge(key, title, [t for t in trials if t.freedom], "faces", "")
+    if not check.names:
+        return check
+    curing = [group for group, cured in zip(removable, cures, strict=True) if cured]
+    guilt = Guilt("groups", tuple(curing) if len(curing) == 1 else (), tuple(curing))
+    if guilt.culprits:
+        remedy = f"group {curing[0]} contradicts the others: was target or board moved in it, or the focus changed?"
+        return replace(check, names=(f"group {curing[0]}",), remedy=f"{remedy} Take it again, or leave it out")
+    remedy = (
+        "groups contradict one another: target, board or a face moved in one of them, or the focus changed; photograph "
+        "the faces in further groups, which tell the one that is wrong"
+    )
+    return replace(check, reason=f"{check.reason}; {guilt.words()}", names=(), remedy=remedy)
+
+
+def _agree(joint: JointResult, networks: Sequence[Network]) -> bool:
+    """Whether a joint adjustment adds no more to the squared residuals of its groups than chance does."""
+    extra, freedom, free = _added(joint, networks)
+    return float(fdtrc(freedom, free, extra / freedom)) >= SUSPICIOUS
+
+
+def _added(joint: JointResult, networks: Sequence[Network]) -> tuple[float, int, float]:
+    """Returns what a joint adjustment adds to the squared residuals of its groups, the degrees of freedom of that, and
+    those of the groups."""
+    free = float(sum(n.redundancy.sum() for n in networks))
+    square = float(sum((n.residual**2).sum() for n in networks))
+    return max(joint.sigma0**2 * joint.redundancy - square, 0.0), round(joint.redundancy - free), free
 
 
 def _nested_trial(name: str, change, larger: np.ndarray, smaller: np.ndarray, redundancy: float) -> Trial:
@@ -229,10 +262,7 @@ def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
     its last steps slow.
     """
     key, title = "agreement", "Groups, board and faces against one another (σ₀)"
-    free = float(sum(n.redundancy.sum() for n in networks))
-    square = float(sum((n.residual**2).sum() for n in networks))
-    extra = max(joint.sigma0**2 * joint.redundancy - square, 0.0)
-    freedom = round(joint.redundancy - free)
+    extra, freedom, free = _added(joint, networks)
     value = float(np.sqrt(extra / freedom))
     remedy = "look at the checks of board, groups and flatness: one of their σ is too small, or something moved"
     trial = Trial("all groups", value, "σ", extra, freedom, free)
@@ -250,11 +280,13 @@ def agreement_check(joint: JointResult, networks: Sequence[Network]) -> Check:
     )
 
 
-def flatness_check(networks: Sequence[Network], flatness_mm: float | None) -> Check:
+def flatness_check(
+    networks: Sequence[Network], flatness_mm: float | None, printed: Collection[str] = (), factor: float = 1.0
+) -> Check:
     """Tests the distance of each circle from the plane of the other circles of its face.
 
     It is taken from the free networks of all groups that see the circle, and tested against its σ and the stated
-    flatness.
+    flatness. ``printed`` : ids of faces of known shape, whose flatness is ``factor`` times the stated one.
     """
     key, title = "flatness", "Each circle against the plane of its face"
     if flatness_mm is None:
@@ -266,7 +298,8 @@ def flatness_check(networks: Sequence[Network], flatness_mm: float | None) -> Ch
                 heights.setdefault(face, []).append(_heights(network, members))
     redundancy = float(sum(n.redundancy.sum() for n in networks))
     trials = []
-    for parts in heights.values():
+    for face, parts in heights.items():
+        sigma_mm = flatness_mm * factor if face in printed else flatness_mm
         labels = sorted({label for names, _, _ in parts for label in names})
         normal, right = np.zeros((len(labels), len(labels))), np.zeros(len(labels))
         for names, height, weight in parts:
@@ -276,13 +309,15 @@ def flatness_check(networks: Sequence[Network], flatness_mm: float | None) -> Ch
         covariance = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
         adjusted_heights = covariance @ right
         held = covariance @ normal
-        weight = np.linalg.pinv(covariance + flatness_mm**2 * held @ held.T, rcond=1e-9, hermitian=True)
+        weight = np.linalg.pinv(covariance + sigma_mm**2 * held @ held.T, rcond=1e-9, hermitian=True)
         for i, label in enumerate(labels):
             if weight[i, i] > 0:
                 height = float(weight[i] @ adjusted_heights / weight[i, i])
                 trials.append(Trial(label, MICRO * height, "µm", height**2 * weight[i, i], 1, redundancy))
     remedy = "a circle out of its plane, or a face less flat than stated: press or glue it flat, or state --flatness"
-    return judge(key, title, trials, "circles", remedy)
+    # Bent paper does no harm: its corners are where they are, and the frame is laid over all of them.
+    worst = "suspicious" if heights.keys() <= set(printed) else "failed"
+    return judge(key, title, trials, "circles", remedy, worst)
 
 
 def _heights(network: Network, members: np.ndarray) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """Checks of images, labels, single observations and camera from the residuals of the free networks."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -15,6 +15,7 @@ from stcal.io.cameras.model import PARAMETER_NAMES, CalibratedCamera, CameraPrio
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, solve_score
+from stcal.sfm.checks.culprits import Guilt, culprits, culprits_by_score
 from stcal.sfm.checks.verdict import SHOWN, SUSPICIOUS, Check, Measured, Trial, judge, without_image
 from stcal.sfm.data.model import ImageObservations, Outlier
 
@@ -101,7 +102,8 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
 
     def columns(network: Network) -> np.ndarray:
         size = np.array([camera.width, camera.height])
-        x, y = (2 * network.model.measured_px / size - 1).T
+        # Not at the measured places: a field that poses and points absorb would leave the residuals themselves.
+        x, y = (2 * camera.project(network.model.xyz_camera()) / size - 1).T
         terms = np.stack([x**i * y**j for i in range(FIELD_DEGREE + 1) for j in range(FIELD_DEGREE + 1 - i)], axis=1)
         zeros = np.zeros_like(terms)
         field = np.stack([np.hstack([terms, zeros]), np.hstack([zeros, terms])], axis=1)
@@ -230,18 +232,17 @@ def moved_check(networks: Sequence[Network]) -> Check:
     In every image all faces together may be shifted and turned against the board. Whether this motion is needed is a
     test with six degrees of freedom.
     """
-    trials = []
+    trials: list[Trial] = []
+    found: dict[str, tuple[Network, np.ndarray, list[int]]] = {}
     for network in networks:
         model = network.model
         on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])
         if on_face.all() or not on_face.any():
             continue
-        middle = model.xyz_model[on_face].mean(0)
-        arm = model.xyz_model[model.point_index] - middle
-        motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
-        motion = motion * on_face[model.point_index][:, None, None]
-        normal, right = network.score_by_image(network.by_point @ motion)
+        columns = _motion(network, on_face)
+        normal, right = network.score_by_image(columns)
         redundancy = network.redundancy.sum()
+        tested = []
         for i, (name, rows) in enumerate(zip(model.images, model.rows_by_image(), strict=True)):
             faces = on_face[model.point_index[rows]].sum()
             if min(faces, len(rows) - faces) < MIN_CIRCLES:
@@ -250,11 +251,44 @@ def moved_check(networks: Sequence[Network]) -> Check:
             if test.freedom:
                 shift_um = 1e3 * float(np.linalg.norm(test.estimate[3:]))
                 trials.append(Trial(name, shift_um, "µm", test.statistic, test.freedom, redundancy - test.freedom))
+                tested.append(i)
+        found[model.group] = network, columns, tested
+    check = judge("moved", "Target against board, image by image", trials, "images", "")
+    if not check.names or len(check.names) > max(NEARLY_ALL * check.tested, 1):
+        return _take_out(check, "")
+    guilt = [
+        culprits_by_score(network, columns, tested, check.tested, f"group {group}")
+        for group, (network, columns, tested) in found.items()
+        if any(network.model.images[i] in check.names for i in tested)
+    ]
     remedy = (
         "in these images the target stood elsewhere against the board than in the others of the group: sort the images "
         "into groups between which nothing moved, or take the group again; of a single one, run without it"
     )
-    return _take_out(judge("moved", "Target against board, image by image", trials, "images", ""), remedy)
+    causes = "target or board moved between these images, or zoom or focus changed: take the group again"
+    return with_culprits(check, guilt, remedy, causes)
+
+
+def _motion(network: Network, on_face: np.ndarray) -> np.ndarray:
+    """Returns the derivatives (n, 2, 6) over σ by a motion of all faces together, of points (p,) ``on_face``."""
+    model = network.model
+    arm = model.xyz_model[model.point_index] - model.xyz_model[on_face].mean(0)
+    motion = np.concatenate([-skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
+    return network.by_point @ (motion * on_face[model.point_index][:, None, None])
+
+
+def with_culprits(check: Check, guilt: Sequence[Guilt], remedy: str, causes: str) -> Check:
+    """Returns the check with the names of the culprits alone, and what to do about them.
+
+    ``remedy`` : for culprits, of which the first is taken out; ``causes`` : what makes such a fault and what to do, if
+    no culprit is known.
+    """
+    names = tuple(name for own in guilt for name in own.culprits)
+    names = tuple(sorted(names, key=check.names.index)) if set(names) <= set(check.names) else names
+    open_ones = [words for own in guilt if (words := own.words())]
+    reason = "; ".join([check.reason, *open_ones])
+    advice = [f"{remedy}: {without_image(names[0])}"] if names else []
+    return replace(check, reason=reason, names=names, remedy="; ".join(advice + [causes] * bool(open_ones)))
 
 
 NEARLY_ALL = 0.7
@@ -290,7 +324,8 @@ def labels_check(
     remedy = "look at these circles in the overlays: hidden in part, dirty, a reflection, or a wrong label"
     check = judge("labels", "Each centre against all others", _trials(networks), "centres", remedy, "suspicious")
     swapped = _exchanged(networks, outliers, images, camera)
-    lost = tuple(name for name, count in Counter(o.image for o in outliers).most_common() if count >= MANY)
+    guilt = _images_of_outliers(networks, outliers)
+    lost = tuple(name for own in guilt for name in own.culprits)
     if not outliers:
         return check
     named = tuple(f"{o.image} {o.label}" for o in outliers)
@@ -299,12 +334,15 @@ def labels_check(
     )
     reason = f"{len(outliers)} left out, first {named[0]}: {outliers[0].residual_px:.3g} px"
     verdict = "suspicious"
-    if lost:
+    if guilt:
         verdict = "failed"
-        reason = f"{len(outliers)} left out, {MANY} or more of image {', '.join(lost)}"
+        words = [f"{MANY} or more of image {', '.join(lost)}"] * bool(lost) + [w for own in guilt if (w := own.words())]
+        reason = f"{len(outliers)} left out, {'; '.join(words)}"
         remedy = (
             "in these images the target stood elsewhere against the board, or they are of another group: take them "
             f"out, the first with {without_image(lost[0])}"
+            if lost
+            else "target or board moved between the images of a group, or zoom or focus changed: take it again"
         )
     if swapped:
         verdict = "failed"
@@ -319,6 +357,26 @@ def labels_check(
         names=(*swapped, *lost, *named, *check.names),
         remedy=remedy,
     )
+
+
+def _images_of_outliers(networks: Sequence[Network], outliers: Sequence[Outlier]) -> list[Guilt]:
+    """Returns the culprits of each group of which an image lost :data:`MANY` centres or more."""
+    count = Counter(o.image for o in outliers)
+    found = []
+    for network in networks:
+        names = [*network.model.images, *(n for n in count if _of_group(n, network) and n not in network.model.images)]
+
+        def worst(out: Collection[int], names: list[str] = names) -> int | None:
+            many = [i for i, name in enumerate(names) if i not in out and count[name] >= MANY]
+            return max(many, key=lambda i: count[names[i]], default=None)
+
+        if worst(()) is not None:
+            found.append(culprits(names, worst, f"group {network.model.group}"))
+    return found
+
+
+def _of_group(image: str, network: Network) -> bool:
+    return image.rpartition("/")[0] == network.model.group
 
 
 def _trials(networks: Sequence[Network]) -> list[Trial]:

@@ -6,9 +6,10 @@ from functools import partial
 
 import numpy as np
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign, faces_of_known_shape
 from stcal.errors import StcalError
 from stcal.io.cameras.model import CalibratedCamera, CameraPrior
+from stcal.labels import Label
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factors, with_sigma
 from stcal.sfm.adjust.network import Network, free_network, solve_score
@@ -36,6 +37,7 @@ from stcal.sfm.checks.images import (
     sigma_check,
     summed,
 )
+from stcal.sfm.checks.scales import scales_check
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
 
@@ -73,6 +75,11 @@ class Evidence:
     blur_px: dict[str, float]
     rim: bool = False
 
+    def radius_mm(self) -> dict[Label, float]:
+        """Returns the radii of all circles and dots, without the corners of printed faces."""
+        radius: dict[Label, float] = {**self.target.radius_of(), **self.board.radius_of()}
+        return {label: value for label, value in radius.items() if value > POINT_RADIUS_MM}
+
     def networks(self) -> list[Network]:
         """Returns the free networks of all groups, mm, at the intrinsics of the result."""
         camera = self.calibration.camera
@@ -87,12 +94,17 @@ class Evidence:
 def _rims(evidence: Evidence) -> tuple[dict[str, Rim], float | None, float | None]:
     """Returns the rims by kind of circle; the largest σ of a face's position, mm, None if it is not known; and the
     height that the result allows for, None if it is to be estimated."""
-    radius = evidence.target.radius_of() | evidence.board.radius_of()
-    rims = find_rims(evidence.calibration.models, evidence.images, radius, evidence.calibration.camera)
+    rims = find_rims(evidence.calibration.models, evidence.images, evidence.radius_mm(), evidence.calibration.camera)
     known = [np.sqrt(np.diag(c)[3:].max()) for c in evidence.calibration.target.face_covariance.values()]
     stated = list(evidence.target.rim_of().values())
     allowed = None if evidence.rim else float(np.mean(stated)) if stated else 0.0
     return rims, float(max(known)) if known else None, allowed
+
+
+def _bend(evidence: Evidence) -> tuple[set[str], float]:
+    """Returns the faces of known shape, and the factor on the flatness of these."""
+    joint = evidence.calibration.joint
+    return {face.id for face in faces_of_known_shape(evidence.board)}, 1.0 if joint is None else joint.bend_factor
 
 
 def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Check, ...]:
@@ -102,7 +114,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
     """
     networks, calibration = evidence.networks(), evidence.calibration
     camera, board, target = calibration.camera, evidence.board, evidence.target
-    radii = measure_radii(networks, evidence.images, target.radius_of() | board.radius_of(), camera)
+    radii = measure_radii(networks, evidence.images, evidence.radius_mm(), camera)
     makers: tuple[Callable[[], Check | Iterable[Check]], ...] = (
         lambda: camera_check(networks, evidence.camera, calibration, evidence.prior),
         lambda: field_check(networks, camera),
@@ -117,9 +129,13 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: pitch_check(calibration.target, target, radii),
         lambda: radius_checks(radii),
         lambda: rim_check(*_rims(evidence)),
-        lambda: flatness_check(networks, evidence.options.flatness_mm),
+        lambda: flatness_check(networks, evidence.options.flatness_mm, *_bend(evidence)),
         lambda: control_check(evidence, networks),
     )
+    if isinstance(board, ScaleReference):  # the target tells its size itself
+        joint = calibration.joint
+        factor = 1.0 if joint is None else joint.print_factor
+        makers += (lambda: scales_check(networks, board, factor),)
     step = counted(progress or (lambda *_: None), "check", len(makers) + IN_PAIRS)
     checks: list[Check] = []
     for make in makers:
@@ -128,7 +144,8 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
             checks.append(check)
             step(None)
     failed = any(check.verdict == "failed" for check in checks)
-    cause = whole_set_cause(networks, camera) if failed else None
+    moved = any(check.key == "moved" and check.verdict == "failed" and not check.names for check in checks)
+    cause = whole_set_cause(networks, camera, moved) if failed else None
     return (cause, *checks) if cause else tuple(checks)
 
 
@@ -145,7 +162,7 @@ def _joint_checks(evidence: Evidence, networks: list[Network]) -> list[Callable[
     return [
         partial(agreement_check, joint, linked_networks),
         partial(halves_check, again),
-        partial(groups_check, again),
+        partial(groups_check, again, linked_networks),
         partial(loops_check, again),
     ]
 
@@ -158,6 +175,8 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
     all else free. The factor is 1 up to chance, and 0 if the centres are not those of ellipses.
     """
     key = "control"
+    if not evidence.radius_mm():
+        return impossible(key, CONTROL, "corners alone, which have no eccentricity", "")
     if not evidence.options.eccentricity:
         return impossible(key, CONTROL, "this run is the control", "run with eccentricity")
     test = solve_score(*summed(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None])))

@@ -15,7 +15,7 @@ from scipy.special import fdtrc
 
 from stcal.geometry.robust import ratio_limit
 from stcal.sfm.report.checks import ORDER
-from stcal.sfm.report.judgement import CAUSE
+from stcal.sfm.report.judgement import CAUSE, GENERAL
 
 Verdict = Literal["passed", "suspicious", "failed", "not possible"]
 SUSPICIOUS = 1e-3
@@ -134,11 +134,14 @@ def ranked(checks: Sequence[Check], images: frozenset[str]) -> list[Check]:
     """Returns the checks in the order in which to read them, the worst first.
 
     Among equal verdicts the cause of the whole set comes first, then those that name an image: it may be the reason why
-    the others fail.
+    the others fail. Those that do not tell what is wrong come last.
     """
-    return sorted(
-        checks, key=lambda check: (ORDER.index(check.verdict), check.key != CAUSE, images.isdisjoint(check.names))
-    )
+
+    def place(check: Check) -> tuple:
+        named = not images.isdisjoint(check.names)
+        return ORDER.index(check.verdict), check.key != CAUSE, not named, check.key in GENERAL
+
+    return sorted(checks, key=place)
 
 
 def impossible(key: str, title: str, reason: str, remedy: str) -> Check:

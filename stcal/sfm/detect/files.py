@@ -6,18 +6,18 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import combinations
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cache import keep, kept, packed
+from stcal.io.cache import keep, keep_packed, kept, made_by, packed
 from stcal.io.cameras.model import CameraModel
-from stcal.io.files import save
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import (
     MAJORITY,
@@ -37,7 +37,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
-CACHE_VERSION = 7
+CACHE_VERSION = 8
 """Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
 LOSSY = (".jpg", ".jpeg")
@@ -98,7 +98,7 @@ def detect_files(
     Raises
     ------
     InputError
-        No file is usable; the message names the first one and its reason.
+        No file is usable; the message names the first one and its reason. Or a file is gone meanwhile.
     DetectionError
         A process that worked on an image was ended from outside.
     """
@@ -126,6 +126,16 @@ def detect_files(
     return DetectionResult(tuple(images), tuple(skipped), camera)
 
 
+def seen_by(detection: DetectionResult, camera: Camera) -> DetectionResult:
+    """Returns the detections of corners alone for another camera, which moves none of them."""
+    images = []
+    for image in detection.images:
+        centres = image.detection.centres
+        seen = replace(centres, centre=camera.normalised_from_pixel(centres.centre_px))
+        images.append(replace(image, detection=replace(image.detection, centres=seen)))
+    return replace(detection, images=tuple(images), camera=camera)
+
+
 def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera, str]:
     """The camera, and what its size is from: a file of OpenCV may not say it, then most of the images do."""
     if camera_model.width and camera_model.height:
@@ -144,7 +154,15 @@ def _fingerprint(
         return value.tolist() if isinstance(value, np.ndarray) else str(value)
 
     dots = {key: value for key, value in asdict(board).items() if key != "stated"} if board else None
-    parts = [CACHE_VERSION, asdict(camera), asdict(target.patterns_alone()), dots, asdict(options)]
+    parts = [
+        CACHE_VERSION,
+        made_by(),
+        cv2.__version__,
+        asdict(camera),
+        asdict(target.patterns_alone()),
+        dots,
+        asdict(options),
+    ]
     parts += [detector.__name__] if detector else []
     return hashlib.sha256(json.dumps(parts, default=plain, sort_keys=True).encode()).hexdigest()
 
@@ -160,7 +178,7 @@ def _kept(file: ImageFile, settings: str, cache: Path) -> DetectedImage | None:
         path = cache / f"{_key(file.read(), settings)[1]}.npz"
     except OSError:
         return None
-    return _load(file, path, reused=True) if path.exists() else None
+    return _load(file, path, reused=True)
 
 
 def _detect_file(
@@ -183,13 +201,13 @@ def _detect_file(
     except ConvergenceError as error:
         return Skipped(file.name, str(error), "distortion")
     digest, key = _key(data, settings)
-    return key, _packed(detection, digest, image)
+    return key, _packed(detection, key, digest, image)
 
 
 def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedImage:
     """Saves a result in the cache and loads it from there."""
     path = cache / f"{key}.npz"
-    save(path, content)
+    keep_packed(path, content)
     found = _load(file, path, reused=False)
     if found is None:
         raise InputError("E-OUTPUT-READ-BACK", f"{path}: written, and cannot be read again; check the disk")
@@ -197,7 +215,13 @@ def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedI
 
 
 def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, np.ndarray] | Skipped:
-    """Content of a file and the grey image in it, or why it cannot be used; ``size_from`` : what the size is from."""
+    """Content of a file and the grey image in it, or why it cannot be used; ``size_from`` : what the size is from.
+
+    Raises
+    ------
+    InputError
+        The file is gone.
+    """
     try:
         data = file.read()
     except OSError as error:
@@ -212,12 +236,13 @@ def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, 
     return data, image
 
 
-def _packed(detection: ImageDetection, digest: str, image: np.ndarray) -> bytes:
+def _packed(detection: ImageDetection, key: str, digest: str, image: np.ndarray) -> bytes:
     jpeg, scale = thumbnail(grey_8bit(image))
     meta = {
         "digest": digest,
         "scale": scale,
         "faces": [each.face for each in detection.faces],
+        "printed": [each.face for each in detection.printed],
         "boards": len(detection.boards),
         "open_faces": [[each.face for each in faces] for faces in detection.open_faces],
         "mirrored": detection.mirrored,
@@ -227,16 +252,18 @@ def _packed(detection: ImageDetection, digest: str, image: np.ndarray) -> bytes:
     arrays = _centre_arrays(detection.centres)
     for i, face in enumerate(detection.faces):
         arrays |= {f"face_rows_{i}": face.rows, f"face_circles_{i}": face.circles}
+    for i, face in enumerate(detection.printed):
+        arrays |= {f"printed_rows_{i}": face.rows, f"printed_corners_{i}": face.circles}
     for i, faces in enumerate(detection.open_faces):
         for k, face in enumerate(faces):
             arrays |= {f"open_rows_{i}_{k}": face.rows, f"open_circles_{i}_{k}": face.circles}
     for i, each in enumerate(detection.boards):
         arrays |= {f"board_{f.name}_{i}": getattr(each, f.name) for f in fields(BoardSighting)}
-    return packed({"thumbnail": jpeg, **arrays}, meta)
+    return packed(key, {"thumbnail": jpeg, **arrays}, meta)
 
 
 def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
-    """Loads a cached result; None if the file is damaged."""
+    """Loads a cached result; None if there is none, or the file is not as it was saved."""
 
     def make(stored, meta) -> DetectedImage:
         faces = [
@@ -262,6 +289,10 @@ def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:
             tuple(meta["notes"]),
             meta["candidates"],
             tuple(open_faces),
+            tuple(
+                FaceSighting(face, stored[f"printed_rows_{i}"], stored[f"printed_corners_{i}"])
+                for i, face in enumerate(meta["printed"])
+            ),
         )
         return DetectedImage(file, detection, meta["digest"], stored["thumbnail"].tobytes(), meta["scale"], reused)
 
@@ -285,7 +316,7 @@ def look_again(
 ) -> dict[str, SecondLook]:
     """Measures the circles that are predicted in images; returns results by name, cached ones included.
 
-    An image that can no longer be read is left as it was after the first look.
+    An image that can no longer be read is left as it was after the first look; one that is gone is an error.
     """
     found: dict[str, SecondLook] = {}
     pending: list[tuple[ImageFile, Camera, PredictedCircles, EllipseOptions]] = []
@@ -306,7 +337,8 @@ def look_again(
 
 
 def _predicted_key(digest: str, predicted: PredictedCircles, camera: Camera, options: EllipseOptions) -> str:
-    hasher = hashlib.sha256(f"{CACHE_VERSION}\0{digest}\0{predicted.labels}\0{predicted.polarity}\0{options}".encode())
+    stated = (CACHE_VERSION, made_by(), cv2.__version__, digest, predicted.labels, predicted.polarity, options)
+    hasher = hashlib.sha256("\0".join(map(str, stated)).encode())
     for values in (predicted.centre_px, predicted.shape_px, predicted.wanted, camera.parameters()):
         hasher.update(values.tobytes())
     return hasher.hexdigest()[:40]
@@ -316,8 +348,12 @@ def _look_again(
     file: ImageFile, camera: Camera, predicted: PredictedCircles, options: EllipseOptions
 ) -> SecondLook | None:
     try:
-        image = decode(file.read(), file.name, (camera.width, camera.height))
-    except (InputError, OSError):
+        data = file.read()
+    except OSError:
+        return None
+    try:
+        image = decode(data, file.name, (camera.width, camera.height))
+    except InputError:
         return None
     return measure_predicted(image, camera, predicted, options)
 

@@ -7,117 +7,13 @@ from itertools import permutations
 import numpy as np
 from scipy.spatial import KDTree
 
-from stcal.geometry.least_squares import PoseStack, minimise
-from stcal.geometry.normal_equations import blocks_of, reduce
-from stcal.geometry.rigid import Rigid, skew
-from stcal.geometry.robust import huber_cost, huber_weights
+from stcal.geometry.least_squares import PoseStack
+from stcal.geometry.plane_bundle import PlaneBundle
+from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD
+from stcal.lookalikes import alike
 from stcal.sfm.data.patterns import Pattern
 from stcal.sfm.detect.sightings import PlaneView, Readings, flipped_pose, mirrored_as
-
-HUBER_PX = 1.5
-"""Residual beyond which an observation loses weight.
-
-Such residuals are deviations of printed planes, not of centres.
-"""
-SETTLED = 1e-4
-"""Relative decrease of χ² at convergence. A prediction to a fraction of a pixel is sufficient."""
-MAX_STEPS = 30
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlaneBundle:
-    """n observations of points of planes: ``image``, ``plane`` : (n,); ``xyz`` : (n, 3) in the plane; ``seen`` : (n, 2)
-    measured, ideal px."""
-
-    image: np.ndarray
-    plane: np.ndarray
-    xyz: np.ndarray
-    seen: np.ndarray
-    focal_px: float
-
-    def adjusted(self, poses: PoseStack, planes: PoseStack) -> tuple[PoseStack, PoseStack]:
-        """Returns the poses camera_from_world of the m images and world_from_plane of the planes; the first plane is
-        fixed.
-
-        Without convergence the last state is returned: its predictions are verified anyway.
-        """
-
-        def moved(state, step: np.ndarray):
-            own = step[6 * len(poses) :].reshape(-1, 6)
-            return state[0].moved(step[: 6 * len(poses)].reshape(-1, 6)), state[1].moved(
-                np.vstack([np.zeros((1, 6)), own])
-            )
-
-        return minimise(
-            (poses, planes),
-            lambda state: self._linearised(*state),
-            moved,
-            settled=SETTLED,
-            max_steps=MAX_STEPS,
-            damping=1e-3,
-        ).state
-
-    def _linearised(self, poses: PoseStack, planes: PoseStack) -> "_Linear":
-        m, k = len(poses), 6 * (len(planes) - 1)
-        turned = np.einsum("nij,nj->ni", planes.rotation[self.plane], self.xyz)
-        rotation = poses.rotation[self.image]
-        placed = np.einsum("nij,nj->ni", rotation, turned + planes.translation[self.plane])
-        xyz = placed + poses.translation[self.image]
-        if (xyz[:, 2] <= 0).any():
-            return _Linear(np.inf, np.zeros((m, 6, 6)), np.zeros((m, 6)), np.eye(k), np.zeros(k), np.zeros((m, 6, k)))
-        ideal = xyz[:, :2] / xyz[:, 2:]
-        residual = self.seen - self.focal_px * ideal
-        length = np.linalg.norm(residual, axis=1)
-        root = np.sqrt(huber_weights(length, HUBER_PX))
-        by_point = np.zeros((len(xyz), 2, 3))
-        by_point[:, 0, 0] = by_point[:, 1, 1] = 1
-        by_point[:, :, 2] = -ideal
-        by_point *= (root * self.focal_px / xyz[:, 2])[:, None, None]
-        by_pose = np.concatenate([-by_point @ skew(placed), by_point], axis=2)
-        by_group = by_point @ rotation
-        by_plane = np.concatenate([-by_group @ skew(turned), by_group], axis=2)
-        residual = residual * root[:, None]
-        blocks, right = blocks_of(by_pose, residual, self.image, m)
-        own, own_right = blocks_of(by_plane, residual, self.plane, len(planes))
-        normal = np.zeros((k, k))
-        for b in range(1, len(planes)):
-            at = slice(6 * b - 6, 6 * b)
-            normal[at, at] = own[b]
-        cross = np.zeros((m, len(planes), 6, 6))
-        np.add.at(cross, (self.image, self.plane), np.swapaxes(by_pose, 1, 2) @ by_plane)
-        return _Linear(
-            float(huber_cost(length, HUBER_PX).sum()),
-            blocks,
-            right,
-            normal,
-            own_right[1:].ravel(),
-            cross[:, 1:].transpose(0, 2, 1, 3).reshape(m, 6, k),
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Linear:
-    """Normal equations of the images' poses, which are eliminated, and of all planes except the first."""
-
-    cost: float
-    poses: np.ndarray
-    pose_right: np.ndarray
-    planes: np.ndarray
-    plane_right: np.ndarray
-    cross: np.ndarray
-
-    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
-        """Returns the step of the images (6m,) and planes, and the predicted gain."""
-        damped = self.poses * (1 + damping * np.eye(6))
-        away = reduce(damped, self.pose_right, self.cross)
-        k = len(self.plane_right)
-        own = self.planes * (1 + damping * np.eye(k)) - away.normal
-        planes = np.linalg.lstsq(own, self.plane_right - away.right, rcond=1e-12)[0] if k else np.zeros(0)
-        poses = away.back(planes)
-        gain = float((poses * self.pose_right).sum() + planes @ self.plane_right)
-        return np.concatenate([poses.ravel(), planes]), gain
-
 
 MAX_SHIFT_PITCHES = 0.3
 """Largest deviation of a plane from its place in an image's first pose, in steps of the pattern. A wrong numbering of
@@ -166,7 +62,7 @@ class Arrangement:
 def arrange(
     images: Sequence[list[Readings]], patterns: dict[str, Pattern], step_mm: float, focal_px: float
 ) -> Arrangement:
-    """Returns the arrangement that explains most circles of one group.
+    """Returns the arrangement that explains most circles of one group, without what a mirror shows.
 
     Parameters
     ----------
@@ -179,6 +75,22 @@ def arrange(
     focal_px
         Focal length of the camera.
     """
+    reach_mm = MAX_SHIFT_PITCHES * step_mm
+    found, reflected = _best(images, patterns, step_mm, focal_px), {}
+    while mirror := _mirror_of_group(found, patterns, reach_mm):
+        behind = {i: gone for i in found.camera_from_group if (gone := _behind(images[i], found, i, mirror))}
+        if not behind:
+            break
+        reflected = {i: reflected.get(i, ()) + behind.get(i, ()) for i in {*reflected, *behind}}
+        images = [[r for r in own if not any(r[0] is v for v in behind.get(i, ()))] for i, own in enumerate(images)]
+        found = _best(images, patterns, step_mm, focal_px)
+    whole = {i: reflected.get(i, ()) + found.reflected.get(i, ()) for i in {*reflected, *found.reflected}}
+    return replace(found, reflected=whole)
+
+
+def _best(
+    images: Sequence[list[Readings]], patterns: dict[str, Pattern], step_mm: float, focal_px: float
+) -> Arrangement:
     total = sum(len(views[0].rows) for readings in images for views in readings if views[0].named)
     best = Arrangement({}, {}, {})
     for i, reading in _seeds(images):
@@ -193,12 +105,71 @@ def arrange(
     return best
 
 
+Mirror = tuple[np.ndarray, np.ndarray]
+"""Normal of a mirror, towards the cameras, and a point of it; group frame."""
+
+
+def _mirror_of_group(found: Arrangement, patterns: dict[str, Pattern], reach_mm: float) -> Mirror | None:
+    """Returns the mirror that most images show, such as a shiny table; None without one.
+
+    A plane that one image shows at two places, each the mirror image of the other, is in a mirror at one of them. Of
+    the two worlds the one on the cameras' side is real, the other one has its handedness reversed.
+    """
+    mirrors = []
+    for i, contradicted in found.contradicted.items():
+        centre, planes = found.camera_from_group[i].inverse(), {view.plane for view in found.views[i]}
+        for view in (view for views in contradicted for view in views if view.plane in planes):
+            pattern = patterns[view.plane]
+            own, other = found.group_from_plane[view.plane], centre @ view.camera_from_plane
+            xyz = pattern.xyz_mm()
+            mirror = _mirror_between(own @ xyz, other @ xyz, pattern.radius_mm, reach_mm)
+            if mirror is not None:
+                normal, middle = mirror
+                mirrors.append((normal * np.sign((centre.translation - middle) @ normal), middle, i))
+    if not mirrors:
+        return None
+    images = [{j for _, m, j in mirrors if abs((m - middle) @ normal) < reach_mm} for normal, middle, _ in mirrors]
+    return mirrors[int(np.argmax([len(own) for own in images]))][:2]
+
+
+def _mirror_between(own: np.ndarray, other: np.ndarray, radius: np.ndarray, reach_mm: float) -> Mirror | None:
+    """Returns normal and a point of the mirror that shows the circles ``own`` as ``other``, (n, 3) each, in any order;
+    None if there is none.
+
+    Nothing real lies on both sides of a mirror; a plane half way between a grid and the same grid numbered otherwise
+    cuts both.
+    """
+    between = own.mean(0) - other.mean(0)
+    length = float(np.linalg.norm(between))
+    if length < 2 * reach_mm:
+        return None
+    normal, middle = between / length, (own.mean(0) + other.mean(0)) / 2
+    if ((own - middle) @ normal <= 0).any():
+        return None
+    apart, nearest = KDTree(other).query(own - 2 * ((own - middle) @ normal)[:, None] * normal)
+    same = len(np.unique(nearest)) == len(own) and apart.max() < reach_mm and alike(radius, radius[nearest]).all()
+    return (normal, middle) if same else None
+
+
+def _behind(readings: list[Readings], found: Arrangement, image: int, mirror: Mirror) -> tuple[PlaneView, ...]:
+    """Returns the first view of the readings of one image that lie behind a mirror."""
+    group_from_camera = found.camera_from_group[image].inverse()
+    normal, middle = mirror
+
+    def is_behind(view: PlaneView) -> bool:
+        xyz = group_from_camera @ (view.camera_from_plane @ view.xyz_mm())
+        return bool(np.median((xyz - middle) @ normal) < 0)
+
+    return tuple(views[0] for views in readings if all(is_behind(view) for view in views))
+
+
 def across_groups(groups: Sequence[Arrangement], patterns: dict[str, Pattern], reach_mm: float) -> list[Arrangement]:
     """Compares the arrangements of all groups, as the faces of a target have the same relative poses in all of them.
 
     A face is removed from a group in which its place differs from that in most groups. A face is added to a group if
     its place is known from other groups, even if no image of the group has a reading of it: the second look decides.
-    The places of all faces then also identify the mirror image of a face that a group does not show.
+    The places of all faces then also identify the mirror image of a face that a group does not show. A group that
+    contradicts the others, and whose faces may all be mirror images of other faces, has mirrored images and loses them.
     """
     faces = [_as_faces(group) for group in groups]
     best: Arrangement = Arrangement({}, {}, {})
@@ -212,9 +183,15 @@ def across_groups(groups: Sequence[Arrangement], patterns: dict[str, Pattern], r
             settled.append(group)
             continue
         agreed = {view.plane for view in best.views[i]}
-        reduced, foreign = group.without({p for p in group.group_from_plane if p != BOARD} - agreed)
+        faces = {p for p in group.group_from_plane if p != BOARD}
+        if faces - agreed and all(_may_be_mirrored(group, patterns, face) for face in faces):
+            reduced, foreign = group.without(faces)
+            others = [replace(reduced, foreign=foreign) if each is group else each for each in groups]
+            return across_groups(others, patterns, reach_mm)
+        reduced, foreign = group.without(faces - agreed)
         pose = best.camera_from_group[i]
         known = {p: pose @ target_from_face for p, target_from_face in best.group_from_plane.items()}
+        foreign = {k: group.foreign.get(k, ()) + foreign.get(k, ()) for k in {*group.foreign, *foreign}}
         settled.append(replace(reduced, group_from_plane=known | reduced.group_from_plane, foreign=foreign))
     cleared = [_without_reflections(group, patterns, reach_mm) for group in settled]
     reflections = [s.group_from_plane.keys() - c.group_from_plane.keys() for s, c in zip(settled, cleared, strict=True)]
@@ -469,13 +446,10 @@ def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, imag
     radii included; they stand where a mirror shows them; and most images are taken from the other plane's side."""
     if not {real, image} <= found.group_from_plane.keys():
         return False
-    views = {i: v for i, own in found.views.items() for v in own if v.plane == image}
-    labels = list(patterns[image].labels)
-    seen = {i: {labels.index(label) for label in view.labels} for i, view in views.items()}
+    seen = _circles_seen(found, patterns, image)
     own, other = (found.group_from_plane[p] @ patterns[p].xyz_mm() for p in (real, image))
     for pairs in mirrored_as(patterns[real], patterns[image]):
-        explained = [i for i, circles in seen.items() if circles <= set(pairs[:, 1].tolist())]
-        if 2 * len(explained) <= len(seen):
+        if not _in_most(seen, pairs):
             continue  # most images show circles, or radii, that the mirror image does not have
         mirror = _mirror(own[pairs[:, 0]], other[pairs[:, 1]], reach_mm)
         if mirror is None:
@@ -485,6 +459,25 @@ def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, imag
         if np.mean(sides) > 0.5:
             return True
     return False
+
+
+def _circles_seen(found: Arrangement, patterns: dict[str, Pattern], face: str) -> dict[int, set[int]]:
+    """Returns the circles of a face, as places in its pattern, by image."""
+    labels = list(patterns[face].labels)
+    views = {i: view for i, own in found.views.items() for view in own if view.plane == face}
+    return {i: {labels.index(label) for label in view.labels} for i, view in views.items()}
+
+
+def _in_most(seen: dict[int, set[int]], pairs: np.ndarray) -> bool:
+    """Whether most images show no circles but those of ``pairs``, the second places."""
+    return 2 * sum(circles <= set(pairs[:, 1].tolist()) for circles in seen.values()) > len(seen)
+
+
+def _may_be_mirrored(found: Arrangement, patterns: dict[str, Pattern], face: str) -> bool:
+    """Whether what a group shows of a face may be the mirror image of any face, itself included."""
+    seen = _circles_seen(found, patterns, face)
+    reals = [pattern for plane, pattern in patterns.items() if plane != BOARD]
+    return any(_in_most(seen, pairs) for real in reals for pairs in mirrored_as(real, patterns[face]))
 
 
 def _mirror(own: np.ndarray, other: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray] | None:

@@ -6,9 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from stcal.boards.faces import find_on_faces
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
-from stcal.io.images import grey_8bit, grey_fine
+from stcal.io.images import grey_8bit, grey_fine, require_grey
 from stcal.labels import Label
 from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.board import BoardReading, find_boards
@@ -87,6 +88,47 @@ def _read_once(
 
 
 def detect_image(
+    image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+) -> ImageDetection:
+    """Finds and measures all points of the target and the board in one grey image of the camera's size.
+
+    Circles are searched where the design has any; the corners of printed faces are taken as they are found.
+
+    Raises
+    ------
+    InputError
+        The image is not grey, not of 8 or 16 bits, or not of the camera's size.
+    """
+    require_grey(image, (camera.width, camera.height))
+    image = np.ascontiguousarray(image)
+    circles, printed = target.with_faces(printed=False), target.with_faces(printed=True)
+    if not printed.faces:
+        return _detect_circles(image, camera, target, board, options)
+    boards = {face.id: face.printed for face in printed.faces}
+    views, notes = find_on_faces(image, "", boards, camera)  # type: ignore[arg-type]
+    detection = ImageDetection(_corners(np.zeros((0, 2)), np.zeros((0, 2, 2)), camera), ())
+    if circles.faces or board is not None:
+        detection = _detect_circles(image, camera, circles, board, options)
+    parts, sightings, first = [detection.centres], [], len(detection.centres)
+    for face, view in views.items():
+        assert view.covariance_px2 is not None, "detectors of boards on faces state σ"
+        parts.append(_corners(view.xy_px, view.covariance_px2, camera))
+        sightings.append(FaceSighting(face, first + np.arange(len(view)), view.ids))
+        first += len(view)
+    return replace(
+        detection, centres=Centres.concatenate(parts), printed=tuple(sightings), notes=(*detection.notes, *notes)
+    )
+
+
+def _corners(xy_px: np.ndarray, covariance_px2: np.ndarray, camera: Camera) -> Centres:
+    """Returns corners as centres of ellipses without extent."""
+    n = len(xy_px)
+    zero, one = np.zeros(n), np.ones(n)
+    flat, centre = np.zeros((n, 2, 2)), camera.normalised_from_pixel(xy_px)
+    return Centres(xy_px, centre, flat, covariance_px2, zero, zero, zero, one, np.zeros((n, 2)), np.ones(n, bool))
+
+
+def _detect_circles(
     image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> ImageDetection:
     """Finds and measures all circles of the target and the board in one grey image of the camera's size."""

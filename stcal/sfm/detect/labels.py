@@ -15,7 +15,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import Centres, ImageObservations
-from stcal.sfm.data.patterns import Pattern, patterns_of
+from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.defocus import Focus, correct_defocus
 from stcal.sfm.detect.files import DetectedImage, DetectionResult, look_again
@@ -39,6 +39,9 @@ from stcal.sfm.detect.sightings import ImageDetection, PlaneView, Readings, like
 
 MIN_EXPECTED = 6
 """Least number of circles that other images must show for their absence to count: as many as identify a face."""
+STEEP_RAD = np.radians(85)
+"""Largest tilt of circles of the first look that are compared with their places. They are not searched for beyond
+``MAX_TILT_RAD``, but may have been found there."""
 MIN_CONFIRMED = 0.2
 """Least share of these circles that must be found. A face of which two images show less could not be mapped either."""
 
@@ -120,8 +123,40 @@ def label_images(
 ) -> list[LabelledImage]:
     """Returns the labelled circles of all images, in the order of their groups.
 
-    ``cache`` : folder for what the second look measures.
+    Corners of printed faces name themselves; circles are named by image and group. ``cache`` : folder for what the
+    second look measures.
     """
+    circles = target.with_faces(printed=False)
+    if len(circles.faces) == len(target.faces):
+        return _label_circles(detection, target, board, options, cache, workers)
+    if circles.faces or board is not None:
+        labelled = _label_circles(detection, circles, board, options, cache, workers)
+    else:
+        labelled = [
+            labelled_image(name, group, (), found.centres.select(np.zeros(0, int)), found.notes)
+            for _, images in _groups(detection)
+            for name, group, found in images
+        ]
+    by_name = {image.file.name: image.detection for image in detection.images}
+    return [_with_corners(image, by_name[image.observations.name], target) for image in labelled]
+
+
+def _with_corners(image: LabelledImage, detection: ImageDetection, target: TargetDesign) -> LabelledImage:
+    """Returns the image with the corners of its printed faces."""
+    labels = [label for each in detection.printed for label in each.labels(target.face(each.face))]
+    rows = [each.rows for each in detection.printed]
+    return image.plus(labels, detection.centres.select(np.concatenate(rows)), ()) if rows else image
+
+
+def _label_circles(
+    detection: DetectionResult,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: EllipseOptions,
+    cache: Path,
+    workers: int | None = None,
+) -> list[LabelledImage]:
+    """Returns the labelled circles of all images, in the order of their groups."""
     camera = detection.camera
     groups = _groups(detection)
     patterns = patterns_of(target, board)
@@ -132,10 +167,14 @@ def label_images(
     for (members, _), (images_of_group, arrangement) in zip(groups, labelled_groups, strict=True):
         images_of_group, arrangement = _without_outlying(images_of_group, arrangement, patterns, focal_px)
         for i, (image, image_labels) in enumerate(zip(members, images_of_group, strict=True)):
-            predicted = predict_circles(arrangement, i, image_labels.observations.labels, target, board, camera)
-            if predicted is None:
+            seen = image_labels.observations
+            predicted, steep = (
+                predict_circles(arrangement, i, seen.labels, target, board, camera, tilt)
+                for tilt in (MAX_TILT_RAD, STEEP_RAD)
+            )
+            if predicted is None or steep is None:
                 continue
-            wrong = contradictions(predicted, image_labels.observations, camera)
+            wrong = contradictions(steep, seen, camera)
             images_of_group[i] = image_labels.without(wrong, contradicted_notes(wrong))
             if predicted.wanted.any():
                 jobs.append((image, predicted))
@@ -336,11 +375,13 @@ def _open(views: Readings) -> str:
 
 
 def _reflection(view: PlaneView) -> str:
+    if view.plane == BOARD:
+        return f"a board of {len(view.rows)} dots: the image of the board in a mirror; left out"
     return f"a pattern like face {view.plane}: the image of another face in a mirror; left out"
 
 
 def _foreign(view: PlaneView) -> str:
     return (
         f"a pattern like face {view.plane}: not where other groups see that face against the others; left out, it is a "
-        "reflection or another object"
+        "reflection or another object, or the image is mirrored"
     )

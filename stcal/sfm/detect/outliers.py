@@ -7,10 +7,11 @@ import numpy as np
 
 from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.least_squares import PoseStack
+from stcal.geometry.plane_bundle import PlaneBundle
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import Pattern
-from stcal.sfm.detect.group_geometry import Arrangement, PlaneBundle
+from stcal.sfm.detect.group_geometry import Arrangement
 
 MIN_LIMIT_PX = 0.5
 """Largest deviation that never counts as outlying.

@@ -70,7 +70,8 @@ class ImageDetection:
 
     ``centres`` : the measured circles; ``faces`` and ``boards`` : their readings, boards with the most dots first; a
     face or the board may occur more than once; ``open_faces`` : patterns without a name; ``mirrored`` : ids of faces
-    that appear mirrored; ``notes`` : exclusions with reasons; ``candidates`` : number of outlines.
+    that appear mirrored; ``notes`` : exclusions with reasons; ``candidates`` : number of outlines; ``printed`` : faces
+    with a board or tags, which name themselves; their corners are among the centres, without extent.
     """
 
     centres: Centres
@@ -80,6 +81,7 @@ class ImageDetection:
     notes: tuple[str, ...] = ()
     candidates: int = field(default=0)
     open_faces: tuple[OpenFace, ...] = ()
+    printed: tuple[FaceSighting, ...] = ()
 
     @property
     def repeated(self) -> tuple[str, ...]:
@@ -96,7 +98,7 @@ class ImageDetection:
     def single_faces(self) -> tuple[FaceSighting, ...]:
         """Returns the faces that are in view exactly once."""
         ids = [sighting.face for sighting in self.faces]
-        return tuple(sighting for sighting in self.faces if ids.count(sighting.face) == 1)
+        return (*(sighting for sighting in self.faces if ids.count(sighting.face) == 1), *self.printed)
 
     def labelled_rows(self, target: TargetDesign) -> tuple[list[CircleLabel], np.ndarray]:
         """Returns the labels of the circles of :meth:`single_faces`, and their indices among the centres."""

@@ -190,7 +190,28 @@ def _faces(run: SavedRun) -> list[Finding]:
         labels = tuple(run.target.face(face_id).labels())
         views = sum(bool(set(labels) & set(image.labels)) for image in run.observations)
         findings.append(Finding("", labels, "views", views, MIN_VIEWS, "images", advice("views")))
-    return findings + [Finding("", (), "note", None, None, "", note) for note in run.report["notes"]]
+    notes = [*run.report["notes"], *_depth_of_field(run)]
+    return findings + [Finding("", (), "note", None, None, "", note) for note in notes]
+
+
+def _depth_of_field(run: SavedRun) -> list[str]:
+    """Returns which f-number and distance keep what depth of field moves centres by below their σ, if more is moved.
+
+    The shift grows with the square of the aperture's diameter, and falls with the third power of the distance.
+    """
+    rows = [row for row in run.report["focus"] if row["shift_px"] > 0]
+    if not rows:
+        return []
+    worst = max(rows, key=lambda row: row["shift_px"])
+    sigma = float(np.median(np.concatenate([image.sigma_px() for image in run.observations])))
+    times = worst["shift_px"] / sigma
+    if times <= 1:
+        return []
+    return [
+        f"depth of field moves centres by up to {worst['shift_px']:.3f} px ({worst['image']}), {times:.0f} times their "
+        f"σ, which is corrected to about 15 %; it is below σ from {np.sqrt(times):.1f} times the f-number "
+        f"({np.ceil(np.log2(times)):.0f} stops), or from {times ** (1 / 3):.1f} times the distance"
+    ]
 
 
 def _remedy_in(left_out: dict) -> str:

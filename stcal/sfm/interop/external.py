@@ -12,7 +12,7 @@ from stcal.geometry.camera import Camera
 from stcal.io.files import json_text, save
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate
-from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.adjust.file import FacesFile, require_faces_written
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.data.model import WorldModel
 from stcal.sfm.mapping.database import image_ids
@@ -97,6 +97,7 @@ def write_faces(path: Path, calibration: Calibration, run: SavedRun, solve: Chai
     options = _options(run, solve)
     faces = FacesFile.of(calibration.target, run.target, options, calibration.sigma_factors.circles)
     save(path, json_text(faces.content()))
+    require_faces_written(path, calibration.target)
 
 
 def _camera_change_px(camera: Camera, run: SavedRun) -> float:

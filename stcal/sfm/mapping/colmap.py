@@ -1,19 +1,29 @@
-"""COLMAP's bindings, imported only here. They install signal handlers; this module restores the previous ones."""
+"""COLMAP's bindings, imported only here. They install signal handlers; this module restores the previous ones.
 
+The system's own handlers are restored, of every signal and in whatever thread the import takes place. Python knows only
+some of them, and changes them in its main thread alone.
+"""
+
+import ctypes
+import os
 import signal
-import threading
 
-_before = signal.getsignal(signal.SIGTERM)
-_masks = hasattr(signal, "pthread_sigmask")
-if _masks:  # a signal waits until the import ends: their handler would print a C stack and abort
-    _blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+_ROOM = 1024
+"""More bytes than the system's ``struct sigaction`` has anywhere."""
+_handlers: dict[int, ctypes.Array] = {}
+if os.name == "posix":
+    _system = ctypes.CDLL(None)
+    _blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # it waits until the import ends
+    for _number in signal.valid_signals():
+        _before = ctypes.create_string_buffer(_ROOM)
+        if _system.sigaction(int(_number), None, _before) == 0:
+            _handlers[int(_number)] = _before
 try:
     import pycolmap
 finally:
-    if threading.current_thread() is threading.main_thread():
-        # Python does not know that the system's handler changed, so its own has to be set again.
-        signal.signal(signal.SIGTERM, _before if _before is not None else signal.SIG_DFL)
-    if _masks:
+    if os.name == "posix":
+        for _number, _before in _handlers.items():
+            _system.sigaction(_number, _before, None)
         signal.pthread_sigmask(signal.SIG_SETMASK, _blocked)
 
 __all__ = ["pycolmap"]

@@ -3,6 +3,7 @@
 import csv
 import io
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from stcal.sfm.mapping.colmap import pycolmap
 
 CAMERA_ID = 1
 RIG_ID = 1
+LOG_FATAL_ALONE = 3
 
 
 def colmap_camera(camera: CalibratedCamera) -> pycolmap.Camera:
@@ -74,17 +76,26 @@ def write_database(
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
     remove_database(partial)
+    pycolmap.logging.minloglevel = LOG_FATAL_ALONE  # what fails is raised
     try:
         with pycolmap.Database.open(str(partial)) as database:
             _write(database, camera, observations, pairs, keypoints_px)
+        if Path(f"{partial}-wal").exists():  # SQLite could not move its content into the database, and does not say so
+            raise RuntimeError("a part of it is left in the log")
     except RuntimeError as error:
         remove_database(partial)
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE", f"database {path}: cannot be written ({error}); check the folder's space and rights"
-        ) from error
+        raise unwritable(path, error) from error
     for suffix in ("-wal", "-shm"):
         Path(f"{path}{suffix}").unlink(missing_ok=True)
     os.replace(partial, path)
+
+
+def unwritable(path: Path, error: RuntimeError) -> InputError:
+    """Returns the error of a database that COLMAP cannot write, or cannot open for lack of space beside it."""
+    reason = re.sub(r"^\[[^]]*] *", "", str(error))
+    return InputError(
+        "E-OUTPUT-UNWRITABLE", f"database {path}: cannot be written ({reason}); check the folder's space and rights"
+    )
 
 
 def remove_database(path: Path) -> None:
@@ -94,29 +105,29 @@ def remove_database(path: Path) -> None:
 
 
 def _write(database, camera, observations, pairs, keypoints_px) -> None:
-    with pycolmap.DatabaseTransaction(database):
-        native = colmap_camera(camera)
-        database.write_camera(native, use_camera_id=True)
-        rig = pycolmap.Rig(rig_id=RIG_ID)
-        rig.add_ref_sensor(native.sensor_id)
-        database.write_rig(rig, use_rig_id=True)
-        ids = image_ids(observations)
-        for i, image in enumerate(observations):
-            record = pycolmap.Image(name=image.name, camera_id=CAMERA_ID, image_id=ids[image.name])
-            frame = pycolmap.Frame(frame_id=ids[image.name], rig_id=RIG_ID)
-            frame.add_data_id(record.data_id)
-            database.write_image(record, use_image_id=True)
-            database.write_frame(frame, use_frame_id=True)
-            xy = image.centre_px if keypoints_px is None else keypoints_px[i]
-            database.write_keypoints(ids[image.name], to_colmap_px(xy).astype(np.float32))
-        for i, j in pairs:
-            a, b = observations[i], observations[j]
-            matches = match_labels(a, b)
-            database.write_matches(ids[a.name], ids[b.name], matches)
-            geometry = pycolmap.TwoViewGeometry(inlier_matches=matches)
-            # COLMAP 4.x silently skips pairs of configuration UNDEFINED.
-            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-            database.write_two_view_geometry(ids[a.name], ids[b.name], geometry)
+    """Writes row by row. A transaction of COLMAP ends the process where the disk is full."""
+    native = colmap_camera(camera)
+    database.write_camera(native, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=RIG_ID)
+    rig.add_ref_sensor(native.sensor_id)
+    database.write_rig(rig, use_rig_id=True)
+    ids = image_ids(observations)
+    for i, image in enumerate(observations):
+        record = pycolmap.Image(name=image.name, camera_id=CAMERA_ID, image_id=ids[image.name])
+        frame = pycolmap.Frame(frame_id=ids[image.name], rig_id=RIG_ID)
+        frame.add_data_id(record.data_id)
+        database.write_image(record, use_image_id=True)
+        database.write_frame(frame, use_frame_id=True)
+        xy = image.centre_px if keypoints_px is None else keypoints_px[i]
+        database.write_keypoints(ids[image.name], to_colmap_px(xy).astype(np.float32))
+    for i, j in pairs:
+        a, b = observations[i], observations[j]
+        matches = match_labels(a, b)
+        database.write_matches(ids[a.name], ids[b.name], matches)
+        geometry = pycolmap.TwoViewGeometry(inlier_matches=matches)
+        # COLMAP 4.x silently skips pairs of configuration UNDEFINED.
+        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+        database.write_two_view_geometry(ids[a.name], ids[b.name], geometry)
 
 
 def labels_csv(

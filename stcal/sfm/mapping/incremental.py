@@ -13,7 +13,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.labels import Label
 from stcal.sfm.data.model import MIN_POINTS, ImageObservations, M, Outlier, WorldModel
 from stcal.sfm.mapping.colmap import pycolmap
-from stcal.sfm.mapping.database import CAMERA_ID
+from stcal.sfm.mapping.database import CAMERA_ID, unwritable
 from stcal.sfm.mapping.models import rigid_from_colmap
 from stcal.sfm.mapping.pairs import PairScore, share_board_alone
 
@@ -145,19 +145,16 @@ def map_group(
     ------
     MappingError
         There is no model of two or more images.
+    InputError
+        There is no space for what COLMAP writes beside the database.
     """
     names = [image.name for image in group if image.name in skeleton]
-    first, second = (next(i for i in group if i.name == name) for name in (pairs[0].first, pairs[0].second))
-    reconstruction = None
-    if share_board_alone(first, second):
-        seeded = "our relative pose of the chosen pair, by the board (a plane has two essential matrices)"
-        reconstruction = _own_mapping(database, names, ids, pairs[0])
-    if reconstruction is None:
-        seeded = "COLMAP's estimate of the chosen pair"
-        reconstruction = seeded_mapping(database, scratch, names, (ids[first.name], ids[second.name]))
-    if reconstruction is None:
-        seeded = "our relative pose of the chosen pair (COLMAP's gates refused its own)"
-        reconstruction = _own_mapping(database, names, ids, pairs[0])
+    try:
+        reconstruction, seeded = _mapped(database, scratch, group, names, ids, pairs[0])
+    except RuntimeError as error:
+        if "SQLite" not in str(error):
+            raise
+        raise unwritable(database, error) from error
     if reconstruction is None:
         raise MappingError(
             "E-MAPPING-NO-MODEL",
@@ -169,14 +166,38 @@ def map_group(
     return Mapping(model, outliers, left_out(group, model), seeded)
 
 
-def left_out(group: list[ImageObservations], model: WorldModel) -> dict[str, str]:
-    """Returns why images of the group are not in the model, by image name."""
+def _mapped(
+    database: Path,
+    scratch: Path,
+    group: list[ImageObservations],
+    names: list[str],
+    ids: dict[str, int],
+    pair: PairScore,
+) -> tuple[pycolmap.Reconstruction | None, str]:
+    """Returns the model that grows from the chosen pair, None if none does, and how the pair was registered."""
+    first, second = (next(i for i in group if i.name == name) for name in (pair.first, pair.second))
+    if share_board_alone(first, second):
+        reconstruction = _own_mapping(database, names, ids, pair)
+        if reconstruction is not None:
+            seeded = "our relative pose of the chosen pair, by the board (a plane has two essential matrices)"
+            return reconstruction, seeded
+    reconstruction = seeded_mapping(database, scratch, names, (ids[first.name], ids[second.name]))
+    if reconstruction is not None:
+        return reconstruction, "COLMAP's estimate of the chosen pair"
+    seeded = "our relative pose of the chosen pair (COLMAP's gates refused its own)"
+    return _own_mapping(database, names, ids, pair), seeded
+
+
+def left_out(
+    group: list[ImageObservations], model: WorldModel, remedy: str = "photograph faces and board together"
+) -> dict[str, str]:
+    """Returns why images of the group are not in the model, by image name; ``remedy`` for too few circles in it."""
     reasons = {}
     for image in group:
         if image.name not in model.images:
             known = len(set(image.labels) & set(model.labels))
             reasons[image.name] = (
-                f"{known} of its circles are in the model, {MIN_POINTS} needed; photograph faces and board together"
+                f"{known} of its circles are in the model, {MIN_POINTS} needed; {remedy}"
                 if known < MIN_POINTS
                 else f"fewer than {MIN_POINTS} of its {known} circles fit the model to {MAX_REPROJECTION_PX:g} px; "
                 "check that it is sharp, and that nothing but the camera moved"

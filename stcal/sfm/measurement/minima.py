@@ -118,25 +118,30 @@ def start_pose(
             "E-MEASURE-FEW-CIRCLES",
             f"{where}: {count} circles seen, {MIN_CIRCLES} of one face needed; show one face as a whole",
         )
-    for face_id in by_size:
-        rows, plane = faces[face_id], target.target_from_plane[face_id]
-        plane_from_target = plane.inverse()
-        xy = (plane_from_target @ problem.xyz[rows])[:, :2]
-        long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
-        if broad < MIN_BREADTH * long:
-            reason = f"{len(rows)} circles, {MIN_CIRCLES} off one line needed"
-            continue
-        try:
-            homography = fit_homography(xy, problem.centre[rows])
-        except DegenerateError as error:
-            reason = error
-            continue
-        pose = camera_from_plane(homography) @ plane_from_target
-        if (problem.xyz @ pose.rotation[2] + pose.translation[2] <= 0).any():
-            reason = "its circles would be behind the camera; check their labels"
-            continue
-        return PoseStack.of(pose), plane
-    raise DegenerateError("E-MEASURE-AMBIGUOUS", f"{where}: face {by_size[0]}: {reason}; show all of its circles")
+    reasons = []
+    for face_id in (face for face in by_size if len(faces[face]) >= MIN_CIRCLES):
+        pose = _pose_by_face(target.target_from_plane[face_id], problem, faces[face_id])
+        if isinstance(pose, Rigid):
+            return PoseStack.of(pose), target.target_from_plane[face_id]
+        reasons.append(pose)
+    raise DegenerateError("E-MEASURE-AMBIGUOUS", f"{where}: face {by_size[0]}: {reasons[0]}; show all of its circles")
+
+
+def _pose_by_face(target_from_plane: Rigid, problem: PoseProblem, rows: list[int]) -> Rigid | str:
+    """Returns the pose from the homography of one face's circles, or the reason why there is none."""
+    plane_from_target = target_from_plane.inverse()
+    xy = (plane_from_target @ problem.xyz[rows])[:, :2]
+    long, broad = np.linalg.svd(xy - xy.mean(0), compute_uv=False)
+    if broad < MIN_BREADTH * long:
+        return f"{len(rows)} circles, {MIN_CIRCLES} off one line needed"
+    try:
+        homography = fit_homography(xy, problem.centre[rows])
+    except DegenerateError as error:
+        return str(error)
+    pose = camera_from_plane(homography) @ plane_from_target
+    if (problem.xyz @ pose.rotation[2] + pose.translation[2] <= 0).any():
+        return "its circles would be behind the camera; check their labels"
+    return pose
 
 
 def minima_without_outliers(problem: PoseProblem, start: PoseStack, plane: Rigid, names: list[CircleLabel], where: str):

@@ -2,14 +2,16 @@
 
 import csv
 import io
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from stcal.errors import InputError
+from stcal.geometry.rigid import Poses
 from stcal.io.json import Finite, Matrix6, NamedReason, Pair, Part, Pose, ResultFile
-from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells
+from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells, require_pose_table_written
 from stcal.report.document import (
     Block,
     Document,
@@ -137,6 +139,13 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
                 f"{where}: none of its images was measured; names are like {result.images[0].name}",
             )
     return stream.getvalue(), tuple(unmatched)
+
+
+def require_table_written(path: str | Path, result: MeasureResult, joints: Table | None = None) -> None:
+    """Read a written ``poses.csv`` again, and require the poses that were measured; arguments as :func:`poses_csv`."""
+    joined = set(joints.text(IMAGE)) if joints is not None else {image.name for image in result.images}
+    poses = [image.pose.camera_from_target for image in result.images if image.name in joined]
+    require_pose_table_written(path, {"": Poses.of(poses)})
 
 
 def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str, list[str]]]:

@@ -1,217 +1,50 @@
-"""HTTP service of ``measure --serve``: one JSON answer per image, measured by processes that hold the target."""
+"""HTTP service of ``measure --serve``: one JSON answer per image, within limits that no client can use up alone."""
 
+import asyncio
 import json
 import socket
 import threading
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from dataclasses import dataclass
+from email.utils import formatdate
+from hmac import compare_digest
+from http.client import responses
 from ipaddress import ip_address
-from pathlib import Path
-from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+import h11
+
 import stcal
-from stcal.design import BoardDesign
-from stcal.errors import ConvergenceError, InputError
-from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraModel
-from stcal.io.images import Skipped, decode, name_fault, stated_size
-from stcal.parallel import OwnProcess
-from stcal.sfm.detect.circles.candidates import EllipseOptions
-from stcal.sfm.measurement.images import MeasureOptions, outcome, result_of
-from stcal.sfm.measurement.pose import PoseOptions
-from stcal.sfm.measurement.report import poses_file
-from stcal.sfm.measurement.target import TargetCircles
-from stcal.sfm.measurement.tracker import Tracker
-
-SEQUENCES = 1024
-"""Number of sequences followed at a time. With more, the least recent is forgotten, and searched as a whole again."""
-WAITING = 8
-"""Number of images that may wait for each process. More are refused."""
-LONGEST_NAME = 255
-DONE, NO_POSE, REFUSED, FAILED, BUSY = 200, 422, 400, 500, 503
-"""Status codes of HTTP."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Setting:
-    """The data that every process holds; see :class:`stcal.sfm.measurement.tracker.Tracker`."""
-
-    target: TargetCircles
-    camera: CameraModel
-    board: BoardDesign | None = None
-    pose: PoseOptions = field(default_factory=PoseOptions)
-    ellipses: EllipseOptions = field(default_factory=EllipseOptions)
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """An answer. ``code`` : status code of HTTP; ``text`` : JSON in one line."""
-
-    code: int
-    text: str
-
-
-def refusal(code: int, kind: str, reason: str) -> Answer:
-    """Returns the answer of an error. ``kind`` : code of the error, like ``E-IMAGE-SIZE``."""
-    return Answer(code, json.dumps({"error": reason, "code": kind}, ensure_ascii=False))
-
-
-class MeasureService:
-    """Answers images with poses, by several processes.
-
-    Each image goes to the process with the fewest waiting images, together with the previous poses of its sequence.
-    Images of a sequence are measured in the order in which they came.
-
-    Parameters
-    ----------
-    setting : Setting
-        Target and camera.
-    workers : int
-        Number of processes.
-    """
-
-    def __init__(self, setting: Setting, workers: int):
-        named = replace(setting, camera=replace(setting.camera, source=Path(setting.camera.source).name))
-        self._processes = [OwnProcess(_begin, named) for _ in range(workers)]
-        self._waiting = [0] * workers
-        self._sequences: OrderedDict[str, _Sequence] = OrderedDict()
-        self._guard = threading.Lock()
-
-    def start(self) -> None:
-        """Starts the processes now, not with the first images."""
-        for process in self._processes:
-            process.call(_ready)
-
-    def answer(self, data: bytes, name: str = "image", sequence: str = "") -> Answer:
-        """Returns the answer to one image.
-
-        Parameters
-        ----------
-        data : bytes
-            Content of an image file.
-        name : str
-            Name of the image, for the answer.
-        sequence : str
-            Name of the sequence whose next image it is; empty for a single image.
-
-        Returns
-        -------
-        Answer
-            200 with the poses file of ``measure`` of this image. 422 with the same file if there is no pose; the reason
-            is in ``left_out``. 400 if the data are no image of this camera, 503 if too many images wait, 500 if the
-            process ended, with ``{"error": …, "code": …}``.
-        """
-        if fault := name_fault(name) or name_fault(sequence):
-            return refusal(REFUSED, "E-SERVICE-NAME", f"name: {fault}; give that of the image alone")
-        if not name or max(len(name), len(sequence)) > LONGEST_NAME:
-            return refusal(
-                REFUSED, "E-SERVICE-NAME", f"name: empty or longer than {LONGEST_NAME} characters; give a shorter one"
-            )
-        if not sequence:
-            return self._measured(data, name, ())[0]
-        state = self._sequence(sequence)
-        with state.turn:
-            answer, state.recent = self._measured(data, name, state.recent)
-        return answer
-
-    def close(self) -> None:
-        """Ends the processes."""
-        for process in self._processes:
-            process.close()
-
-    def _sequence(self, name: str) -> "_Sequence":
-        with self._guard:
-            state = self._sequences.setdefault(name, _Sequence())
-            self._sequences.move_to_end(name)
-            while len(self._sequences) > SEQUENCES:
-                self._sequences.popitem(last=False)
-            return state
-
-    def _measured(self, data: bytes, name: str, recent: tuple[Rigid, ...]) -> tuple[Answer, tuple[Rigid, ...]]:
-        with self._guard:
-            place = min(range(len(self._waiting)), key=self._waiting.__getitem__)
-            if self._waiting[place] >= WAITING:
-                reason = f"{WAITING} images wait for each of {len(self._waiting)} processes; send it again later"
-                return refusal(BUSY, "E-SERVICE-BUSY", f"{name}: {reason}"), recent
-            self._waiting[place] += 1
-        try:
-            return self._processes[place].call(_answer, data, name, recent)
-        except BrokenExecutor:
-            return refusal(
-                FAILED, "E-WORKER-DIED", f"{name}: the process that measured it ended; send it again"
-            ), recent
-        finally:
-            with self._guard:
-                self._waiting[place] -= 1
-
-
-@dataclass(slots=True, eq=False)
-class _Sequence:
-    """State of a sequence of images.
-
-    ``turn`` : held while one of its images is measured; ``recent`` : as in
-    :class:`stcal.sfm.measurement.tracker.Tracker`.
-    """
-
-    turn: threading.Lock = field(default_factory=threading.Lock)
-    recent: tuple[Rigid, ...] = ()
-
-
-_tracker: Tracker | None = None
-"""The tracker of this process, with target and camera."""
-
-
-def _begin(setting: Setting) -> None:
-    global _tracker
-    _tracker = Tracker(setting.target, setting.camera, setting.board, setting.pose, setting.ellipses)
-
-
-def _ready() -> bool:
-    return _tracker is not None
-
-
-def _answer(data: bytes, name: str, recent: tuple[Rigid, ...]) -> tuple[Answer, tuple[Rigid, ...]]:
-    """Returns the answer, and the poses from which the next image of the sequence is predicted."""
-    tracker = _tracker
-    assert tracker is not None
-    tracker.recent = recent
-    try:
-        width, height = stated_size(data, name)
-        camera = tracker.model
-        if (camera.width or width, camera.height or height) != (width, height):
-            raise InputError(
-                "E-IMAGE-SIZE",
-                f"{name}: {width}×{height} px, camera {camera.width}×{camera.height} px; send it as the camera took it",
-            )
-        image = decode(data, name)
-        try:
-            labelled, pose = tracker.observe(image, name)
-            measured = outcome(name, pose, labelled.notes)
-        except ConvergenceError as error:
-            measured = Skipped(name, str(error), "distortion")
-    except InputError as error:
-        return refusal(REFUSED, error.code, str(error)), recent
-    result = result_of([measured], tracker.target, MeasureOptions(tracker.pose_options), tracker.prior)
-    content = poses_file(result).content()
-    text = json.dumps(content, ensure_ascii=False, allow_nan=False)
-    return Answer(DONE if result.images else NO_POSE, text), tracker.recent
-
+from stcal.errors import InputError
+from stcal.parallel import LOOK_S
+from stcal.sfm.measurement.service import BUSY, DONE, FAILED, NO_POSE, REFUSED, Answer, MeasureService, refusal
+from stcal.sfm.measurement.service import WAITING as WAITING
+from stcal.sfm.measurement.service import Setting as Setting
 
 LOCALHOST, PORT = "127.0.0.1", 8765
 MAX_MEGABYTES = 64.0
 PATIENCE_S = 30.0
-"""Time without data after which a client is disconnected, s."""
-CONNECTIONS = 64
+"""Time for the head of a request, in which a client may be silent, s; and for its body beside its length."""
+SLOWEST = 100_000
+"""Least rate at which a body comes, bytes a second."""
+CONNECTIONS, CONNECTIONS_EACH = 256, 64
+"""Number of connections in all, and from one address. A new one takes the place of the one that is idle longest."""
+HELD_BYTES = 256_000_000
+"""Bytes of images that are received, wait or are measured; two images at least. Beyond, the stalest uploads end."""
+HEAD_BYTES, HEAD_FIELDS = 32_768, 100
+CHUNK_BYTES = 65_536
+CROWDED_S = 1.0
+"""Time for which an image tries to join those that wait, where they are too many, s."""
 LINGER_S = 1.0
 """Time for which the rest of a refused request is read, s. Else the client could lose the answer."""
 MEASURE, STATUS = "/measure", "/"
-NO_LENGTH, TOO_LARGE, NOT_FOUND, NOT_ALLOWED = 411, 413, 404, 405
+NO_TOKEN, NOT_FOUND, NOT_ALLOWED, NO_LENGTH, TOO_LARGE, LONG_TARGET, MANY_FIELDS, OTHER_HTTP = (
+    *(401, 404, 405, 411, 413, 414, 431, 505),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,20 +59,33 @@ class ServeOptions:
         Port to listen on; any free one if 0.
     max_megabytes : float
         Largest size of an image file.
+    token : str
+        Word that each request must carry as ``Authorization: Bearer``; none is needed if empty.
     """
 
     host: str = LOCALHOST
     port: int = PORT
     max_megabytes: float = MAX_MEGABYTES
+    token: str = ""
 
 
-class MeasureServer(ThreadingHTTPServer):
-    """HTTP server that passes images to the service, with a thread for each connection.
+class _Refused(Exception):
+    """A request that is answered with a status code and a reason, and ends its connection."""
+
+    def __init__(self, code: int, reason: str, kind: str = "E-SERVICE-REQUEST"):
+        super().__init__(code, reason)
+        self.answer = refusal(code, kind, reason)
+
+
+class MeasureServer:
+    """HTTP server that passes images to the service. One thread holds all connections; h11 reads and writes HTTP.
 
     Attributes
     ----------
     counts : Counter
         Number of answers by status code.
+    left : int
+        Number of images that were not measured because their clients had gone.
 
     Raises
     ------
@@ -247,31 +93,40 @@ class MeasureServer(ThreadingHTTPServer):
         If it cannot listen on the address.
     """
 
-    daemon_threads = True
-    request_queue_size = 128
-
     def __init__(self, service: MeasureService, options: ServeOptions):
         self.service, self.options = service, options
         self.most_bytes = int(options.max_megabytes * 1e6)
+        self.most_held = max(HELD_BYTES, 2 * self.most_bytes)
         self.counts: Counter[int] = Counter()
-        self._guard = threading.Lock()
-        self._free = threading.BoundedSemaphore(CONNECTIONS)
-        if ":" in options.host:
-            self.address_family = socket.AF_INET6
+        self.left = 0
+        self.threads = ThreadPoolExecutor(service.most_waiting + 4)  # more than may wait, so that refusals do not
+        self._open: dict[_Connection, None] = {}
+        self._held = 0
+        self._ended = threading.Event()
+        self._stop: Callable[[], object] | None = None
+        family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
         try:
-            super().__init__((options.host, options.port), _Handler)
+            self._socket = socket.create_server((options.host, options.port), family=family, backlog=512)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise InputError(
                 "E-SERVICE-ADDRESS",
                 f"--host {options.host} --port {options.port}: cannot be listened at: {reason}; give another",
             ) from error
+        self.server_address: tuple = self._socket.getsockname()
+
+    def __enter__(self) -> "MeasureServer":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.shutdown()
+        self._socket.close()
+        self.threads.shutdown(wait=False, cancel_futures=True)
 
     @property
     def url(self) -> str:
         """URL of the server."""
         host, port = self.server_address[:2]
-        host = host.decode() if isinstance(host, bytes | bytearray) else host
         return f"http://{f'[{host}]' if ':' in host else host}:{port}"
 
     @property
@@ -279,112 +134,264 @@ class MeasureServer(ThreadingHTTPServer):
         """Whether only this machine can reach the server."""
         return ip_address(str(self.server_address[0]).partition("%")[0]).is_loopback
 
-    def count(self, code: int) -> None:
-        """Counts one more answer with this code."""
-        with self._guard:
-            self.counts[code] += 1
+    def serve_forever(self) -> None:
+        """Answers requests until :meth:`shutdown`, which another thread calls."""
+        asyncio.run(self._serve())
 
-    def process_request(self, request: Any, client_address) -> None:
-        """Handles a request in a thread of its own, or answers 503 if none is free."""
-        if self._free.acquire(blocking=False):
-            super().process_request(request, client_address)
+    def shutdown(self) -> None:
+        """Ends :meth:`serve_forever`, and with it all connections."""
+        self._ended.set()
+        if self._stop is not None:
+            with suppress(RuntimeError):  # it has ended already
+                self._stop()
+
+    async def _serve(self) -> None:
+        ended, loop = asyncio.Event(), asyncio.get_running_loop()
+        self._stop = lambda: loop.call_soon_threadsafe(ended.set)
+        if self._ended.is_set():
             return
-        self.count(503)
-        with suppress(OSError):
-            request.sendall(b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: 0\r\n\r\n")
-        self.shutdown_request(request)
+        server = await asyncio.start_server(self._connected, sock=self._socket.dup(), limit=CHUNK_BYTES)
+        await ended.wait()
+        server.close()
+        for connection in list(self._open):
+            connection.abort()
 
-    def process_request_thread(self, request, client_address) -> None:
-        """Handles one connection to its end, and frees its thread."""
+    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        connection = _Connection(self, reader, writer)
+        if not self._has_room(connection.address):
+            connection.refuse_at_once(f"{CONNECTIONS_EACH} connections from one address, {CONNECTIONS} in all")
+            return
+        self._open[connection] = None
         try:
-            super().process_request_thread(request, client_address)
+            await connection.run()
         finally:
-            self._free.release()
+            del self._open[connection]
 
-    def handle_error(self, request, client_address) -> None:
-        """Ignores the error of a client that went away."""
+    def _has_room(self, address: str) -> bool:
+        """Returns whether one more connection may be open, after the one that was idle longest has made room."""
+        every = [each for each in self._open if not each.ended]
+        own = [each for each in every if each.address == address]
+        if len(own) < CONNECTIONS_EACH and len(every) < CONNECTIONS:
+            return True
+        idle = [each for each in (own if len(own) >= CONNECTIONS_EACH else every) if not each.complete]
+        if idle:
+            min(idle, key=_Connection.staleness).abort()
+        return bool(idle)
+
+    def hold(self, connection: "_Connection", count: int) -> None:
+        """Counts bytes that a connection has received. The stalest uploads end if all hold more than is allowed."""
+        self._held += count
+        connection.held += count
+        while self._held > self.most_held:
+            uploads = [each for each in self._open if each.held and not each.complete]
+            stalest = min(uploads, key=_Connection.staleness)
+            reason = f"{self.most_held / 1e6:.0f} MB of images are under way; send it again later"
+            if stalest is connection:
+                raise _Refused(BUSY, reason, "E-SERVICE-BUSY")
+            stalest.refuse_at_once(reason)
+
+    def release(self, connection: "_Connection") -> None:
+        """Counts the bytes of a connection as no longer held."""
+        self._held -= connection.held
+        connection.held = 0
 
 
-class _Handler(BaseHTTPRequestHandler):
-    """One connection, whose images come one after the other."""
+class _Connection:
+    """One connection, whose requests come one after the other.
 
-    protocol_version = default_request_version = "HTTP/1.1"
-    server_version = f"stcal/{stcal.__version__}"
-    sys_version = ""
-    timeout = PATIENCE_S
-    disable_nagle_algorithm = True
-    server: MeasureServer
+    ``complete`` : whether a request has come and its answer is due; ``held`` : bytes of its image; ``left`` : whether
+    the client has closed its side; ``ended`` : whether this side has ended it.
+    """
 
-    def do_POST(self) -> None:
-        """Answers an image, or refuses any other data."""
-        parts = urlsplit(self.path)
-        if parts.path != MEASURE:
-            self._refuse(NOT_FOUND, f"POST an image to {MEASURE}")
-            return
-        length = self.headers.get("Content-Length", "")
-        if self.headers.get("Transfer-Encoding") or not length.isdecimal() or len(length) > 18:
-            self._refuse(NO_LENGTH, "Content-Length needed, in bytes")
-            return
-        if int(length) > self.server.most_bytes:
-            limit = self.server.options.max_megabytes
-            self._refuse(TOO_LARGE, f"{int(length) / 1e6:.1f} MB; {limit:g} MB at most, see --max-megabytes")
-            return
-        data = self.rfile.read(int(length))
-        if len(data) < int(length):  # the client went away
-            self.close_connection = True
-            return
-        asked = parse_qs(parts.query)
-        name, sequence = (asked.get(key, [default])[0] for key, default in (("name", "image"), ("sequence", "")))
+    def __init__(self, server: MeasureServer, reader: asyncio.StreamReader, writer: asyncio.StreamWriter):
+        self.server, self.reader, self.writer = server, reader, writer
+        self.address = str((writer.get_extra_info("peername") or ("",))[0])
+        self.http = h11.Connection(h11.SERVER, max_incomplete_event_size=HEAD_BYTES)
+        self.complete, self.held, self.left, self.ended = False, 0, False, False
+        self._answers, self._last, self._method = 0, time.monotonic(), b""
+
+    def staleness(self) -> tuple[bool, float]:
+        """Returns a sort key: those that never got an answer first, then by the time of their last byte."""
+        return self._answers > 0, self._last
+
+    def abort(self) -> None:
+        """Ends the connection at once."""
+        self.ended = True
+        self.server.release(self)
+        self.writer.transport.abort()
+
+    def refuse_at_once(self, reason: str) -> None:
+        """Answers that the service is busy, as far as the client can be told, and ends the connection."""
+        self.server.counts[BUSY] += 1
+        with suppress(h11.LocalProtocolError, OSError):
+            self._write(refusal(BUSY, "E-SERVICE-BUSY", reason), closing=True)
+        self.ended = True
+        self.server.release(self)
+        self.writer.close()
+
+    async def run(self) -> None:
+        """Answers requests until either side ends the connection."""
         try:
-            answer = self.server.service.answer(data, name, sequence)
-        except Exception as error:  # a fault of the program must not end the connection without an answer
-            answer = refusal(500, "E-SERVICE-FAILED", f"{type(error).__name__}: not answered")
-        self._send(answer)
+            while await self._one():
+                self.http.start_next_cycle()
+        except h11.RemoteProtocolError as error:
+            await self._refuse(_fault(error, self.http).answer)
+        except _Refused as refused:
+            await self._refuse(refused.answer)
+        except (OSError, EOFError, h11.LocalProtocolError, asyncio.CancelledError):  # it went away, or took too long
+            pass
+        finally:
+            self.server.release(self)
+            self.writer.close()
 
-    def do_GET(self) -> None:
-        """Answers with a description of the service and its counts."""
-        if urlsplit(self.path).path != STATUS:
-            self._refuse(NOT_FOUND, f"POST an image to {MEASURE}; GET {STATUS} tells what this is")
-            return
-        counts = {str(code): n for code, n in sorted(self.server.counts.items())}
+    async def _one(self) -> bool:
+        """Answers one request; returns whether another one may follow."""
+        async with asyncio.timeout(PATIENCE_S):
+            request = await self._event()
+        if not isinstance(request, h11.Request):
+            return False
+        self._method = request.method
+        place, asked, length = _checked(request, self.server)
+        async with asyncio.timeout(PATIENCE_S + length / SLOWEST):
+            data = await self._body()
+        self.complete = True
+        until = time.monotonic() + CROWDED_S
+        answer = self._status() if place == STATUS else await self._measured(data, asked)
+        while answer is not None and answer.code == BUSY and time.monotonic() < until:
+            await asyncio.sleep(LOOK_S)
+            answer = await self._measured(data, asked)
+        self.server.release(self)
+        if answer is None:
+            self.server.left += 1
+            return False
+        if place != STATUS:
+            self.server.counts[answer.code] += 1
+        self._write(answer)
+        async with asyncio.timeout(PATIENCE_S):
+            await self.writer.drain()
+        self.complete, self._answers = False, self._answers + 1
+        return self.http.our_state is h11.DONE and self.http.their_state is h11.DONE
+
+    async def _event(self):
+        """Returns the next event of the connection."""
+        while (event := self.http.next_event()) is h11.NEED_DATA:
+            if self.http.they_are_waiting_for_100_continue:
+                self.writer.write(self.http.send(h11.InformationalResponse(status_code=100, headers=[])) or b"")
+            data = await self.reader.read(CHUNK_BYTES)
+            if self.ended or not data:
+                raise EOFError
+            self._last = time.monotonic()
+            if self.http.their_state is h11.IDLE and data.partition(b"\r\n\r\n")[0].count(b"\n") > HEAD_FIELDS:
+                raise _Refused(MANY_FIELDS, f"more than {HEAD_FIELDS} header fields")
+            self.http.receive_data(data)
+        return event
+
+    async def _body(self) -> bytes:
+        parts: list[bytes] = []
+        while isinstance(event := await self._event(), h11.Data):
+            self.server.hold(self, len(event.data))
+            parts.append(bytes(event.data))
+        if not isinstance(event, h11.EndOfMessage):
+            raise EOFError
+        return b"".join(parts)
+
+    async def _measured(self, data: bytes, asked: dict[str, str]) -> Answer | None:
+        """Returns the answer to an image; None if the client goes away while the image waits."""
+        named = asked.get("name", "image"), asked.get("sequence", "")
+        work = asyncio.get_running_loop().run_in_executor(
+            self.server.threads, self.server.service.answer, data, *named, lambda: self.left
+        )
+        if self.left:
+            return await work
+        watch = asyncio.ensure_future(self.reader.read(CHUNK_BYTES))
+        await asyncio.wait((work, watch), return_when=asyncio.FIRST_COMPLETED)
+        watch.cancel()  # without effect if it is done
+        await asyncio.wait((watch,))
+        if not watch.cancelled():
+            data = b"" if watch.exception() else watch.result()
+            self.left = not data
+            if data:  # the beginning of its next request
+                self.http.receive_data(data)
+        try:
+            return await work
+        except Exception as error:  # a fault of the program must not end the connection without an answer
+            return refusal(FAILED, "E-SERVICE-FAILED", f"{type(error).__name__}: not answered")
+
+    def _status(self) -> Answer:
         description = {
             "format": "stcal service 1",
             "version": stcal.__version__,
             "measure": f"POST {MEASURE}?name=&sequence=",
+            "max_megabytes": self.server.options.max_megabytes,
+            "answers": {str(code): count for code, count in sorted(self.server.counts.items())},
+            "left": self.server.left,
         }
-        description |= {"max_megabytes": self.server.options.max_megabytes, "answers": counts}
-        self._send(Answer(200, json.dumps(description)), counted=False)
+        return Answer(DONE, json.dumps(description))
 
-    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Sends JSON in place of a page for a request that the standard library refuses."""
-        self._refuse(NOT_ALLOWED if code == 501 else code, message or self.responses.get(code, ("refused",))[0])
-
-    def log_message(self, *_) -> None:
-        """Writes no log, as only counts are kept."""
-
-    def _refuse(self, code: int, reason: str) -> None:
+    async def _refuse(self, answer: Answer) -> None:
         """Refuses the request and ends the connection, as the rest of its data is unknown."""
-        self.close_connection = True
-        self._send(refusal(code, "E-SERVICE-REQUEST", reason))
-        with suppress(OSError):
-            self.connection.shutdown(socket.SHUT_WR)
-            self.connection.settimeout(LINGER_S)
-            end = time.monotonic() + LINGER_S
-            while time.monotonic() < end and self.connection.recv(1 << 16):
-                pass
+        with suppress(h11.LocalProtocolError, OSError, TimeoutError):
+            self.server.counts[answer.code] += 1
+            self._write(answer, closing=True)
+            self.server.release(self)
+            async with asyncio.timeout(LINGER_S):
+                await self.writer.drain()
+                self.writer.write_eof()
+                while await self.reader.read(CHUNK_BYTES):
+                    pass
 
-    def _send(self, answer: Answer, counted: bool = True) -> None:
-        if counted:
-            self.server.count(answer.code)
+    def _write(self, answer: Answer, closing: bool = False) -> None:
         body = answer.text.encode() + b"\n"
-        self.send_response(answer.code)
-        self.send_header("Content-Type", "application/json; charset=utf-8")
-        self.send_header("Content-Length", str(len(body)))
-        if self.close_connection:
-            self.send_header("Connection", "close")
-        self.end_headers()
-        if getattr(self, "command", None) != "HEAD":
-            self.wfile.write(body)
+        headers = [
+            ("Server", f"stcal/{stcal.__version__}"),
+            ("Date", formatdate(usegmt=True)),
+            ("Content-Type", "application/json; charset=utf-8"),
+            ("Content-Length", str(len(body))),
+            *([("Connection", "close")] if closing else []),
+            *([("WWW-Authenticate", "Bearer")] if answer.code == NO_TOKEN else []),
+        ]
+        response = h11.Response(status_code=answer.code, headers=headers, reason=responses.get(answer.code, ""))
+        content = [] if self._method == b"HEAD" else [h11.Data(data=body)]
+        for event in (response, *content, h11.EndOfMessage()):
+            self.writer.write(self.http.send(event) or b"")
+
+
+def _checked(request: h11.Request, server: MeasureServer) -> tuple[str, dict[str, str], int]:
+    """Returns path, query and length of the body of a request; raises if it is refused before its body is read."""
+    fields = {name.decode(): value.decode("latin-1") for name, value in request.headers}
+    if request.http_version not in (b"1.0", b"1.1"):
+        raise _Refused(OTHER_HTTP, "version 1.1 of HTTP needed")
+    given, wanted = fields.get("authorization", ""), f"Bearer {server.options.token}"
+    if server.options.token and not compare_digest(given.encode("latin-1"), wanted.encode()):
+        raise _Refused(NO_TOKEN, "Authorization: Bearer with the token of the service needed")
+    try:
+        parts = urlsplit(request.target.decode())
+    except ValueError as error:
+        raise _Refused(REFUSED, "the request's target is no URL") from error
+    place = {b"POST": MEASURE, b"GET": STATUS}.get(request.method)
+    if place is None:
+        raise _Refused(NOT_ALLOWED, f"POST an image to {MEASURE}; GET {STATUS} tells what this is")
+    if parts.path != place:
+        raise _Refused(NOT_FOUND, f"POST an image to {MEASURE}; GET {STATUS} tells what this is")
+    stated = fields.get("content-length", "" if place == MEASURE else "0")
+    if "transfer-encoding" in fields or not stated:
+        raise _Refused(NO_LENGTH, "Content-Length needed, in bytes")
+    length = int(stated)  # digits alone: h11 has looked
+    if place == STATUS and length:
+        raise _Refused(REFUSED, "a GET with a body; leave the body out")
+    if length > server.most_bytes:
+        limit = server.options.max_megabytes
+        raise _Refused(TOO_LARGE, f"{length / 1e6:.1f} MB; {limit:g} MB at most, see --max-megabytes")
+    return place, {key: values[0] for key, values in parse_qs(parts.query).items()}, length
+
+
+def _fault(error: h11.RemoteProtocolError, http: h11.Connection) -> _Refused:
+    """Returns the refusal of a request that is no HTTP."""
+    if "bad Content-Length" in str(error):
+        return _Refused(NO_LENGTH, "Content-Length needed, in bytes")
+    if error.error_status_hint == MANY_FIELDS and b"\r\n" not in http.trailing_data[0]:
+        return _Refused(LONG_TARGET, f"more than {HEAD_BYTES} bytes of a request line")
+    return _Refused(error.error_status_hint, f"no request of HTTP: {error}")
 
 
 def serve(service: MeasureService, options: ServeOptions, ready: Callable[[MeasureServer], None]) -> None:
@@ -395,9 +402,13 @@ def serve(service: MeasureService, options: ServeOptions, ready: Callable[[Measu
     with MeasureServer(service, options) as server:
         try:
             service.start()
+            thread = threading.Thread(target=server.serve_forever, daemon=True)  # signals come to this one
+            thread.start()
             ready(server)
-            server.serve_forever(poll_interval=0.5)
+            while thread.is_alive():
+                thread.join(0.5)
         finally:
+            server.shutdown()
             service.close()
 
 

@@ -12,7 +12,7 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, CameraPrior
-from stcal.io.images import grey_8bit, grey_fine
+from stcal.io.images import grey_8bit, grey_fine, require_grey
 from stcal.labels import Label
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import MAX_TILT_RAD, patterns_of
@@ -155,21 +155,13 @@ class Tracker:
         return labelled, pose
 
     def _camera_of(self, image: np.ndarray, name: str) -> Camera:
-        if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
-            raise InputError(
-                "E-IMAGE-TYPE", f"{name}: {image.dtype} of shape {image.shape}; a grey image of 8 or 16 bits needed"
-            )
+        require_grey(image, None, name)
         height, width = image.shape
         if self.camera is None:
             if not (self.model.width and self.model.height):
                 self.model.require_inside(width, height, name)
             self.camera = self.model.sized(width, height)
-        if (width, height) != (self.camera.width, self.camera.height):
-            raise InputError(
-                "E-IMAGE-SIZE",
-                f"{name}: {width}×{height} px, camera {self.camera.width}×{self.camera.height} px; "
-                "give images as the camera took them",
-            )
+        require_grey(image, (self.camera.width, self.camera.height), name)
         return self.camera
 
     def _search(self, image: np.ndarray, camera: Camera, name: str) -> tuple[LabelledImage, TargetPose | StcalError]:

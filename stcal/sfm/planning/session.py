@@ -1,5 +1,6 @@
 """Forecast of a plan before any image exists: the σ to expect, and what would help most."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations
 
@@ -7,11 +8,14 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.camera import Camera
+from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, camera_prior, refinable
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.data.model import MetricModel
+from stcal.sfm.detect.defocus import RESPONSE
 from stcal.sfm.planning.forecast import (
     ONE_PLATE,
     CentreNoise,
@@ -107,8 +111,8 @@ class Remedy:
 class Plan:
     """A plan with its forecast and remedies.
 
-    ``observations`` : number of centres; ``centre_sigma_px`` : RMS of their σ; ``shares`` : of the variance, by face
-    and source.
+    ``observations`` : number of centres; ``centre_sigma_px`` : RMS of their σ; ``aperture_mm`` : see
+    :func:`widest_aperture_mm`; ``shares`` : of the variance, by face and source.
     """
 
     options: PlanOptions
@@ -116,6 +120,7 @@ class Plan:
     groups: tuple[str, ...]
     observations: int
     centre_sigma_px: float
+    aperture_mm: float
     forecast: Forecast
     shares: dict[str, dict[str, float]]
     remedies: tuple[Remedy, ...]
@@ -202,10 +207,33 @@ def plan(
         tuple(scene.groups),
         sum(len(m.image_index) for m in models),
         float(np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models]).mean())),
+        widest_aperture_mm(models, scene.camera),
         expected,
         variance_shares(expected, without_sources(models, setup, expected.derivatives)),
         tuple(remedies),
     )
+
+
+def widest_aperture_mm(models: Sequence[MetricModel], camera: Camera) -> float:
+    """Returns the diameter of the aperture up to which depth of field moves no centre by more than its σ.
+
+    Each image is in focus at the mean inverse depth of its circles. The squared blur of a point at the inverse depth u
+    is then (f_px A/4)² (u − u_f)² for an aperture of diameter A, and a centre moves by a multiple of its gradient
+    (:mod:`stcal.sfm.detect.defocus`).
+    """
+    focal_px, widest = float(np.sqrt(camera.focal.prod())), []
+    for model in models:
+        normal = np.zeros((len(model.labels), 3))
+        for members in model.points_by_face().values():
+            normal[members] = fit_plane(model.xyz_model[members]).normal
+        rotation = np.stack([pose.rotation for pose in model.camera_from_model])[model.image_index]
+        n, c = np.einsum("nij,nj->ni", rotation, normal[model.point_index]), model.xyz_camera()
+        gradient = np.linalg.norm(n[:, :2], axis=1) / np.abs((n * c).sum(1)) / focal_px
+        u = 1 / c[:, 2]
+        away = np.abs(u - (np.bincount(model.image_index, u) / np.bincount(model.image_index))[model.image_index])
+        by_square = 2 * RESPONSE * (focal_px / 4) ** 2 * away * gradient
+        widest.append(np.sqrt(model.sigma_px() / np.maximum(by_square, 1e-12)).min())
+    return float(min(widest))
 
 
 def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Scene:

@@ -31,6 +31,8 @@ QUESTIONS = {
 Use = Literal["yes", "with care", "no"]
 CAUSE = "cause"
 """Key of the check that names what all images have in common and makes others fail."""
+GENERAL = ("centres", "agreement", "halves")
+"""Keys of the checks that tell that something is wrong and not what. Other checks are said before them."""
 OF_WHOLE_SET = "Cause of the whole set: "
 """How the title of that check begins, before the cause."""
 LEFT_OUT_WHOLE = "left out whole: "
@@ -259,11 +261,13 @@ def _gaps(report: dict) -> list[str]:
 
 
 def _first(report: dict, verdict: str) -> dict:
-    """Returns the cause of the whole set, else the first check of this verdict that names an image, or the first."""
+    """Returns the cause of the whole set, else the first check of this verdict that names an image, or the first that
+    is not a general one."""
     images = {image["name"] for image in report["images"]}
     matching = [check for check in report.get("checks", []) if check["verdict"] == verdict]
     naming = [check for check in matching if any(name in images for name in check["names"])]
-    return [*(check for check in matching if check["key"] == CAUSE), *naming, *matching][0]
+    telling = [check for check in matching if check["key"] not in GENERAL]
+    return [*(check for check in matching if check["key"] == CAUSE), *naming, *telling, *matching][0]
 
 
 # --- how good ---------------------------------------------------------------------------------------------------------
@@ -306,7 +310,11 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
 
 def _premise(report: dict) -> str:
     refined = report["options"].get("refine_camera")
-    return "the board's pitch is" if refined else "the intrinsics and the board's pitch are"
+    sizes = {"board": "the board's pitch", "faces": "the printed size of the faces", "distances": "the known distances"}
+    premises = [sizes[source] for source in report["summary"].get("scale_from", ["board"])]
+    premises = premises if refined else ["the intrinsics", *premises]
+    single = len(premises) == 1 and not premises[0].endswith("distances")
+    return f"{' and '.join(premises)} {'is' if single else 'are'}"
 
 
 def _largest(report: dict, key: str) -> tuple[float, str] | None:
@@ -372,6 +380,12 @@ def _by_sigma(report: dict) -> _Cause:
     face = report["faces"][worst]
     size = 1e-3 * (report["summary"]["scale_sigma_ppm"] or 0.0) * math.hypot(*face["translation_mm"])
     if size**2 > SHARE_OF_SCALE * spread[worst] ** 2:
+        if "board" not in report["summary"].get("scale_from", ["board"]):
+            return _Cause(
+                f"The scale: σ of the size make {number(size, 1)} of the {number(spread[worst], 1)} µm of face "
+                f"{worst}.",
+                "More photographs hardly help: measure the print, and state size_sigma_mm, or a known distance.",
+            )
         return _Cause(
             f"The board: σ of the size make {number(size, 1)} of the {number(spread[worst], 1)} µm of face {worst}.",
             "More photographs hardly help: measure the board's dots, or take a better plate, and state its σ.",

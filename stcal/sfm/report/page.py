@@ -39,6 +39,7 @@ SOLVES = {
     "chain": "chain: group by group, then combined",
     "paper": "paper: as published by Zhang & Wei (2017), for comparison",
 }
+SCALES = {"board": "the board", "faces": "printed size of the faces", "distances": "known distances"}
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 
@@ -318,7 +319,11 @@ def _settings(report: dict) -> list[list[str]]:
             "Left out",
             f"{len(left_out['files'])} files, {len(left_out['images'])} images, {len(left_out['circles'])} circles",
         ],
-        ["Camera, as given", f"{camera['model']}, {sizes} px"],
+        ["Scale", join([SCALES[source] for source in summary.get("scale_from", ["board"])])],
+        [
+            "Camera, as given" if summary.get("camera_given", True) else "Camera, found from the photographs",
+            f"{camera['model']}, {sizes} px",
+        ],
         ["Focal lengths (px)", ", ".join(number(v, 4) for v in camera["focal_px"])],
         ["Principal point (px)", ", ".join(number(v, 4) for v in camera["centre_px"]) + " (pixel centres integer)"],
         ["Distortion", ", ".join(f"{v:.8g}" for v in camera["distortion"])],
@@ -410,15 +415,24 @@ def _scale(report: dict, boards: dict[str, str]) -> list[Block]:
             "",
         )
         for group in report["groups"]
+        if group["name"] in boards
+    ]
+    without = (
+        "Without a board in view, λ is from the corners of faces with printed boards or tags, or from known distances "
+        "between points: they stand for the dots in this table"
+    )
+    of_boards = [
+        subheading("Board residuals"),
+        "Reconstructed minus design, in the board's frame, on the board's grid; one scale for all groups. Arrows show "
+        "x and y, colour shows z",
+        plots(*pictures),
     ]
     return [
         "λ turns a group's model into mm, by least squares over all dots of the board, and by rows as published "
         "(first and last row, all pairs). σ is that of λ from the board's stated σ",
         Table(heads, _scales(report)),
-        subheading("Board residuals"),
-        "Reconstructed minus design, in the board's frame, on the board's grid; one scale for all groups. Arrows show "
-        "x and y, colour shows z",
-        plots(*pictures),
+        *([without] if len(pictures) < len(report["groups"]) else []),
+        *(of_boards if pictures else []),
     ]
 
 
@@ -437,7 +451,11 @@ def _scales(report: dict) -> list[list]:
 
 def _boards(report: dict) -> dict[str, tuple]:
     """Returns the input of the plots of the boards' residuals, by group."""
-    residuals = {group["name"]: group["scale"]["board_residuals_um"] for group in report["groups"]}
+    residuals = {
+        group["name"]: group["scale"]["board_residuals_um"]
+        for group in report["groups"]
+        if group["scale"].get("source", "board") == "board"
+    }
     vectors = [vector for board_residuals in residuals.values() for vector in board_residuals.values()]
     reach = max((math.hypot(*vector[:2]) for vector in vectors), default=0.0)
     height = max((abs(vector[2]) for vector in vectors), default=0.0)

@@ -12,15 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.file import save_run_board
+from stcal.boards.target import save_body
 from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
-from stcal.io.design import board_toml, target_toml
+from stcal.io.cameras.model import CalibratedCamera
+from stcal.io.cameras.write import save_camera
 from stcal.io.files import BOARD, CAMERA, REFINED_CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, json_text, read_bytes, save
 from stcal.io.json import checked, read_json
 from stcal.parallel import Progress
 from stcal.report.page import pdf_of, require_pdf
-from stcal.sfm.adjust.file import FacesFile
+from stcal.sfm.adjust.file import FacesFile, require_faces_written
 from stcal.sfm.data.model import GroupModel, ImageObservations
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
@@ -86,9 +88,9 @@ def overlay_path(out: Path, name: str) -> Path:
     A long name is cut, and ends in its hash.
     """
     group, slash, file_name = name.rpartition("/")
-    if len(file_name.encode()) > LONGEST_NAME:
-        cut = file_name.encode()[: LONGEST_NAME - HASH_DIGITS - 1].decode(errors="ignore")
-        file_name = f"{cut}-{hashlib.sha256(name.encode()).hexdigest()[:HASH_DIGITS]}"
+    if len(os.fsencode(file_name)) > LONGEST_NAME:
+        cut = os.fsencode(file_name)[: LONGEST_NAME - HASH_DIGITS - 1].decode(errors="ignore")
+        file_name = f"{cut}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:HASH_DIGITS]}"
     suffix = "" if file_name.lower().endswith((".jpg", ".jpeg")) else ".jpg"
     return out / "overlays" / f"{group}{slash}{file_name}{suffix}"
 
@@ -116,16 +118,18 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
         write_model(folder, [model], observations, ids, result.camera)
     adjusted = CalibratedCamera.of(result.calibration.camera, result.camera.colmap_model)
     write_model(out / "target_model", result.calibration.models, observations, ids, adjusted)
-    write_cameras_txt(out / CAMERA, result.camera)
+    save_camera(out / CAMERA, result.camera)
     if (refined := result.refined_camera) is not None:
-        write_cameras_txt(out / REFINED_CAMERA, refined)
-    save(out / TARGET, target_toml(result.target_design))
-    save(out / BOARD, board_toml(result.board_design))
+        save_camera(out / REFINED_CAMERA, refined)
+    save_body(out / TARGET, result.target_design)
+    if result.board_design.rows:
+        save_run_board(out / BOARD, result.board_design)
     report = judged(report_of(result).content())
     if result.target.target_from_face:  # a run of the board alone has no faces
         options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.circles
         faces = FacesFile.of(result.target, result.target_design, options, factor, result.calibration.rim_mm)
         save(out / "faces.json", json_text(faces.content()))
+        require_faces_written(out / "faces.json", result.target)
     write_report(out, report, out, reload_s)
     progress("report", 1, 1)
     return Judgement.model_validate(report["judgement"])
@@ -205,7 +209,7 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
     gone, residuals = len(shown) - len(overlays), _residuals(run, list(overlays))
     with _as_written(path):
         page = report_html(report, overlays, residuals, gone=gone)
-    outputs: list[tuple[Path, bytes]] = [(out, page.encode())]
+    outputs: list[tuple[Path, bytes]] = [(out, page.encode("utf-8", "backslashreplace"))]
     if pdf:
         outputs.append((out.with_suffix(".pdf"), pdf_of(page)))
     for file, content in outputs:
@@ -215,7 +219,7 @@ def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], in
 
 def _report_page(run: Path, report: dict, reload_s: int | None = None) -> bytes:
     overlays = {name: _overlay_in(run, name).read_bytes() for name in shown_overlays(report)}
-    return report_html(report, overlays, _residuals(run, list(overlays)), reload_s).encode()
+    return report_html(report, overlays, _residuals(run, list(overlays)), reload_s).encode("utf-8", "backslashreplace")
 
 
 def _residuals(run: Path, names: list[str]) -> dict[str, Residuals]:

@@ -3,10 +3,11 @@
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Literal, get_args
+from typing import Literal
 
 from stcal.design import TargetDesign
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_choices
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import AdjustOptions, Solve
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -80,10 +81,7 @@ class RunOptions:
     expect_faces: tuple[str, ...] = ()
 
     def __post_init__(self):
-        if self.compare not in (None, *get_args(Compare)):
-            raise InputError(
-                "E-OPTION-VALUE", f"compare {self.compare!r}: not a choice; use {' or '.join(get_args(Compare))}"
-            )
+        require_choices(self, "options")
 
     def adjustment(self, target: TargetDesign) -> AdjustOptions:
         """Returns the options of the adjustment, with every default decided.

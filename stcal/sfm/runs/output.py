@@ -19,7 +19,7 @@ MICRO = 1e3
 
 def report_of(result: RunResult) -> ReportFile:
     """Returns the report of a run."""
-    models = _final_models(result)
+    models, joint = _final_models(result), result.calibration.joint
     residual = {name: model.residuals_px(result.calibration.camera) for name, model in models.items()}
     all_residuals = np.concatenate(list(residual.values()))
     return ReportFile.model_validate(
@@ -68,6 +68,11 @@ def report_of(result: RunResult) -> ReportFile:
                 "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
                 "last_move_px": result.calibration.joint.last_move_px if result.calibration.joint else None,
                 "rim_mm": float(np.mean(rims)) if (rims := list(result.calibration.rim_mm.values())) else None,
+                "rim_sigma_mm": result.calibration.rim_sigma_mm if rims else None,
+                "scale_from": result.scale_from(),
+                "print_factor": joint.print_factor if joint and "faces" in result.scale_from() else None,
+                "bend_factor": joint.bend_factor if joint and "faces" in result.scale_from() else None,
+                "camera_given": result.camera_given,
             },
             "faces": {face: _face(result, face) for face in result.target.target_from_face},
             "between_faces": _between(result),
@@ -202,6 +207,7 @@ def _group(result: RunResult, solution) -> dict:
             "board_residuals_um": {
                 label: MICRO * residual for label, residual in zip(scale.labels, scale.residuals_mm, strict=True)
             },
+            "source": scale.source,
         },
     }
 

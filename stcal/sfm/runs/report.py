@@ -8,6 +8,7 @@ from stcal.io.images import name_fault
 from stcal.io.json import ByFace, ByGroup, ByLabel, Matrix3, Pair, Part, Points, Pose, ResultFile, Vector, Vector3
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import Solve
+from stcal.sfm.adjust.scale import ScaleSource
 from stcal.sfm.checks.verdict import Verdict
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.crosscheck import Crosscheck
@@ -52,6 +53,11 @@ class Summary(Part):
     redundancy: int | None
     last_move_px: float | None
     rim_mm: float | None = None
+    rim_sigma_mm: float | None = None
+    scale_from: list[ScaleSource] = Field(default=["board"])
+    print_factor: float | None = None
+    bend_factor: float | None = None
+    camera_given: bool = True
 
 
 class FaceRow(Part):
@@ -131,6 +137,7 @@ class ScaleRow(Part):
     board_spread_um: float
     board_rms_um: float
     board_residuals_um: dict[ByLabel, Vector3]
+    source: ScaleSource = "board"
 
 
 class GroupRow(Part):
@@ -145,7 +152,8 @@ class GroupRow(Part):
         description="`mm_per_unit` by least squares over all dots, `mm_per_unit_rows` from all pairs of the two "
         "`rows`, `difference_ppm`, `sigma_ppm`, `dots`; residuals after the similarity, reconstructed minus design, "
         "board frame: `board_mean_um`, `board_spread_um` (standard deviation), `board_rms_um` of their lengths, "
-        "`board_residuals_um` label → `[x, y, z]`"
+        "`board_residuals_um` label → `[x, y, z]`; `source` of λ: `board`, `faces` of known shape, whose corners then "
+        "stand for the dots, or known `distances`"
     )
 
 
@@ -248,7 +256,10 @@ class ReportFile(ResultFile):
         "of the circles of the faces and `dot_sigma_factor` of the dots, which multiply these σ; `scale_sigma_ppm`: σ "
         "of the size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
         "moved a projection at most (settled: less than 1e-6); these four are null with `chain` and `paper`; "
-        "`rim_mm` mean height of the rims behind which the faces lie, null where they are as seen"
+        "`rim_mm` mean height of the rims behind which the faces lie, `rim_sigma_mm` its σ (0 where stated), null "
+        "where they are as seen; `scale_from` what the size rests on; `print_factor`, `bend_factor` by which corners "
+        "of printed faces are off their design over their σ, in the plane and off it (null without such faces); "
+        "`camera_given` false where the camera was found from the photographs"
     )
     faces: dict[ByFace, FaceRow] = Field(
         description="`target_from_face`, `translation_mm`, `angle_to_reference_deg`, `translation_sigma_um` and "

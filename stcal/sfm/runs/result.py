@@ -1,16 +1,19 @@
 """Result of a run, and its comparison with the published method."""
 
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from pydantic import Field
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, known_distances
 from stcal.io.cameras.model import CalibratedCamera, CameraPrior
 from stcal.io.json import ByFace, Part
 from stcal.sfm.adjust.calibration import Calibration
-from stcal.sfm.adjust.chain import FaceChain
+from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
+from stcal.sfm.adjust.scale import ScaleSource
 from stcal.sfm.checks.suite import Evidence
 from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import ImageObservations
@@ -92,6 +95,8 @@ class RunResult:
         Comparison with the published method, if requested.
     judgement : Judgement, optional
         The report in words, once it is made.
+    camera_given : bool
+        False if the camera was found from the photographs; ``camera`` is then the start of its adjustment.
     """
 
     out: Path
@@ -109,11 +114,43 @@ class RunResult:
     checks: tuple[Check, ...] = ()
     comparison: Comparison | None = None
     judgement: Judgement | None = None
+    camera_given: bool = True
+
+    def scale_from(self) -> list[ScaleSource]:
+        """Returns what the size of the result rests on."""
+        board = self.board_design
+        known = {"board": board.rows, "faces": faces_of_known_shape(board), "distances": known_distances(board)}
+        return [source for source in get_args(ScaleSource) if known[source]]
 
     @property
-    def target(self):
+    def target(self) -> CalibratedTarget:
         """The calibrated target."""
         return self.calibration.target
+
+    def __repr__(self) -> str:
+        faces = "; ".join(", ".join(row) for row in self._summary())
+        return f"<RunResult in {self.out}: {self._verdict()}; face, σ µm, σ mdeg: {faces or 'no face'}>"
+
+    def _repr_html_(self) -> str:
+        """Returns verdict, faces and σ as HTML, which notebooks show."""
+        rows = [f"<tr><td>{'</td><td>'.join(map(escape, row))}</td></tr>" for row in self._summary()]
+        head = "<tr><th>face</th><th>σ µm</th><th>σ mdeg</th></tr>"
+        return f"<p>{escape(self._verdict())}</p><table>{head}{''.join(rows)}</table>"
+
+    def _verdict(self) -> str:
+        return "not judged" if self.judgement is None else f"may I use it? {self.judgement.use}"
+
+    def _summary(self) -> list[tuple[str, str, str]]:
+        """Returns each face with the length of σ of its place and of its rotation over the three axes."""
+        rows = []
+        for face in self.target.target_from_face:
+            covariance = self.target.face_covariance.get(face)
+            if face == self.target.reference_face or covariance is None:
+                rows.append((face, "reference" if face == self.target.reference_face else "", ""))
+                continue
+            rotation, place = (float(np.sqrt(np.trace(covariance[part, part]))) for part in (slice(3), slice(3, 6)))
+            rows.append((face, f"{1e3 * place:.2f}", f"{1e3 * np.degrees(rotation):.2f}"))
+        return rows
 
     @property
     def refined_camera(self) -> CalibratedCamera | None:

@@ -10,7 +10,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.boards.file import load_run_board
+from stcal.boards.target import load_body
+from stcal.design import BoardDesign, TargetDesign, scale_reference
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
@@ -18,7 +20,6 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CalibratedCamera, CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.io.covariance import OF_PIXEL, first_fault
-from stcal.io.design import load_board, load_target
 from stcal.io.files import BOARD, CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, read_bytes
 from stcal.io.json import Part, checked, read_json
 from stcal.labels import circle_labels
@@ -26,6 +27,7 @@ from stcal.sfm.adjust.calibration import SigmaFactors, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.adjust.joint import Adjusted, adjusted
+from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.data.model import ImageObservations, by_group
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.database import image_ids
@@ -101,13 +103,15 @@ class SavedRun:
         return CalibratedCamera.of(camera, self.camera.colmap_model)
 
 
-def load_run(folder: str | Path) -> SavedRun:
+def load_run(folder: str | Path, printed: bool = False) -> SavedRun:
     """Reads a finished run.
 
     Parameters
     ----------
     folder : path
         Folder that was given to the run as ``out``.
+    printed : bool
+        Whether the caller takes a target with boards or tags on its faces.
 
     Returns
     -------
@@ -125,7 +129,18 @@ def load_run(folder: str | Path) -> SavedRun:
             "E-RUN-FOLDER", f"run {folder}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"
         )
     complete_interrupted(folder)
-    needed = (CAMERA, TARGET, BOARD, "labels.csv", "database.db", "report.json", "faces.json")
+    has_target = (folder / TARGET).is_file()
+    target = load_body(folder / TARGET) if has_target else None
+    without_board = target is not None and target.has_scale and not (folder / BOARD).exists()
+    needed = (
+        CAMERA,
+        TARGET,
+        *(() if without_board else (BOARD,)),
+        "labels.csv",
+        "database.db",
+        "report.json",
+        "faces.json",
+    )
     missing = [name for name in needed if not (folder / name).is_file()]
     if missing == ["faces.json"]:
         raise InputError(
@@ -138,9 +153,16 @@ def load_run(folder: str | Path) -> SavedRun:
             "E-RUN-UNFINISHED",
             f"run {folder}: unfinished, or of another version: no {', '.join(missing)}; run it again",
         )
+    assert target is not None
+    if not printed and target.with_faces(printed=True).faces:
+        raise InputError(
+            "E-RUN-PRINTED",
+            f"run {folder}: its target has boards or tags on its faces, which this command does not take yet; "
+            "`measure`, `compare`, `report` and `verify` do",
+        )
     marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
     camera = read_camera(folder / CAMERA).calibrated(0, 0)
-    target, board = load_target(folder / TARGET), load_board(folder / BOARD)
+    board = scale_reference(None if without_board else load_run_board(folder / BOARD), target)
     with _as_written(folder / RUN_MARKER):
         marker_file = checked(marker, MarkerFile)
         options, images = _options(marker_file.options or {}).settled(target), Path(marker_file.images)
@@ -151,6 +173,7 @@ def load_run(folder: str | Path) -> SavedRun:
     with _as_written(folder / "labels.csv"):
         known = {*target.radius_of(), *board.radius_of()}
         observations, corrected = _labels(folder / "labels.csv", names, camera, known)
+        board = with_edge_sigma(board, observations)
     return SavedRun(
         folder=folder,
         images=images,

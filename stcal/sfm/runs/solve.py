@@ -13,7 +13,7 @@ from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cache import keep, kept
+from stcal.io.cache import keep, kept, made_by
 from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, parse_labels, unseen_lines
@@ -26,10 +26,12 @@ from stcal.sfm.detect.labels import LabelledImage, leaves_a_board_out
 from stcal.sfm.mapping.database import image_ids, write_database
 from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, rank_pairs
+from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model
 from stcal.sfm.report.judgement import LEFT_OUT_WHOLE
 from stcal.sfm.runs.options import RunOptions
 
 CACHE_VERSION = 6
+SHOW_MORE = "show two faces of it at once, or one by more corners"
 _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 
 
@@ -50,11 +52,15 @@ class GroupSolution:
 
 
 def usable_groups(
-    groups: dict[str, list[ImageObservations]], skipped: Sequence[Skipped], board_alone: bool = False
+    groups: dict[str, list[ImageObservations]],
+    skipped: Sequence[Skipped],
+    board_alone: bool = False,
+    needs_board: bool = True,
 ) -> tuple[dict[str, list[ImageObservations]], list[str]]:
     """Returns the groups that can be solved, and the reasons why others cannot, before anything is mapped.
 
-    The others include groups of which every image was skipped. With ``board_alone``, groups need no face.
+    The others include groups of which every image was skipped. With ``board_alone``, groups need no face; without
+    ``needs_board``, no board.
 
     Raises
     ------
@@ -83,7 +89,7 @@ def usable_groups(
                         f"leave it out with --exclude {group[0].name}"
                     )
                 raise MappingError("E-GROUP-FEW-IMAGES", f"group {name}: {count}, 2 needed{why}; {remedy}")
-            require_usable(group, board_alone)
+            require_usable(group, board_alone, needs_board)
         except MappingError as error:
             errors.append(error)
         else:
@@ -122,8 +128,9 @@ def _left_out(error: StcalError) -> str:
     return f"{LEFT_OUT_WHOLE}{error}"
 
 
-def require_usable(group: list[ImageObservations], board_alone: bool = False) -> None:
-    """Refuses a group that cannot be solved, before anything is mapped; with ``board_alone`` it needs no face.
+def require_usable(group: list[ImageObservations], board_alone: bool = False, needs_board: bool = True) -> None:
+    """Refuses a group that cannot be solved, before anything is mapped; with ``board_alone`` it needs no face, without
+    ``needs_board`` no board.
 
     Raises
     ------
@@ -142,7 +149,7 @@ def require_usable(group: list[ImageObservations], board_alone: bool = False) ->
             f"{where}: no face of the target recognised in {len(group)} images; look at the overlays, "
             "check target.toml (radii, polarity) and the exposure; of the board alone, use --board-only",
         )
-    if not any(isinstance(label, DotLabel) for image in group for label in image.labels):
+    if needs_board and not any(isinstance(label, DotLabel) for image in group for label in image.labels):
         raise MappingError(
             "E-GROUP-NO-BOARD",
             f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
@@ -200,6 +207,7 @@ def _key(
         hasher.update(image.centre_px.tobytes() + image.covariance_px2.tobytes())
     plain = [
         CACHE_VERSION,
+        made_by(),
         list(skeleton),
         [camera.width, camera.height, camera.parameters()],
         asdict(target.patterns_alone()),
@@ -248,6 +256,46 @@ def _stored(stored, meta) -> GroupSolution:
     )
     outliers = tuple(Outlier(**o) for o in meta["outliers"])
     return GroupSolution(pairs, model, meta["seeded"], meta["rounds"], meta["left_out"], outliers)
+
+
+def solve_body(
+    observations: Sequence[ImageObservations],
+    body: PlacedBody,
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign,
+    eccentricity: bool,
+    progress: Progress,
+) -> tuple[list[GroupSolution], list[str]]:
+    """Maps and refines the groups of a body that its faces of known shape have placed.
+
+    Returns the solutions, and the reasons why groups have none. Images that show no such face are resected by what the
+    others map.
+
+    Raises
+    ------
+    MappingError, ScaleError, ConvergenceError, DegenerateError
+        No group has a solution; the error of the first group is raised.
+    """
+    solutions: list[GroupSolution] = []
+    errors: list[StcalError] = []
+    groups = by_group(observations)
+    for done, group in enumerate(groups.values(), 1):
+        try:
+            model = model_of_body(body, group, camera)
+            refined = refine(model, camera, target, board, eccentricity)
+            find_scale(refined.model, board)
+        except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
+            errors.append(error)
+        else:
+            members = [image for image in group if image.name in refined.model.images]
+            missing = left_out(group, model, SHOW_MORE) | left_out(members, refined.model, SHOW_MORE)
+            pair = pair_of_model(refined.model)
+            solutions.append(GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, refined.outliers))
+        progress("map", done, len(groups))
+    if not solutions:
+        raise errors[0]
+    return solutions, [_left_out(error) for error in errors]
 
 
 def unseen_board(solutions: list[GroupSolution], board: BoardDesign) -> list[str]:

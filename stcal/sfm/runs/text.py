@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.design import faces_of_known_shape, known_distances
 from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.files import REFINED_CAMERA
 from stcal.io.images import Skipped
 from stcal.labels import DotLabel
 from stcal.report.text import text_table, wrapped
+from stcal.sfm.adjust.scale import Scale
 from stcal.sfm.checks.verdict import BY_CHANCE, Check, ranked
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
@@ -19,6 +21,8 @@ from stcal.sfm.report.judgement import images_left_out
 from stcal.sfm.runs.result import Comparison, RunResult
 from stcal.sfm.runs.solve import GroupSolution
 
+WEAK_FOCAL = 0.01
+"""Relative σ of a focal length beyond which the views lack what determines it."""
 NOTED, NAMED = 4, 6
 """Number of images whose notes are printed, and number of further images that are named."""
 
@@ -27,9 +31,10 @@ def run_text(result: RunResult) -> str:
     """Returns the result of a run: groups, what was left out, faces with σ, and checks that did not pass."""
     lines = [*_skipped(result.detection.skipped)]
     for solution in result.solutions:
-        lines += _group(solution, result.calibration.scales[solution.model.group].rms_mm())
+        lines += _group(solution, result.calibration.scales[solution.model.group])
     lines += result.notes
     lines += _noted(result.labelled)
+    lines += [*_scale_of_target(result), *_found_camera(result)]
     lines += _defocus(result.labelled)
     if result.options.solve == "paper":
         lines.append(
@@ -69,6 +74,42 @@ def _camera_taken_as_exact(camera: CalibratedCamera) -> str:
         f"the camera file states σ of its parameters ({focal:.2g} px of the focal length), and this run takes them as "
         "exact: no σ below holds them; --refine-camera adjusts the intrinsics within them and carries them into all σ"
     )
+
+
+def _scale_of_target(result: RunResult) -> Iterator[str]:
+    """Yields what the size rests on where that is not the board alone, and how good print and flatness are."""
+    sources, joint = result.scale_from(), result.calibration.joint
+    known = faces_of_known_shape(result.board_design)
+    if "faces" in sources:
+        beside = " beside the board" if "board" in sources else ", no board"
+        stated = any(face.size_sigma for face in known)
+        size = "" if stated else ", which is taken as exact: state size_sigma_mm of a measured square or tag"
+        yield f"scale: from the printed size of {len(known)} faces{beside}{size}"
+        if joint is not None:
+            within = 1e3 * joint.print_factor * float(np.median([face.sigma_mm or 0.0 for face in known]))
+            flat = result.options.flatness_mm
+            off = "" if flat is None else f", {1e3 * joint.bend_factor * flat:.0f} µm off it"
+            yield f"print: corners lie {within:.0f} µm about the design in the plane{off} (σ, from the photographs)"
+    if "distances" in sources:
+        yield f"scale: from {len(known_distances(result.board_design))} known distances"
+
+
+def _found_camera(result: RunResult) -> Iterator[str]:
+    """Yields how well a camera that was found from the photographs is determined, and what the views lack."""
+    refined = result.refined_camera
+    if result.camera_given or refined is None or refined.covariance is None:
+        return
+    sigma = np.sqrt(np.diag(refined.covariance))
+    focal, centre = refined.focal, refined.centre
+    yield (
+        f"camera: found from the photographs, no file: f {focal[0]:.1f} ± {sigma[0]:.1f}, {focal[1]:.1f} ± "
+        f"{sigma[1]:.1f} px, principal point {centre[0]:.1f} ± {sigma[2]:.1f}, {centre[1]:.1f} ± {sigma[3]:.1f} px"
+    )
+    if sigma[0] > WEAK_FOCAL * focal[0]:
+        yield (
+            f"camera: the focal length is known to {100 * sigma[0] / focal[0]:.1f} % alone: take views from "
+            "nearer, and of faces at 30° to 60°, or give a camera file"
+        )
 
 
 def _defocus(labelled: Sequence[LabelledImage]) -> list[str]:
@@ -132,12 +173,13 @@ def _noted(labelled: Sequence[LabelledImage]) -> Iterator[str]:
         yield f"something was left out in {', '.join(others[:NAMED])}{surplus} too; the report says what and why"
 
 
-def _group(solution: GroupSolution, board_rms_mm: float) -> Iterator[str]:
+def _group(solution: GroupSolution, scale: Scale) -> Iterator[str]:
     pair = solution.pairs[0]
+    of_scale = {"board": "board", "faces": "printed faces", "distances": "known distances"}[scale.source]
     yield (
         f"group {solution.model.group}: {len(solution.model.images)} images, {len(solution.model.labels)} circles, "
         f"initial pair {Path(pair.first).name} – {Path(pair.second).name} at "
-        f"{np.degrees(pair.median_angle_rad):.0f}°, board {1e3 * board_rms_mm:.1f} µm RMS"
+        f"{np.degrees(pair.median_angle_rad):.0f}°, {of_scale} {1e3 * scale.rms_mm():.1f} µm RMS"
     )
     for name, reason in solution.left_out.items():
         yield f"left out {name}: {reason}"

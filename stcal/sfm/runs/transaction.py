@@ -7,7 +7,7 @@ import shutil
 import socket
 import stat
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -90,6 +90,11 @@ COMPARISON = "compare.json"
 RESULTS = (*RUN_ENTRIES, COMPARISON)
 """Entries that new results replace, or remove if the new results lack them."""
 HOLDER, ENTRIES, LOCK = "holder.txt", "entries.txt", "lock"
+LONGEST_DATABASE, MOST_DATABASE_BYTES = "scratch/mapping.db.partial-journal", 500
+"""Longest path of a database below the folder of an unfinished run, and the longest that SQLite takes (512, of which it
+keeps a few)."""
+LOOKED_AT = ("detections.csv", "overlays")
+"""Results of a run that fails which help to see why, and claim nothing."""
 DATABASE_SIDES = ("-wal", "-shm", "-journal")
 
 
@@ -111,7 +116,7 @@ def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object
     """Claims a run's folder; at the end of the block its results take the place of the earlier ones.
 
     If the block raises, earlier results stay, and the files that it made are left in ``unfinished/``. If there are no
-    earlier results, these files take their places all the same, to be looked at.
+    earlier results, the detections and their overlays take their places all the same, to be looked at.
 
     Parameters
     ----------
@@ -125,6 +130,7 @@ def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object
         The folder holds something else, an input, or a run in progress.
     """
     out = Path(out)
+    _require_short(out)
     folder = RunFolder(out, out / UNFINISHED, out / CACHE)
     _require_ours(out)
     _require_no_inputs(out, inputs)
@@ -254,6 +260,17 @@ def _require_ours(out: Path) -> None:
     _require_no_links(out)
 
 
+def _require_short(out: Path) -> None:
+    """Refuses a path that SQLite cannot open a database below."""
+    length = len(os.fsencode(Path(real_place(out)) / UNFINISHED / LONGEST_DATABASE))
+    if length > MOST_DATABASE_BYTES:
+        raise InputError(
+            "E-OUTPUT-LENGTH",
+            f"output folder {out}: databases in it have paths of {length} bytes, {MOST_DATABASE_BYTES} at most; give a "
+            "shorter --out",
+        )
+
+
 def _require_no_links(out: Path) -> None:
     for name in (UNFINISHED, ADDED, READY, CACHE):
         if (out / name).is_symlink():
@@ -295,7 +312,8 @@ def _locked(out: Path) -> Iterator[None]:
     except OSError as error:
         raise _unwritable(out, error) from error
     try:
-        save(cache / HOLDER, _me())
+        with suppress(StcalError):  # it only says to others who writes here
+            save(cache / HOLDER, _me())
         yield
     finally:
         lock.release()
@@ -323,11 +341,12 @@ def _leave(folder: RunFolder, content: MarkerFile, error: BaseException) -> None
     """Moves the files of a failed run to their places if there are no earlier results; else leaves them aside."""
     remove(folder.stage / "scratch")
     if not _finished(folder.out):
-        save(folder.stage / RUN_MARKER, json_text(content.content()))
+        with suppress(StcalError):  # where there is no space, that of the beginning stays
+            save(folder.out / RUN_MARKER, json_text(content.content()))
         for name in RESULTS:
             if name != RUN_MARKER:
                 remove(folder.out / name)
-            if (folder.stage / name).exists():
+            if name in LOOKED_AT and (folder.stage / name).exists():
                 os.replace(folder.stage / name, folder.out / name)
         remove(folder.stage)
     elif not any(folder.stage.iterdir()):

@@ -1,10 +1,12 @@
 """Results on the way from photographs to joint values: their page, summary and folder."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from stcal.io.files import json_text
+from stcal.io.json import ResultFile, require_result_written
 from stcal.report.document import Block, Document, Section, Table, bullets, links, listed, plot, tiles
 from stcal.report.figure import COLOURS, calm, new_figure
 from stcal.report.text import number
@@ -12,8 +14,8 @@ from stcal.robot.axes.model import AxesResult
 from stcal.robot.axes.report import axes_file, axes_report
 from stcal.robot.identification.predicted import predicted_at
 from stcal.robot.identification.report import identified_file, identified_report
-from stcal.robot.identification.result import Identified
-from stcal.robot.kinematics.file import robot_toml
+from stcal.robot.identification.result import Identified, require_identified_written
+from stcal.robot.kinematics.file import require_robot_written, robot_toml
 from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import Robot
 from stcal.robot.use.compensation import (
@@ -21,12 +23,21 @@ from stcal.robot.use.compensation import (
     compensated_csv,
     compensated_summary,
     compensation_file,
+    require_compensated_written,
 )
 from stcal.robot.use.evaluation import Figures
 from stcal.robot.use.report import compensation_report
 from stcal.sfm.measurement.images import MeasureResult
-from stcal.sfm.measurement.report import measure_report, poses_csv, poses_file, summary
+from stcal.sfm.measurement.report import (
+    measure_report,
+    poses_csv,
+    poses_file,
+    require_table_written,
+    summary,
+)
 
+STAGES = ("poses", "axes", "identified", "compensated")
+"""Names of the files, in the order of the steps."""
 DRAWING, AXES, SAME_ROWS = "as drawn", "by the axis method", "identified, the same rows"
 
 
@@ -261,30 +272,49 @@ def _figure(result: FromPhotos):
 POSES = "poses.csv"
 
 
+def _results(result: FromPhotos) -> dict[str, ResultFile]:
+    """Returns the result files, by name."""
+    axes, identified, compensated = result.axes, result.identified, result.compensated
+    return {
+        "poses.json": poses_file(result.measured),
+        "identified.json": identified_file(identified, result.nominal),
+        **({} if axes is None else {"axes.json": axes_file(axes)}),
+        **({} if compensated is None else {"compensated.json": compensation_file(compensated, identified.robot)}),
+    }
+
+
 def files_of(result: FromPhotos) -> dict[str, str]:
     """Returns the contents of all files, by name."""
     identified, compensated = result.identified.robot, result.compensated
-    files = {
+    source = f"Identified from {result.data.where}: {result.identified.rank} parameters."
+    files = {name: json_text(content) for name, content in _results(result).items()} | {
         POSES: poses_csv(result.measured)[0],
-        "poses.json": json_text(poses_file(result.measured)),
         "poses.html": measure_report(result.measured, result.images).page(),
+        "identified.toml": robot_toml(identified, [source]),
+        "identified.html": identified_report(result.identified, result.nominal).page(),
     }
     if result.axes is not None:
         files |= {
             "axes.toml": robot_toml(result.axes.robot, ["Identified by the axis method from the sweeps."]),
-            "axes.json": json_text(axes_file(result.axes)),
             "axes.html": axes_report(result.axes, result.data.where).page(),
         }
-    source = f"Identified from {result.data.where}: {result.identified.rank} parameters."
-    files |= {
-        "identified.toml": robot_toml(identified, [source]),
-        "identified.json": json_text(identified_file(result.identified, result.nominal)),
-        "identified.html": identified_report(result.identified, result.nominal).page(),
-    }
     if compensated is not None:
         files |= {
             "compensated.csv": compensated_csv(compensated, identified),
-            "compensated.json": json_text(compensation_file(compensated, identified)),
             "compensated.html": compensation_report(compensated, identified).page(),
         }
+    files = dict(sorted(files.items(), key=lambda item: STAGES.index(item[0].split(".")[0])))
     return files | {"report.html": from_photos_page(result, tuple(files))}
+
+
+def require_files_written(out: Path, result: FromPhotos) -> None:
+    """Read the results, tables and robots of :func:`files_of` in folder ``out`` again, and require what was
+    reported."""
+    for name, content in _results(result).items():
+        require_result_written(out / name, content)
+    require_table_written(out / POSES, result.measured)
+    require_identified_written(out / "identified.toml", result.identified)
+    if result.axes is not None:
+        require_robot_written(out / "axes.toml", result.axes.robot, result.axes.chain)
+    if result.compensated is not None:
+        require_compensated_written(out / "compensated.csv", result.compensated, result.identified.robot)

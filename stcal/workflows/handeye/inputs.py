@@ -9,12 +9,13 @@ import numpy as np
 from stcal.boards.several import load_boards
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye import HandEyePoses, View, Views, pairs_of_views, read_poses
+from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, handeye, pairs_of_views, read_poses
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
 from stcal.handeye.data.pairs import SETUPS, Loop, Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import Timed
+from stcal.handeye.judge.flips import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.methods import closed_form
 from stcal.io.cameras.model import CameraPrior, camera_prior, refinable
@@ -442,3 +443,35 @@ def _dry_images(
     left_out = [(skipped_image.name, skipped_image.reason) for skipped_image in skipped] + list(at_images.left_out)
     left_out += _without_partner(files, rows, missing, poses.name)
     return lines + [f"left out {name}: {reason}" for name, reason in left_out]
+
+
+MOST_ROUNDS = 3
+"""Largest number of rounds of solving and tilting; a flip by few degrees stands out when the larger ones are gone."""
+
+
+def without_flips(inputs: HandEyeInput, setup: Setup, options: HandEyeOptions) -> tuple[HandEyeInput, str]:
+    """Returns the input with the second pose of a flat target, tilted the other way, for poses that agree with the
+    others only so; and a sentence that names them.
+
+    Raises
+    ------
+    InputError
+        Images, which tell the poses by themselves.
+    """
+    if inputs.views is not None:
+        raise InputError(
+            "E-OPTION-NEEDS", "--undo-flips: only with poses; corners of images tell the tilt, leave it out"
+        )
+    pairs, undone = inputs.pairs, np.zeros(len(inputs.pairs), bool)
+    for _ in range(MOST_ROUNDS):
+        result = handeye(pairs, setup, "pose", None, options)
+        x, z = result.mount_from_camera, result.stand_from_board
+        flips = flipped(Loop.of(pairs, setup), x, z, result.outliers) & ~undone
+        if not flips.any():
+            break
+        seen, other = pairs.camera_from_board, tilted(pairs.camera_from_board)
+        turned = np.where(flips[:, None, None], other.rotation, seen.rotation)
+        pairs, undone = replace(pairs, camera_from_board=Poses(turned, seen.translation)), undone | flips
+    shown = ", ".join(name for name, flip in zip(pairs.names, undone, strict=True) if flip)
+    said = f"tilted the other way, as --undo-flips asks, {undone.sum()} of {len(pairs)} poses: {shown or 'none'}"
+    return replace(inputs, pairs=pairs), said

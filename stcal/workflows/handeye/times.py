@@ -10,18 +10,19 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.handeye.data.robot_poses import RobotPoses
 from stcal.handeye.data.stream import TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
-from stcal.io.table import read_table
+from stcal.io.join import table_of
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
     """``tolerance_s`` : within which the nearest sample replaces a pose that cannot be interpolated; ``image_times`` :
     file with ``image`` and ``time_s``, where names of images are not times; ``offset`` : whether the clocks' offset is
-    estimated."""
+    estimated; ``times_columns`` : map of the columns of ``image_times``."""
 
     tolerance_s: float = TOLERANCE_S
     image_times: Path | None = None
     offset: bool = False
+    times_columns: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +115,7 @@ def _times_of_images(names: Sequence[str], timing: Timing) -> dict[str, Decimal]
     if timing.image_times is None:
         times = stamps_of(names)
         return None if times is None else dict(zip(names, times, strict=True))
-    table = read_table(timing.image_times, "image times")
+    table = table_of(timing.image_times, timing.times_columns, "image times")
     stated = dict(zip(table.text("image"), table.text("time_s"), strict=True))
     if len(stated) < len(table):
         raise InputError("E-TABLE-ROW-REPEATED", f"{table.where}: an image in two rows; one each needed")

@@ -132,6 +132,7 @@ def test_a_robot_that_is_off_is_seen_in_the_image(truth, outcome):
             assert np.linalg.norm((two - one).mean(0) - expected) < 0.35 * np.linalg.norm(expected)
 
 
+@pytest.mark.slow
 def test_a_board_behind_the_camera_is_nowhere(truth, outcome):
     behind = replace(outcome.result, stand_from_board=Rigid(translation=[0, 0, 1e5]) @ outcome.result.stand_from_board)
     assert any(np.isnan(px).any() for px in by_robot(behind, truth.pairs, truth.views))

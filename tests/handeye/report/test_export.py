@@ -32,6 +32,7 @@ def assert_same(rotation: np.ndarray, metres, pose: Rigid) -> None:
     assert np.abs(1000 * np.asarray(metres) - pose.translation).max() < 1e-9
 
 
+@pytest.mark.slow
 @given(st.tuples(angle, angle, angle, length, length, length))
 @example((0, np.pi / 2, 0, 1, 2, 3))
 def test_ros(twist):

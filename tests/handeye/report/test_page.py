@@ -74,6 +74,7 @@ def of_methods() -> Outcome:
     return Outcome("poses.csv", compared[1].result, compared[1].held_out, (*compared, failed), pairs=truth.pairs)
 
 
+@pytest.mark.slow
 def test_the_text_has_the_transform_with_its_sigma(of_views):
     result = of_views.result
     lines = outcome_report(of_views).text().splitlines()
@@ -111,6 +112,7 @@ def test_corners_with_sigmas_of_their_own_have_a_factor(of_views):
     assert not re.search(r" px +estimated", text)
 
 
+@pytest.mark.slow
 def test_the_page_is_whole_and_shows_every_part(of_views, of_methods):
     page = read(outcome_report(of_views).page())
     assert page.images == 3

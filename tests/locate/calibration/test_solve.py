@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.boards.design import BoardView, ChessboardDesign, view_of
-from stcal.boards.tags import Tags, corners_by_edges
+from stcal.boards.edges import corners_by_edges
+from stcal.boards.tags import Tags
 from stcal.geometry.rigid import Rigid
 from stcal.locate.calibration.solve import CalibratedLayout, _by_board_corners, calibrate, plane_points
 from stcal.locate.data.layout import LayoutPlan, obj_from_plane

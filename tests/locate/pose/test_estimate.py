@@ -136,7 +136,7 @@ def test_two_tags_that_contradict_are_rejected():
 
 
 def test_no_tag_is_refused():
-    empty = SeenTags(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros(0))
+    empty = SeenTags(np.zeros(0, int), np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0))
     with fails_with("E-LOCATE-NO-TAG"):
         locate(empty, LAYOUT, CAMERA)
 
@@ -158,6 +158,6 @@ def test_shared_errors_do_not_average_out():
         for count in (1, 9):
             rng = np.random.default_rng(4)
             seen = merge(simulated_exposures(exact, truth, rng, CornerNoise(0.3, shared), (SIX,) * count), exact).seen
-            sigma[shared, count] = np.sqrt(np.trace(seen.covariance_px2, axis1=2, axis2=3).mean() / 2)
+            sigma[shared, count] = np.sqrt(np.trace(seen.covariance_px2, axis1=1, axis2=2).mean() / 8)
     assert sigma[0.0, 9] / sigma[0.0, 1] == pytest.approx(1 / 3, rel=0.1)
     assert sigma[1.0, 9] / sigma[1.0, 1] == pytest.approx(1, rel=0.1)

@@ -109,6 +109,7 @@ def test_units_of_the_affine_covariance():
     assert sigma[3] > 300 * sigma[0]
 
 
+@pytest.mark.slow
 def test_page_shows_outliers_and_escapes_names():
     page = registration_report(found_of(), [Section("One <more>", ["section"])]).page()
     assert "pairs &lt;a&amp;b&gt;.csv" in page

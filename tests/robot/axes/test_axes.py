@@ -113,6 +113,30 @@ def test_rows_and_chain_of_axes_make_the_same_poses(name):
     assert np.abs(between.rotation - between.rotation[0]).max() < 1e-12
 
 
+def test_a_tracker_that_moved_between_two_rows_is_located():
+    true = arm(scara())
+    data = measured(true, sweep_values(true), SIGMA)
+    assert not any("elsewhere" in note for note in robot_from_sweeps(data, scara()).notes)
+    row, middle = 57, data.points().mean(0)
+    later = Rigid.exp([0, 0, 1e-3, 0.8, 0, 0.6]) @ (data.points()[row:] - middle) + middle
+    positions = np.concatenate([data.points()[:row], later])
+    [note] = [note for note in robot_from_sweeps(moved(data, positions), scara()).notes if "elsewhere" in note]
+    assert f"from line {data.lines[row]}" in note
+    assert "column station" in note
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.004, -0.004])
+def test_positions_about_a_full_turn_are_one_with_any_limit(shift):
+    """At −0.3°, 0.1° and 359.9° a joint stands at one place, where it may stray by 1°."""
+    true = scara()
+    q = np.tile([0.2, 0.1, 30.0, 0.0], (4, 1))
+    q[:, 0] = [shift - 0.005, shift + 0.002, shift + 2 * np.pi - 0.002, 1.0]
+    data = measured(arm(true), np.vstack([q, sweep_values(true)]))
+    arcs, notes = find_arcs(data, true, np.radians(1.0))
+    assert sum("an arc of 2 positions is not used" in note for note in notes) == 3  # of each reflector
+    assert not any(arc.rows[0] == 0 for arc in arcs)
+
+
 def true_axes(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     rotation, origin = joint_frames(robot.chain(), np.zeros((1, len(robot.rows))))
     return rotation[:, 0, :, 2], origin[:, 0]

@@ -5,14 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.adjustment import Weighting
 from stcal.robot.identification.report import identified_file, identified_report
 from stcal.robot.identification.residuals import State, jacobian, observed
 from stcal.robot.identification.result import IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.identification.unexplained import left
+from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import forward, joint_frames
-from stcal.robot.kinematics.measurements import Measurements
+from stcal.robot.kinematics.measurements import Measurements, read_measurements
 from stcal.robot.kinematics.model import Robot, mh80
 from stcal.robot.simulated import joint_vectors, measured
 from tests.robot.identification.test_solve import simulated
@@ -104,6 +106,84 @@ def test_two_causes_are_two_findings():
     assert found[0].share > found[1].share
 
 
+JUMP = Rigid.exp([0, 0, 2e-3, 0.6, -0.8, 0])
+"""Of the instrument: a millimetre, and a tenth of a degree."""
+
+
+def moved_from(row: int, data: Measurements, by: Rigid) -> Measurements:
+    """The measurements with those from a row on moved, about the middle of all."""
+    middle = Rigid(np.eye(3), data.points().mean(0))
+    moved = middle @ by @ middle.inverse() @ data.poses()
+    later = np.arange(len(data)) >= row
+    return replace(
+        data,
+        positions=np.where(later[:, None], moved.translation, data.points()),
+        rotations=np.where(later[:, None, None], moved.rotation, data.rotations),
+    )
+
+
+@pytest.mark.parametrize("kind", ["pose", "position"])
+@pytest.mark.parametrize("row", [8, 20, 34])
+def test_an_instrument_that_moved_is_located_and_a_station_proposed(row, kind):
+    true, data = simulated(11, 40)
+    finding, *others = left_of(true, moved_from(row, data, JUMP), kind)
+    assert finding.line == data.lines[row]
+    assert f"the instrument or the robot's base elsewhere from line {data.lines[row]}" in finding.what
+    assert "column station" in finding.sentence()
+    assert finding.effect_mm == pytest.approx(1.0, rel=0.3)
+    assert finding.effect_rad == pytest.approx(2e-3, rel=0.3)
+    assert others == []
+
+
+def test_a_jump_among_wrong_rows_is_found():
+    true, data = simulated(12, 60)
+    data = moved_from(25, data, JUMP)
+    positions = np.array(data.positions)
+    positions[[3, 30, 50]] += [[20.0, 0, 0], [0, -30, 0], [0, 0, 50]]
+    finding, *_ = left_of(true, replace(data, positions=positions), "position")
+    assert finding.line == data.lines[25]
+
+
+def test_a_target_that_slipped_and_a_joint_that_lost_its_zero_are_told_apart():
+    true, data = simulated(13, 60, targets=("a", "b"))
+    later = np.arange(60) >= 30
+    slipped = np.array([each == "b" for each in data.targets]) & later
+    positions = data.points() + slipped[:, None] * (data.rotations @ np.array([0.5, 0.5, 0]))
+    finding, *_ = left_of(true, replace(data, positions=positions), "position")
+    assert "target b elsewhere on its flange from line" in finding.what
+    really = data.q.copy()
+    really[later, 3] += 2e-3
+    lost = replace(measured(true, really, np.random.default_rng(1), targets=data.targets), q=data.q)
+    finding, *_ = left_of(true, lost, "pose")
+    assert (finding.joint, finding.line) == (4, data.lines[30])
+    assert finding.effect_rad == pytest.approx(2e-3, rel=0.2)
+
+
+def test_a_drift_is_no_jump():
+    true, data = simulated(14, 60)
+    along = np.linspace(0, 1, 60)[:, None]
+    drifted = replace(data, positions=data.points() + along * [0.8, 0.6, 0])
+    finding, *_ = left_of(true, drifted, "position")
+    assert "by and by" in finding.what
+    assert finding.line is None
+    assert finding.effect_mm == pytest.approx(1.0, rel=0.3)
+
+
+@pytest.mark.slow
+def test_identify_tells_that_the_instrument_moved_and_a_station_mends_it():
+    """Half of the rows moved by 10 mm, which neither errors nor the arm explain."""
+    true, data = simulated(15, 60)
+    data = moved_from(30, data, Rigid.exp([0, 0, 5e-3, 6, -8, 0]))
+    nominal = replace(mh80(), tools=true.tools)
+    found = identify(nominal, data, QUICK)
+    assert found.left[0].line == data.lines[30]
+    assert any("column station" in note for note in found.notes)
+    assert identified_file(found, nominal).content()["left"][0]["line"] == data.lines[30]
+    mended = identify(nominal, replace(data, stations=("A",) * 30 + ("B",) * 30), QUICK)
+    assert mended.left == ()
+    assert mended.fitted_mm.mean() < 0.2 < 2 < found.fitted_mm.mean()
+
+
 def test_without_noise_rounding_is_not_told():
     true, data = simulated(8, 40, 0, 0)
     assert left_of(true, data, "position") == ()
@@ -158,3 +238,13 @@ def test_what_is_not_seen_of_base_and_tool_has_no_sigma():
     base, tool = identify(mh80(), distances, QUICK).placed
     assert base.sigma_or_none() is None
     assert (tool.sigma[3:] > 0).all()
+
+
+def test_a_tracker_that_moved_halfway_is_told(shared_data):
+    """Reported: errors of 6.4 mm and no word. The tracker moved by 10 mm between lines 31 and 32."""
+    case = shared_data("../cases/rob_tracker_moved_halfway")
+    nominal = load_robot(case / "robot.toml")
+    found = identify(nominal, read_measurements(case / "data.csv", nominal), QUICK)
+    assert found.left[0].line == 32
+    assert found.left[0].share > 0.99
+    assert "column station" in found.left[0].sentence()

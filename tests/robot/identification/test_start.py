@@ -88,6 +88,7 @@ def with_rows_exchanged(robot):
     return replace(robot, rows=tuple(rows))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mistaken", "named"),
     [
@@ -102,6 +103,7 @@ def test_mistakes_in_the_rows_are_named(mistaken, named):
         start(mistaken(mh80()), replace(seen(5, 40), rotations=None))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "named"),
     [
@@ -116,6 +118,44 @@ def test_mistakes_in_the_joint_values_are_named(change, named):
     data = replace(seen(6, 40), rotations=None)
     with fails_with(f"E-IDENTIFY-MISFIT … {named}"):
         start(mh80(), replace(data, q=change(data.q)))
+
+
+def with_wrong_rows(data, rows, size_mm: float = 600.0):
+    positions = np.array(data.positions)
+    positions[rows] += np.random.default_rng(0).normal(0, size_mm, (len(rows), 3))
+    return replace(data, positions=positions, rotations=None)
+
+
+def test_several_rows_that_are_far_off_are_named():
+    data = with_wrong_rows(seen(7, 40), [3, 20, 31])
+    with fails_with("E-IDENTIFY-MISFIT … lines 5, 22, 33 were not there … remove them"):
+        start(mh80(), data)
+
+
+@pytest.mark.parametrize(
+    ("mistaken", "named"),
+    [(with_zero, "theta of joint 4 … +90°"), (with_rows_exchanged, "rows 2 and 3 were exchanged")],
+)
+def test_a_mistake_is_named_beside_wrong_rows(mistaken, named):
+    data = with_wrong_rows(seen(8, 40), [3, 20])
+    with fails_with(f"E-IDENTIFY-MISFIT … {named} … lines 5, 22 were not there"):
+        start(mistaken(mh80()), data)
+
+
+@pytest.mark.slow
+def test_two_mistakes_of_different_kinds_are_named():
+    data = replace(seen(9, 40), rotations=None)
+    data = replace(data, q=data.q * [1, 1, -1, 1, 1, 1])
+    with fails_with("E-IDENTIFY-MISFIT … theta of joint 4 … +90° and joint 3 had the opposite sign"):
+        start(with_zero(mh80()), data)
+
+
+def test_reasons_that_explain_as_much_are_named_together():
+    """Of an arm whose joint 1 is square to joint 2 half a turn of the one's zero is the opposite sign of the other."""
+    robot = mh80()
+    rows = tuple(replace(row, theta=row.theta + np.pi * (i == 3)) for i, row in enumerate(robot.rows))
+    with fails_with("E-IDENTIFY-MISFIT … or if"):
+        start(replace(robot, rows=rows), replace(seen(10, 40), rotations=None))
 
 
 def test_the_order_of_quaternions_is_an_option(tmp_path, monkeypatch, capsys):

@@ -50,6 +50,7 @@ def test_two_stations_are_as_good_as_one_but_for_six_numbers(kind):
     assert next(iter(found.state.stations)) == "A"
 
 
+@pytest.mark.slow
 def test_stations_taken_for_one_are_refused():
     with fails_with("E-IDENTIFY-MISFIT … misses the measurements"):
         identify(mh80(), replace(drawn("position"), stations=()))
@@ -70,6 +71,7 @@ def test_a_station_of_two_rows_is_named():
         identify(mh80(), drawn("position", second=2))
 
 
+@pytest.mark.slow
 def test_rows_of_another_station_are_named():
     data = drawn("position")
     names = list(data.stations)

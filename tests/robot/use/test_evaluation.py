@@ -189,6 +189,7 @@ def test_distances_have_their_own_errors(refit):
     assert "by distance" not in evaluation_report(result).page()
 
 
+@pytest.mark.slow
 def test_another_arm_is_refused_in_one_line():
     data = seen(arm(), 9)
     other = Robot(

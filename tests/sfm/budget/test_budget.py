@@ -95,6 +95,20 @@ def test_what_is_stated_adds_its_part(saved, plain, stated):
     assert found.correction == pytest.approx(1e-6 * (8 * 4 - 23 * 2))
 
 
+def test_rims_that_were_estimated_are_a_row(saved, plain):
+    """Each face lies half of an error of the height along its own normal: against the reference face by the difference
+    of both normals."""
+    faces = saved.faces.model_copy(update={"rim_mm": dict.fromkeys(saved.faces.circles, 0.2)})
+    summary = saved.report["summary"] | {"rim_sigma_mm": 0.01}
+    found = budget_of_run(replace(saved, faces=faces, report=saved.report | {"summary": summary}))
+    assert [each.origin for each in found.sources if each.key == "rims"] == ["estimated"]
+    assert all(each.key != "rims" for each in plain.sources)
+    normal = {face: np.array(m)[:3, 2] for face, m in saved.faces.target_from_face.items()}
+    for row in found.of_kind("position"):
+        apart = normal[row.measurand.name] - normal[saved.faces.reference_face]
+        assert row.contributions["rims"] == pytest.approx(0.005 * np.linalg.norm(apart), rel=0.02)
+
+
 def test_a_statement_goes_before_the_boards_own(saved, tmp_path):
     path = tmp_path / "lab.toml"
     path.write_text("[board]\ntemperature_c = 24\n")

@@ -36,6 +36,7 @@ def test_gross_errors_are_left_out_and_other_points_stay():
     assert "3 corners in 1 views are left out" in gated.warnings()[0]
 
 
+@pytest.mark.slow
 def test_a_view_of_gross_errors_is_skipped():
     views = views_of(np.random.default_rng(5), count=10)
     spoiled = [*views]
@@ -67,6 +68,7 @@ def test_rows_and_columns_that_no_image_shows(rows, columns, said):
     assert [note.split(":")[0] for note in unseen_lines(labels, rows, columns)] == [f"board {each}" for each in said]
 
 
+@pytest.mark.slow
 def test_a_row_too_many_is_a_warning_of_the_calibration():
     views = views_of(np.random.default_rng(8), count=6)
     longer = replace(BOARD, rows=BOARD.rows + 1)

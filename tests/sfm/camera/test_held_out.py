@@ -28,7 +28,7 @@ def test_held_out_residuals_are_those_of_noise():
     below 3 %; 2900 coordinates scatter by 1.3 %."""
     views = views_of(np.random.default_rng(0), count=24)
     dots = np.mean([len(view) for view in views])
-    found = held_out(views, BOARD, calibrated(views).camera, "OPENCV")
+    found = held_out(calibrated(views), views, BOARD)
     assert 0.96 < found.rms_px() / (0.02 * np.sqrt(1 - 3 / dots)) < 1.07
     assert abs(found.factor - 1) < 0.1
     assert len(found.in_sigma) == 24
@@ -42,7 +42,7 @@ def test_each_view_is_foretold_without_itself():
     other = views_of(rng, count=1, camera=Camera(2592, 1728, [2790.0, 2784.0], [1301.0, 859.0], [0.1, *[0] * 7]))[0]
     object.__setattr__(other, "name", views[4].name)
     views[4] = other
-    squares = held_out(views, BOARD, calibrated(views).camera, "OPENCV").squares(1.0)
+    squares = held_out(calibrated(views), views, BOARD).squares(1.0)
     assert squares.argmax() == 4
 
 
@@ -50,15 +50,15 @@ def test_each_view_is_foretold_without_itself():
 def test_a_dot_that_is_wrong_does_not_count():
     views = views_of(np.random.default_rng(2), count=12)
     centre = views[3].centre_px.copy()
-    before = held_out(views, BOARD, calibrated(views).camera, "OPENCV").rms_px()
+    before = held_out(calibrated(views), views, BOARD).rms_px()
     centre[5] += 4.0
     object.__setattr__(views[3], "centre_px", centre)
-    assert held_out(views, BOARD, calibrated(views).camera, "OPENCV").rms_px() < 1.05 * before
+    assert held_out(calibrated(views), views, BOARD).rms_px() < 1.05 * before
 
 
 def test_too_few_views_are_not_held_out():
     views = views_of(np.random.default_rng(3), count=3)
-    assert held_out(views, BOARD, calibrated(views).camera, "OPENCV") is None
+    assert held_out(calibrated(views), views, BOARD) is None
 
 
 def known_of(views, truth):

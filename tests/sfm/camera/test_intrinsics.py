@@ -346,3 +346,11 @@ def test_dots_nearer_to_the_grid_than_stated_are_told():
     made = np.column_stack([BOARD.xy_mm(), np.zeros(63)]) + 0.4 * BOARD.sigma_mm * rng.standard_normal((63, 3))
     result = calibrated(views_of(rng, count=20, made=made))
     assert 0.2 < result.factors.dots < 0.6
+
+
+def test_where_the_closed_form_gives_no_focal_length_several_are_tried(monkeypatch):
+    """The nearest of a row with steps of √2 is within a factor of 2^¼."""
+    monkeypatch.setattr("stcal.sfm.camera.intrinsics.FOCAL_LIMITS", (60.0, 60.0))
+    views = views_of(np.random.default_rng(1), count=6)
+    found = closed_form(views, BOARD, start_camera(TRUE.width, TRUE.height, "OPENCV")).focal[0]
+    assert 2**-0.3 < found / TRUE.focal[0] < 2**0.3

@@ -15,6 +15,7 @@ from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.joint import SETTLED_PX
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import refine
+from stcal.sfm.checks.culprits import culprits
 from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS, Trial, judge
 from stcal.sfm.pipeline import run
@@ -160,8 +161,10 @@ def test_noise_beyond_the_centres_own_sigma_is_said(full_scene, lab, over, verdi
 
 
 @pytest.mark.parametrize("solve", ["chain", pytest.param("joint", marks=pytest.mark.full)])
-def test_a_moved_target_is_named(full_scene, lab, solve):
-    """0.2 mm and 0.05° against the board, in half of the images of a group; the others are innocent."""
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_moved_target_is_named(full_scene, lab, solve, count):
+    """0.2 mm and 0.05° against the board. In half of the images of a group: which half is the wrong one, nothing
+    tells."""
     motion = Rigid.exp([np.radians(0.05), 0, 0, 0.2, 0, 0])
     group = full_scene.groups["14"]
     elsewhere = replace(
@@ -171,12 +174,35 @@ def test_a_moved_target_is_named(full_scene, lab, solve):
         target_from_board=motion.inverse() @ group.target_from_board,
     )
     moved = lab.observe(replace(full_scene, groups=full_scene.groups | {"14": elsewhere}))
-    names = {"14/0000", "14/0001", "14/0002"}
+    names = {f"14/{k:04d}" for k in range(count)}
     images = [b if b.name in names else a for a, b in zip(lab.observe(full_scene), moved, strict=True)]
     check = lab.check(full_scene, images, solve=solve)["moved"]
     assert check.verdict == "failed"
-    assert {name[:3] for name in check.names} == {"14/"}
+    assert set(check.names) == (names if count < 3 else set())
+    assert check.measured[0].name.startswith("14/")
+    assert ("group 14: leaving out less than half" in check.reason) == (count == 3)
     assert check.measured[0].value > 80  # µm
+
+
+def test_a_culprit_is_named_only_where_no_other_would_do():
+    """The suspects are leading the worse the higher their number; each stands against the others in its own way."""
+
+    def search(count, cures):
+        def worst(out):
+            return None if cures(set(out)) else max(set(range(count)) - set(out))
+
+        return culprits([f"i{k}" for k in range(count)], worst, "group 1")
+
+    assert search(4, lambda out: 3 in out).culprits == ("i3",)
+    assert (
+        search(5, lambda out: 1 in out and len(out) < 5).words()
+        == "group 1: leaving out less than half of them does not cure it"
+    )
+    assert search(6, lambda out: {4, 5} <= out).culprits == ("i5", "i4")
+    either = search(4, lambda out: len(out) > 0)
+    assert (either.culprits, either.rivals) == ((), ("i0", "i1", "i2", "i3"))
+    assert search(6, lambda out: 4 in out).culprits == ("i4",)  # the first that was taken was innocent
+    assert search(2, lambda out: 1 in out).culprits == ()  # of two either may be it
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from stcal.design import reference_board, reference_target
+from stcal.errors import InputNote
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import find_images
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -56,6 +57,22 @@ def test_a_detection_is_kept_and_a_damaged_one_made_again(detected):
         np.testing.assert_array_equal(repaired.detection.centres.centre_px, first.detection.centres.centre_px)
 
 
+def test_a_detection_of_another_image_is_not_used(detected, sample):
+    detect, folder, cache = detected
+    detect()
+    (file,) = cache.glob("*.npz")
+    other = "12/IMG_1001.jpg"
+    shutil.copy(sample / "images" / other, folder / other)
+    own = detect()[0].images[1].detection.centres.centre_px
+    (second,) = set(cache.glob("*.npz")) - {file}
+    shutil.copy(file, second)
+    with pytest.warns(InputNote, match=f"{second.name} is made from other inputs"):
+        found = detect()[0]
+    assert [image.reused for image in found.images] == [True, False]
+    assert found.skipped == ()
+    np.testing.assert_array_equal(found.images[1].detection.centres.centre_px, own)
+
+
 def test_a_copy_and_a_file_that_is_no_image_are_named(detected):
     detect, folder, _ = detected
     shutil.copy(folder / IMAGE, folder / "12" / "copy.jpg")
@@ -65,6 +82,16 @@ def test_a_copy_and_a_file_that_is_no_image_are_named(detected):
     reasons = {each.name: each.reason for each in found.skipped}
     assert set(reasons) == {"12/copy.jpg", "12/no.jpg"}
     assert reasons["12/copy.jpg"] == f"the same image as {IMAGE}"
+
+
+def test_a_photograph_that_is_gone_is_an_error(detected, sample, monkeypatch):
+    """It was there when the folder was looked at: a result without it would be another one."""
+    detect, folder, _ = detected
+    listed = find_images(folder)
+    monkeypatch.setattr(f"{__name__}.find_images", lambda _: listed)
+    (folder / IMAGE).unlink()
+    with fails_with(f"E-IMAGES-GONE … {IMAGE}"):
+        detect()
 
 
 def test_no_usable_file_is_an_error(detected):

@@ -79,6 +79,7 @@ def test_four_of_ten_circles_of_every_face_hidden_in_every_image(bench, group):
         assert not picture.hidden & found.labels(name)
 
 
+@pytest.mark.slow
 def test_a_strip_over_the_first_images_board_leaves_the_others_theirs(bench):
     """Three of nine columns, or two of seven rows, whole or in part. The first keeps what is left."""
     found = bench.label("one board covered", 0.3)

@@ -21,6 +21,19 @@ def checkerboard(side: int = 6) -> np.ndarray:
     return cv2.GaussianBlur((((x // side) + (y // side)) % 2 * 160 + 40).astype(np.uint8), (0, 0), 0.7)
 
 
+@pytest.mark.parametrize(
+    ("image", "error"),
+    [
+        (checkerboard()[::2, ::2], "E-IMAGE-SIZE … 240×180 px, camera 480×360"),
+        (np.dstack([checkerboard()] * 3), "E-IMAGE-TYPE … (360, 480, 3) … green"),
+        (checkerboard() / 255, "E-IMAGE-TYPE … float64"),
+    ],
+)
+def test_an_array_that_is_no_grey_image_of_the_camera_is_refused(image, error):
+    with fails_with(error):
+        stage.detect_image(image, CAMERA, reference_target(), None, EllipseOptions())
+
+
 @pytest.mark.slow
 def test_of_a_fine_pattern_the_largest_outlines_are_tried_and_it_is_said(monkeypatch):
     monkeypatch.setattr(stage, "MAX_FREE", 60)

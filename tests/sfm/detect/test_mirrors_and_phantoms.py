@@ -17,9 +17,13 @@ from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.files import DetectedImage, require_upright
 from stcal.sfm.detect.labels import label_groups
 from stcal.sfm.detect.sightings import FaceSighting, ImageDetection, likeness_notes, mirror_images
-from tests.sfm.detect.degraded import study
+from stcal.synthetic.dataset import write_dataset
+from stcal.synthetic.render import RenderOptions
+from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.sfm.detect.degraded import Bench, study
 from tests.sfm.detect.test_arrangement import FOCAL_PX, TARGET, Seen, plane_centres
 from tests.support import degrade
+from tests.support.photograph import read_set
 
 FIRST = "12/IMG_1000"
 ALL = ("12", "14", "15", "23")
@@ -69,6 +73,41 @@ def two_groups(scene, labels_only):
     return [[o for o in seen if o.group == group] for group in scene.groups if "2" in group]
 
 
+def test_a_table_that_mirrors_board_and_target_is_a_second_world(scene, two_groups):
+    """It moves with the real one in all images, and a face in it reads as face 3. What lies behind it goes out."""
+    own = two_groups[0]
+    group = scene.groups["12"]
+    up = group.axes[1]
+    points = np.vstack([*(scene.face_outline(face) for face in "12345"), scene.board_outline("12")])
+    turn = np.eye(3) - 2 * np.outer(up, up)
+    shift = 2 * ((points @ up).min() - OFF_MM) * up
+    left_handed = np.diag([-1.0, 1.0, 1.0])
+    pose = scene.target_from_face["2"]
+    target_from_image = Rigid(turn @ pose.rotation @ left_handed, turn @ pose.translation + shift)
+    seen = [Seen(o) for o in own]
+    for each, camera_from_target in zip(seen, group.camera_from_target, strict=True):
+        xyz = camera_from_target @ (group.board_circles_target @ turn + shift)
+        each.board(xyz[:, :2] / xyz[:, 2:], [[row, 8 - column] for row in range(7) for column in range(9)])
+        each.face("3", plane_centres(camera_from_target @ target_from_image, TARGET.face("3").xy_mm))
+    named = [(o.name, o.group, s.detection()) for o, s in zip(own, seen, strict=True)]
+    (alone,) = label_groups([named], scene.target, scene.board, FOCAL_PX)
+    for result, o in zip(alone[0], own, strict=True):
+        assert set(result.observations.labels) == set(o.labels)
+        assert sorted(result.notes) == [
+            "a board of 63 dots: the image of the board in a mirror; left out",
+            "a pattern like face 3: the image of another face in a mirror; left out",
+        ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reflectance", [0.3, 0.9])
+def test_a_shiny_table_gives_no_wrong_label(reflectance, tmp_path):
+    options = SceneOptions(seed=3, width=1300, height=867, images_per_group=3, distance_mm=1400, groups=(("1", "2"),))
+    scene = make_scene(options)
+    write_dataset(tmp_path / "set", scene, RenderOptions(clutter=True, reflectance=reflectance, seed=3), workers=1)
+    Bench(read_set(tmp_path / "set"), tmp_path / "bench").label("plain").assert_all_found()
+
+
 def test_a_face_that_another_group_has_elsewhere_goes_out(scene, two_groups):
     """The first group sees face 1 on a shiny floor as face 3, but for one circle; the second has the real face 3 beside
     face 2. Without it nothing contradicts."""
@@ -113,6 +152,31 @@ def test_a_mirrored_image_of_which_every_face_passes_for_another_is_told_by_its_
     (note,) = found.images[mirrored].notes
     assert note.startswith("the image is mirrored: it shows the board as a mirror does; left out")
     assert found.counts["must"] == 2 * 20
+
+
+@pytest.mark.slow
+def test_a_mirrored_group_whose_faces_pass_for_others_is_told_by_the_other_groups(bench):
+    """Faces 2, 3 and 5 of all images of group 23 pass for 4, 5 and 3, and nothing in that group contradicts."""
+    found = bench.label("mirrored", "a group", *ALL)
+    found.assert_all_found()
+    assert all(not found.labels(name, face) for name in found.images for face in "12345" if name.startswith("23/"))
+    assert "or the image is mirrored" in found.notes()
+
+
+@pytest.mark.slow
+def test_a_board_that_one_image_numbers_otherwise_is_no_mirror_image(bench):
+    """Half of it is covered, by something else in every image: a numbering that is shifted by its length looks as if a
+    mirror stood at its edge, but no image shows it twice."""
+    found = bench.label("board covered", 0.5, "15")
+    found.assert_all_found()
+    assert "in a mirror" not in found.notes()
+
+
+@pytest.mark.slow
+def test_circles_blurred_beyond_their_size_give_no_wrong_label(bench):
+    """Circles of a third face at 75°, half as wide as their blur: not searched for, but seen by the first look."""
+    found = bench.label("defocus", 5.0, *ALL)
+    found.assert_all_found(0.9)
 
 
 def detected(name, faces=(), mirrored=()):
@@ -222,11 +286,12 @@ def test_a_face_that_stands_like_a_mirror_image_but_has_other_radii_stays(kind, 
 
 
 @pytest.mark.parametrize("kind", GRIDS)
-def test_a_real_mirror_image_of_the_same_patterns_goes_out(kind):
+def test_a_real_mirror_image_of_the_same_patterns_goes_out(kind, monkeypatch):
     """The second face is the first one's mirror image with its radii: the design says so, and the group leaves it out
     where it stands as a mirror would show it."""
     front = GRIDS[kind][0]
     image = replace(front, id="right", xy_mm=front.xy_mm * [-1, 1] + [70, 0], origin="3", x="1", y="9")
+    monkeypatch.setattr("stcal.design.require_distinct", lambda *_: None)  # one of the patterns is its own mirror image
     target = TargetDesign("two", "dark", (front, image))
     assert "right" in mirror_images(target)["front"]
     assert any("mirror images: front" in note for note in likeness_notes(target))

@@ -40,6 +40,7 @@ class FirstLook:
         # What measuring leaves: a twentieth of a pixel, half a per cent.
         self.centre_px = self.place + rng.normal(0, 0.05, (n, 2))
         self.shape_px = self.shape * (1 + rng.normal(0, 0.005, (n, 1, 1)))
+        self.blur_px = np.full(n, 0.7)
 
     def cut(self, circle, share):
         """A segment of this share of the circle's area covered: the ellipse of what is left."""
@@ -57,7 +58,9 @@ class FirstLook:
         by_ideal = CAMERA.focal[:, None] * CAMERA.distort_jacobian(centre)[1]
         shape = np.linalg.solve(by_ideal, self.shape_px)
         covariance = np.tile(1e-4 * np.eye(2), (len(self.labels), 1, 1))
-        seen = ImageObservations("12/0", "12", tuple(self.labels), self.centre_px, centre, shape, covariance)
+        seen = ImageObservations(
+            "12/0", "12", tuple(self.labels), self.centre_px, centre, shape, covariance, blur_px=self.blur_px
+        )
         return contradictions(predicted(self.labels, self.place, self.shape, wanted=False), seen, CAMERA)
 
 
@@ -93,6 +96,16 @@ def test_a_plane_whose_circles_are_all_larger_stays_and_excuses_no_other():
     look.shape_px[:10] *= 1.33
     look.shape_px[14] *= 1.33
     assert list(look.taken_out()) == [look.labels[14]]
+
+
+def test_a_circle_more_blurred_than_its_smaller_radius_goes_out():
+    """Its rims merge: the ellipse of such a blob may lie anywhere between it and its neighbour."""
+    look = FirstLook()
+    smaller = np.linalg.svd(look.shape, compute_uv=False)[:, 1]
+    look.blur_px[[2, 14]] = smaller[2] * 0.95, smaller[14] * 1.05
+    ((label, reason),) = look.taken_out().items()
+    assert label == look.labels[14]
+    assert reason.startswith("blurred by")
 
 
 class Sheet:

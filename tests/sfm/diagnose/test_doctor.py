@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.patterns import Pattern, ideal_border, in_view
 from stcal.sfm.detect.circles.candidates import EllipseOptions, find_ellipses
-from stcal.sfm.diagnose.doctor import diagnose, missing_circles
+from stcal.sfm.diagnose.doctor import _depth_of_field, diagnose, missing_circles
 from stcal.sfm.diagnose.examine import LEAST_MIN_DIAMETER_PX, trace_outlines
 from stcal.sfm.diagnose.findings import Diagnosis, Finding, GateCount, by_gate, in_order, table
 from stcal.sfm.mapping.database import image_ids
@@ -380,6 +381,20 @@ def test_the_command(patient, stcal_sfm, tmp_path):
     assert content["format"] == "stcal doctor 1"
     assert content["gates"] == {"hidden": {"circles": 4, "images": 1, "by_option": 0}}
     assert [f["labels"] for f in content["findings"] if f["image"]] == [["2:2"], ["2:7"], ["board:3:4"], ["board:3:5"]]
+
+
+@pytest.mark.parametrize(("shift_px", "times"), [(0.0, 0), (0.4, 1), (64.0, 4)])
+def test_depth_of_field_is_said_where_it_moves_centres_by_more_than_their_sigma(small_run, shift_px, times):
+    """64 σ: eight times the f-number, six stops, or four times the distance."""
+    run = load_run(small_run)
+    sigma = float(np.median(np.concatenate([image.sigma_px() for image in run.observations])))
+    row = {"image": "12/IMG_1000.jpg", "shift_px": shift_px * sigma}
+    notes = _depth_of_field(replace(run, report=run.report | {"focus": [row]}))
+    if times < 2:
+        assert notes == []
+    else:
+        assert "from 8.0 times the f-number (6 stops), or from 4.0 times the distance" in notes[0]
+        assert "12/IMG_1000.jpg), 64 times" in notes[0]
 
 
 def test_a_report_of_another_version_is_refused(small_run):

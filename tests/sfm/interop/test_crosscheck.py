@@ -90,6 +90,7 @@ def checked(small_run, colmap, tmp_path_factory):
     return run, before, (ended.value.code or 0, out.getvalue(), err.getvalue())
 
 
+@pytest.mark.slow
 def test_the_two_programs_agree(checked):
     run, _, (code, out, err) = checked
     assert code == 0, err

@@ -55,6 +55,7 @@ def require_frames(statics, faces):
     assert len(target_from) == 1 + len(faces["target_from_face"]) + len(faces["circles"])
 
 
+@pytest.mark.slow
 def test_urdf(files, faces):
     robot = ElementTree.parse(files["urdf"]).getroot()
     joints = robot.findall("joint")

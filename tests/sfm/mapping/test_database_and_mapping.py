@@ -1,11 +1,13 @@
 """Labels into COLMAP's database and out of its models: ids, order, pixel origin, and what COLMAP must not change."""
 
+import os
 import sqlite3
 
 import numpy as np
 import pycolmap
 import pytest
 
+from stcal.errors import InputError
 from stcal.geometry.align import align_similarity
 from stcal.sfm.mapping.database import (
     from_colmap_px,
@@ -31,6 +33,31 @@ def database(scene, observed, tmp_path_factory):
     path = tmp_path_factory.mktemp("database") / "database.db"
     write_database(path, scene.camera, observed, image_graph(observed, scene.board, "all").pairs)
     return path
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no such limit there")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_a_database_that_finds_no_space_is_one_error_and_nothing_is_left(scene, observed, tmp_path):
+    """COLMAP's transaction ended the process instead. Each size is tried in a process of its own."""
+    import resource
+
+    pairs = np.array([(i, j) for i in range(6) for j in range(i)])
+    write_database(tmp_path / "whole.db", scene.camera, observed[:6], pairs)
+    ends = []
+    for size in range(0, (tmp_path / "whole.db").stat().st_size, 20_000):
+        if (child := os.fork()) == 0:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+            try:
+                write_database(tmp_path / "cut.db", scene.camera, observed[:6], pairs)
+                os._exit(0)
+            except InputError as error:
+                os._exit(error.exit_code if error.code == "E-OUTPUT-UNWRITABLE" else 9)
+            finally:
+                os._exit(8)
+        ends.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+        assert [path.name for path in tmp_path.iterdir()] == ["whole.db"], size
+    assert set(ends) == {2}
+    assert len(ends) > 3
 
 
 def test_the_pixel_origin_moves_by_half_a_pixel_and_back(database, observed):

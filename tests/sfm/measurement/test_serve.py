@@ -10,7 +10,8 @@ import sys
 import threading
 import time
 import zlib
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from stcal.io.cameras.read import read_camera
 from stcal.sfm import MeasureOptions, measure
 from stcal.sfm.measurement.report import poses_file
 from stcal.sfm.measurement.serve import (
+    CONNECTIONS_EACH,
     DONE,
     WAITING,
     Answer,
@@ -164,6 +166,10 @@ def test_rubbish(server, photographs, kind):
         (b"\x00\x01\x02 rubbish\r\n\r\n", 400),
         (b"GET " + b"x" * 70_000 + b" HTTP/1.1\r\n\r\n", 414),
         (b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 200 + b"\r\n", 431),
+        (b"GET http://[x/ HTTP/1.1\r\nHost: x\r\n\r\n", 400),
+        (b"GET / HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\n\r\nGET / HTTP/1.1\r\nHost: x\r\n\r\n", 400),
+        (b"POST /measure HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\nsixsix", 400),
+        (b"POST /measure HTTP/1.1\r\nHost: x\r\nContent-Length : 5\r\n\r\nshort", 400),
     ],
 )
 def test_broken_requests(server, raw, code):
@@ -171,6 +177,7 @@ def test_broken_requests(server, raw, code):
     head, _, body = answer.partition(b"\r\n\r\n")
     assert head.split(b" ")[1] == str(code).encode()
     assert json.loads(body)["code"] == "E-SERVICE-REQUEST"
+    assert answer.count(b"HTTP/1.1 ") == 1  # a body is no second request
     assert b"Python" not in head
 
 
@@ -259,6 +266,109 @@ def test_images_of_a_sequence_keep_their_order(known):
     for which in "01":
         own = [(name, recent) for name, recent in seen if name[0] == which]
         assert [recent for _, recent in own] == [(), *((name,) for name, _ in own[:-1])]
+
+
+class Waiting:
+    """A process that measures nothing until it is told to, one image after the other."""
+
+    def __init__(self):
+        self.go, self.names, self._turn = threading.Event(), [], threading.Lock()
+
+    def call(self, _, data, name, recent, given_up=lambda: False):
+        while not self._turn.acquire(timeout=0.01):
+            if given_up():
+                raise CancelledError
+        self.go.wait(PATIENCE_S)
+        self.names.append(name)
+        self._turn.release()
+        return Answer(DONE, json.dumps({"bytes": len(data)})), ()
+
+    def close(self):
+        self.go.set()
+
+
+@contextmanager
+def held(known, **options):
+    """A server whose one process waits to be told."""
+    service = MeasureService(Setting(*known), 1)
+    service._processes = [process := Waiting()]
+    with MeasureServer(service, ServeOptions(port=0, max_megabytes=4, **options)) as running:
+        thread = threading.Thread(target=running.serve_forever, daemon=True)
+        thread.start()
+        yield running, process
+        service.close()
+
+
+def sent(server, head: str, body: bytes = b"") -> socket.socket:
+    """A connection over which this was sent."""
+    line = socket.create_connection(server.server_address[:2], timeout=PATIENCE_S)
+    line.sendall(head.replace("\n", "\r\n").encode() + body)
+    return line
+
+
+def until(condition):
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+UPLOAD = "POST /measure?name={} HTTP/1.1\nHost: x\nContent-Length: {}\n\n"
+
+
+def test_images_of_clients_that_left_are_not_measured(known):
+    with held(known) as (server, process):
+        lines = [sent(server, UPLOAD.format(i, 1), b"x") for i in range(WAITING)]
+        until(lambda: server.service._inside == WAITING)
+        for line in lines[1:]:
+            line.close()
+        until(lambda: server.left == WAITING - 1)
+        process.go.set()
+        assert post(server, b"y", "?name=last") == (200, {"bytes": 1})
+        assert process.names == ["0", "last"]
+        lines[0].close()
+
+
+def test_idle_connections_make_room(known):
+    """Those that were never answered go first: a client that keeps its connection does not lose it."""
+    with held(known) as (server, process):
+        process.go.set()
+        kept = http.client.HTTPConnection(*server.server_address[:2], timeout=PATIENCE_S)
+        kept.request("POST", "/measure", body=b"x")
+        kept.getresponse().read()
+        idle = [sent(server, "") for _ in range(2 * CONNECTIONS_EACH)]
+        until(lambda: len(server._open) == CONNECTIONS_EACH)
+        assert post(server, b"y")[0] == 200
+        kept.request("POST", "/measure", body=b"x")
+        assert kept.getresponse().status == 200
+        for line in (*idle, kept):
+            line.close()
+
+
+def test_bytes_under_way_are_bounded(known):
+    """Uploads that stall end, the stalest first, and an image that comes at once is answered."""
+    with held(known) as (server, process):
+        process.go.set()
+        server.most_held = 10_000_000
+        lines = [sent(server, UPLOAD.format(i, 4_000_000), bytes(3_900_000)) for i in range(6)]
+        until(lambda: server.counts[503] == 4)
+        assert server._held <= server.most_held
+        assert post(server, bytes(3_900_000)) == (200, {"bytes": 3_900_000})
+        assert lines[0].recv(100).startswith(b"HTTP/1.1 503 ")
+        for line in lines:
+            line.close()
+        until(lambda: server._held == 0)
+
+
+def test_a_token_is_asked_for(known):
+    with held(known, token="öffne") as (server, process):
+        process.go.set()
+        right = {"Authorization": "Bearer öffne".encode()}
+        assert post(server, b"x", **right)[0] == 200
+        for headers in ({}, {"Authorization": "Bearer other"}, {"Authorization": "öffne".encode()}):
+            code, content = post(server, b"x", **headers)
+            assert (code, content["code"]) == (401, "E-SERVICE-REQUEST")
+            assert "öffne" not in content["error"]
 
 
 @pytest.mark.parametrize(("host", "port"), [("256.1.1.1", 0), ("no.such.host.invalid", 0)])

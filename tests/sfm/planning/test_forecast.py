@@ -18,6 +18,7 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjust_jointly, covariance_of
 from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.data.model import MetricModel
+from stcal.sfm.detect.defocus import RESPONSE
 from stcal.sfm.planning import views
 from stcal.sfm.planning.advise import Known, advise, known_of
 from stcal.sfm.planning.forecast import (
@@ -33,7 +34,7 @@ from stcal.sfm.planning.forecast import (
     forecast,
 )
 from stcal.sfm.planning.nominal import observe, true_models
-from stcal.sfm.planning.session import PlanOptions
+from stcal.sfm.planning.session import PlanOptions, widest_aperture_mm
 from stcal.sfm.planning.session import plan as make_plan
 from stcal.sfm.planning.views import PlannedView, candidates, known_scene
 from stcal.sfm.runs.saved import load_run
@@ -397,6 +398,7 @@ def test_advise_without_the_final_model(stcal_sfm, small_run, tmp_path):
     assert "target_model: damaged or incomplete" in error
 
 
+@pytest.mark.slow
 def test_plan_command(stcal_sfm, tmp_path):
     code, text, _ = stcal_sfm("plan", "--width", 2592, "--images", 2, "--json", tmp_path / "plan.json")
     content = json.loads((tmp_path / "plan.json").read_text())
@@ -416,6 +418,27 @@ def plan(images=2, noise=NOISE, groups=(("1", "2"), ("2", "3"))):
 
 
 @pytest.mark.slow
+def test_through_the_widest_aperture_depth_of_field_moves_one_centre_by_its_sigma(exact):
+    """By differences of the squared blur between two points of a circle's plane, a hundredth of a px apart in the
+    image."""
+    sigma_px = 0.01
+    model = true_models(exact, observe(exact, sigma_px, np.random.default_rng(0)))[0]
+    aperture_mm = widest_aperture_mm([model], exact.camera)
+    focal_px = float(np.sqrt(exact.camera.focal.prod()))
+    xyz = model.xyz_camera()
+    times = []
+    for k, (image, point) in enumerate(zip(model.image_index, model.point_index, strict=True)):
+        plane = model.points_by_face()[model.labels[point].plane]
+        own = model.camera_from_model[image] @ model.xyz_model[plane]
+        normal = np.linalg.svd(own - own.mean(0))[2][2]
+        focus = np.mean(1 / xyz[model.image_index == image, 2])
+        rays = np.append(xyz[k, :2] / xyz[k, 2], 1) + 0.01 / focal_px * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+        inverse_depth = rays @ normal / (normal @ xyz[k])
+        blur2 = (focal_px * aperture_mm / 4) ** 2 * (inverse_depth - focus) ** 2
+        times.append(RESPONSE * np.linalg.norm(blur2[1:] - blur2[0]) / 0.01 / sigma_px)
+    assert max(times) == pytest.approx(1, rel=2e-3)
+
+
 def test_plan_remedies_are_plans_of_their_own():
     """Twice the images is what a plan with twice the images says."""
     two, four = plan(), plan(images=4)

@@ -84,6 +84,14 @@ def test_the_check_that_names_an_image_comes_first():
     assert found.next == "Look at it."
 
 
+def test_a_check_that_does_not_tell_what_is_wrong_comes_after_those_that_do():
+    found = judgement_of(
+        report(check("agreement", "failed", ("all",), "look"), check("board", "failed", (), "measure it"))
+    )
+    assert found.use == "No: 2 of 2 checks failed, the first: Check board."
+    assert found.next == "Measure it."
+
+
 def test_the_cause_of_the_whole_set_is_said_before_all():
     cause = check(CAUSE, "failed", remedy="give the originals") | {"title": OF_WHOLE_SET + "they are undistorted"}
     names_an_image = check("moved", "failed", ("a/1.jpg",), "look at it")

@@ -30,6 +30,7 @@ def exposure(sharp, seed: int) -> np.ndarray:
     return np.clip(sharp + noise, 0, 255).round().astype(np.uint8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quality", [60, 80, 95])
 def test_a_form_with_losses_is_the_same_photograph_and_a_second_exposure_is_not(sharp, quality):
     first, second = exposure(sharp, 1), exposure(sharp, 2)

@@ -26,6 +26,7 @@ def own(small_run, tmp_path):
     return own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
 
 
+@pytest.mark.slow
 def test_the_same_files_make_the_same_page(own, small_run, stcal_sfm, monkeypatch):
     monkeypatch.setattr(folder, "pdf_of", lambda page: page[:15].encode())
     (own / "report.html").write_text("spoilt")
@@ -37,6 +38,7 @@ def test_the_same_files_make_the_same_page(own, small_run, stcal_sfm, monkeypatc
     assert verify(own).whole
 
 
+@pytest.mark.slow
 def test_a_pdf_goes_with_the_page_that_it_was_made_of(own, stcal_sfm, monkeypatch):
     monkeypatch.setattr(folder, "pdf_of", lambda page: b"%PDF")
     assert stcal_sfm("report", own, "--pdf")[0] == 0
@@ -57,6 +59,7 @@ def test_into_a_file_of_ones_own(own, tmp_path, stcal_sfm):
     assert not (own / "report.pdf").exists()
 
 
+@pytest.mark.slow
 def test_photographs_that_are_gone_are_counted(own, tmp_path, stcal_sfm):
     shutil.rmtree(own / "overlays" / "12")
     code, out, _ = stcal_sfm("report", own, "--out", tmp_path / "page.html")
@@ -81,6 +84,7 @@ def test_what_cannot_be_made_is_said_in_one_line(own, tmp_path, stcal_sfm):
     assert (own / "report.html").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "old", "new"),
     [

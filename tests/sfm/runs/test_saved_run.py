@@ -64,6 +64,7 @@ def grey(path) -> None:
     path.write_bytes(cv2.imencode(".jpg", np.full((864, 1296), 90, np.uint8))[1].tobytes())
 
 
+@pytest.mark.slow
 def test_labels_and_centres_are_the_same_numbers(written):
     result, saved = written
     assert [image.name for image in saved.observations] == [image.name for image in result.observations()]

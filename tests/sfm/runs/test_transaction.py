@@ -29,9 +29,9 @@ def make(out, text, **names):
         write(folder.stage, text, **names)
 
 
-def fail(out):
+def fail(out, names=("detections.csv",)):
     with run_folder(out, MARKER, {}) as folder:
-        write(folder.stage, "new", names=("detections.csv",))
+        write(folder.stage, "new", names=names)
         raise DetectionError("E-TEST", "nothing found")
 
 
@@ -70,6 +70,19 @@ def test_a_first_run_that_fails_leaves_its_overlays_in_place(tmp_path):
     with pytest.raises(DetectionError, match=r"^nothing found$"):
         fail(tmp_path / "run")
     assert set(content(tmp_path / "run")) == {RUN_MARKER, "detections.csv", "overlays/12/a.jpg"}
+
+
+def test_a_first_run_that_fails_while_it_writes_leaves_no_half_results(tmp_path):
+    """As on a disk that fills: a ``faces.json`` without its report would pass for a result."""
+    with fails_with("E-TEST"):
+        fail(tmp_path / "run", names=("detections.csv", "faces.json", "database.db"))
+    assert set(content(tmp_path / "run")) == {RUN_MARKER, "detections.csv", "overlays/12/a.jpg"}
+
+
+def test_a_path_that_is_too_long_for_a_database_is_refused_at_once(tmp_path):
+    with fails_with("E-OUTPUT-LENGTH … 500"):
+        make(tmp_path / ("x" * 200) / ("y" * 200) / ("z" * 200), "new")
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("moment", range(len(RESULTS) + 2))

@@ -79,6 +79,32 @@ def test_an_empty_folder_ends_and_none_is_an_error(small_dataset, tmp_path):
         WatchOptions(interval_s=0)
 
 
+def test_a_folder_that_goes_is_told(small_dataset, tmp_path):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    with fails_with("E-IMAGES-FOLDER … gone"):
+        list(watched(small_dataset, folder, tmp_path / "run", lambda _: folder.rmdir() if folder.is_dir() else None))
+
+
+def test_a_photograph_counts_when_two_looks_agree_and_no_other_is_used(small_dataset, tmp_path, monkeypatch):
+    """One is renamed when the others are used: it is not complete under its new name."""
+    used = []
+
+    def update(self, images, came, gone, progress, complete):
+        if not used:
+            (folder / "b.jpg").rename(folder / "c.jpg")
+        files, _ = self._files(complete)
+        used.append([file.name for file in files])
+
+    monkeypatch.setattr("stcal.workflows.watch.Growing.update", update)
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for name in "ab":
+        (folder / f"{name}.jpg").write_bytes(b"x")
+    list(watched(small_dataset, folder, tmp_path / "run", lambda _: None))
+    assert used == [["a.jpg"], ["a.jpg"], ["a.jpg", "c.jpg"]]
+
+
 def test_a_folder_that_is_no_runs_is_refused(small_dataset, tmp_path):
     other = tmp_path / "mine"
     other.mkdir()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from stcal.io.cameras.read import read_camera
+from stcal.io.images import find_images
 from stcal.sfm import RunOptions, run
 from stcal.sfm.adjust.calibration import SigmaFactors, image_sigma_factors, with_sigma
 from stcal.sfm.adjust.joint import adjust_jointly
@@ -64,7 +65,8 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
     target, board = again.target_design, again.board_design
     coarse = RunOptions(workers=1, solve="chain", ellipses=EllipseOptions(min_diameter_px=9.0)).settled(target)
     own, camera = RunFolder(small.out, small.out / "unfinished", small.out / "cache"), folder / "cameras.txt"
-    detection, _ = detect(folder / "images", read_camera(camera), own, target, board, coarse, lambda *_: None)
+    files = find_images(folder / "images")
+    detection, _ = detect(files, read_camera(camera), own, target, board, coarse, lambda *_: None)
     assert not any(image.reused for image in detection.images)
 
 

@@ -13,7 +13,7 @@ from stcal.handeye.data.formats.arrays import NPY, NPZ, load_npy, load_npz
 from stcal.handeye.data.formats.numeric import TABLE, read_columns, read_numbers, todays
 from stcal.handeye.data.formats.record import Content, Said, Side, require_each_once
 from stcal.handeye.data.formats.tree import read_tree
-from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes
+from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
 from stcal.io.plain_yaml import load_yaml
 from stcal.io.quaternions import Order
 from stcal.io.table import is_comment, read_table, separator_stated
@@ -74,7 +74,7 @@ def _read(path: Path, said: Said, key: str, quaternions: Order) -> Content | Non
             content = read_tree(arrays, "NumPy arrays", said, where)
         return replace(_required(content, where), passed_over=(*_required(content, where).passed_over, *others))
     try:
-        text = data.decode("utf-8-sig")
+        text = text_of(data)
     except UnicodeDecodeError:
         return None
     return _of_text(text, path, said, key, quaternions)

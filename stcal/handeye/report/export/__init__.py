@@ -1,12 +1,14 @@
 """Export of a hand-eye transform to files of other programs; each file is read back and compared."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from stcal.errors import InputError, StcalError
-from stcal.geometry.rigid import Rigid
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.report.export import files
 from stcal.handeye.report.export.files import opencv_yaml, read_zivid, ros_yaml, urdf_joint, zivid_yaml
 from stcal.handeye.report.export.frames import (
@@ -17,10 +19,12 @@ from stcal.handeye.report.export.frames import (
     tree,
 )
 from stcal.handeye.result import HandEye
+from stcal.io.plain_yaml import load_yaml
 from stcal.io.poses.columns import program_name
 from stcal.io.poses.controllers import ABB, FANUC, KUKA, UR
 from stcal.io.poses.static import (
     Static,
+    read_messages,
     read_ros1_launch,
     read_ros2_commands,
     read_ros2_launch,
@@ -28,6 +32,7 @@ from stcal.io.poses.static import (
     ros2_commands,
     ros2_launch,
 )
+from stcal.io.table import require_poses_written
 
 __all__ = [
     "FORMS",
@@ -37,6 +42,7 @@ __all__ = [
     "exported",
     "frame_names",
     "opencv_yaml",
+    "require_export_written",
     "require_form",
     "require_frame_names",
     "ros_yaml",
@@ -128,3 +134,29 @@ def exported(
                 "E-EXPORT-READ-BACK", f"--export {form}: the file does not give the transform back; use another form"
             )
     return text
+
+
+def require_export_written(
+    path: Path,
+    kind: str,
+    result: HandEye,
+    parent: str = "",
+    child: str = "",
+    camera_frame: CameraFrame = "optical",
+) -> None:
+    """Read a written file again, and require the transforms of ``result``.
+
+    ``kind`` : ``json``, the result file, or ``opencv``, ``ros``, ``urdf`` of :func:`opencv_yaml`, :func:`ros_yaml` and
+    :func:`urdf_joint`.
+    """
+
+    def again() -> Poses:
+        text = path.read_text(encoding="utf-8")
+        if kind in ("ros", "urdf"):
+            return Poses.of(static.pose for static in (read_messages if kind == "ros" else files.read_urdf)(text))
+        content = json.loads(text) if kind == "json" else load_yaml(text)
+        matrices = [content[name] if kind == "json" else content[name]["data"] for name in result.transforms]
+        return Poses.of(Rigid.from_matrix(np.reshape(matrix, (4, 4))) for matrix in matrices)
+
+    statics = tree(result, parent, child, camera_frame) if kind in ("ros", "urdf") else ()
+    require_poses_written(path, again, Poses.of([each.pose for each in statics] or result.transforms.values()))

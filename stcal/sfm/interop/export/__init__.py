@@ -1,12 +1,15 @@
 """Export of a finished run to files of other programs: robots' software, drawings, viewers, tables."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from stcal.errors import InputError
+from stcal.geometry.rigid import Poses
 from stcal.io.files import save
+from stcal.io.poses.static import Static, read_messages, read_ros1_launch, read_ros2_launch
+from stcal.io.table import require_poses_written
 from stcal.sfm.interop.export import solids, tables, viewers
 from stcal.sfm.interop.export.content import Content, content_of
 from stcal.sfm.interop.export.viewers import write_rrd
@@ -22,22 +25,25 @@ class Form:
     """A form of export.
 
     ``suffix`` : suffix of its files; ``write`` : returns their content, None if a library writes the file; ``lost`` :
-    results among faces, circles, σ and cameras that the files do not hold.
+    results among faces, circles, σ and cameras that the files do not hold; ``read`` : returns the transforms of
+    :meth:`Content.statics` from a text, None for drawings and viewers, from which nothing is read.
     """
 
     suffix: str
     write: Callable[[Content], str | bytes] | None
     lost: str
+    read: Callable[[str], Sequence[Static]] | None = None
 
 
+FRAMES_ONLY = "cameras, radii, σ of circles; σ of faces is in comments"
 FORMS = {
-    "urdf": Form(".urdf", tables.urdf, "cameras, σ of circles; σ of faces is in comments"),
-    "xacro": Form(".xacro", tables.xacro, "cameras, σ of circles; σ of faces is in comments"),
-    "tf2": Form(".yaml", tables.tf2, "cameras, radii, σ of circles; σ of faces is in comments"),
-    "ros2": Form(".py", tables.launch_ros2, "cameras, radii, σ of circles; σ of faces is in comments"),
-    "ros1": Form(".launch", tables.launch_ros1, "cameras, radii, σ of circles; σ of faces is in comments"),
-    "opencv": Form(".yml", tables.opencv, "cameras"),
-    "csv": Form(".csv", tables.table, "cameras, correlations"),
+    "urdf": Form(".urdf", tables.urdf, "cameras, σ of circles; σ of faces is in comments", tables.read_urdf),
+    "xacro": Form(".xacro", tables.xacro, "cameras, σ of circles; σ of faces is in comments", tables.read_urdf),
+    "tf2": Form(".yaml", tables.tf2, FRAMES_ONLY, read_messages),
+    "ros2": Form(".py", tables.launch_ros2, FRAMES_ONLY, read_ros2_launch),
+    "ros1": Form(".launch", tables.launch_ros1, FRAMES_ONLY, read_ros1_launch),
+    "opencv": Form(".yml", tables.opencv, "cameras", tables.read_opencv),
+    "csv": Form(".csv", tables.table, "cameras, correlations", tables.read_table),
     "ply": Form(".ply", solids.ply, "σ of circles, the lens's distortion; σ of faces is in comments"),
     "dxf": Form(".dxf", solids.dxf, "cameras, correlations; σ is in extended data"),
     "gltf": Form(".gltf", viewers.gltf, "the lens's distortion but as numbers in extras"),
@@ -88,6 +94,12 @@ def export_run(run: str | Path, path: str | Path, form: str = "", name: str = RO
     write = FORMS[form].write
     if write is not None:
         save(path, write(content))
+        if (read := FORMS[form].read) is not None:
+            require_poses_written(
+                path,
+                lambda: Poses.of(static.pose for static in read(path.read_text(encoding="utf-8"))),
+                Poses.of(static.pose for static in content.statics()),
+            )
         return ExportedRun(path, form, content, [])
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:

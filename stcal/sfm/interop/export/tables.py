@@ -2,6 +2,7 @@
 
 import csv
 import io
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from textwrap import indent
 from xml.sax.saxutils import quoteattr
@@ -9,13 +10,15 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stcal.io.plain_yaml import opencv_matrix
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.io.plain_yaml import load_yaml, opencv_matrix
 from stcal.io.poses.static import (
     Static,
     fixed_joint,
     messages,
     ros1_launch,
     ros2_launch,
+    static_of_joint,
 )
 from stcal.sfm.interop.export.content import Content
 
@@ -169,3 +172,32 @@ def _comments(content: Content) -> list[str]:
 def _escaped(text: str) -> str:
     """Escapes expressions that xacro would evaluate."""
     return text.replace("$(", "$$(").replace("${", "$${")
+
+
+def read_urdf(text: str) -> list[Static]:
+    """Returns the frames in a text of :func:`urdf` or :func:`xacro`."""
+    joints = ElementTree.fromstring(text).iter("joint")
+    return [static_of_joint(joint) for joint in joints if joint.find("origin") is not None]
+
+
+def read_table(text: str) -> list[Static]:
+    """Returns the frames in a text of :func:`table`."""
+    frames: list[Static] = []
+    for row in csv.DictReader(io.StringIO(text)):
+        turn, place = ([float(row[name]) for name in COLUMNS[at]] for at in (slice(6, 10), slice(3, 6)))
+        pose = Poses.from_quaternions([turn], [place])[0]
+        if row["kind"] == "face":
+            face = pose
+        frames.append(Static(row["face"], row["circle"], pose if row["kind"] == "face" else face.inverse() @ pose))
+    return frames
+
+
+def read_opencv(text: str) -> list[Static]:
+    """Returns the frames in a text of :func:`opencv`."""
+    frames = []
+    for face in load_yaml(text)["faces"]:
+        pose = Rigid.from_matrix(np.reshape(face["target_from_face"]["data"], (4, 4)))
+        frames.append(Static("", face["id"], pose))
+        centres = np.reshape(face["centres"]["data"], (-1, 3)) if "centres" in face else ()
+        frames += [Static(face["id"], "", Rigid(np.eye(3), pose.inverse() @ centre)) for centre in centres]
+    return frames

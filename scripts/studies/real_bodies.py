@@ -1,0 +1,77 @@
+#!/usr/bin/env python
+"""Calibrate bodies with printed faces from real photographs, without a board and without a camera file.
+
+No truth is known but the nominal geometry: the faces of a cube are at right angles as far as paper on a cube is. What
+is printed: images used, faces, residuals, the focal length with its σ, how far the normals of neighbouring faces are
+off 90°, and the largest σ of a face's position and rotation.
+
+Data: `real` of shared/data; a set that is not there is left out. A set takes a minute or two.
+"""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from stcal.boards.design import CharucoDesign
+from stcal.boards.target import printed_face
+from stcal.design import TargetDesign
+from stcal.sfm import pipeline
+from stcal.sfm.runs.result import RunResult
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
+SAME_PLANE_DEG = 45.0
+"""Smallest angle between the planes of neighbouring faces."""
+
+
+def pycamset_cube() -> TargetDesign:
+    """The cube of pyCamSet: six ChArUco faces of 10 × 10 squares of 3.2 mm; face k has the tags from 50 k on."""
+    boards = [CharucoDesign(10, 10, 3.2, 2.4, "DICT_6X6_1000", first_id=50 * k) for k in range(6)]
+    return TargetDesign("cube", "bright", tuple(printed_face(str(k), board) for k, board in enumerate(boards)))
+
+
+SETS = {"pycamset_cube": ("cam0", pycamset_cube)}
+
+
+def row(name: str, result: RunResult) -> str:
+    """The row of the table."""
+    target, joint, camera = result.target, result.calibration.joint, result.refined_camera
+    assert joint is not None
+    assert camera is not None
+    assert camera.covariance is not None
+    normals = np.array([pose.rotation[:, 2] for pose in target.target_from_face.values()])
+    angles = np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)))[np.triu_indices(len(normals), 1)]
+    off = np.abs(angles[np.minimum(angles, 180 - angles) > SAME_PLANE_DEG] - 90)
+    sigma = np.sqrt([np.diag(c) for f, c in target.face_covariance.items() if f != target.reference_face])
+    residuals = np.concatenate([m.residuals_px(result.calibration.camera).ravel() for m in joint.models])
+    images = sum(len(solution.model.images) for solution in result.solutions)
+    total = len(result.detection.images) + len(result.detection.skipped)
+    cells = [
+        name,
+        f"{images} of {total}",
+        f"{len(target.target_from_face)} of {len(result.target_design.faces)}",
+        f"{np.sqrt((residuals**2).mean()):.3f}",
+        f"{camera.focal[0]:.1f} ± {np.sqrt(camera.covariance[0, 0]):.1f}",
+        f"{off.mean():.2f}, {off.max():.2f}",
+        f"{1e3 * sigma[:, 3:].max():.0f}",
+        f"{1e3 * np.degrees(sigma[:, :3].max()):.0f}",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    """Print the table."""
+    print(
+        "| set | images | faces | residuals, px | focal length, px | neighbours off 90°, mean and worst, ° | "
+        "σ of a position, µm | of a rotation, mdeg |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    for name, (folder, design) in SETS.items():
+        if not (DATA / name).is_dir():
+            continue
+        with tempfile.TemporaryDirectory() as scratch:
+            print(row(name, pipeline.run(DATA / name / folder, None, Path(scratch) / "run", design())), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,588 @@
+"""Planted causes at three strengths on three sets: does the first sentence of the answer name them, is an error silent?
+
+    .venv/bin/python scripts/studies/verdict_study.py [--only WORD] [--sets NAMES] [--sound DRAWS] [--json FILE]
+
+Sets: the sample and `../shared/data/stereo_target/white_block` with the circles that were found in their photographs,
+and a simulated one of three faces with noise of 0.02 px. What is planted changes centres, camera file or designs, and
+mapping begins at the true geometry. `named`: of the runs that are not "Yes", the share whose first sentence (cause of
+the whole set, or first of the failed or suspicious checks) names the planted cause. `yes`: runs that answer "Yes", and
+the largest error of their faces, √(eᵀC⁻¹e/6). `silent`: "Yes" with an error over 4 σ. Sound sets: exact
+centres of the same sets with new noise of the σ of each centre.
+"""
+
+import argparse
+import json
+import tempfile
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from stcal.design import BoardDesign, TargetDesign
+from stcal.errors import StcalError
+from stcal.geometry.camera import Camera
+from stcal.geometry.conic import circle_conic, circle_image_offset, ellipse_of_conic
+from stcal.geometry.rigid import Rigid, Similarity
+from stcal.io.cameras.model import CalibratedCamera
+from stcal.io.cameras.read import read_camera
+from stcal.io.images import find_images
+from stcal.labels import CircleLabel, DotLabel
+from stcal.parallel import one_thread
+from stcal.report.text import text_table
+from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.adjust.refine import refine
+from stcal.sfm.checks.suite import Evidence, run_checks
+from stcal.sfm.checks.verdict import Check, ranked
+from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.files import detect_files
+from stcal.sfm.detect.labels import label_images
+from stcal.sfm.planning.nominal import observe, true_models
+from stcal.sfm.report.judgement import CAUSE
+from stcal.synthetic.observe import image_circles
+from stcal.synthetic.scene import Group, Scene, SceneOptions, make_scene, second_design
+from tests.support.photograph import read_set
+
+ROOT = Path(__file__).resolve().parents[2]
+SAMPLE = ROOT / "tests" / "data" / "sample"
+BLOCK = ROOT.parent / "shared" / "data" / "stereo_target" / "white_block"
+NOISE_PX = 0.02
+SILENT_SIGMA = 4.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a run is given; ``scene`` : the truth."""
+
+    scene: Scene
+    images: list[ImageObservations]
+    camera: CalibratedCamera
+    target: TargetDesign
+    board: BoardDesign
+    seed: int = 0
+
+    def file(self, **change) -> "Case":
+        """The case with another camera file."""
+        values = {key: getattr(self.camera, key) for key in ("width", "height", "focal", "centre", "distortion")}
+        camera = Camera(**values | change)
+        return replace(self, camera=CalibratedCamera.of(camera, "FULL_OPENCV"))
+
+    def centres(self, change: Callable[[ImageObservations, int], np.ndarray]) -> "Case":
+        """The case with other centres, px, made from each image and its number."""
+        return replace(self, images=[_moved(i, change(i, k), self.scene.camera) for k, i in enumerate(self.images)])
+
+    @property
+    def last(self) -> str:
+        """Group that changes where one group alone does."""
+        return list(self.scene.groups)[-1]
+
+
+def _moved(image: ImageObservations, centre_px: np.ndarray, camera: Camera) -> ImageObservations:
+    return replace(image, centre_px=centre_px, centre=camera.normalised_from_pixel(centre_px))
+
+
+# ---------------------------------------------------------------- sets
+
+
+def photographed(folder: Path) -> Case:
+    """A rendered set with the circles found in its photographs."""
+    data = read_set(folder)
+    groups = {}
+    for name, truth in data.truth["groups"].items():
+        poses = tuple(Rigid.from_matrix(image["camera_from_target"]) for image in truth["images"].values())
+        dots = np.array(truth["board_circles_target"])
+        groups[name] = Group(name, (), np.eye(3), Rigid(), dots, poses)
+    frames = {face: Rigid.from_matrix(m) for face, m in data.truth["target_from_face"].items()}
+    circles = {CircleLabel(*label.split(":")): np.array(xyz) for label, xyz in data.truth["circles"].items()}
+    camera = CalibratedCamera.of(data.camera, "FULL_OPENCV")
+    scene = Scene(data.target, data.board, camera, frames, circles, groups, 0)
+    with tempfile.TemporaryDirectory() as scratch:
+        designs, options = (data.target, data.board), EllipseOptions()
+        file = read_camera(folder / "cameras.txt")
+        found = detect_files(find_images(folder / "images")[0], file, *designs, options, Path(scratch), 1)
+        labelled = [each.observations for each in label_images(found, *designs, options, Path(scratch), 1)]
+    names = {name.rpartition(".")[0]: k for g in data.truth["groups"].values() for k, name in enumerate(g["images"])}
+    images = [replace(i, name=f"{i.group}/{names[i.name.rpartition('.')[0]]:04d}") for i in labelled]
+    return Case(scene, _seen_twice(_numbered(scene, images)), camera, data.target, data.board)
+
+
+def _seen_twice(images: list[ImageObservations]) -> list[ImageObservations]:
+    """The images without circles that one image of their group alone shows, as mapping would leave them out."""
+    count = Counter((image.group, label) for image in images for label in image.labels)
+    return [i.select([k for k, label in enumerate(i.labels) if count[i.group, label] > 1]) for i in images]
+
+
+def _numbered(scene: Scene, images: list[ImageObservations]) -> list[ImageObservations]:
+    """The images with the true numbers of the board's dots, which are known up to its symmetry."""
+    numbered = []
+    for name, group in scene.groups.items():
+        place = dict(zip(scene.board.labels(), group.board_circles_target, strict=True))
+        own = [image for image in images if image.group == name]
+        tried = []
+        for turned in (False, True):
+            renamed = [
+                replace(i, labels=tuple(_turned(x, scene.board) if turned else x for x in i.labels)) for i in own
+            ]
+            off = 0.0
+            for image in renamed:
+                dots = [k for k, label in enumerate(image.labels) if isinstance(label, DotLabel)]
+                pose = group.camera_from_target[int(image.name.rpartition("/")[2])]
+                xyz = pose @ np.array([place[image.labels[k]] for k in dots])
+                off += float(np.linalg.norm(scene.camera.project(xyz) - image.centre_px[dots], axis=1).sum())
+            tried.append((off, turned, renamed))
+        numbered += min(tried, key=lambda each: each[:2])[2]
+    return numbered
+
+
+def _turned(label, board: BoardDesign):
+    if not isinstance(label, DotLabel):
+        return label
+    return DotLabel(board.rows - 1 - label.row, board.columns - 1 - label.column)
+
+
+def simulated(seed: int = 7) -> Case:
+    """A set of another target and board, four images in each of three groups, without photographs."""
+    options = SceneOptions(seed=seed, width=2400, height=1600, images_per_group=4)
+    scene = make_scene(options, *second_design())
+    camera = CalibratedCamera.of(scene.camera, "FULL_OPENCV")
+    images = observe(scene, NOISE_PX, np.random.default_rng(seed))
+    return Case(scene, [shaped(scene, i) for i in images], camera, scene.target, scene.board)
+
+
+def shaped(scene: Scene, image: ImageObservations) -> ImageObservations:
+    """The image with the true shapes of its ellipses."""
+    seen = image_circles(scene, image.group, int(image.name.rpartition("/")[2]))
+    own = [seen.labels.index(label) for label in image.labels]
+    conics = (circle_conic(seen.xyz_camera[k], seen.normal_camera[k], seen.radius_mm[k]) for k in own)
+    return replace(image, shape=np.array([ellipse_of_conic(conic)[1] for conic in conics]))
+
+
+def drawn(case: Case, seed: int) -> Case:
+    """The set with exact centres and new noise of the σ of each centre."""
+    rng = np.random.default_rng(seed)
+
+    def change(image: ImageObservations, _: int) -> np.ndarray:
+        xyz, normal, radius = _seen(case, image)
+        exact = case.scene.camera.project(circle_image_offset(xyz, normal, radius))
+        noise = np.linalg.cholesky(image.covariance_px2) @ rng.standard_normal((len(exact), 2, 1))
+        return exact + noise[..., 0]
+
+    return case.centres(change)
+
+
+def _seen(case: Case, image: ImageObservations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres, normals and radii of the true circles of an image, camera frame."""
+    scene, group = case.scene, case.scene.groups[image.group]
+    pose = group.camera_from_target[int(image.name.rpartition("/")[2])]
+    place = scene.circles_target | dict(zip(scene.board.labels(), group.board_circles_target, strict=True))
+    dots = group.board_circles_target
+    of_board = np.linalg.svd(dots - dots.mean(0))[2][2]
+    normal = np.array(
+        [scene.target_from_face[x.plane].rotation[:, 2] if x.plane != "board" else of_board for x in image.labels]
+    )
+    radius = scene.target.radius_of() | scene.board.radius_of()
+    xyz = np.array([place[label] for label in image.labels])
+    return pose @ xyz, normal @ pose.rotation.T, np.array([radius[label] for label in image.labels])
+
+
+# ---------------------------------------------------------------- causes
+
+
+def on_face(image: ImageObservations) -> np.ndarray:
+    return np.array([isinstance(label, CircleLabel) for label in image.labels])
+
+
+def through(case: Case, distortion: np.ndarray) -> Case:
+    """The photographs as a lens of another distortion takes them."""
+    own = case.scene.camera
+    other = Camera(own.width, own.height, own.focal, own.centre, distortion)
+    return case.centres(lambda image, _: other.pixel_from_normalised(own.normalised_from_pixel(image.centre_px)))
+
+
+LENS = np.array([-0.12, 0.06, 4e-4, -3e-4, 0, 0, 0, 0, 0, 0, 0, 0])
+
+
+def lens(strength: float, taken: float, stated: float) -> Callable[[Case, float], Case]:
+    """A lens of some distortion: ``taken`` of it is in the photographs, ``stated`` in the camera file."""
+    return lambda case, value: through(case, strength * taken * value * LENS).file(distortion=stated * value * LENS)
+
+
+def zoomed(by: Callable[[Case, ImageObservations, int], float]) -> Callable[[Case, float], Case]:
+    def plant(case: Case, value: float) -> Case:
+        middle = case.scene.camera.centre
+        return case.centres(lambda image, k: middle + (1 + value * by(case, image, k)) * (image.centre_px - middle))
+
+    return plant
+
+
+def spread(k: int, n: int = 2) -> np.ndarray:
+    return np.random.default_rng([5, k]).normal(size=n)
+
+
+def moved(which: Callable[[Case, ImageObservations, int], bool], faces: Callable[[str], bool] = lambda _: True):
+    """The target, or some of its faces, stands elsewhere (mm) against the board in some images."""
+
+    def plant(case: Case, value: float) -> Case:
+        def change(image: ImageObservations, k: int) -> np.ndarray:
+            if not which(case, image, k):
+                return image.centre_px
+            xyz, normal, radius = _seen(case, image)
+            pose = case.scene.groups[image.group].camera_from_target[int(image.name.rpartition("/")[2])]
+            shift = pose.rotation @ (value * np.array([0.6, -0.5, 0.62]))
+            hit = np.array([isinstance(x, CircleLabel) and faces(x.face) for x in image.labels])
+            before, after = (circle_image_offset(at, normal, radius) for at in (xyz, xyz + hit[:, None] * shift))
+            project = case.scene.camera.project
+            return image.centre_px + project(after) - project(before)
+
+        return case.centres(change)
+
+    return plant
+
+
+def shifted_points(case: Case, shift_mm: Callable[[ImageObservations], np.ndarray]) -> Case:
+    """Circles (n,) that stand elsewhere, by (n, 3) mm in the frame of the target."""
+
+    def change(image: ImageObservations, _: int) -> np.ndarray:
+        xyz, normal, radius = _seen(case, image)
+        pose = case.scene.groups[image.group].camera_from_target[int(image.name.rpartition("/")[2])]
+        shift = shift_mm(image) @ pose.rotation.T
+        before, after = (circle_image_offset(at, normal, radius) for at in (xyz, xyz + shift))
+        return image.centre_px + case.scene.camera.project(after) - case.scene.camera.project(before)
+
+    return case.centres(change)
+
+
+def board_shifted(at: Callable[[np.ndarray, BoardDesign], np.ndarray]) -> Callable[[Case, float], Case]:
+    """Dots of the board off their places: ``at`` gives (n, 3) of unit size, board frame, from (n, 2) cells, −1 to 1."""
+
+    def plant(case: Case, value: float) -> Case:
+        def shift(image: ImageObservations) -> np.ndarray:
+            dots = case.scene.groups[image.group].board_circles_target.reshape(case.board.rows, case.board.columns, 3)
+            axes = np.array([dots[0, -1] - dots[0, 0], dots[-1, 0] - dots[0, 0]])
+            axes = axes / np.linalg.norm(axes, axis=1)[:, None]
+            axes = np.vstack([axes, np.cross(*axes)])
+            out = np.zeros((len(image.labels), 3))
+            for k, label in enumerate(image.labels):
+                if isinstance(label, DotLabel):
+                    cell = np.array(
+                        [2 * label.column / (case.board.columns - 1) - 1, 2 * label.row / (case.board.rows - 1) - 1]
+                    )
+                    out[k] = value * at(cell, case.board) @ axes
+            return out
+
+        return shifted_points(case, shift)
+
+    return plant
+
+
+def rolling(case: Case, value: float) -> Case:
+    height = case.camera.height
+    return case.centres(lambda i, k: i.centre_px + value * spread(k) * (i.centre_px[:, 1:] / height - 0.5))
+
+
+def exchanged(case: Case, value: float) -> Case:
+    """Exchanged labels of ``value`` pairs of circles of a face in one image."""
+
+    def change(image: ImageObservations, k: int) -> np.ndarray:
+        centre = image.centre_px.copy()
+        own = np.flatnonzero(on_face(image))
+        for pair in range(int(value) if k == 1 else 0):
+            centre[own[[2 * pair, 2 * pair + 1]]] = centre[own[[2 * pair + 1, 2 * pair]]]
+        return centre
+
+    return case.centres(change)
+
+
+def noisy(case: Case, value: float) -> Case:
+    """One image whose centres have ``value`` times the noise that they state."""
+
+    def change(image: ImageObservations, k: int) -> np.ndarray:
+        noise = np.random.default_rng(3).normal(size=image.centre_px.shape) * image.sigma_px()[:, None]
+        return image.centre_px + (value * noise if k == 4 else 0)
+
+    return case.centres(change)
+
+
+def radii(case: Case, factor: Callable[[CircleLabel | DotLabel], float]) -> Case:
+    """Circles of other radii than their design, seen from the same places."""
+    return replace(
+        case,
+        images=[
+            replace(i, shape=i.shape * np.array([factor(x) for x in i.labels])[:, None, None]) for i in case.images
+        ],
+    )
+
+
+def behind_rims(case: Case, value: float) -> Case:
+    """Discs of the faces behind a rim of ``value`` mm: half of it higher, and narrower by h tan τ/π."""
+    normals = {face: pose.rotation[:, 2] for face, pose in case.scene.target_from_face.items()}
+    zero = np.zeros(3)
+    raised = shifted_points(
+        case,
+        lambda i: np.array([value / 2 * normals[x.face] if isinstance(x, CircleLabel) else zero for x in i.labels]),
+    )
+    images = []
+    for image in raised.images:
+        xyz, normal, radius = _seen(case, image)
+        cosine = np.abs((xyz * normal).sum(1)) / np.linalg.norm(xyz, axis=1)
+        lost = value * np.sqrt(1 / cosine**2 - 1) / np.pi / radius * on_face(image)
+        images.append(replace(image, shape=image.shape * (1 - lost)[:, None, None]))
+    return replace(raised, images=images)
+
+
+def centroids(case: Case, value: float) -> Case:
+    """Centres without a share of the eccentricity, as of the images of the circles' centres."""
+
+    def change(image: ImageObservations, _: int) -> np.ndarray:
+        xyz, normal, radius = _seen(case, image)
+        project = case.scene.camera.project
+        return image.centre_px - value * (project(circle_image_offset(xyz, normal, radius)) - project(xyz))
+
+    return case.centres(change)
+
+
+def with_board(**change: Callable[[BoardDesign, float], float]) -> Callable[[Case, float], Case]:
+    return lambda case, v: replace(case, board=replace(case.board, **{k: f(case.board, v) for k, f in change.items()}))
+
+
+def one_image(case: Case, image: ImageObservations, k: int) -> bool:
+    return k == 2
+
+
+def half_a_group(case: Case, image: ImageObservations, k: int) -> bool:
+    own = [i.name for i in case.images if i.group == case.last]
+    return image.name in own[len(own) // 2 :]
+
+
+def whole_group(case: Case, image: ImageObservations, k: int) -> bool:
+    return image.group == case.last
+
+
+def first_circle(case: Case) -> CircleLabel:
+    return case.target.faces[0].labels()[3]
+
+
+def lifted_circle(case: Case, value: float) -> Case:
+    label, normal = first_circle(case), case.scene.target_from_face[first_circle(case).face].rotation[:, 2]
+    return shifted_points(case, lambda i: np.array([value * normal * (x == label) for x in i.labels]))
+
+
+Plant = Callable[[Case, float], Case]
+CAUSES: dict[str, tuple[tuple[float, float, float], Plant, tuple[str, ...]]] = {
+    "focal length long": (
+        (0.002, 0.005, 0.02),
+        lambda c, v: c.file(focal=c.camera.focal * (1 + v)),
+        ("the focal length",),
+    ),
+    "focal length short": (
+        (0.002, 0.005, 0.02),
+        lambda c, v: c.file(focal=c.camera.focal * (1 - v)),
+        ("the focal length",),
+    ),
+    "fx over fy": ((0.001, 0.004, 0.02), lambda c, v: c.file(focal=c.camera.focal * [1 + v, 1]), ("width and height",)),
+    "cropped": (
+        (5, 20, 80),
+        lambda c, v: c.file(centre=c.camera.centre + np.array([v, -0.6 * v])),
+        ("the principal point", "turned by 180°"),
+    ),
+    "another camera": (
+        (0.3, 1, 3),
+        lambda c, v: c.file(
+            focal=c.camera.focal * [1 + 0.01 * v, 1 + 0.007 * v],
+            centre=c.camera.centre + np.array([9 * v, 5 * v]),
+            distortion=c.camera.distortion + 0.02 * v * np.eye(12)[0],
+        ),
+        ("the intrinsics", "the focal length", "scaled", "the principal point", "width and height"),
+    ),
+    "distortion": (
+        (0.02, 0.1, 0.5),
+        lambda c, v: through(c, LENS).file(distortion=LENS * (1 - v)),
+        ("the distortion", "undistorted"),
+    ),
+    "no distortion in the file": ((0.1, 0.3, 1), lens(1, 1, 0), ("the distortion",)),
+    "distortion negated": ((0.1, 0.3, 1), lens(1, 1, -1), ("negated", "reversed")),
+    "already undistorted": ((0.1, 0.3, 1), lens(1, 0, 1), ("already undistorted",)),
+    "scaled": (
+        (0.002, 0.005, 0.02),
+        lambda c, v: c.centres(lambda i, _: (1 + v) * (i.centre_px + 0.5) - 0.5),
+        ("scaled against", "the focal length"),
+    ),
+    "turned by 180°": ((6, 20, 60), lambda c, v: turned_by_180(c, v), ("turned by 180°", "the principal point")),
+    "zoom by group": (
+        (0.001, 0.004, 0.02),
+        zoomed(lambda c, i, _: list(c.scene.groups).index(i.group) - 1),
+        ("between the groups",),
+    ),
+    "autofocus": ((0.001, 0.004, 0.02), zoomed(lambda c, i, k: spread(k, 1)[0]), ("from image to image",)),
+    "rolling shutter": ((0.5, 2, 6), rolling, ("rolling shutter",)),
+    "pitch long": ((0.001, 0.004, 0.02), with_board(pitch_mm=lambda b, v: b.pitch_mm * (1 + v)), ("pitch",)),
+    "pitch short": ((0.001, 0.004, 0.02), with_board(pitch_mm=lambda b, v: b.pitch_mm * (1 - v)), ("pitch",)),
+    "board stretched": (
+        (3e-4, 1e-3, 5e-3),
+        board_shifted(lambda c, b: np.array([c[0], 0, 0]) * b.pitch_mm * (b.columns - 1) / 2),
+        ("board", "board-lines", "stretched"),
+    ),
+    "board bent": ((0.05, 0.2, 1), board_shifted(lambda c, b: np.array([0, 0, c @ c])), ("board", "bent")),
+    "column of dots off": (
+        (0.05, 0.2, 1),
+        board_shifted(lambda c, b: np.array([c[0] > 0.99, 0, 0])),
+        ("board", "board-lines"),
+    ),
+    "radii of the board": (
+        (0.03, 0.08, 0.2),
+        lambda c, v: radii(c, lambda x: 1 + v * isinstance(x, DotLabel)),
+        ("radius-design",),
+    ),
+    "radii of the target": (
+        (0.03, 0.08, 0.2),
+        lambda c, v: radii(c, lambda x: 1 + v * isinstance(x, CircleLabel)),
+        ("radius-design",),
+    ),
+    "radius of one circle": (
+        (0.03, 0.08, 0.2),
+        lambda c, v: radii(c, lambda x: 1 + v * (x == first_circle(c))),
+        ("radius",),
+    ),
+    "circle out of plane": ((0.2, 0.5, 2), lifted_circle, ("flatness",)),
+    "rim": ((0.05, 0.15, 0.4), behind_rims, ("rim",)),
+    "centroids": ((0.3, 0.6, 1), centroids, ("control",)),
+    "target moved, one image": ((0.05, 0.2, 1), moved(one_image), ("moved",)),
+    "target moved, half a group": ((0.05, 0.2, 1), moved(half_a_group), ("moved",)),
+    "a face moved, one group": (
+        (0.05, 0.2, 1),
+        lambda c, v: moved(whole_group, lambda f: f == seen_in_last(c))(c, v),
+        ("groups", "loops", "agreement"),
+    ),
+    "one image of another focus": (
+        (0.002, 0.005, 0.02),
+        zoomed(lambda c, i, k: k == 2),
+        ("moved", "image-residuals", "image of another focus"),
+    ),
+    "one noisy image": ((4, 8, 20), noisy, ("image-residuals",)),
+    "labels exchanged": ((1, 2, 3), exchanged, ("labels",)),
+}
+"""By name: strengths, what is planted, and keys of checks or words of causes that name it."""
+
+
+def turned_by_180(case: Case, value: float) -> Case:
+    """A camera whose principal point is ``value`` px off the middle, its photographs turned."""
+    middle = (np.array([case.camera.width, case.camera.height]) - 1) / 2
+    by = middle + np.array([value / 2, -value / 3]) - case.camera.centre
+    own = case.centres(lambda i, _: i.centre_px + by)  # as the lens would have them behind a shifted sensor
+    at = 2 * middle - (case.camera.centre + by)
+    return own.file(centre=at)
+
+
+def seen_in_last(case: Case) -> str:
+    """A face of the last group that other groups show, too."""
+    elsewhere = {face for image in case.images if image.group != case.last for face in image.face_ids()}
+    own = [face for image in case.images if image.group == case.last for face in image.face_ids() if face in elsewhere]
+    return max(set(own), key=own.count)
+
+
+# ---------------------------------------------------------------- runs
+
+
+def answer(case: Case) -> dict:
+    """Verdict, the check that the first sentence names, and the largest error of a face in σ."""
+    try:
+        world = Similarity(1, Rigid.exp([0.3, -0.2, 0.5, 40, -30, 900]))
+        starts = [model.in_world(world) for model in true_models(case.scene, case.images)]
+        refined = [refine(model, case.camera, case.target, case.board) for model in starts]
+        options = AdjustOptions(case.target.faces[0].id, "joint")
+        models = tuple(each.model for each in refined)
+        calibration = calibrate(models, case.camera, case.target, case.board, options)
+        outliers = tuple(o for each in refined for o in each.outliers)
+        evidence = Evidence(
+            models, outliers, tuple(case.images), case.camera, case.target, case.board, options, calibration, None, {}
+        )
+        checks = run_checks(evidence)
+    except StcalError as error:
+        return {"verdict": "error", "first": str(error), "sigma": 0.0, "bad": []}
+    first = ranked(checks, frozenset(image.name for image in case.images))[0]
+    verdict = {"failed": "no", "suspicious": "care"}.get(first.verdict, "yes")
+    bad = [check.key for check in checks if check.verdict in ("failed", "suspicious")]
+    return {"verdict": verdict, "first": _words(first), "sigma": worst_sigma(case, calibration.target), "bad": bad}
+
+
+def _words(check: Check) -> str:
+    return f"{check.key}: {check.title}" if check.verdict in ("failed", "suspicious") else ""
+
+
+def worst_sigma(case: Case, target) -> float:
+    """√(eᵀC⁻¹e/6), the largest of all faces."""
+    known, own = case.scene.target_from_face, target.reference_face
+    worst = 0.0
+    for face, pose in target.target_from_face.items():
+        if face == own:
+            continue
+        true = known[own].inverse() @ known[face]
+        error = np.concatenate([Rigid(pose.rotation @ true.rotation.T).log()[:3], pose.translation - true.translation])
+        covariance = target.face_covariance[face]
+        worst = max(worst, float(np.sqrt(error @ np.linalg.solve(covariance, error) / 6)))
+    return worst
+
+
+def names_it(first: str, words: tuple[str, ...]) -> bool:
+    """Whether a first sentence names a planted cause: by the key of a check, or by words of a whole set's cause."""
+    key, _, title = first.partition(": ")
+    return key in words or (key == CAUSE and any(word in title for word in words))
+
+
+@one_thread()
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", help="causes with this word in their name")
+    parser.add_argument("--sets", default="sample,block,own")
+    parser.add_argument("--sound", type=int, default=40, help="draws of each sound set")
+    parser.add_argument("--json", type=Path, help="write each run here")
+    given = parser.parse_args()
+    makers = {"sample": lambda: photographed(SAMPLE), "block": lambda: photographed(BLOCK), "own": simulated}
+    cases = {name: makers[name]() for name in given.sets.split(",")}
+    rows, kept = [], []
+    for name, (strengths, plant, words) in CAUSES.items():
+        if given.only not in name:
+            continue
+        runs = []
+        for where, case in cases.items():
+            for value in strengths:
+                found = answer(plant(case, value))
+                runs.append(
+                    found | {"cause": name, "set": where, "value": value, "named": names_it(found["first"], words)}
+                )
+        kept += runs
+        asked = [r for r in runs if r["verdict"] != "yes"]
+        quiet = [r for r in runs if r["verdict"] == "yes"]
+        silent = [r for r in quiet if r["sigma"] > SILENT_SIGMA]
+        others = sorted({r["first"].partition(": ")[2] for r in asked if not r["named"]})
+        rows.append(
+            [
+                name,
+                f"{sum(r['named'] for r in asked)}/{len(asked)}",
+                f"{len(quiet)}" + (f" ({max(r['sigma'] for r in quiet):.1f} σ)" if quiet else ""),
+                str(len(silent)),
+                "; ".join(text[:60] for text in others),
+            ]
+        )
+        print("  ".join(rows[-1]), flush=True) if given.json else None
+    asked = [r for r in kept if r["verdict"] != "yes"]
+    named = sum(r["named"] for r in asked)
+    quiet = [r for r in kept if r["verdict"] == "yes"]
+    print("\n".join(text_table([["<planted cause", "named", "yes", "silent", "<named instead"], *rows])))
+    print(f"named: {named} of {len(asked)} runs that are not Yes, {100 * named / max(len(asked), 1):.0f} %")
+    print(f"silent: {sum(r['sigma'] > SILENT_SIGMA for r in quiet)} of {len(kept)} runs")
+    sound = [answer(drawn(case, seed)) for case in cases.values() for seed in range(given.sound)]
+    wrong = [r for r in sound if r["verdict"] != "yes"]
+    said = sorted({key for r in wrong for key in r["bad"]})
+    share = f"{100 * len(wrong) / max(len(sound), 1):.1f} %"
+    listed = f": {', '.join(said)}" if said else ""
+    print(f"sound sets: {len(wrong)} of {len(sound)} answered No or With care, {share}{listed}")
+    if given.json:
+        given.json.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

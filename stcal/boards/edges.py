@@ -1,0 +1,479 @@
+"""Straight edges between dark and bright areas, their crossings and corners of tags, by the areas in each pixel."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.special import ndtr
+
+from stcal.geometry.least_squares import block_diagonal
+from stcal.geometry.robust import median_length
+
+SAMPLES = 25
+"""Number of samples of a profile across an edge."""
+POINTS = 32
+"""Largest number of places along an edge that are used; at most one per pixel."""
+ALONG = (0.08, 0.92)
+"""Range of an edge that is used, as shares of its length: near its ends the next edge's blur disturbs it."""
+END_PX = 2.0
+"""Distance from an edge's ends from which on pixels are used, px."""
+CELLS_ACROSS = 0.8
+"""Reach of a profile to either side, in cells; the border of a tag, and the white around it, is one cell wide."""
+REACH_PX = (1.5, 6.0)
+MIN_RISE = 0.15
+"""Smallest step that counts as a part of the edge, as a share of a profile's steepest step; smaller ones are noise."""
+MIN_CONTRAST = 0.3
+"""Smallest contrast of a profile, as a share of the tag's; a lower one is another tag's edge, a stain or a shadow."""
+MIN_SHARE = 0.25
+"""Smallest share of good profiles of a visible edge."""
+MIN_CELL_PX = 2.0
+CUT = 2.5
+"""Largest distance of a point from the line, in robust σ; points beyond it are outliers."""
+CUT_ROUNDS = 4
+MIN_SIGMA_PX = 0.01
+"""Smallest σ of edge points: below it printing, flatness and the lens limit the accuracy of a corner, not noise."""
+STEPS = 3
+"""Number of Gauss–Newton steps; the last one is below a thousandth of a pixel."""
+START_VARIANCE, MIN_VARIANCE = 0.4, 0.01
+"""Variance of the blur at the start, and its lower limit, px²."""
+MOST_MOVED_PX = 1.0
+"""Largest distance of an edge from where its profiles have it; one that ends farther away stays with the profiles."""
+ROUNDING = 1 / 12
+"""Variance of rounding to whole grey values."""
+PIXEL_VARIANCE = 1 / 12
+"""Variance of a square pixel about its centre, px²."""
+BLURS, LEAST_INSIDE_PX = 2.5, 1.0
+"""Distance from the tag's inner cells, in σ of blur and pixel, from which on pixels are used, and the least width of
+the border's band that is used, px."""
+CROSSING_STEPS = 4
+"""Number of Gauss–Newton steps to a crossing, which may end :data:`MOST_MOVED_PX` from its start."""
+MOST_LEFT = 0.15
+"""Largest RMS residual of a window, as a share of the contrast; a window with a larger one shows something else."""
+WIDEST_BLUR = 0.4
+"""Largest σ of the blur, in half sides of the window: a wider one leaves no area of one colour."""
+
+
+def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the share of the bright side of an edge in pixels, and derivatives of this share.
+
+    The square pixel as the edge's normal sees it is a trapezoid, the convolution of two boxes. The wider one, and with
+    it an edge along the rows, is integrated exactly; the narrower one, like the blur, as a Gaussian of its variance.
+
+    Parameters
+    ----------
+    distance : (m, ...) array
+        Distances of the pixels' centres from the edges, positive on the bright side, px.
+    normal : (m, 2) array
+        Normals of the edges.
+    variance : (m,) array
+        Variances of the blur, px².
+
+    Returns
+    -------
+    tuple of (m, ...) arrays
+        The share; its derivatives by distance and by variance; its third derivative by distance.
+    """
+    narrow, wide = (side.reshape(-1, *(1,) * (distance.ndim - 1)) for side in np.sort(np.abs(normal), axis=1).T)
+    sigma = np.sqrt(variance.reshape(narrow.shape) + narrow**2 / 12)
+    first, last = ((distance + shift) / sigma for shift in (wide / 2, -wide / 2))
+    below = ndtr(first), ndtr(last)
+    density = tuple(np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi) for at in (first, last))
+    step = sigma * (first * below[0] + density[0] - last * below[1] - density[1])
+    widening = (density[0] - density[1]) / (2 * sigma)
+    skew = (last * density[1] - first * density[0]) / sigma**2
+    return step / wide, (below[0] - below[1]) / wide, widening / wide, skew / wide
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeCorners:
+    """The refined corners ``corners_px`` (n, 4, 2), with ``covariance_px2`` (n, 8, 8) of the four corners together.
+
+    Two corners share the errors of the edge between them: they move together with its offset, against each other with
+    its slope.
+
+    ``seen`` : (n,) True if all four edges of a tag are visible; otherwise its values are meaningless.
+    """
+
+    corners_px: np.ndarray
+    covariance_px2: np.ndarray
+    seen: np.ndarray
+
+
+def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> EdgeCorners:
+    """Refine the corners (n, 4, 2), in cyclic order, of dark tags with ``cells`` (n,) cells per side, border included.
+
+    An edge is not visible if it is too short, hidden, outside of the image, or without contrast.
+    """
+    n = len(corners)
+    if not n:
+        return EdgeCorners(np.zeros((0, 4, 2)), np.zeros((0, 8, 8)), np.zeros(0, bool))
+    frame = _frame(np.asarray(corners, float), cells)
+    offset, good = _profiles(grey, frame)
+    with np.errstate(divide="ignore", invalid="ignore"):  # edges that are not visible
+        rough = _fit(frame.place, offset, good)
+        lines = _by_area(grey, frame, rough)
+        meeting, covariance = _meet(frame, lines)
+    seen = good.mean(2) >= MIN_SHARE
+    seen &= np.isfinite(covariance.sum((1, 2)))[:, None] & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
+    return EdgeCorners(meeting, covariance, seen.all(1))
+
+
+def corners_by_edges(corners: np.ndarray) -> np.ndarray:
+    """Return the shifts of the corners (..., 4, 2) of tags, in cyclic order, if all four edges move outwards by one.
+
+    Over-exposure, spread ink and a nonlinear response of the camera move all edges alike.
+    """
+    along = np.roll(corners, -1, axis=-2) - corners
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    outwards = np.sign((normal * (corners - corners.mean(-2, keepdims=True))).sum((-1, -2)))
+    normal *= outwards[..., None, None]
+    pair = np.stack([np.roll(normal, 1, axis=-2), normal], axis=-2)
+    return np.linalg.solve(pair, np.ones((*pair.shape[:-1], 1)))[..., 0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    """Geometry of the edges, px.
+
+    ``middle`` : (n, 4, 2) of each edge; ``along`` : (n, 4, 2) direction; ``normal`` : (n, 4, 2) outwards; ``length`` :
+    (n, 4); ``cell`` : (n, 4) width of a cell across; ``reach`` : (n, 4) of the profiles; ``place`` : (n, 4, POINTS) of
+    the profiles from the middle.
+    """
+
+    middle: np.ndarray
+    along: np.ndarray
+    normal: np.ndarray
+    length: np.ndarray
+    cell: np.ndarray
+    reach: np.ndarray
+    place: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lines:
+    """Lines of points p with ``normal @ (p − middle) = offset + slope · along @ (p − middle)``.
+
+    ``offset``, ``slope`` : (n, 4); ``covariance`` : (n, 4, 2, 2) of the two; ``keep`` : (n, 4, POINTS) profiles that
+    are no outliers.
+    """
+
+    offset: np.ndarray
+    slope: np.ndarray
+    covariance: np.ndarray
+    keep: np.ndarray
+
+
+def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
+    """Return the edges from each corner to the next."""
+    end = np.roll(corners, -1, axis=1)
+    length = np.linalg.norm(end - corners, axis=2)
+    along = (end - corners) / length[..., None]
+    middle = (corners + end) / 2
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    depth = 2 * ((middle - corners.mean(1, keepdims=True)) * normal).sum(2)
+    normal = normal * np.where(depth < 0, -1.0, 1.0)[..., None]
+    cell = np.minimum(np.abs(depth), length) / np.reshape(cells, (-1, 1))
+    reach = np.clip(CELLS_ACROSS * cell, *REACH_PX)
+    place = (np.linspace(*ALONG, POINTS) - 0.5) * length[..., None]
+    return _Frame(middle, along, normal, length, cell, reach, place)
+
+
+def _profiles(grey: np.ndarray, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edge in each profile, px from the frame's line, and a mask of good profiles, (n, 4, POINTS)."""
+    n = len(frame.length)
+    across = np.linspace(-1, 1, SAMPLES) * frame.reach[..., None]
+    base = frame.middle[:, :, None] + frame.place[..., None] * frame.along[:, :, None]
+    xy = base[:, :, :, None] + (across[..., None] * frame.normal[:, :, None])[:, :, None]
+    flat = xy.reshape(4 * n, POINTS * SAMPLES, 2).astype(np.float32)
+    level = (
+        cv2.remap(grey, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR).reshape(n, 4, POINTS, SAMPLES).astype(np.float32)
+    )
+    inside = np.all((xy >= 0) & (xy <= [grey.shape[1] - 1, grey.shape[0] - 1]), axis=(2, 3, 4))
+    rise = np.diff(level, axis=3).clip(0)
+    rise[rise < MIN_RISE * rise.max(3, keepdims=True)] = 0
+    total = rise.sum(3)
+    low, high = np.percentile(level.reshape(n, -1), [5, 95], axis=1)
+    good = (total > MIN_CONTRAST * (high - low)[:, None, None]) & (total > 0) & inside[..., None]
+    middle = (across[..., 1:] + across[..., :-1]) / 2
+    return np.einsum("nkps,nks->nkp", rise, middle) / np.where(good, total, 1.0), good
+
+
+def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
+    """Fit straight lines by least squares, with removal of outliers."""
+    keep = good
+    for _ in range(CUT_ROUNDS):
+        value, spread = _line(place, offset, keep)
+        off = np.abs(offset - value[..., :1] - value[..., 1:] * place)
+        sorted_off = np.sort(np.where(keep, off, np.inf), axis=2)
+        middle = np.maximum(keep.sum(2, keepdims=True) - 1, 0) // 2
+        sigma = np.take_along_axis(sorted_off, middle, axis=2) / median_length(1)
+        new = good & (off < CUT * np.maximum(sigma, MIN_SIGMA_PX))
+        if (new == keep).all():
+            break
+        keep = new
+    value, spread = _line(place, offset, keep)
+    off = offset - value[..., :1] - value[..., 1:] * place
+    count = keep.sum(2)
+    variance = np.maximum((off**2 * keep).sum(2) / (count - 2), MIN_SIGMA_PX**2)
+    extent = np.where(keep, place, -np.inf).max(2) - np.where(keep, place, np.inf).min(2)
+    points = np.minimum(count, np.maximum(extent, 1.0))
+    return _Lines(value[..., 0], value[..., 1], (variance * count / points)[..., None, None] * spread, keep)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pixels:
+    """Pixels about m edges: ``level`` (m, p, s) in p rows or columns, ``along`` and ``across`` (m, p, s) of their
+    centres from the edge's middle, px, ``used`` (m, p, s)."""
+
+    level: np.ndarray
+    along: np.ndarray
+    across: np.ndarray
+    used: np.ndarray
+
+
+def _pixels(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Pixels:
+    """Return the pixels within reach of the edges ``rough``, in the columns or rows of the profiles that are kept."""
+    m, each = frame.length.size, np.arange(frame.length.size)
+    middle, along, normal = (value.reshape(m, 2) for value in (frame.middle, frame.along, frame.normal))
+    length, reach = frame.length.reshape(m, 1, 1), frame.reach.reshape(m, 1, 1)
+    offset, slope = (np.nan_to_num(value).reshape(m, 1) for value in (rough.offset, rough.slope))
+    place = frame.place.reshape(m, -1)
+    point = middle[:, None] + place[..., None] * along[:, None] + (offset + slope * place)[..., None] * normal[:, None]
+    major = np.abs(along).argmax(1)  # 0 : an edge along the rows, whose pixels are taken by columns
+    # Each profile moves to the nearest column; of those in one column, one is used.
+    column = np.rint(point[each, :, major])
+    keep = rough.keep.reshape(m, -1).copy()
+    keep[:, 1:] &= np.diff(column, axis=1) != 0
+    rise = (along[each, 1 - major] / along[each, major])[:, None]
+    start = np.rint(point[each, :, 1 - major] + rise * (column - point[each, :, major]))
+    half = int(np.ceil(reach.max() * np.sqrt(2)))
+    across = start[..., None] + np.arange(-half, half + 1)
+    by_column = (major == 0)[:, None, None]
+    x, y = np.where(by_column, column[..., None], across), np.where(by_column, across, column[..., None])
+    height, width = grey.shape
+    level = grey[y.clip(0, height - 1).astype(int), x.clip(0, width - 1).astype(int)].astype(float)
+    off = np.stack([x, y], axis=-1) - middle[:, None, None]
+    t, d = np.einsum("mpsi,mi->mps", off, along), np.einsum("mpsi,mi->mps", off, normal)
+    used = keep[..., None] & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    used &= np.abs(d - offset[..., None] - slope[..., None] * t) <= reach
+    used &= np.abs(t) <= np.minimum((0.5 - ALONG[0]) * length, length / 2 - END_PX)
+    return _Pixels(level, t, d, used)
+
+
+def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Lines:
+    """Return the lines that split the pixels into dark and bright areas as the image has them."""
+    pixels = _pixels(grey, frame, rough)
+    m = len(pixels.level)
+    normal, most = frame.normal.reshape(m, 2), frame.reach.ravel() ** 2
+    weight, t, d = pixels.used.astype(float), pixels.along, pixels.across
+    relative = 2 * t / frame.length.reshape(m, 1, 1)
+    distance = residual = third = d
+    design, inverse = np.zeros((*t.shape, 7)), np.zeros((m, 7, 7))
+    value = np.zeros((m, 7))  # offset, slope, variance of the blur, dark and rise with their changes along the edge
+    value[:, :2] = np.nan_to_num(np.stack([rough.offset, rough.slope], -1).reshape(m, 2))
+    value[:, 2] = START_VARIANCE
+    for k in range(STEPS + 1):
+        if k == STEPS - 1:  # the blur is known: the next cell's must not reach the pixels
+            clear = frame.cell.reshape(m, 1, 1) - BLURS * np.sqrt(value[:, 2] + PIXEL_VARIANCE)[:, None, None]
+            weight = weight * (distance >= -np.maximum(clear, LEAST_INSIDE_PX))
+        distance = d - value[:, :1, None] - value[:, 1:2, None] * t
+        step, slope, widening, skew = integrated_step(distance, normal, value[:, 2])
+        levels = np.stack([np.ones_like(t), relative, step, step * relative], axis=-1)
+        if not k:  # the levels follow linearly
+            value[:, 3:] = solved(levels, weight, pixels.level)[0]
+        rise = value[:, 5, None, None] + value[:, 6, None, None] * relative
+        residual = pixels.level - np.einsum("mpsi,mi->mps", levels, value[:, 3:])
+        design = np.concatenate([(rise * np.stack([-slope, -slope * t, widening])).transpose(1, 2, 3, 0), levels], -1)
+        third = rise * skew
+        change, inverse = solved(design, weight, residual)
+        if k < STEPS:
+            value += change
+            value[:, 2] = value[:, 2].clip(MIN_VARIANCE, most)
+            value = np.where(np.isfinite(value), value, 0.0)
+    covariance = _covariance(residual, design, third, distance, weight, inverse, shape := frame.length.shape)
+    line = np.moveaxis(value[:, :2].reshape(*shape, 2), 2, 0)
+    settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
+    offset, slope = np.where(settled, line, [rough.offset, rough.slope])
+    return _Lines(offset, slope, np.where(settled[..., None, None], covariance, rough.covariance), rough.keep)
+
+
+BIN_PX = 0.25
+"""Width of a class of distances from the edge: pixels in one class see the same part of its profile."""
+PRIOR_PX, PRIOR_EDGES = 0.005, 4
+"""σ of the displacements of an edge's profile before its image is seen, and the number of edges that it counts as."""
+
+
+def _covariance(residual, design, skew, distance, weight, inverse, shape) -> np.ndarray:
+    """Return the covariances (*shape, 2, 2) of offset and slope of edges, from the residuals of their pixels.
+
+    Three errors are told apart. Noise of single pixels. Displacements of the edge from one of the profiles along it to
+    the next, as by its print, which all pixels of a profile share. And displacements of the profile itself that all
+    pixels at one distance from the edge share, as by rounding, compression, sampling, or a blur that is not Gaussian:
+    they do not average out where the edge lies along the pixel rows, since few distances occur there. They show in the
+    profile's asymmetry (``skew``, its third derivative), which no offset and no symmetric blur explains.
+    """
+    m, q = design.shape[0], design.shape[-1]
+    most = round(2 * REACH_PX[1] / BIN_PX)
+    place = np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most
+    bins = 2 * most + 1
+    row = (place + bins * np.arange(m)[:, None, None]).ravel()
+
+    def summed(value: np.ndarray) -> np.ndarray:
+        return np.bincount(row, (weight * value).ravel(), m * bins).reshape(m, bins)
+
+    count = summed(np.ones_like(residual))
+    within = (weight * residual**2).sum((1, 2)) - (summed(residual) ** 2 / np.maximum(count, 1)).sum(1)
+    noise = np.maximum(within / np.maximum(count.sum(1) - (count > 0).sum(1), 1), ROUNDING)
+    good = np.isfinite(inverse).all((1, 2)) & (count.sum(1) > 2 * q)
+    offset = design[..., 0]  # by a displacement of 1 px
+    pull = np.stack([summed(offset * design[..., i]) for i in range(q)], axis=-1)
+    # The skew that the parameters leave: what noise makes of it, and what displacements of 1 px make of it.
+    skew = skew - (design @ solved(design, weight, skew)[0][:, None, :, None])[..., 0]
+    by_noise = (weight * skew**2).sum((1, 2))
+    by_displacement = np.maximum((summed(skew * offset) ** 2).sum(1), 1e-12)
+    square = ((weight * skew * residual).sum((1, 2)) ** 2 - noise * by_noise) / by_displacement
+    certainty = good * (noise * by_noise / by_displacement + PRIOR_PX**2) ** -2
+    prior = PRIOR_EDGES * PRIOR_PX**-4
+    with np.errstate(invalid="ignore"):
+        displaced = (np.nansum(certainty * square) + prior * PRIOR_PX**2) / (np.nansum(certainty) + prior)
+    # Of the profiles: squares of their pulls at the offset, over what the noise of single pixels makes of them.
+    of_profile = ((weight * offset * residual).sum(2) ** 2).sum(1)
+    profiles = weight.any(2).sum(1)
+    expected = noise * (weight * offset**2).sum((1, 2)) * (1 - 2 / np.maximum(profiles, 3))
+    usable = np.where(good & (profiles > 3), 1.0, 0.0).reshape(shape)
+    growth = (usable * of_profile.reshape(shape)).sum(1) / np.maximum((usable * expected.reshape(shape)).sum(1), 1e-12)
+    factor = noise * np.repeat(np.maximum(growth, 1.0), shape[1])
+    covariance = factor[:, None, None] * inverse
+    covariance += max(displaced, 0.0) * inverse @ np.swapaxes(pull, 1, 2) @ pull @ inverse
+    covariance[~good] = np.nan
+    return covariance[:, :2, :2].reshape(*shape, 2, 2)
+
+
+def solved(design: np.ndarray, weight: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least-squares solutions (m, q) and inverse normal matrices (m, q, q)."""
+    m, q = len(design), design.shape[-1]
+    rows, w = design.reshape(m, -1, q), weight.reshape(m, -1, 1)
+    normal = np.swapaxes(rows, 1, 2) @ (w * rows) + 1e-9 * np.eye(q)
+    inverse = np.linalg.inv(normal)
+    return (inverse @ (np.swapaxes(rows, 1, 2) @ (w * right.reshape(m, -1, 1))))[..., 0], inverse
+
+
+def _line(place: np.ndarray, offset: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return offset and slope (n, 4, 2) of the points ``keep``, and their inverse normal matrix (n, 4, 2, 2)."""
+    s0, s1, s2 = keep.sum(2), (place * keep).sum(2), (place**2 * keep).sum(2)
+    y0, y1 = (offset * keep).sum(2), (offset * place * keep).sum(2)
+    inverse = np.stack([np.stack([s2, -s1], -1), np.stack([-s1, s0.astype(float)], -1)], -2)
+    inverse = inverse / (s0 * s2 - s1**2)[..., None, None]
+    return (inverse @ np.stack([y0, y1], -1)[..., None])[..., 0], inverse
+
+
+def _meet(frame: _Frame, lines: _Lines) -> tuple[np.ndarray, np.ndarray]:
+    """Return the intersection of each edge with the previous one, (n, 4, 2), and the covariance (n, 8, 8) of all."""
+    row = frame.normal - lines.slope[..., None] * frame.along
+    right = lines.offset + (row * frame.middle).sum(2)
+    pair = np.stack([np.roll(row, 1, axis=1), row], axis=2)
+    bad = ~np.isfinite(pair).all((2, 3)) | (np.abs(np.linalg.det(np.nan_to_num(pair))) < 1e-6)
+    pair[bad] = np.eye(2)
+    inverse = np.linalg.inv(pair)
+    point = (inverse @ np.stack([np.roll(right, 1, axis=1), right], axis=2)[..., None])[..., 0]
+    n, corner = len(pair), np.arange(4)
+    by_line = np.zeros((n, 4, 2, 4, 2))
+    for side, turn in enumerate((1, 0)):
+        middle, along = np.roll(frame.middle, turn, axis=1), np.roll(frame.along, turn, axis=1)
+        gradient = np.stack([np.ones(point.shape[:2]), ((point - middle) * along).sum(2)], axis=-1)
+        moved = inverse[..., side, None] * gradient[:, :, None]
+        by_line[:, corner, :, (corner - turn) % 4] = np.moveaxis(moved, 1, 0)
+    by_line = by_line.reshape(n, 8, 8)
+    covariance = by_line @ block_diagonal(lines.covariance) @ np.swapaxes(by_line, 1, 2)
+    covariance[bad.any(1)] = np.nan
+    return point, covariance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Crossings:
+    """Crossings ``xy_px`` (n, 2) with ``covariance_px2`` (n, 2, 2); ``seen`` : (n,) False where a window shows none."""
+
+    xy_px: np.ndarray
+    covariance_px2: np.ndarray
+    seen: np.ndarray
+
+
+def crossings(grey: np.ndarray, start: np.ndarray, along: np.ndarray, half: np.ndarray) -> Crossings:
+    """Measure the crossings near ``start`` (n, 2) of edges in the directions ``along`` (n, 2, 2), one edge in a row.
+
+    ``half`` : (n,) half the sides of the square windows, whole px; nothing else may be in a window.
+    """
+    n = len(start)
+    xy, covariance, seen = start.astype(float), np.full((n, 2, 2), np.nan), np.zeros(n, bool)
+    for side in np.unique(half).tolist():
+        rows = np.flatnonzero(half == side)
+        xy[rows], covariance[rows], seen[rows] = _of_size(grey, start[rows], along[rows], side)
+    return Crossings(np.where(seen[:, None], xy, start), covariance, seen)
+
+
+def _of_size(grey, start, along, half: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the crossings, their covariances and a mask of those seen, for windows of one size."""
+    n, q = len(start), 11
+    offsets = np.stack(np.meshgrid(*[np.arange(-half, half + 1)] * 2), axis=-1).reshape(-1, 2)
+    pixels = np.rint(start).astype(int)[:, None] + offsets
+    last = np.array(grey.shape[::-1]) - 1
+    inside = ((pixels >= 0) & (pixels <= last)).all((1, 2))
+    x, y = np.moveaxis(pixels.clip(0, last), 2, 0)
+    level, weight = grey[y, x].astype(float), np.ones(x.shape)
+    relative = offsets / half
+    shade = np.broadcast_to(np.column_stack([np.ones(len(offsets)), relative]), (n, len(offsets), 3))
+    angle = np.arctan2(along[..., 1], along[..., 0])
+    value = np.zeros((n, q))  # shift, turns of both edges, variance of the blur, dark and rise with their gradients
+    value[:, 4] = START_VARIANCE
+    residual = first = second = distance = level
+    design, inverse = np.zeros((*level.shape, q)), np.zeros((n, q, q))
+    for k in range(CROSSING_STEPS + 1):
+        direction = np.stack([np.cos(angle + value[:, 2:4]), np.sin(angle + value[:, 2:4])], axis=-1)
+        normal = np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
+        off = pixels - (start + value[:, :2])[:, None]
+        distance, place = (np.einsum("nki,nei->enk", off, axes) for axes in (normal, direction))
+        (one, slope1, wide1, _), (two, slope2, wide2, _) = (
+            integrated_step(distance[e], normal[:, e], value[:, 4]) for e in (0, 1)
+        )
+        # Where edges are not square, the pixel sees both at once (first term of the tetrachoric series).
+        both = (normal[:, 0] * normal[:, 1]).sum(1) * (value[:, 4] + PIXEL_VARIANCE)
+        cross = one * two + (1 - one) * (1 - two) + 2 * both[:, None] * slope1 * slope2
+        by_first, by_second = (2 * two - 1) * slope1, (2 * one - 1) * slope2
+        levels = np.concatenate([shade, cross[..., None] * shade], axis=2)
+        if not k:
+            value[:, 5:] = solved(levels, weight, level)[0]
+        rise = (shade @ value[:, 8:, None])[..., 0]
+        first, second = rise * by_first, rise * by_second
+        design = np.concatenate(
+            [
+                -first[..., None] * normal[:, None, 0] - second[..., None] * normal[:, None, 1],
+                np.stack([-first * place[0], -second * place[1]], axis=-1),
+                (rise * ((2 * two - 1) * wide1 + (2 * one - 1) * wide2))[..., None],
+                levels,
+            ],
+            axis=2,
+        )
+        residual = level - (levels @ value[:, 5:, None])[..., 0]
+        change, inverse = solved(design, weight, residual)
+        if k < CROSSING_STEPS:
+            value += np.where(np.isfinite(change), change, 0.0)
+            value[:, 4] = value[:, 4].clip(MIN_VARIANCE, half**2)
+    noise = np.maximum((residual**2).sum(1) / (len(offsets) - q), ROUNDING)
+    pull = (design @ inverse)[..., :2]
+    covariance = noise[:, None, None] * inverse[:, :2, :2]
+    for displaced, apart in ((first, distance[0]), (second, distance[1])):
+        covariance += PRIOR_PX**2 * _common(pull * displaced[..., None], apart, half)
+    seen = inside & np.isfinite(covariance).all((1, 2)) & (np.linalg.norm(value[:, :2], axis=1) <= MOST_MOVED_PX)
+    seen &= (np.sqrt(noise) <= MOST_LEFT * np.abs(value[:, 8])) & (np.sqrt(value[:, 4]) <= WIDEST_BLUR * half)
+    return start + value[:, :2], covariance, seen
+
+
+def _common(pull: np.ndarray, distance: np.ndarray, half: int) -> np.ndarray:
+    """Return Σ over classes of distances of the squares (n, 2, 2) of what all pixels of a class pull (n, k, 2)."""
+    n, most = len(pull), round(2 * half / BIN_PX)
+    bins = 2 * most + 1
+    row = np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most + bins * np.arange(n)[:, None]
+    summed = np.stack([np.bincount(row.ravel(), pull[..., i].ravel(), n * bins) for i in (0, 1)], axis=-1)
+    summed = summed.reshape(n, bins, 2)
+    return np.swapaxes(summed, 1, 2) @ summed

@@ -1,0 +1,73 @@
+"""Lengths in mm: how large hardware is, and the refusal of those that are metres or another unit."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from stcal.errors import InputError
+
+LEAST_SIDE_MM, MOST_SIDE_MM = 1.0, 5e3
+"""Sides of tags and squares, and pitches. Tags of 1 m are 1 mm if metres are taken as mm; in a file in metres whose
+values are mm, a tag of 5 mm is one of 5 m."""
+LEAST_RADIUS_MM, MOST_RADIUS_MM = 0.05, 2e3
+"""Radii of printed dots: 50 mm in metres are 0.05 mm, and dots of half a millimetre are the smallest in use."""
+LEAST_LINK_MM, MOST_LINK_MM = 10.0, 5e4
+"""The longest link of an arm: 10 m in metres are 10 mm, and no arm has links of 50 m. Along joint axes that are nearly
+parallel the common normal may be any distance away, so that ``d`` has no upper limit."""
+KEY = "unusual_size"
+"""The key with which a file states that its lengths are as small, or as large, as they stand."""
+
+
+@dataclass(frozen=True, slots=True)
+class Length:
+    """A length of a file. ``place`` : its key, with what it belongs to; ``least``, ``most`` : between which hardware
+    has it, mm."""
+
+    place: str
+    value_mm: float
+    least: float
+    most: float
+
+    @property
+    def plausible(self) -> bool:
+        """True if hardware has such a length; True for an exact zero, which is meant."""
+        return not self.value_mm or self.least <= abs(self.value_mm) <= self.most
+
+
+def side(place: str, value_mm: float) -> Length:
+    """Returns the side of a tag or a square, or a pitch."""
+    return Length(place, value_mm, LEAST_SIDE_MM, MOST_SIDE_MM)
+
+
+def radius(place: str, value_mm: float) -> Length:
+    """Returns the radius of a dot."""
+    return Length(place, value_mm, LEAST_RADIUS_MM, MOST_RADIUS_MM)
+
+
+def implausible(lengths: Iterable[Length]) -> Iterator[Length]:
+    """Returns the lengths that no hardware has."""
+    return (each for each in lengths if not each.plausible)
+
+
+def require_millimetres(lengths: Iterable[Length], stated: bool, where: str) -> None:
+    """Refuse lengths that no hardware has in mm. ``stated`` : the file says with :data:`KEY` that they are right.
+
+    Raises
+    ------
+    InputError
+        The message names the first one, what is possible, and the likely unit.
+    """
+    wrong = None if stated else next(implausible(lengths), None)
+    if wrong is None:
+        return
+    small = abs(wrong.value_mm) < wrong.least
+    limit = f"at least {wrong.least:g} mm" if small else f"at most {wrong.most:g} mm"
+    remedy = "if lengths are metres, multiply them by 1000" if small else "if lengths are in another unit, convert them"
+    raise InputError(
+        "E-LENGTH-UNIT",
+        f"{where}: {wrong.place} is {wrong.value_mm:g} mm, {limit} usual; {remedy}; if it is right, add `{KEY} = true`",
+    )
+
+
+def stated_unusual(lengths: Iterable[Length]) -> list[str]:
+    """Returns the line of a file that states lengths as meant, where they would be refused without it."""
+    return [f"{KEY} = true"] if next(implausible(lengths), None) is not None else []

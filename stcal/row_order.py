@@ -1,0 +1,184 @@
+"""Test for jumps and drifts along the order of the rows: the instrument, the base or the target moved meanwhile."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+LEAST_SIDE = 4
+"""Smallest number of rows before and after a jump. Fewer are outliers, which are named by themselves."""
+INDEPENDENT = 1e-6
+"""Share of the squares of a motion that must be left beside the fitted parameters; less is rounding."""
+GROSS_SIGMAS, ROUNDS = 5.0, 5
+"""Size in σ from which a row is an error that belongs to neither side; and largest number of rounds without them."""
+EQUAL = 4.6
+"""Difference of log likelihood below which another row may be the first one after the jump, at 99 %."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """A change along the order of the rows.
+
+    Parameters
+    ----------
+    kind : {"jump", "drift"}
+        Whether the rows from ``row`` on are moved, or all rows in proportion to their place in the order.
+    row : int
+        First row after a jump; 0 for a drift.
+    first, last : int
+        Range of rows that may be the first one after the jump.
+    motion : (c,) array
+        Jump, or drift from the first to the last row, in units of the motions given.
+    moves : (r,) array
+        Share of the motion in each row: 0 and 1, or 0 to 1.
+    share : float
+        Share of the squared residuals that it explains.
+    log_p : float
+        Logarithm of the probability of such a change by chance, wherever it is in the order.
+    good : (r,) array
+        Mask of the rows that are no gross errors.
+    """
+
+    kind: Literal["jump", "drift"]
+    row: int
+    first: int
+    last: int
+    motion: np.ndarray
+    moves: np.ndarray
+    share: float
+    log_p: float
+    good: np.ndarray
+
+    @property
+    def p(self) -> float:
+        """Probability of such a change by chance."""
+        return float(np.exp(min(self.log_p, 0.0)))
+
+
+def change_along(errors: np.ndarray, explained: np.ndarray, motions: np.ndarray) -> Change | None:
+    """Returns the jump or the drift that explains residuals best, however improbable it is by chance.
+
+    The F test of each place of a jump, and of a drift, is made in the space that the fitted parameters leave open;
+    probabilities are multiplied by their number (Bonferroni). Rows that fit neither side are left out.
+
+    Parameters
+    ----------
+    errors : (r, w) array
+        Residuals in units of one common σ, in the order of measurement.
+    explained : (r, w, k) array
+        Derivatives by the fitted parameters, in the same units.
+    motions : (r, w, c) array
+        Effects of motions of what may have moved, in the same units.
+
+    Returns
+    -------
+    Change or None
+        None if there are too few rows, or the parameters explain any such change.
+    """
+    return changes_along(errors, explained, [motions])[0]
+
+
+def changes_along(
+    errors: np.ndarray, explained: np.ndarray, families: Sequence[np.ndarray]
+) -> tuple[Change | None, ...]:
+    """Returns :func:`change_along` for each of several ``families`` of motions (r, w, c)."""
+    known: dict[bytes, np.ndarray] = {}
+
+    def basis_of(good: np.ndarray) -> np.ndarray:
+        key = good.tobytes()
+        if key not in known:
+            known[key] = _basis(_flat(explained[good]))
+        return known[key]
+
+    def change(motions: np.ndarray) -> Change | None:
+        good = np.ones(len(errors), bool)
+        for _ in range(ROUNDS):
+            found = _best(errors, basis_of(good), motions, good)
+            if found is None:
+                return None
+            stay = errors - found.moves[:, None] * (motions @ found.motion)
+            left = np.linalg.norm(stay - _refitted(stay, explained, good), axis=1)
+            limit = GROSS_SIGMAS * _sigma(left[good], errors.shape[1]) * np.sqrt(errors.shape[1])
+            before, good = good, left <= limit
+            if (good == before).all() or good.mean() < 0.5:
+                break
+        return found
+
+    return tuple(change(motions) for motions in families)
+
+
+def _basis(explained: np.ndarray) -> np.ndarray:
+    """Returns an orthonormal basis (N, k') of the columns (N, k)."""
+    size = np.linalg.norm(explained, axis=0)
+    u, s, _ = np.linalg.svd(explained[:, size > 0] / size[size > 0], full_matrices=False)
+    return u[:, s > 1e-9 * s[:1].max(initial=0.0)]
+
+
+def _sigma(lengths: np.ndarray, width: int) -> float:
+    """Returns σ of one coordinate from the median length of residuals of ``width`` coordinates."""
+    return float(np.median(lengths)) / np.sqrt(max(width - 2 / 3, 0.45))
+
+
+def _refitted(errors: np.ndarray, explained: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Returns the part (r, w) of residuals that the parameters explain, as fitted to the good rows."""
+    step = np.linalg.lstsq(_flat(explained[good]), errors[good].ravel(), rcond=1e-12)[0]
+    return explained @ step
+
+
+def _flat(values: np.ndarray) -> np.ndarray:
+    return values.reshape(values.shape[0] * values.shape[1], values.shape[2])
+
+
+def _sums(values: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Returns the sums (m + 1, …) of values (m, …) over the rows from each on, and last the sum weighted by ``along``
+    (m, 1)."""
+    weighted = np.einsum("r,r...->...", along[:, 0], values)
+    return np.concatenate([np.flip(np.cumsum(np.flip(values, 0), 0), 0), weighted[None]])
+
+
+def _best(errors: np.ndarray, basis: np.ndarray, motions: np.ndarray, good: np.ndarray) -> Change | None:
+    rows, (r, w, c) = np.flatnonzero(good), motions.shape
+    scale = np.linalg.norm(_flat(motions), axis=0)
+    unit = motions[good] / np.where(scale > 0, scale, 1.0)
+    before = errors[good].ravel()
+    rest = before - basis @ (basis.T @ before)
+    square, freedom = float(rest @ rest), len(before) - basis.shape[1]
+    if len(rows) < 2 * LEAST_SIDE or freedom <= c + 1 or square <= 0:
+        return None
+
+    by_row = basis.reshape(len(rows), w, basis.shape[1])
+    along = (rows / max(r - 1, 1))[:, None]
+    normal = _sums(np.einsum("rwi,rwj->rij", unit, unit), along**2)
+    shared = _sums(np.einsum("rwk,rwj->rkj", by_row, unit), along)
+    pull = _sums(np.einsum("rwj,rw->rj", unit, rest.reshape(len(rows), w)), along)
+    places = np.array([*range(LEAST_SIDE, len(rows) - LEAST_SIDE + 1), len(rows)])
+    normal, shared, pull = normal[places], shared[places], pull[places]
+    values, directions = np.linalg.eigh(normal - np.swapaxes(shared, 1, 2) @ shared)
+    keep = values > INDEPENDENT * np.maximum(np.trace(normal, axis1=1, axis2=2), 1e-300)[:, None]
+    inside = np.einsum("pij,pi->pj", directions, pull)
+    inverse = np.where(keep, 1 / np.where(keep, values, 1.0), 0.0)
+    gains, counts = (inside**2 * inverse).sum(1), keep.sum(1)
+    ratio = gains / np.maximum(counts, 1) / np.maximum((square - gains) / np.maximum(freedom - counts, 1), 1e-300)
+    chances = np.where(counts > 0, f_distribution.logsf(ratio, np.maximum(counts, 1), freedom - counts), 0.0)
+    if not counts.any():
+        return None
+    best = int(chances.argmin())
+    place, gain, step = int(places[best]), float(gains[best]), directions[best] @ (inverse[best] * inside[best])
+    jump = place < len(rows)
+    moves = np.where(np.arange(r) >= rows[place], 1.0, 0.0) if jump else np.arange(r) / max(r - 1, 1)
+    motion = step / np.where(scale > 0, scale, 1.0)
+    variance = max(square - gain, 1e-300) / freedom
+    near = places[:-1][(gain - gains[:-1]) / variance / 2 < EQUAL]
+    return Change(
+        kind="jump" if jump else "drift",
+        row=int(rows[place]) if jump else 0,
+        first=int(rows[near[0]]) if jump else 0,
+        last=int(rows[near[-1]]) if jump else 0,
+        motion=motion,
+        moves=moves,
+        share=gain / square,
+        log_p=float(chances[best] + np.log(len(places))),
+        good=good,
+    )

@@ -1,0 +1,103 @@
+"""Who is guilty: a culprit is named only where leaving it out cures the result and leaving out another does not."""
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import fdtrc
+
+from stcal.sfm.adjust.network import Network, ScoreTest, solve_score
+from stcal.sfm.checks.verdict import SUSPICIOUS
+
+MOST = 0.5
+"""Share of the suspects from which they are no culprits: either part may be the wrong one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Guilt:
+    """Result of a search among suspects, which are the images of a group, or groups.
+
+    ``where`` : what the suspects are in, for sentences; ``culprits`` : the fewest whose leaving out cures the result,
+    none if others would cure it as well, or half of all or more are needed; ``rivals`` : those of which any cures it.
+    """
+
+    where: str
+    culprits: tuple[str, ...] = ()
+    rivals: tuple[str, ...] = ()
+
+    def words(self) -> str:
+        """Returns why no culprit is named, empty if one is."""
+        if self.culprits:
+            return ""
+        if self.rivals:
+            return f"{self.where}: leaving out {' or '.join(self.rivals)} cures it alike"
+        return f"{self.where}: leaving out less than half of them does not cure it"
+
+
+def culprits(names: Sequence[str], worst: Callable[[Collection[int]], int | None], where: str) -> Guilt:
+    """Returns the culprits among suspects.
+
+    ``worst`` : returns the suspect that the others contradict most if some are left out, None if the rest is sound.
+    """
+    out: list[int] = []
+    while (next_one := worst(out)) is not None:
+        out.append(next_one)
+        if len(out) >= MOST * len(names):
+            return Guilt(where)
+    for i in list(out):  # one that was taken first may be innocent
+        if len(out) > 1 and worst([k for k in out if k != i]) is None:
+            out.remove(i)
+    rivals = {
+        k
+        for i in out
+        for j in range(len(names))
+        if j not in out and worst([j if k == i else k for k in out]) is None
+        for k in (i, j)
+    }
+    if rivals:
+        return Guilt(where, rivals=tuple(names[k] for k in sorted(rivals)))
+    return Guilt(where, tuple(names[i] for i in out))
+
+
+def culprits_by_score(network: Network, columns: np.ndarray, suspects: Sequence[int], count: int, where: str) -> Guilt:
+    """Returns the images of a group that further parameters of their own cure.
+
+    Parameters
+    ----------
+    network
+        The free network of the group.
+    columns : (n, 2, q)
+        Derivatives of the projections by the parameters, over σ.
+    suspects
+        Images that may have them.
+    count
+        Number of values tested, for the limit.
+    where
+        What the images are in, for sentences.
+    """
+    n, _, q = columns.shape
+    images, place = len(network.model.images), network.model.image_index
+    apart = np.zeros((n, 2, images, q))
+    apart[np.arange(n), :, place] = columns
+    normal, right = network.score(apart.reshape(n, 2, images * q))
+    redundancy = float(network.redundancy.sum())
+
+    def test(image: int, out: Collection[int]) -> ScoreTest:
+        own = q * image + np.arange(q)
+        held = (q * np.array(sorted(out), int)[:, None] + np.arange(q)).ravel()
+        if not len(held):
+            return solve_score(normal[np.ix_(own, own)], right[own])
+        away = normal[np.ix_(own, held)] @ np.linalg.pinv(normal[np.ix_(held, held)], hermitian=True)
+        return solve_score(normal[np.ix_(own, own)] - away @ normal[np.ix_(held, own)], right[own] - away @ right[held])
+
+    def worst(out: Collection[int]) -> int | None:
+        tests = {i: test(i, out) for i in suspects if i not in out}
+        chance = {
+            i: fdtrc(t.freedom, max(redundancy - t.freedom, 1.0), t.statistic / t.freedom)
+            for i, t in tests.items()
+            if t.freedom
+        }
+        guilty = [i for i, probability in chance.items() if probability * count < SUSPICIOUS]
+        return max(guilty, key=lambda i: tests[i].statistic, default=None)
+
+    return culprits(network.model.images, worst, where)

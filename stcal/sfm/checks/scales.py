@@ -1,0 +1,97 @@
+"""Check of what the size rests on: printed faces, known distances and the board against one another."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stcal.design import BoardDesign, known_distances
+from stcal.errors import DegenerateError
+from stcal.geometry.align import align_similarity
+from stcal.labels import DotLabel
+from stcal.sfm.adjust.network import Network
+from stcal.sfm.adjust.scale import MIN_DOTS, known_points
+from stcal.sfm.checks.verdict import Check, Trial, impossible, judge
+
+PPM = 1e6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Source:
+    """A source of the scale: ``log_scale`` of the model over what is known, its derivative by the points, (3p,), and
+    the variance of what is known."""
+
+    name: str
+    log_scale: float
+    gradient: np.ndarray
+    variance: float
+
+
+def scales_check(networks: Sequence[Network], board: BoardDesign, print_factor: float) -> Check:
+    """Tests each source of the scale against the mean of all, in the free network of a group.
+
+    A face that was printed at another scale, a distance that was measured wrongly, or a board of another pitch stands
+    out: each network has one scale. ``print_factor`` : factor on the σ of printed faces.
+    """
+    key, title = "scales", "Scales against one another"
+    trials: list[Trial] = []
+    for network in networks:
+        sources = _sources(network, board, print_factor)
+        if len(sources) < 2:
+            continue
+        gradient = np.array([source.gradient for source in sources])
+        value = np.array([source.log_scale for source in sources])
+        own = np.diag([source.variance for source in sources])
+        covariance = gradient @ network.covariance_mm2 @ gradient.T + own
+        weight = np.linalg.inv(covariance)
+        mean = float(weight.sum(0) @ value / weight.sum())
+        away = value - mean
+        spread = np.diag(covariance) - 1 / weight.sum()
+        freedom = float(network.redundancy.sum())
+        for source, off, variance in zip(sources, away.tolist(), spread.tolist(), strict=True):
+            if variance > 0:
+                trials.append(Trial(source.name, PPM * off, "ppm", off**2 / variance, 1, freedom))
+    if not trials:
+        return impossible(key, title, "one source of the scale alone", "state a known distance with scale")
+    remedy = (
+        "one print, distance or board is of another size than stated: measure a side of each print and correct "
+        "target.toml, or state size_sigma_mm"
+    )
+    return judge(key, title, trials, "sources of the scale", remedy)
+
+
+def _sources(network: Network, board: BoardDesign, print_factor: float) -> list[_Source]:
+    model = network.model
+    parts = [
+        (f"face {face.id}", members, face.places_mm(model.labels[i].circle for i in members),
+         print_factor * (face.sigma_mm or 1.0), face.size_sigma)
+        for face, members in known_points(model.labels, board)
+    ]  # fmt: skip
+    dots = np.array([i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)], int)
+    if len(dots) >= MIN_DOTS:
+        parts.append(("board", dots, board.places_mm(model.labels[i] for i in dots), board.sigma_mm, 0.0))
+    sources = []
+    for name, members, design, sigma_mm, size_sigma in parts:
+        try:
+            found = align_similarity(model.xyz_model[members], design)
+        except DegenerateError:
+            continue
+        middle = design - design.mean(0)
+        square = float((middle**2).sum())
+        gradient = np.zeros((len(model.labels), 3))
+        gradient[members] = middle @ found.rigid.rotation.T / (square * found.scale)
+        variance = sigma_mm**2 / square + size_sigma**2
+        sources.append(_Source(name, float(np.log(found.scale)), gradient.ravel(), variance))
+    place = {label: i for i, label in enumerate(model.labels)}
+    for known in known_distances(board):
+        if known.first in place and known.second in place:
+            i, j = place[known.first], place[known.second]
+            apart = model.xyz_model[i] - model.xyz_model[j]
+            length = float(np.linalg.norm(apart))
+            gradient = np.zeros((len(model.labels), 3))
+            gradient[i], gradient[j] = apart / length**2, -apart / length**2
+            name = f"distance {known.first} to {known.second}"
+            sources.append(
+                _Source(name, float(np.log(length / known.mm)), gradient.ravel(), (known.sigma_mm / known.mm) ** 2)
+            )
+    return sources

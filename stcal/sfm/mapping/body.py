@@ -1,0 +1,454 @@
+"""Placement of a body by its faces of known shape: poses of faces and images, and the camera if it is unknown.
+
+Each view of such a face gives its pose up to the reflection that a plane has (Schweighofer & Pinz 2006). Of the
+reflections, those are taken on which the images agree. One adjustment over faces and images follows.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.design import FaceDesign
+from stcal.errors import DegenerateError, MappingError
+from stcal.geometry.camera import Camera
+from stcal.geometry.least_squares import Normal, PoseStack, descend, minimise
+from stcal.geometry.normal_equations import blocks_of, reduce
+from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
+from stcal.geometry.rigid import Rigid, skew
+from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma
+from stcal.labels import Label
+from stcal.sfm.data.model import MIN_POINTS, ImageObservations
+
+MIN_CORNERS = 4
+"""Smallest number of corners of a view of a face: they determine its homography."""
+SAME_TURN_RAD, SAME_PLACE = np.radians(10.0), 0.25
+"""Largest differences of two poses of one face relative to another that agree: rotation, and translation as a share of
+the distance of the faces."""
+MOST_VOTES = 250
+"""Most images that vote on how two faces lie; time and memory grow with their square."""
+LEAST_SIGMA_PX = 0.05
+"""σ that print, lens and detector leave to any corner."""
+BETTER = 0.2
+"""Share by which another pose of a face must fit its corners better."""
+PASSES, ROBUST_ROUNDS = 3, 3
+MAX_STEPS = 100
+FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)
+"""Focal lengths over the longer image side at which the search for an unknown camera starts."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corners:
+    """n corners of known faces in the images: ``image``, ``face`` : (n,) indices into ``images`` and ``faces``;
+    ``xy_face`` : (n, 2) mm; ``xy_px`` : (n, 2); ``root`` : (n, 2, 2) whitens residuals in px."""
+
+    images: tuple[str, ...]
+    faces: tuple[FaceDesign, ...]
+    image: np.ndarray
+    face: np.ndarray
+    xy_face: np.ndarray
+    xy_px: np.ndarray
+    root: np.ndarray
+
+    @classmethod
+    def of(cls, observations: Sequence[ImageObservations], faces: Sequence[FaceDesign]) -> "Corners":
+        """Returns the corners of views with at least four corners of a face."""
+        place: dict[Label, tuple[int, int]] = {
+            label: (f, k) for f, face in enumerate(faces) for k, label in enumerate(face.labels())
+        }
+        rows: list[tuple[int, int, int]] = []
+        pixels, covariances = [np.zeros((0, 2))], [np.zeros((0, 2, 2))]
+        for i, image in enumerate(observations):
+            own = [k for k, label in enumerate(image.labels) if label in place]
+            of_face = np.array([place[image.labels[k]][0] for k in own], int)
+            keep = [k for k, f in zip(own, of_face, strict=True) if (of_face == f).sum() >= MIN_CORNERS]
+            rows += [(i, *place[image.labels[k]]) for k in keep]
+            pixels.append(image.centre_px[keep])
+            covariances.append(image.covariance_px2[keep])
+        image, face, corner = np.array(rows, int).reshape(-1, 3).T
+        xy = np.array([faces[f].xy_mm[k] for f, k in zip(face, corner, strict=True)]).reshape(-1, 2)
+        covariance = np.concatenate(covariances) + LEAST_SIGMA_PX**2 * np.eye(2)
+        root = np.linalg.inv(np.linalg.cholesky(covariance))
+        names = tuple(each.name for each in observations)
+        return cls(names, tuple(faces), image, face, xy, np.concatenate(pixels), root)
+
+    def select(self, keep: np.ndarray) -> "Corners":
+        """Returns the corners of a mask."""
+        arrays = {name: getattr(self, name)[keep] for name in ("image", "face", "xy_face", "xy_px", "root")}
+        return replace(self, **arrays)
+
+    def xyz_face(self) -> np.ndarray:
+        """Returns the corners in the frames of their faces, (n, 3)."""
+        return np.pad(self.xy_face, ((0, 0), (0, 1)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """Poses of faces and images, and the camera.
+
+    ``body_from_face``, ``camera_from_body`` : by index in the corners, only the ``placed_faces`` and ``placed_images``
+    (masks) have a meaning; ``cost`` : of all corners of placed faces in placed images, in σ².
+    """
+
+    body_from_face: PoseStack
+    camera_from_body: PoseStack
+    camera: Camera
+    placed_faces: np.ndarray
+    placed_images: np.ndarray
+    cost: float = np.inf
+
+    def xyz_camera(self, corners: Corners) -> np.ndarray:
+        """Returns the corners in the frames of the cameras, (n, 3)."""
+        f, i = self.body_from_face, self.camera_from_body
+        body = np.einsum("nij,nj->ni", f.rotation[corners.face], corners.xyz_face()) + f.translation[corners.face]
+        return np.einsum("nij,nj->ni", i.rotation[corners.image], body) + i.translation[corners.image]
+
+    def lengths(self, corners: Corners) -> np.ndarray:
+        """Returns the lengths of the residuals in σ, (n,); infinite behind a camera."""
+        return _lengths(self.xyz_camera(corners), corners, self.camera)
+
+    def used(self, corners: Corners) -> np.ndarray:
+        """Returns the mask of the corners of placed faces in placed images, (n,)."""
+        return self.placed_faces[corners.face] & self.placed_images[corners.image]
+
+
+def _lengths(xyz_camera: np.ndarray, corners: Corners, camera: Camera) -> np.ndarray:
+    ahead = xyz_camera[:, 2] > 0
+    safe = np.where(ahead[:, None], xyz_camera, [0.0, 0.0, 1.0])
+    with np.errstate(over="ignore", invalid="ignore"):
+        residual = np.einsum("nij,nj->ni", corners.root, corners.xy_px - camera.project(safe))
+        length = np.linalg.norm(residual, axis=1)
+    return np.where(ahead & np.isfinite(length), length, np.inf)
+
+
+def place_body(corners: Corners, camera: Camera) -> Body:
+    """Returns start values of all poses for a given camera.
+
+    Raises
+    ------
+    MappingError
+        No two faces are ever seen together.
+    """
+    views = _Views.of(corners, camera)
+    edges = _edges(views, len(corners.faces))
+    if not edges:
+        raise MappingError(
+            "E-BODY-UNLINKED",
+            f"target: {len(corners.faces)} faces of known shape, of which no image shows two together; add images that "
+            "show neighbouring faces, each by four corners at least",
+        )
+    body_from_face, placed_faces = _tree(views, edges, len(corners.faces))
+    camera_from_body, placed_images = _images(views, corners, body_from_face, placed_faces, camera)
+    return Body(body_from_face, camera_from_body, camera, placed_faces, placed_images)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Views:
+    """v views of a face in an image: ``image``, ``face`` : (v,); ``poses`` : (2v,) camera_from_face, both minima of
+    each view one after the other; ``cost`` : (v, 2)."""
+
+    image: np.ndarray
+    face: np.ndarray
+    poses: PoseStack
+    cost: np.ndarray
+
+    @classmethod
+    def of(cls, corners: Corners, camera: Camera) -> "_Views":
+        normalised = camera.normalised_from_pixel(corners.xy_px)
+        key, view_of = np.unique(np.column_stack([corners.image, corners.face]), axis=0, return_inverse=True)
+        members = [np.flatnonzero(view_of == v) for v in range(len(key))]
+        starts, kept = [], []
+        for v, own in enumerate(members):
+            try:
+                pose = camera_from_plane(fit_homography(corners.xy_face[own], normalised[own]))
+            except DegenerateError:
+                continue
+            if ((pose @ corners.xyz_face()[own])[:, 2] <= 0).any():
+                continue
+            middle = Rigid(np.eye(3), np.append(corners.xy_face[own].mean(0), 0.0))
+            starts += [PoseStack.of(pose), mirrored(PoseStack.of(pose), middle)]
+            kept.append(v)
+        if not kept:
+            return cls(
+                np.zeros(0, int), np.zeros(0, int), PoseStack(np.zeros((0, 3, 3)), np.zeros((0, 3))), np.zeros((0, 2))
+            )
+        most = max(len(members[v]) for v in kept)
+        index = np.array([np.pad(members[v], (0, most - len(members[v]))) for v in kept])
+        real = np.array([np.arange(most) < len(members[v]) for v in kept])
+        index, real = np.repeat(index, 2, axis=0), np.repeat(real, 2, axis=0)
+        xyz, xy = corners.xyz_face()[index], normalised[index]
+        root = corners.root[index] * camera.focal * real[..., None, None]
+
+        def evaluate(poses: PoseStack) -> Normal:
+            rotated = xyz @ np.swapaxes(poses.rotation, 1, 2)
+            p = rotated + poses.translation[:, None]
+            possible = np.asarray(((p[..., 2] > 0) | ~real).all(1))
+            depth = np.where(p[..., 2] > 0, p[..., 2], 1.0)
+            by_point = np.zeros((*p.shape[:2], 2, 3))
+            by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / depth
+            by_point[..., :2, 2] = -p[..., :2] / depth[..., None] ** 2
+            by_pose = np.concatenate([-by_point @ skew(rotated), by_point], axis=3)
+            residual = xy - p[..., :2] / depth[..., None]
+            return Normal.of((root @ residual[..., None])[..., 0], root @ by_pose, possible, np.inf)
+
+        first = starts[0]
+        for start in starts[1:]:
+            first = first.plus(start)
+        minima = descend(evaluate, first, 1e-6)
+        return cls(key[kept, 0], key[kept, 1], minima.poses, minima.cost.reshape(-1, 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edge:
+    """``a_from_b`` of two faces as the images see it, and the number of images that agree on it."""
+
+    a: int
+    b: int
+    a_from_b: Rigid
+    images: int
+
+
+def _edges(views: _Views, faces: int) -> list[_Edge]:
+    by_pair: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for image in np.unique(views.image):
+        own = np.flatnonzero(views.image == image).tolist()
+        for x, v in enumerate(own):
+            for w in own[x + 1 :]:
+                pair = (v, w) if views.face[v] < views.face[w] else (w, v)
+                by_pair.setdefault((int(views.face[pair[0]]), int(views.face[pair[1]])), []).append(pair)
+    return [_edge(a, b, pairs, views) for (a, b), pairs in sorted(by_pair.items())]
+
+
+def _edge(a: int, b: int, pairs: list[tuple[int, int]], views: _Views) -> _Edge:
+    pairs = pairs[:: 1 + len(pairs) // MOST_VOTES]
+    rotation, translation, cost, of_pair = [], [], [], []
+    for p, (v, w) in enumerate(pairs):
+        for i in range(2):
+            for j in range(2):
+                turn = views.poses.rotation[2 * v + i].T
+                rotation.append(turn @ views.poses.rotation[2 * w + j])
+                translation.append(turn @ (views.poses.translation[2 * w + j] - views.poses.translation[2 * v + i]))
+                cost.append(views.cost[v, i] + views.cost[w, j])
+                of_pair.append(p)
+    rotation, translation, of_pair = np.array(rotation), np.array(translation), np.array(of_pair)
+    cost = np.array(cost).reshape(-1, 4)
+    turned = np.arccos(np.clip((np.einsum("xij,yij->xy", rotation, rotation) - 1) / 2, -1, 1))
+    apart = np.linalg.norm(translation[:, None] - translation, axis=2) / np.linalg.norm(translation, axis=1)[:, None]
+    agrees = (turned < SAME_TURN_RAD) & (apart < SAME_PLACE)
+    votes = np.zeros(len(rotation))
+    for p in range(len(pairs)):
+        votes += agrees[:, of_pair == p].any(1)
+    # Where few images vote, the residuals do: of equal votes the pose of least cost in its image.
+    excess = (cost - cost.min(1, keepdims=True)).ravel()
+    best = int(np.lexsort((excess, -votes))[0])
+    near = np.flatnonzero(agrees[best])
+    mean = Rotation.from_matrix(rotation[near]).mean().as_matrix()
+    return _Edge(a, b, Rigid(mean, np.median(translation[near], axis=0)), int(votes[best]))
+
+
+def _tree(views: _Views, edges: list[_Edge], faces: int) -> tuple[PoseStack, np.ndarray]:
+    """Returns body_from_face along the edges that most images agree on, and the mask of the faces that are linked.
+
+    The frame of the body is that of the face with most views.
+    """
+    seen = np.bincount(views.face, minlength=faces)
+    linked = {face for edge in edges for face in (edge.a, edge.b)}
+    root = max(linked, key=lambda face: seen[face])
+    poses = {root: Rigid()}
+    while True:
+        open_edges = [edge for edge in edges if (edge.a in poses) != (edge.b in poses)]
+        if not open_edges:
+            break
+        edge = max(open_edges, key=lambda edge: edge.images)
+        if edge.a in poses:
+            poses[edge.b] = poses[edge.a] @ edge.a_from_b
+        else:
+            poses[edge.a] = poses[edge.b] @ edge.a_from_b.inverse()
+    placed = np.array([face in poses for face in range(faces)])
+    return PoseStack.of(*(poses.get(face, Rigid()) for face in range(faces))), placed
+
+
+def _images(
+    views: _Views, corners: Corners, body_from_face: PoseStack, placed_faces: np.ndarray, camera: Camera
+) -> tuple[PoseStack, np.ndarray]:
+    """Returns camera_from_body of each image: of what its views say, that which fits most of its corners best."""
+    count = len(corners.images)
+    rotation, translation = np.tile(np.eye(3), (count, 1, 1)), np.tile([0.0, 0.0, 1.0], (count, 1))
+    placed = np.zeros(count, bool)
+    f = body_from_face
+    body = np.einsum("nij,nj->ni", f.rotation[corners.face], corners.xyz_face()) + f.translation[corners.face]
+    for image in np.unique(views.image):
+        own = np.flatnonzero((corners.image == image) & placed_faces[corners.face])
+        if len(own) < MIN_POINTS:
+            continue
+        part, least = corners.select(own), np.inf
+        for v in np.flatnonzero((views.image == image) & placed_faces[views.face]):
+            back = f.rotation[views.face[v]].T
+            for k in (2 * v, 2 * v + 1):
+                turn = views.poses.rotation[k] @ back
+                shift = views.poses.translation[k] - turn @ f.translation[views.face[v]]
+                length = _lengths(body[own] @ turn.T + shift, part, camera)
+                cost = _robust(length)
+                if cost < least:
+                    least, rotation[image], translation[image], placed[image] = cost, turn, shift, True
+    return PoseStack(rotation, translation), placed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """Normal equations over the placed faces but one and the intrinsics, with the images eliminated."""
+
+    cost: float
+    normal: np.ndarray
+    right: np.ndarray
+    block: np.ndarray
+    block_right: np.ndarray
+    cross: np.ndarray
+
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
+        """Returns the step of faces and intrinsics, then of the images, and the predicted gain."""
+        held = self.block + damping * self.block * np.eye(6)
+        reduction = reduce(held, self.block_right, self.cross)
+        scale = np.sqrt(np.maximum(np.diag(self.normal), 1e-300))
+        left = self.normal + damping * np.diag(scale**2) - reduction.normal
+        outer = np.linalg.lstsq(left / scale[:, None] / scale, (self.right - reduction.right) / scale, rcond=1e-12)[0]
+        outer = outer / scale
+        inner = reduction.back(outer)
+        gain = float(outer @ self.right + (inner * self.block_right).sum())
+        return np.concatenate([outer, inner.ravel()]), gain
+
+
+def adjust_body(
+    start: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera, rounds: int = ROBUST_ROUNDS
+) -> Body:
+    """Returns the body of least robust cost over all poses, and over the camera's parameters of ``basis`` (16, q).
+
+    ``prior`` : (q, q) weight matrix of these parameters about those of ``given``.
+    """
+    body = start
+    used = corners.select(body.used(corners))
+    for _ in range(rounds):
+        length = body.lengths(used)
+        huber = HUBER * max(robust_sigma(length[np.isfinite(length)], 2), 1e-3) if len(length) else np.inf
+        body = _minimum(body, used, basis, prior, given, huber)
+    length = np.minimum(body.lengths(used), 1e6)
+    return replace(body, cost=float(huber_cost(length, HUBER * max(robust_sigma(length, 2), 1e-3)).sum()))
+
+
+def _minimum(body: Body, used: Corners, basis, prior, given: Camera, huber: float) -> Body:
+    faces, images = np.flatnonzero(body.placed_faces), np.flatnonzero(body.placed_images)
+    free = faces[1:]
+    face_place, image_place = np.full(len(body.placed_faces), -1), np.full(len(body.placed_images), -1)
+    face_place[free], image_place[images] = np.arange(len(free)), np.arange(len(images))
+    q, m, k = basis.shape[1], len(images), 6 * len(free)
+    away = np.linalg.pinv(basis)
+
+    def cost(state: Body) -> float:
+        length = state.lengths(used)
+        if not np.isfinite(length).all():
+            return np.inf
+        off = away @ (state.camera.parameters() - given.parameters())
+        return float(huber_cost(length, huber).sum() + off @ prior @ off)
+
+    def linearise(state: Body) -> _Equations:
+        f, i = state.body_from_face, state.camera_from_body
+        in_face = np.einsum("nij,nj->ni", f.rotation[used.face], used.xyz_face())
+        in_body = in_face + f.translation[used.face]
+        rotated = np.einsum("nij,nj->ni", i.rotation[used.image], in_body)
+        p = rotated + i.translation[used.image]
+        ideal = p[:, :2] / p[:, 2:]
+        distorted, by_ideal = state.camera.distort_jacobian(ideal)
+        by_ideal = state.camera.focal[:, None] * by_ideal
+        by_camera = np.concatenate([by_ideal, -by_ideal @ ideal[..., None]], axis=2) / p[:, 2, None, None]
+        residual = used.xy_px - (distorted * state.camera.focal + state.camera.centre)
+        residual = np.einsum("nij,nj->ni", used.root, residual)
+        root = np.sqrt(huber_weights(np.linalg.norm(residual, axis=1), huber))[:, None, None] * used.root
+        weighted = residual * np.sqrt(huber_weights(np.linalg.norm(residual, axis=1), huber))[:, None]
+        by_image = root @ np.concatenate([-by_camera @ skew(rotated), by_camera], axis=2)
+        turned = by_camera @ i.rotation[used.image]
+        by_face = root @ np.concatenate([-turned @ skew(in_face), turned], axis=2)
+        by_lens = root @ (state.camera.parameter_jacobian(ideal) @ basis)
+        place, own = image_place[used.image], face_place[used.face]
+        block, block_right = blocks_of(by_image, weighted, place, m)
+        normal, right, cross = np.zeros((k + q, k + q)), np.zeros(k + q), np.zeros((m, 6, k + q))
+        on = own >= 0
+        blocks, rights = blocks_of(by_face[on], weighted[on], own[on], len(free))
+        columns = 6 * np.arange(len(free))[:, None] + np.arange(6)
+        normal[columns[:, :, None], columns[:, None]] = blocks
+        right[:k] = rights.ravel()
+        coupled = np.zeros((m, len(free), 6, 6))
+        np.add.at(coupled, (place[on], own[on]), np.swapaxes(by_image[on], 1, 2) @ by_face[on])
+        cross[:, :, :k] = coupled.transpose(0, 2, 1, 3).reshape(m, 6, k)
+        if q:
+            np.add.at(cross[:, :, k:], place, np.swapaxes(by_image, 1, 2) @ by_lens)
+            to_lens = np.zeros((len(free), 6, q))
+            np.add.at(to_lens, own[on], np.swapaxes(by_face[on], 1, 2) @ by_lens[on])
+            normal[:k, k:] = to_lens.reshape(k, q)
+            normal[k:, :k] = normal[:k, k:].T
+            off = away @ (state.camera.parameters() - given.parameters())
+            normal[k:, k:] = np.einsum("nki,nkj->ij", by_lens, by_lens) + prior
+            right[k:] = np.einsum("nki,nk->i", by_lens, weighted) - prior @ off
+        return _Equations(cost(state), normal, right, block, block_right, cross)
+
+    def moved(state: Body, step: np.ndarray) -> Body:
+        face_step, image_step = np.zeros((len(state.placed_faces), 6)), np.zeros((len(state.placed_images), 6))
+        face_step[free], image_step[images] = step[:k].reshape(-1, 6), step[k + q :].reshape(-1, 6)
+        camera = state.camera
+        if q:
+            parameters = camera.parameters() + basis @ step[k : k + q]
+            parameters[:2] = np.maximum(parameters[:2], 0.1 * camera.focal)
+            camera = camera.with_parameters(parameters)
+        return replace(
+            state,
+            body_from_face=state.body_from_face.moved(face_step),
+            camera_from_body=state.camera_from_body.moved(image_step),
+            camera=camera,
+        )
+
+    return minimise(body, linearise, moved, cost=cost, settled=1e-7, max_steps=MAX_STEPS).state
+
+
+def _faces_again(views: _Views, corners: Corners, body: Body) -> PoseStack:
+    """Returns body_from_face, each as that view of the face in a placed image has it which fits all of its corners
+    best, or as it was where none fits better."""
+    rotation, translation = body.body_from_face.rotation.copy(), body.body_from_face.translation.copy()
+    i = body.camera_from_body
+    for face in np.flatnonzero(body.placed_faces)[1:]:
+        own = np.flatnonzero((corners.face == face) & body.placed_images[corners.image])
+        part, xyz = corners.select(own), corners.xyz_face()[own]
+
+        def cost(turn: np.ndarray, shift: np.ndarray, part: Corners = part, xyz: np.ndarray = xyz) -> float:
+            in_body = xyz @ turn.T + shift
+            seen = np.einsum("nij,nj->ni", i.rotation[part.image], in_body) + i.translation[part.image]
+            return _robust(_lengths(seen, part, body.camera))
+
+        least = (1 - BETTER) * cost(rotation[face], translation[face])
+        for v in np.flatnonzero((views.face == face) & body.placed_images[views.image]):
+            back = i.rotation[views.image[v]].T
+            for k in (2 * v, 2 * v + 1):
+                turn = back @ views.poses.rotation[k]
+                shift = back @ (views.poses.translation[k] - i.translation[views.image[v]])
+                if (of_view := cost(turn, shift)) < least:
+                    least, rotation[face], translation[face] = of_view, turn, shift
+    return PoseStack(rotation, translation)
+
+
+def settled_body(body: Body, corners: Corners, basis: np.ndarray, prior: np.ndarray, given: Camera) -> Body:
+    """Returns the adjusted body, with faces and images placed again where another of their poses fits better."""
+    body = adjust_body(body, corners, basis, prior, given)
+    for _ in range(PASSES - 1):
+        views = _Views.of(corners, body.camera)
+        faces = _faces_again(views, corners, body)
+        poses, placed = _images(views, corners, faces, body.placed_faces, body.camera)
+        start = replace(body, body_from_face=faces, camera_from_body=poses, placed_images=placed)
+        again = adjust_body(start, corners, basis, prior, given)
+        if again.placed_images.sum() <= body.placed_images.sum() and again.cost >= (1 - 1e-3) * body.cost:
+            break
+        body = again
+    return body
+
+
+def _robust(length: np.ndarray) -> float:
+    """Returns the cost of residuals of these lengths, in σ, that hardly grows with gross ones."""
+    return float((np.minimum(length, 1e3) ** 0.5).sum())

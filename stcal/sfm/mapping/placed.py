@@ -1,0 +1,198 @@
+"""Models of the groups of a body whose faces of known shape are placed, and the camera if none is given."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stcal.design import FaceDesign
+from stcal.errors import ConvergenceError, DegenerateError, MappingError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.model import CalibratedCamera, intrinsic_basis
+from stcal.labels import Label
+from stcal.sfm.data.model import ImageObservations, WorldModel
+from stcal.sfm.mapping.body import FOCAL_STEPS, Body, Corners, adjust_body, place_body, settled_body
+from stcal.sfm.mapping.incremental import MAX_REPROJECTION_PX, MIN_RAY_ANGLE_RAD, assemble, complete
+from stcal.sfm.mapping.pairs import PairScore
+
+BY_FACES = "faces of known shape, placed together"
+LENS = "OPENCV"
+"""Model of an unknown camera."""
+SIGMA_FOCAL, SIGMA_SQUARE = 0.5, 2e-3
+"""Relative σ of the focal length of an unknown camera, and of the ratio of its two focal lengths."""
+SIGMA_CENTRE = 0.03
+"""σ of its principal point, in longer image sides."""
+SIGMA_RADIAL, SIGMA_TANGENTIAL = 0.3, 0.01
+"""σ of its distortion, as shares of a corner's distance from the middle of the image."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedBody:
+    """A body with the faces and images that are placed.
+
+    ``body_from_face`` : by face id; ``camera_from_body`` : by image; ``faces`` : designs of the placed faces;
+    ``camera`` : with the covariance of what was assumed of an unknown one.
+    """
+
+    body_from_face: dict[str, Rigid]
+    camera_from_body: dict[str, Rigid]
+    faces: tuple[FaceDesign, ...]
+    camera: CalibratedCamera
+    unlinked: tuple[str, ...]
+
+
+def unknown_lens(camera: Camera) -> CalibratedCamera:
+    """Returns a camera with the covariance of what any camera fulfils, about its own values."""
+    side = max(camera.width, camera.height)
+    reach = float(np.hypot(camera.width, camera.height) / 2 / camera.focal.mean())
+    radial, tangential = SIGMA_RADIAL / reach ** np.array([2.0, 4.0]), SIGMA_TANGENTIAL / reach
+    sigma = np.concatenate([[1.0, 1.0], [SIGMA_CENTRE * side] * 2, radial, [tangential] * 2])
+    covariance, focal = np.diag(sigma**2), float(camera.focal.mean())
+    covariance[:2, :2] = focal**2 * (SIGMA_FOCAL**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 / 2 * np.eye(2))
+    return CalibratedCamera.of(camera, LENS, covariance)
+
+
+def place_with_camera(
+    observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], camera: CalibratedCamera
+) -> PlacedBody:
+    """Returns the body by its faces of known shape, with a known camera.
+
+    Raises
+    ------
+    MappingError
+        No two faces are ever seen together.
+    """
+    corners = Corners.of(observations, faces)
+    none = np.zeros((16, 0))
+    body = settled_body(place_body(corners, camera), corners, none, np.zeros((0, 0)), camera)
+    return _named(body, corners, camera)
+
+
+def place_and_find_camera(
+    observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], starts: Sequence[Camera]
+) -> PlacedBody:
+    """Returns the body by its faces of known shape, with an unknown camera.
+
+    The search begins at each of ``starts``, and at several focal lengths about the first; the least cost decides.
+
+    Raises
+    ------
+    MappingError
+        No two faces are ever seen together, or no focal length explains the images.
+    """
+    corners = Corners.of(observations, faces)
+    side, first = max(starts[0].width, starts[0].height), starts[0]
+    cameras = [*starts, *(replace(first, focal=np.full(2, step * side)) for step in FOCAL_STEPS)]
+    best: Body | None = None
+    for camera in cameras:
+        found = _with_focal_length(corners, camera)
+        if found is not None and (best is None or _better(found, best)):
+            best = found
+    if best is None:
+        raise MappingError(
+            "E-BODY-NO-CAMERA",
+            f"camera: no focal length of {cameras[-1].focal[0]:.0f} px and less explains the views of the faces; check "
+            "the sizes in target.toml, or give a camera file with --camera",
+        )
+    lens = unknown_lens(best.camera)
+    assert lens.covariance is not None
+    basis, prior = intrinsic_basis(LENS), np.linalg.inv(lens.covariance)
+    with suppress(ConvergenceError):  # a lens that folds the image: the adjustment of all begins without distortion
+        best = settled_body(best, corners, basis, prior, lens)
+    return _named(best, corners, unknown_lens(best.camera))
+
+
+def _with_focal_length(corners: Corners, camera: Camera) -> Body | None:
+    """Returns the body with an adjusted focal length, None if there is none from this start."""
+    basis = intrinsic_basis("SIMPLE_PINHOLE")[:, :1]
+    try:
+        for _ in range(2):  # the reflections are chosen again with the better camera
+            prior = np.array([[(2 * camera.focal[0]) ** -2]])
+            body = adjust_body(place_body(corners, camera), corners, basis, prior, camera)
+            camera = body.camera
+        return body
+    except (ConvergenceError, DegenerateError, np.linalg.LinAlgError):
+        return None
+
+
+def _better(body: Body, other: Body) -> bool:
+    """Returns whether a body explains more images, or as many of them better."""
+    images = int(body.placed_images.sum()), int(other.placed_images.sum())
+    return images[0] > images[1] or (images[0] == images[1] and body.cost < other.cost)
+
+
+def _named(body: Body, corners: Corners, camera: CalibratedCamera) -> PlacedBody:
+    placed = np.flatnonzero(body.placed_faces).tolist()
+    return PlacedBody(
+        {corners.faces[f].id: body.body_from_face.rigid(f) for f in placed},
+        {corners.images[i]: body.camera_from_body.rigid(i) for i in np.flatnonzero(body.placed_images).tolist()},
+        tuple(corners.faces[f] for f in placed),
+        camera,
+        tuple(corners.faces[f].id for f in np.flatnonzero(~body.placed_faces) if (corners.face == f).any()),
+    )
+
+
+def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: Camera) -> WorldModel:
+    """Returns the model of a group: its placed images and the points that two of them see from different directions.
+
+    Other images of the group, and other points, are added as far as these determine them.
+
+    Raises
+    ------
+    MappingError
+        Fewer than two images of the group are placed.
+    """
+    placed = [image for image in group if image.name in body.camera_from_body]
+    if len(placed) < 2:
+        raise MappingError(
+            "E-BODY-FEW-IMAGES",
+            f"group {group[0].group}: {len(placed)} of {len(group)} images show faces of known shape well enough, "
+            "2 needed; add images that show two faces each",
+        )
+    designed: dict[Label, np.ndarray] = {
+        label: xyz
+        for face in body.faces
+        for label, xyz in zip(face.labels(), body.body_from_face[face.id] @ face.places_mm(face.ids), strict=True)
+    }
+    rays: dict[Label, list[np.ndarray]] = {}
+    for image in placed:
+        back = body.camera_from_body[image.name].rotation.T
+        for k, label in enumerate(image.labels):
+            if label in designed:
+                ray = back @ np.append(image.centre[k], 1.0)
+                rays.setdefault(label, []).append(ray / np.linalg.norm(ray))
+    xyz = {label: designed[label] for label, seen in rays.items() if _widest(np.array(seen)) > MIN_RAY_ANGLE_RAD}
+    poses = [body.camera_from_body[image.name] for image in placed]
+    model = assemble(WorldModel, group[0].group, placed, poses, xyz)
+    return complete(model, list(group), camera, MAX_REPROJECTION_PX)
+
+
+def _widest(rays: np.ndarray) -> float:
+    """Returns the largest angle between unit rays (n, 3)."""
+    return float(np.arccos(np.clip(rays @ rays.T, -1, 1)).max())
+
+
+def pair_of_model(model: WorldModel) -> PairScore:
+    """Returns the pair of images with most points in common: a report names one for each group."""
+    sees = np.zeros((len(model.images), len(model.labels)), bool)
+    sees[model.image_index, model.point_index] = True
+    shared = np.triu(sees.astype(int) @ sees.T.astype(int), 1)
+    i, j = np.unravel_index(int(shared.argmax()), shared.shape)
+    pose = model.camera_from_model[j] @ model.camera_from_model[i].inverse()
+    both = model.xyz_model[sees[i] & sees[j]]
+    towards = [both - model.camera_from_model[k].inverse().translation for k in (i, j)]
+    cosine = (towards[0] * towards[1]).sum(1) / np.prod([np.linalg.norm(ray, axis=1) for ray in towards], axis=0)
+    angle = float(np.median(np.arccos(np.clip(cosine, -1, 1)))) if len(both) else 0.0
+    length = float(np.linalg.norm(pose.translation)) or 1.0
+    return PairScore(
+        model.images[i],
+        model.images[j],
+        int(shared[i, j]),
+        angle,
+        1.0,
+        abs(float(pose.translation[2])) / length,
+        Rigid(pose.rotation, pose.translation / length),
+        "chosen",
+    )

@@ -1,0 +1,262 @@
+"""Photographs of a body with printed faces, held before a camera in changing poses, with its truth."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stcal.boards.cells import black_areas, clear_mm
+from stcal.boards.target import body_toml
+from stcal.design import FaceDesign, TargetDesign
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.parallel import run_parallel
+from stcal.synthetic.dataset import TruthFile
+from stcal.synthetic.render import encode
+
+BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
+DRAWING_PX = 2000
+"""Longer side of the drawing of a face, px."""
+SAMPLES = 3
+"""Samples of a pixel, along each axis."""
+LIGHT = np.array([0.3, -0.5, -0.8])
+LEAST_FACES = 2
+TRIALS = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class BodyOptions:
+    """Options of photographs of a body.
+
+    ``images`` ; ``distance_mm`` : of the camera from the middle of the body, to ± ``depth_share`` of it; ``noise`` :
+    fraction of full scale; ``blur_px`` ; ``seed`` ; ``pose_sigma_mm``, ``pose_sigma_deg`` : of the faces about their
+    rough poses.
+    """
+
+    images: int = 24
+    distance_mm: float = 400.0
+    depth_share: float = 0.15
+    noise: float = 0.01
+    blur_px: float = 0.7
+    seed: int = 0
+    pose_sigma_mm: float = 0.3
+    pose_sigma_deg: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyScene:
+    """A body with its true poses, mm: ``target_from_face`` by face, ``camera_from_target`` by image."""
+
+    target: TargetDesign
+    target_from_face: dict[str, Rigid]
+    camera: CalibratedCamera
+    camera_from_target: tuple[Rigid, ...]
+    options: BodyOptions = field(default_factory=BodyOptions)
+
+    def circles_target(self) -> dict[str, np.ndarray]:
+        """Returns the corners by label, target frame, mm."""
+        return {
+            str(label): xyz
+            for face in self.target.faces
+            for label, xyz in zip(face.labels(), self.target_from_face[face.id] @ face.places_mm(face.ids), strict=True)
+        }
+
+
+def body_camera(width: int) -> CalibratedCamera:
+    """Returns a camera of medium focal length with a lens that distorts a little; images of 3:2."""
+    height = round(width * 2 / 3)
+    focal = 1.1 * width
+    distortion = np.array([-0.12, 0.05, 4e-4, -3e-4, 0, 0, 0, 0])
+    centre = np.array([width / 2 + 0.006 * width, height / 2 - 0.004 * width])
+    return CalibratedCamera(width, height, np.full(2, focal), centre, distortion, False, "OPENCV")
+
+
+def make_body_scene(target: TargetDesign, camera: CalibratedCamera, options: BodyOptions) -> BodyScene:
+    """Returns a body with faces near their rough poses, in random poses in which it shows two faces at least.
+
+    Raises
+    ------
+    InputError
+        A face has circles, or no rough pose.
+    """
+    rough = target.rough_poses()
+    for face in target.faces:
+        if face.printed is None or face.id not in rough:
+            reason = "circles beside printed faces cannot be drawn" if face.printed is None else "no rough_pose"
+            raise InputError(
+                "E-SIMULATE-BODY",
+                f"face {face.id}: {reason}; photographs of a body need faces with a board or tags, each with a rough "
+                "pose in target.toml",
+            )
+    rng = np.random.default_rng(options.seed)
+    reference = rough[target.faces[0].id]
+    moved = {}
+    for face_id, pose in rough.items():
+        turn = Rotation.from_rotvec(np.radians(options.pose_sigma_deg) * rng.normal(size=3)).as_matrix()
+        shift = options.pose_sigma_mm * rng.normal(size=3)
+        moved[face_id] = Rigid(pose.rotation @ turn, pose.translation + shift)
+    reference = moved[target.faces[0].id]
+    target_from_face = {face_id: reference.inverse() @ pose for face_id, pose in moved.items()}
+    scene = BodyScene(target, target_from_face, camera, (), options)
+    return replace(scene, camera_from_target=tuple(_pose(scene, rng) for _ in range(options.images)))
+
+
+def _pose(scene: BodyScene, rng: np.random.Generator) -> Rigid:
+    """Returns a random pose in which two faces and more look at the camera, within the image."""
+    points = np.array(list(scene.circles_target().values()))
+    middle = (points.min(0) + points.max(0)) / 2
+    options, camera = scene.options, scene.camera
+    size = np.array([camera.width, camera.height])
+    for _ in range(TRIALS):
+        quaternion = rng.normal(size=4)  # of a turn that favours no direction
+        turn = Rotation.from_quat(quaternion / np.linalg.norm(quaternion)).as_matrix()
+        depth = options.distance_mm * (1 + options.depth_share * rng.uniform(-1, 1))
+        place = np.append(rng.uniform(-0.3, 0.3, 2) * size / camera.focal * depth, depth)
+        pose = Rigid(turn, place - turn @ middle)
+        xyz = pose @ points
+        if (xyz[:, 2] < 0.1 * depth).any():
+            continue
+        pixels = camera.project(xyz)
+        if (pixels < 0).any() or (pixels > size - 1).any():
+            continue
+        if sum(_looks_here(scene, face, pose) for face in scene.target.faces) >= LEAST_FACES:
+            return pose
+    raise InputError(
+        "E-SIMULATE-BODY",
+        f"target {scene.target.name}: no pose at {options.distance_mm:g} mm in which it is in the image and shows two "
+        "faces; give another --distance",
+    )
+
+
+def _looks_here(scene: BodyScene, face: FaceDesign, pose: Rigid) -> bool:
+    """Returns whether a face is seen at less than 60° from its normal."""
+    camera_from_face = pose @ scene.target_from_face[face.id]
+    middle = camera_from_face @ np.append(face.xy_mm.mean(0), 0.0)
+    return float(camera_from_face.rotation[:, 2] @ middle / np.linalg.norm(middle)) > 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawing:
+    """A face as a picture of brightness: ``grey`` (h, w); ``px_mm`` pixels in a mm; ``origin`` (2,) its first pixel."""
+
+    grey: np.ndarray
+    px_mm: float
+    origin: np.ndarray
+
+
+def drawing_of(face: FaceDesign) -> Drawing:
+    """Returns the drawing of a printed face with the white about it."""
+    areas = black_areas(face.printed)  # type: ignore[arg-type]
+    every = np.concatenate([line for area in areas for line in area])
+    if face.outline_mm is not None:
+        low, high = np.asarray(face.outline_mm).min(0), np.asarray(face.outline_mm).max(0)
+    else:
+        margin = clear_mm(face.printed)  # type: ignore[arg-type]
+        low, high = every.min(0) - margin, every.max(0) + margin
+    px_mm = DRAWING_PX / float((high - low).max())
+    width, height = np.ceil((high - low) * px_mm).astype(int)
+    grey = np.full((height, width), WHITE, np.float32)
+    for area in areas:
+        lines = [np.round(((line - low) * px_mm - 0.5) * 16).astype(np.int32) for line in area]
+        cv2.fillPoly(grey, lines, BLACK, lineType=cv2.LINE_8, shift=4)
+    return Drawing(grey, px_mm, low)
+
+
+def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> np.ndarray:
+    """Returns one photograph, 8 bit. Each sample of a pixel is the point at which its ray meets a face."""
+    camera, pose, options = scene.camera, scene.camera_from_target[image], scene.options
+    step = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
+    u = (np.arange(camera.width)[:, None] + step).ravel()
+    v = (np.arange(camera.height)[:, None] + step).ravel()
+    total = np.full((len(v), len(u)), BACKGROUND, np.float32)
+    for face in scene.target.faces:
+        camera_from_face = pose @ scene.target_from_face[face.id]
+        drawing = drawings[face.id]
+        extent = np.array(drawing.grey.shape[::-1]) / drawing.px_mm
+        corners = drawing.origin + np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * extent
+        xyz = camera_from_face @ np.pad(corners, ((0, 0), (0, 1)))
+        middle = xyz.mean(0)
+        if camera_from_face.rotation[:, 2] @ middle <= 0 or (xyz[:, 2] <= 0).any():
+            continue
+        box = camera.project(xyz)
+        low, high = np.floor(box.min(0) - 3).astype(int), np.ceil(box.max(0) + 4).astype(int)
+        low, high = np.maximum(low, 0), np.minimum(high, [camera.width, camera.height])
+        if (high <= low).any():
+            continue
+        columns, rows = slice(SAMPLES * low[0], SAMPLES * high[0]), slice(SAMPLES * low[1], SAMPLES * high[1])
+        grid = np.stack(np.meshgrid(u[columns], v[rows]), axis=-1)
+        ideal = camera.normalised_from_pixel(grid)
+        rays = np.concatenate([ideal, np.ones((*ideal.shape[:2], 1))], axis=2) @ camera_from_face.rotation
+        start = -camera_from_face.rotation.T @ camera_from_face.translation
+        depth = -start[2] / np.where(np.abs(rays[..., 2]) > 1e-9, rays[..., 2], 1e-9)
+        at = start[:2] + depth[..., None] * rays[..., :2]
+        place = ((at - drawing.origin) * drawing.px_mm - 0.5).astype(np.float32)
+        inside = ((at >= drawing.origin) & (at <= drawing.origin + extent)).all(2)
+        value = cv2.remap(drawing.grey, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        light = 0.75 + 0.25 * float(camera_from_face.rotation[:, 2] @ (LIGHT / np.linalg.norm(LIGHT)) * -1)
+        part = total[rows, columns]
+        part[inside] = light * value[inside]
+    grey = total.reshape(camera.height, SAMPLES, camera.width, SAMPLES).mean((1, 3))
+    if options.blur_px:
+        grey = cv2.GaussianBlur(grey, (0, 0), options.blur_px)
+    rng = np.random.default_rng([options.seed, 1, image])
+    noisy = grey + options.noise * rng.normal(size=grey.shape)
+    return np.clip(np.rint(255 * noisy), 0, 255).astype(np.uint8)
+
+
+def body_truth(scene: BodyScene) -> TruthFile:
+    """Returns the truth of a body."""
+    return TruthFile(
+        unit="mm",
+        reference_face=scene.target.faces[0].id,
+        target_from_face={face: pose.matrix() for face, pose in scene.target_from_face.items()},  # type: ignore
+        circles=scene.circles_target(),  # type: ignore[arg-type]
+    )
+
+
+def write_body(
+    folder: str | Path,
+    scene: BodyScene,
+    image_format: str = "jpg",
+    jpeg_quality: int = 95,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Path]:
+    """Writes ``images/IMG_1000.jpg`` …, ``cameras.txt``, ``target.toml`` and ``truth.json``.
+
+    Raises
+    ------
+    InputError
+        The folder is not empty or cannot be written.
+    """
+    folder = Path(folder)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            "E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give a new or an empty folder"
+        )
+    try:
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+        write_cameras_txt(folder / "cameras.txt", scene.camera)
+        (folder / "target.toml").write_text(body_toml(scene.target), encoding="utf-8")
+        (folder / "truth.json").write_text(json.dumps(body_truth(scene).content()) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
+        ) from error
+    drawings = {face.id: drawing_of(face) for face in scene.target.faces}
+    count = len(scene.camera_from_target)
+    paths = [folder / "images" / f"IMG_{1000 + i}.{image_format}" for i in range(count)]
+    jobs = [(path, scene, i, drawings, jpeg_quality) for i, path in enumerate(paths)]
+    for done, _ in enumerate(run_parallel(_write_image, jobs, workers), 1):
+        if progress:
+            progress(done, count)
+    return paths
+
+
+def _write_image(path: Path, scene: BodyScene, image: int, drawings: dict[str, Drawing], jpeg_quality: int) -> None:
+    path.write_bytes(encode(render_body(scene, image, drawings), path.suffix, jpeg_quality))

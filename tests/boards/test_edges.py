@@ -1,0 +1,70 @@
+"""Edges measured by area: the integrated step, corners and their σ along the pixel rows and across them."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stcal.boards.charuco import find_charuco
+from stcal.boards.chessboard import find_chessboard
+from stcal.boards.design import CharucoDesign, ChessboardDesign, TagLayout
+from stcal.boards.edges import integrated_step
+from stcal.boards.tags import corner_blocks, find_tags
+from tests.support.areas import homography, rendered, squares_nees
+
+NAME = "DICT_APRILTAG_36h11"
+
+
+def test_the_integrated_step_and_its_derivatives():
+    distance, normal, h = np.linspace(-3, 3, 13)[None], np.array([[0.6, 0.8]]), 1e-4
+    share, slope, widening, skew = integrated_step(distance, normal, np.array([0.3]))
+    by_distance = [integrated_step(distance + s, normal, np.array([0.3])) for s in (h, -h)]
+    by_variance = [integrated_step(distance, normal, np.array([0.3 + s])) for s in (h, -h)]
+    assert np.allclose((by_distance[0][0] - by_distance[1][0]) / (2 * h), slope, atol=1e-6)
+    assert np.allclose((by_variance[0][0] - by_variance[1][0]) / (2 * h), widening, atol=1e-6)
+    assert np.allclose((by_distance[0][1] - 2 * slope + by_distance[1][1]) / h**2, skew, atol=1e-5)
+    assert np.allclose([share[0, 0], share[0, 6], share[0, -1]], [0, 0.5, 1], atol=1e-5)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.2, 0.5])
+def test_a_sharp_edge_along_the_rows_is_split_by_area(phase):
+    """Without blur a pixel holds the share of it on the bright side."""
+    share = integrated_step(np.arange(-2, 3) - phase, np.tile([0.0, 1.0], (5, 1)), np.full(5, 1e-8))[0]
+    assert np.allclose(share, np.clip(np.arange(-2, 3) - phase + 0.5, 0, 1), atol=1e-4)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1.0, 20.0])
+def test_sigma_of_a_tags_corners_holds_at_every_angle(degrees):
+    """Twelve tags of 60 px: 96 squares, whose mean has σ 0.14. It is below 1, as edges keep a prior σ of what may be
+    wrong with their profile."""
+    rng = np.random.default_rng(3)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 30.0
+    squares = []
+    for _ in range(12):
+        layout = TagLayout(((NAME, int(rng.integers(500))),), corners[None])
+        turn = Rotation.from_euler("z", degrees + 90 * rng.integers(4), degrees=True).as_matrix()
+        place = homography(np.eye(3), turn, [*(79.5 + rng.uniform(-1, 1, 2)), 1.0])
+        tags = find_tags(rendered(layout, place, (160, 160), rng), (NAME,))
+        assert tags.tags == layout.tags
+        error = tags.corners_px[0] - (corners @ place[:2, :2].T + place[:2, 2])
+        squares.append(squares_nees(error.ravel()[None], tags.joint_px2))
+        assert np.allclose(corner_blocks(tags.joint_px2), tags.covariance_px2)
+    assert 0.4 < np.mean(squares) < 1.4
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0])
+@pytest.mark.parametrize("kind", ["charuco", "chessboard"])
+def test_corners_of_boards_lie_where_their_areas_meet(kind, degrees):
+    """Squares of whole pixels, so that along the rows all corners have one phase, and would be off to one side."""
+    rng, square = np.random.default_rng(4), 30.0
+    board = CharucoDesign(5, 7, square, 22.0, "DICT_4X4_50") if kind == "charuco" else ChessboardDesign(4, 5, square)
+    turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    middle = turn[:2, :2] @ board.xy_mm().mean(0)
+    place = homography(np.eye(3), turn, [*(np.array([159.7, 149.6]) - middle), 1.0])
+    image = rendered(board, place, (320, 300), rng)
+    view = (find_charuco if kind == "charuco" else find_chessboard)(image, "", board)
+    error = view.xy_px - (view.xyz_board[:, :2] @ place[:2, :2].T + place[:2, 2])
+    assert len(view) == len(board.xy_mm())
+    assert np.abs(error.mean(0)).max() < 0.006
+    assert np.sqrt((error**2).mean()) < 0.015
+    if view.covariance_px2 is not None:
+        assert 0.4 < squares_nees(error, view.covariance_px2).mean() < 1.6

@@ -1,0 +1,103 @@
+"""Camera files that were reported (``../shared/cases``), and the pixels of RAYS by the numbers that stand in them."""
+
+import cv2
+import numpy as np
+import pycolmap
+
+RAYS = np.column_stack([np.random.default_rng(8).uniform(-0.5, 0.5, (40, 2)), np.ones(40)])
+RATIONAL = [0.41, -2.66, 0.0006, -0.0002, 1.52, 0.29, -2.48, 1.45]
+PLUMB = [-0.0306, 0.0352, -0.00013, -0.00014, -0.012, 0, 0, 0]
+KITTI = [-3.728755e-01, 2.037299e-01, 2.219027e-03, 1.383707e-03, -7.233722e-02]
+SAMPLES = (911.5, 910.25, 639, 359), [-0.2, 0.05, 0.001, -0.0005, 0.01]
+ROS = 610.2, 610.5, 640.3, 401.7
+
+
+def perspective(lens, k) -> np.ndarray:
+    fx, fy, cx, cy = lens
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    return cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), matrix, np.array(k, float))[0].reshape(-1, 2)
+
+
+def equidistant(lens, k) -> np.ndarray:
+    fx, fy, cx, cy = lens
+    matrix, none = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), np.zeros((1, 1, 3))
+    return cv2.fisheye.projectPoints(RAYS[:, None], none, none, matrix, np.array(k, float))[0].reshape(-1, 2)
+
+
+def omnidir() -> np.ndarray:
+    """C. Mei, P. Rives, ICRA 2007, as OpenCV's omnidir has it."""
+    unit = RAYS / np.linalg.norm(RAYS, axis=1)[:, None]
+    flat = np.column_stack([unit[:, :2] / (unit[:, 2:] + 1.21), np.ones(len(unit))])
+    matrix = np.array([[920.5, 0, 641.2], [0, 921.1, 478.8], [0, 0, 1]])
+    return cv2.projectPoints(flat, np.zeros(3), np.zeros(3), matrix, np.array([-0.31, 0.12, 3e-4, -2e-4]))[0][:, 0]
+
+
+def metashape() -> np.ndarray:
+    """Agisoft's manual, appendix on camera models."""
+    x, y = RAYS[:, 0], RAYS[:, 1]
+    r2 = x**2 + y**2
+    radial, grown = 1 + 0.11 * r2 - 0.32 * r2**2 + 0.21 * r2**3, 1 + 0.85 * r2 - 0.44 * r2**2
+    moved_x = x * radial + (0.0012 * (r2 + 2 * x * x) + 2 * -0.0031 * x * y) * grown
+    moved_y = y * radial + (-0.0031 * (r2 + 2 * y * y) + 2 * 0.0012 * x * y) * grown
+    u = 4032 / 2 - 44.5 + moved_x * (3268.25 + 1.5) - 0.5
+    return np.column_stack([u, 3024 / 2 + 12.25 + moved_y * 3268.25 - 0.5])
+
+
+def colmap(model: str, size: tuple[int, int], params: list[float]) -> np.ndarray:
+    camera = pycolmap.Camera(model=model, width=size[0], height=size[1], params=params)
+    return np.array([camera.img_from_cam(ray) for ray in RAYS]) - 0.5
+
+
+CASES = {
+    ("bouguet_m/Calib_Results.m", ""): lambda: perspective(
+        (657.395, 657.763, 302.984, 242.617), [-0.2559, 0.1276, -0.0002, 0.00003, 0]
+    ),
+    ("euroc_sensor/sensor.yaml", ""): lambda: perspective(
+        (458.6, 457.2, 367.2, 248.3), [-0.283, 0.0739, 0.000193, 1.76e-05]
+    ),
+    ("interactive/cameraParameters.xml", ""): lambda: perspective(*SAMPLES),
+    ("opencv_old_names/out.xml", ""): lambda: perspective(*SAMPLES),
+    ("stereo_yml/intrinsics.yml", "1"): lambda: perspective(*SAMPLES),
+    ("stereo_yml/intrinsics.yml", "2"): lambda: perspective(*SAMPLES),
+    ("json_tabs/cam.json", ""): lambda: perspective((800, 801, 320.5, 240.5), [-0.1, 0.02, 1e-4, -2e-4, 0]),
+    ("kitti/calib_cam_to_cam.txt", ""): lambda: perspective((984.2439, 980.8141, 690.0, 233.1966), KITTI),
+    ("metashape_p3p4/cal.xml", ""): metashape,
+    ("name_choice/cameras.txt", "2"): lambda: colmap(
+        "OPENCV", (1920, 1080), [1502, 1501, 960, 540, -0.1, 0.02, 0.0001, 0.0002]
+    ),
+    ("name_choice/cams.xml", "Cam B (35mm)"): lambda: perspective(
+        (8196.7, 8196.7, 3000 + 15.4 - 0.5, 2000 + 16.1 - 0.5), [-0.04, 0.02, 0, 0]
+    ),
+    ("opencv_fisheye_model/out_camera_data.yml", ""): lambda: equidistant(
+        (420.5, 421.1, 639.2, 479.8), [-0.021, 0.013, -0.009, 0.0021]
+    ),
+    ("opencv_fisheye_model/out_camera_data.xml", ""): lambda: equidistant(
+        (420.5, 421.1, 639.2, 479.8), [-0.021, 0.013, -0.009, 0.0021]
+    ),
+    ("opencv_omnidir_xi/out.xml", ""): omnidir,
+    ("ros1_echo/info.yaml", ""): lambda: equidistant((1133, 1128, 960.5, 600.5), [-0.0152, 0.0132, -0.0248, 0.0178]),
+    ("ros1_echo/nodash.yaml", ""): lambda: equidistant((1133, 1128, 960.5, 600.5), [-0.0152, 0.0132, -0.0248, 0.0178]),
+    ("ros_camera_model_fisheye/ost.yaml", ""): lambda: equidistant(
+        (401.25, 402.75, 868.4, 601.9), [0.1712, -0.0331, 0.0004, -0.0007]
+    ),
+    ("ros_coefficients/kb.yaml", ""): lambda: equidistant(ROS, [0.1, 0.1, 0, 0]),
+    ("ros_coefficients/none0.yaml", ""): lambda: perspective(ROS, [0.0] * 4),
+    ("ros_coefficients/zeros5.yaml", ""): lambda: perspective(ROS, [0.0] * 4),
+    ("ros_coefficients/six.yaml", ""): lambda: perspective(ROS, [-0.03, 0.03, 0, 0]),
+    ("ros_coefficients/plumb8.yaml", ""): lambda: perspective(ROS, PLUMB),
+    ("ros_coefficients/rat8.yaml", ""): lambda: perspective(ROS, RATIONAL),
+    ("ros_coefficients/thin12.yaml", ""): lambda: perspective(ROS, [*PLUMB, 0.0011, -0.0004, 0.0009, 0.0003]),
+    ("ros_coefficients/tilt14.yaml", ""): lambda: perspective(ROS, [*PLUMB, 0, 0, 0, 0, 0.01, -0.02]),
+    ("yaml_directive_comment/chain.yaml", "cam0"): lambda: equidistant(
+        (190.97847715128717, 190.9733070521226, 254.93170605935475, 256.8974428996504),
+        [0.0034823894022493434, 0.0007150348452162257, -0.0020532361418706202, 0.00020293673591811182],
+    ),
+}
+"""File and name of the camera, and the pixels of RAYS."""
+REFUSED = {
+    ("ros_coefficients/invbc.yaml", ""): "E-CAMERA-MODEL … inverse_brown_conrady … another formula … calibrate anew",
+    ("ros_coefficients/uncal.yaml", ""): "E-CAMERA-UNCALIBRATED … all zero … calibrate",
+    ("ros_none/info.yaml", ""): "E-CAMERA-KEY … binning_x = 2 … set it to 0",
+    ("stereo_yml/intrinsics.yml", ""): "E-CAMERA-SEVERAL … 2 cameras … choose of 1, 2",
+    ("exif/f35zero.jpg", ""): "E-CAMERA-UNREADABLE … a photograph … stcal camera convert",
+}

@@ -1,0 +1,187 @@
+"""Readers of files that people or other programs write: another encoding, line end or order of keys changes nothing.
+
+One key more is named. Camera files: ``test_camera_programs.py``.
+"""
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stcal.boards.file import load_flat_board
+from stcal.errors import InputNote, StcalError
+from stcal.handeye.data.formats.record import Said
+from stcal.handeye.data.inputs import read_pairs, require_own
+from stcal.io.design import load_target
+from stcal.io.table import read_table
+from stcal.locate.data.layout import load_plan
+from stcal.robot.kinematics.file import load_robot, robot_toml
+
+TABLE = "name,x_mm,y_mm,z_mm\n" + "".join(f"P{i},{i}.25,{-i}.5,{10 * i}\n" for i in range(1, 5))
+CIRCLES = "\n".join(
+    f'  {{ id = "{i}", x_mm = {x}, y_mm = {y}, radius_mm = 5.0 }},'
+    for i, (x, y) in enumerate([(0, 0), (40, 0), (0, 40), (45, 50), (20, 25)])
+)
+"""Five circles of a face."""
+LAYOUT = (
+    'type = "tags"\norigin = 0\n\n[[tag]]\ndictionary = "tag36h11"\nid = 0\nsize_mm = 60.0\nx_mm = 0.0\ny_mm = 0.0\n'
+)
+ROBOT = 'name = "a"\nconvention = "standard"\n' + "".join(
+    f"\n[[joint]]\na_mm = {a}\nalpha_deg = {alpha}\nd_mm = {d}\ntheta_deg = 0.0\n"
+    for a, alpha, d in ((0, 90, 300), (400, 0, 0), (350, 0, 0), (0, 90, 100), (0, -90, 90), (0, 0, 80))
+)
+EASY = "parameters: {eye_on_hand: true}\nsamples:\n" + "".join(
+    f"- robot: {{translation: {{x: {x}, y: 0.1, z: 0.5}}, rotation: {{x: {s}, y: 0.0, z: 0.0, w: {c}}}}}\n"
+    f"  optical: {{translation: {{x: 0.0, y: {x}, z: 0.7}}, rotation: {{x: 0.0, y: {s}, z: 0.0, w: {c}}}}}\n"
+    for x, s, c in ((0.1, 0.0, 1.0), (0.2, 0.6, 0.8), (0.3, -0.6, 0.8))
+)
+
+
+def of_board(path: Path) -> np.ndarray:
+    return load_flat_board(path).xy_mm()
+
+
+def of_table(path: Path) -> np.ndarray:
+    table = read_table(path, "points")
+    return np.column_stack([table.numbers(f"{axis}_mm") for axis in "xyz"])
+
+
+def of_target(path: Path) -> np.ndarray:
+    (face,) = load_target(path).faces
+    return np.column_stack([face.xy_mm, face.radius_mm])
+
+
+def of_robot(path: Path) -> np.ndarray:
+    return np.array(robot_toml(load_robot(path)).splitlines())
+
+
+def of_pairs(path: Path) -> np.ndarray:
+    told = read_pairs(path, Said())
+    if told is None:
+        require_own(path)  # what a command does next
+    assert told is not None
+    return np.hstack([told.pairs.base_from_flange.translation, told.pairs.camera_from_board.translation])
+
+
+READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
+    "table": (TABLE, of_table),
+    "table, semicolons": (TABLE.replace(",", ";").replace(".", ","), of_table),
+    "table, tabs": (TABLE.replace(",", "\t"), of_table),
+    "SpatialAnalyzer": (
+        "// units mm\n" + "".join(f"A::B::P{i} {i}.25 {-i}.5 {10 * i}\n" for i in range(1, 5)),
+        of_table,
+    ),
+    "dots": ('rows = 5\ncolumns = 7\npitch_mm = 20.0\nradius_mm = 5.0\npolarity = "dark"\nsigma_mm = 0.01\n', of_board),
+    "chessboard": ('type = "chessboard"\nrows = 5\ncolumns = 8\nsquare_mm = 20.0\n', of_board),
+    "charuco": (
+        'type = "charuco"\nrows = 5\ncolumns = 7\nsquare_mm = 20.0\nmarker_mm = 15.0\ndictionary = "4X4_50"\n',
+        of_board,
+    ),
+    "aprilgrid": ('type = "aprilgrid"\nrows = 3\ncolumns = 4\ntag_mm = 30.0\nspacing = 0.3\n', of_board),
+    "asymmetric circles": (
+        'type = "asymmetric-circles"\nrows = 11\ncolumns = 4\nspacing_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n',
+        of_board,
+    ),
+    "Kalibr, AprilGrid": (
+        "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.3\n",
+        of_board,
+    ),
+    "Kalibr, chessboard": (
+        "target_type: 'checkerboard'\ntargetCols: 6\ntargetRows: 7\nrowSpacingMeters: 0.06\ncolSpacingMeters: 0.06\n",
+        of_board,
+    ),
+    "Kalibr, circles": (
+        "target_type: 'circlegrid'\ntargetCols: 4\ntargetRows: 11\nspacingMeters: 0.02\nasymmetricGrid: True\n",
+        of_board,
+    ),
+    "target": (
+        'name = "a"\npolarity = "dark"\n\n[[face]]\nid = "1"\norigin = "0"\nx = "1"\ny = "2"\ncircles = [\n'
+        f"{CIRCLES}\n]\n",
+        of_target,
+    ),
+    "robot": (ROBOT, of_robot),
+    "easy_handeye": (EASY, of_pairs),
+    "layout": (LAYOUT, lambda path: np.array([repr(load_plan(path))])),
+}
+OF_YAML = [name for name in READERS if name.startswith(("Kalibr", "easy"))]
+OF_ROWS = [name for name in READERS if "table" in name or name == "SpatialAnalyzer"]
+OF_KEYS = [name for name in READERS if name not in OF_ROWS]
+
+
+def outcome(read: Callable[[Path], np.ndarray], path: Path, content: bytes) -> tuple[np.ndarray | None, list[str]]:
+    """What was read, None after an error, and what was said."""
+    path.write_bytes(content)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputNote)
+        try:
+            return read(path), [str(each.message) for each in caught]
+        except StcalError as error:
+            return None, [str(error)]
+
+
+FORMS: dict[str, Callable[[str], bytes]] = {
+    "byte-order mark": lambda text: b"\xef\xbb\xbf" + text.encode(),
+    "utf-16": lambda text: text.encode("utf-16"),
+    "utf-16, big endian": lambda text: b"\xfe\xff" + text.encode("utf-16-be"),
+    "crlf": lambda text: text.replace("\n", "\r\n").encode(),
+    "cr": lambda text: text.replace("\n", "\r").encode(),
+    "blank lines": lambda text: f"\n\n{text}\n\n".encode(),
+    "no last line end": lambda text: text.rstrip("\n").encode(),
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("form", FORMS)
+def test_another_encoding_or_line_end_changes_nothing(tmp_path, name, form):
+    text, read = READERS[name]
+    wanted, said = outcome(read, tmp_path / "file", text.encode())
+    assert wanted is not None, said
+    found, said = outcome(read, tmp_path / "file", FORMS[form](text))
+    assert found is not None, said
+    np.testing.assert_array_equal(found, wanted)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_text_of_another_encoding_is_named(tmp_path, name):
+    """Latin-1 is no UTF-8; of a table of numbers it could be guessed, and is not."""
+    text, read = READERS[name]
+    comment = "// Gerät\n" if name in OF_ROWS else "# Gerät\n"
+    found, said = outcome(read, tmp_path / "file", f"{comment}{text}".encode("latin-1"))
+    assert found is None
+    assert "UTF-8" in said[0] or "utf-8" in said[0], said
+    assert "\n" not in said[0]
+
+
+@pytest.mark.parametrize("name", OF_KEYS)
+def test_an_unknown_key_is_named(tmp_path, name):
+    text, read = READERS[name]
+    more = "operator_42: 7\n" if name in OF_YAML else "operator_42 = 7\n"
+    found, said = outcome(read, tmp_path / "file", f"{more}{text}".encode())
+    if name == "easy_handeye":  # its other keys are settings of the program, and change nothing
+        np.testing.assert_array_equal(found, outcome(read, tmp_path / "file", text.encode())[0])
+    else:
+        assert any("operator_42" in each for each in said), said
+
+
+@pytest.mark.parametrize("name", OF_KEYS)
+def test_another_order_of_keys_changes_nothing(tmp_path, name):
+    text, read = READERS[name]
+    head, bracket, rest = text.partition("\n[[")
+    if name == "easy_handeye":
+        head, bracket, rest = "", "", "samples:" + text.split("samples:")[1] + text.split("samples:")[0]
+    lines = head.splitlines(keepends=True)
+    turned = "".join(reversed(lines)) if all("=" in line or ":" in line for line in lines if line.strip()) else head
+    wanted, _ = outcome(read, tmp_path / "file", text.encode())
+    found, said = outcome(read, tmp_path / "file", f"{turned}{bracket}{rest}".encode())
+    assert found is not None, said
+    np.testing.assert_array_equal(found, wanted)
+
+
+def test_columns_of_a_table_may_stand_in_any_order(tmp_path):
+    rows = [line.split(",") for line in TABLE.splitlines()]
+    turned = "\n".join(",".join(reversed([*row, "weather" if i == 0 else "7"])) for i, row in enumerate(rows))
+    wanted, _ = outcome(of_table, tmp_path / "file", TABLE.encode())
+    found, _ = outcome(of_table, tmp_path / "file", turned.encode())
+    np.testing.assert_array_equal(found, wanted)

@@ -1,0 +1,208 @@
+"""Bodies whose faces are boards or tags: no dot board and no camera file are needed."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stcal.boards.target import body_toml, load_body
+from stcal.design import scale_reference
+from stcal.io.cameras.model import CalibratedCamera, camera_prior
+from stcal.io.design import load_target
+from stcal.labels import CircleLabel
+from stcal.sfm import pipeline
+from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.adjust.refine import refine
+from stcal.sfm.camera.intrinsics import start_camera
+from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera
+from stcal.sfm.report.compare import compare
+from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.saved import adjusted_run, load_run
+from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
+from stcal.synthetic.designs import tag_cube, tag_dodecahedron
+from tests.outcome import fails_with
+
+CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
+SIGMA_PX = 0.1
+TARGET = """name = "mixed"
+[[face]]
+id = "0"
+board = { type = "charuco", rows = 5, columns = 5, square_mm = 10, marker_mm = 7, dictionary = "6X6_250", first_id = 3 }
+[[face]]
+id = "top"
+sigma_mm = 0.02
+size_sigma_mm = 0.1
+tags = [{ dictionary = "APRILTAG_36h11", id = 3, size_mm = 40, x_mm = 0, y_mm = 0, angle_deg = 90 }]
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "target.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_faces_of_boards_and_tags_are_read_and_written(tmp_path):
+    target = load_body(written(tmp_path, TARGET))
+    board, tags = target.faces
+    assert (len(board.ids), board.ids[5], board.sigma_mm, board.outward) == (16, "1.1", 0.01, -1)
+    assert (tags.ids, tags.sigma_mm, tags.size_sigma) == (("3.0", "3.1", "3.2", "3.3"), 0.02, 0.1 / 40)
+    np.testing.assert_allclose(board.xy_mm[5], (20, 20))
+    np.testing.assert_allclose(tags.xy_mm[0], (20, -20), atol=1e-12)  # top left, turned by 90°
+    again = load_body(written(tmp_path, body_toml(target)))
+    for face, same in zip(target.faces, again.faces, strict=True):
+        assert (face.ids, face.sigma_mm) == (same.ids, same.sigma_mm)
+        np.testing.assert_allclose(face.xy_mm, same.xy_mm, atol=1e-9)
+
+
+def test_rough_poses_of_printed_faces_are_kept(tmp_path):
+    cube = tag_cube(60)
+    again = load_body(written(tmp_path, body_toml(cube)))
+    for face, same in zip(cube.faces, again.faces, strict=True):
+        np.testing.assert_allclose(
+            face.rough_target_from_face.matrix(), same.rough_target_from_face.matrix(), atol=1e-8
+        )
+        outward = -face.rough_target_from_face.rotation[:, 2]
+        assert outward @ face.rough_target_from_face.translation == pytest.approx(30)
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        (("first_id = 3", "first_id = 3, pitch_mm = 1"), "E-KEY-UNKNOWN … face 0 … board … pitch_mm"),
+        (("id = 3, size_mm", "id = 587, size_mm"), "E-TAG-ID-RANGE … face top … 587"),
+        (('type = "charuco"', 'type = "chessboard"'), "E-KEY-UNKNOWN … face 0 … board"),
+        (("sigma_mm = 0.02", "sigma = 0.02"), "E-KEY-UNKNOWN … face.2.sigma"),
+        (("APRILTAG_36h11", "6X6_250"), "E-TAG-REPEATED … 3 … 0 … top"),
+        (
+            ('"mixed"', '"mixed"\nscale = [{ from = "0:9.9", to = "0:1.1", mm = 5, sigma_mm = 1 }]'),
+            "E-TARGET-SCALE … 0:9.9",
+        ),
+    ],
+)
+def test_mistakes_in_printed_faces_are_named(tmp_path, change, error):
+    with fails_with(error):
+        load_body(written(tmp_path, TARGET.replace(*change)))
+
+
+def test_commands_without_such_faces_say_so(tmp_path):
+    with fails_with("E-TARGET-PRINTED … face 0 … stcal-sfm run"):
+        load_target(written(tmp_path, TARGET))
+
+
+def test_circles_need_a_camera(tmp_path):
+    with fails_with("E-CAMERA-NEEDED … --camera"):
+        pipeline.run(tmp_path, None, tmp_path / "r")
+
+
+def observed(target, count: int, seed: int):
+    """Corners of a body in images, with noise, as detection would give them; and the scene."""
+    scene = make_body_scene(target, body_camera(1200), BodyOptions(images=count, distance_mm=300, seed=seed))
+    rng = np.random.default_rng(seed)
+    images = []
+    for i, pose in enumerate(scene.camera_from_target):
+        labels: list[CircleLabel] = []
+        pixels = []
+        for face in target.faces:
+            camera_from_face = pose @ scene.target_from_face[face.id]
+            middle = camera_from_face @ np.append(face.xy_mm.mean(0), 0.0)
+            if camera_from_face.rotation[:, 2] @ middle > 0.3 * np.linalg.norm(middle):
+                labels += face.labels()
+                pixels.append(scene.camera.project(camera_from_face @ face.places_mm(face.ids)))
+        xy = np.concatenate(pixels)
+        xy = xy + rng.normal(0, SIGMA_PX, xy.shape)
+        zero = np.zeros((len(xy), 2, 2))
+        images.append(
+            ImageObservations(f"{i}.png", ".", tuple(labels), xy, 0 * xy, zero, zero + SIGMA_PX**2 * np.eye(2))
+        )
+    return scene, images
+
+
+def calibrated(target, images, size):
+    """The calibration of a body from its corners alone, without a camera."""
+    start = CalibratedCamera.of(start_camera(*size, "OPENCV"), "OPENCV")
+    body = place_and_find_camera(images, target.faces, [start])
+    camera = body.camera
+    images = [
+        ImageObservations(
+            i.name, i.group, i.labels, i.centre_px, camera.normalised_from_pixel(i.centre_px), i.shape, i.covariance_px2
+        )
+        for i in images
+    ]
+    board = scale_reference(None, target)
+    model = refine(model_of_body(body, images, camera), camera, target, board).model
+    options = AdjustOptions(target.faces[0].id, refine_camera=True)
+    return body, calibrate([model], camera, target, board, options, camera_prior(camera))
+
+
+@pytest.mark.parametrize("target", [tag_cube(60), tag_dodecahedron(30)], ids=["cube", "dodecahedron"])
+def test_a_body_of_tags_gives_faces_and_camera(target):
+    scene, images = observed(target, 10, 8)
+    body, result = calibrated(target, images, (1200, 800))
+    assert (len(body.body_from_face), len(body.camera_from_body)) == (len(target.faces), 10)
+    focal = scene.camera.focal[0]
+    sigma = float(np.sqrt(result.joint.camera_covariance[0, 0]))
+    assert sigma < 0.01 * focal  # the views determine it
+    assert abs(result.camera.focal[0] - focal) < 4 * sigma
+    for face, pose in result.target.target_from_face.items():
+        if face == result.target.reference_face:
+            continue
+        truth = scene.target_from_face[face]
+        off = np.concatenate(
+            [
+                (pose @ truth.inverse()).log()[:3],
+                pose.translation - truth.translation,
+            ]
+        )
+        normalised = off @ np.linalg.solve(result.target.face_covariance[face], off)
+        assert normalised < 30  # χ² of 6: by chance in 4 of 100 000
+
+
+@pytest.mark.slow
+def test_a_run_of_photographs_without_board_and_camera(tmp_path):
+    scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=14, distance_mm=300, seed=2))
+    write_body(tmp_path / "set", scene)
+    result = pipeline.run(
+        tmp_path / "set/images", None, tmp_path / "r", tmp_path / "set/target.toml", None, RunOptions()
+    )
+    assert len(result.target.target_from_face) == 6
+    errors = compare(tmp_path / "r", tmp_path / "set/truth.json")
+    normalised = [face.normalised_error for face in errors.faces.values() if face.normalised_error is not None]
+    assert 0.3 < np.sqrt(np.mean(np.square(normalised))) < 2  # about 1 of five faces that share their camera
+    summary = load_run(tmp_path / "r", printed=True).report["summary"]
+    assert (summary["scale_from"], summary["camera_given"]) == (["faces"], False)
+    assert not (tmp_path / "r/board.toml").exists()
+    again = adjusted_run(load_run(tmp_path / "r", printed=True)).state.result()
+    assert again.sigma0 == pytest.approx(result.calibration.joint.sigma0, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CUBE.is_dir(), reason="real photographs are not shipped")
+def test_a_real_cube_of_charuco_boards(tmp_path):
+    faces = "".join(
+        f'\n[[face]]\nid = "{k}"\nboard = {{ type = "charuco", rows = 10, columns = 10, square_mm = 3.2, '
+        f'marker_mm = 2.4, dictionary = "DICT_6X6_1000", first_id = {50 * k} }}\n'
+        for k in range(6)
+    )
+    target = written(tmp_path, f'name = "cube"\n{faces}')
+    result = pipeline.run(CUBE / "cam0", None, tmp_path / "r", target)
+    mapped = sum(len(s.model.images) + len(s.left_out) for s in result.solutions)
+    assert mapped + len(result.detection.skipped) == 24
+    assert sum(len(s.model.images) for s in result.solutions) == 24
+    poses = result.target.target_from_face
+    assert len(poses) == 6
+    normals = np.array([pose.rotation[:, 2] for pose in poses.values()])
+    angles = np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)))
+    beside = angles[(angles > 45) & (angles < 135)]
+    assert len(beside) == 24
+    assert np.abs(beside - 90).max() < 1.5
+
+
+@pytest.mark.parametrize("option", [{"solve": "paper"}, {"board_only": True}])
+def test_options_for_circles_are_refused(tmp_path, option):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images/a.png").write_bytes(b"")
+    with fails_with("E-OPTION-CONFLICT … --"):
+        pipeline.run(tmp_path / "images", None, tmp_path / "r", tag_cube(60), None, RunOptions(**option))
