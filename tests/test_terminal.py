@@ -154,7 +154,7 @@ def test_help_shows_every_option_once_and_first_what_most_calls_need():
         assert len(listed) == len(set(listed)) == len(options) + 1, words  # and --help
         used |= set(options)
         titles = re.findall(r"^([A-Z].*):$", shown, flags=re.MULTILINE)
-        assert titles == [title for title in ("Arguments", *PANELS) if title in titles], words
+        assert titles == [t for t in ("Arguments", *PANELS, "Example", "Examples") if t in titles], words
     assert {name for names in PANELS.values() for name in names} <= used
     shown = CliRunner().invoke(app, ["handeye", "--help"]).output
     assert len(re.findall(r"^  --", shown[: shown.index("Output:")], flags=re.MULTILINE)) <= 10
@@ -190,7 +190,10 @@ def test_json_goes_to_standard_output_alone(program, tmp_path, monkeypatch):
     assert json.loads(out) == json.loads((tmp_path / "design.json").read_text(encoding="utf-8"))
     assert err.splitlines() == said.replace("written: design.json\n", "").splitlines()
     assert not (tmp_path / "-").exists()
-    assert "  O1: volume of the ellipsoid of uncertainty (D-optimality)\n  O2: inverse condition number\n" in said
+    assert [line.split()[-1] for line in said.splitlines() if line.startswith(("O1 ", "O2 "))] == [
+        "(D-optimality)",
+        "number",
+    ]
 
 
 def test_only_json_goes_to_standard_output(program, tmp_path, monkeypatch):

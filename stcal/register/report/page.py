@@ -126,7 +126,7 @@ def _table_of(found: Findings, rows: np.ndarray) -> Table:
     result, length = found.registration, found.length_mm
     cells = []
     for row in rows.tolist():
-        values = (number(v, 4) for v in (*result.residuals[row], length[row]))
+        values = (number(float(v), 4) for v in (*result.residuals[row], length[row]))
         cells.append([f"line {found.lines[row]}", "inlier" if result.inliers[row] else "OUTLIER", *values])
     return Table(["<residual, mm", "<", "x", "y", "z", "length"], cells)
 
