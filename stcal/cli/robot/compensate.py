@@ -117,7 +117,7 @@ def compensate(
     for form, path in exports if result.found.usable.any() else ():
         exported_file = exported(result, identified, form, path, export_as.value, pulses)
         write(path, exported_file.text)
-        require_same(path, path.read_text, exported_file.text)  # which gave the points back
+        require_same(path, path.read_bytes, exported_file.text.encode())  # which gave the points back
         print_each("note", exported_file.notes)
     if not result.found.usable.any():
         raise DegenerateError(
