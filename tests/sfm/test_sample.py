@@ -141,7 +141,7 @@ def test_the_report_says_what_the_files_say(calibrated):
     html = (out / "report.html").read_text(encoding="utf-8")
     page = Page()
     page.feed(html)
-    assert {"result", "checks", "trust", "faces", "scale", "residuals", "overlays"} <= page.ids
+    assert {"faces", "use", "trust", "detail", "scale", "residuals", "overlays"} <= page.ids
     assert [a for a in page.addresses if not a.startswith(("#", "data:"))] == []
     faces = json.loads((out / "faces.json").read_text())["target_from_face"]
     for face_id in calibrated.faces:
