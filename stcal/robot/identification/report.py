@@ -319,7 +319,7 @@ def identified_report(result: Identified, nominal: Robot) -> Document:
             Section("Accuracy", accuracy, terminal=True),
             Section("Denavit–Hartenberg rows", rows, terminal=True),
             Section("What the data determine", determined, terminal=True),
-            Section("What the model leaves", [*left, *residual_plots(drawn, result.left or ())]),
+            Section("What the model leaves", [*left, *residual_plots(drawn, result.left or ())], name="left"),
             Section(
                 "Outliers, of less than half weight", [Table(["<Where", "error mm", "weight"], outliers)], terminal=True
             ),

@@ -203,7 +203,7 @@ def test_identify_says_it_in_notes_file_and_page():
     assert "the angle of joint 3, once a turn" in sentence
     assert sentence in found.notes
     assert f"note: {sentence}" in identified_report(found, nominal).text()
-    assert sentence.split(":")[0] in identified_report(found, nominal).page().split('id="left"')[1]
+    assert sentence.split(":")[0][1:] in identified_report(found, nominal).page().split('id="left"')[1]
     assert identified_file(found, nominal).content()["left"][0]["joint"] == 3
     clean = identify(mh80(), simulated(3, 40)[1], QUICK)
     assert clean.left == ()

@@ -111,8 +111,8 @@ def test_notes_reach_terminal_and_json(data, stcal_robot):
     path = data.write("data.csv", WPR, "load")
     code, printed, _ = stcal_robot("identify", path, *robot, "--folds", 0, "--json", out, "--overwrite")
     assert code == 0
-    assert "40 poses, 30 parameters determined" in printed
-    assert "\n  O3: the combination of parameters that is seen worst (E-optimality)\n" in printed
+    assert f"40 poses from robot data {path}, 30 parameters determined" in printed
+    assert "the combination of parameters that is seen worst (E-optimality)\n" in printed
     for note in (angles, "column not read: load"):
         assert f"note: {note}" in printed
         assert note in json.loads(out.read_text())["notes"]
@@ -169,4 +169,4 @@ def test_a_trackers_file_beside_joint_values(data, stcal_robot):
     )
     code, printed, _ = stcal_robot("identify", *files, "--robot", data.folder / "robot.toml", "--folds", 0)
     assert code == 0
-    assert "40 positions, 27 parameters determined" in printed
+    assert "40 positions from joints.csv with tracker.txt, 27 parameters determined" in printed

@@ -126,7 +126,8 @@ def test_ambiguous_poses_are_left_out_and_told(undecided, stcal_robot):
     assert code == 0
     assert "note: " in out
     assert "2 of 40 rows left out, first line 5: their status is ambiguous" in out
-    assert "38 poses, 30 parameters" in out
+    assert "38 poses from robot data" in out
+    assert "30 parameters" in out
     assert "outliers" not in out
     assert "2 of 40 rows" in json.loads((undecided / "found.json").read_text())["notes"][0]
 
