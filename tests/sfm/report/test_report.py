@@ -418,7 +418,7 @@ def test_the_crosscheck_is_a_section_of_its_own():
     assert ["COLMAP 3.8", "2", "0.0036"] in rows
     assert ["2", *["0.763", "0.304", "0.26"] * 2, "–", "–", "–"] in rows
     assert [NASTY, "9.18", "0.536", "0.33"] in rows
-    assert "group b: <none>" in parsed.text
+    assert "Group b: <none>" in parsed.text
     assert "Allowed in the first two: 3 σ of faces and circles between the programs, 0.5 σ" in parsed.text
     assert "20 µm of cameras" in parsed.text
     differing = Page(report_html(make() | {"crosscheck": crosscheck(["face <2> 5 µm"])}, OVERLAYS)).text
