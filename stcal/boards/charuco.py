@@ -74,7 +74,8 @@ def find_charuco(image: np.ndarray, name: str, board: CharucoDesign) -> BoardVie
         corners = blurred.xy_px
     sharp = _edges_meet(_gradient(smooth), corners, _half_px(small, foretold))
     along = np.swapaxes(homography_jacobian(_robust_homography(squares, corners), squares), 1, 2)
-    by_area = crossings(grey, sharp.otherwise(blurred).xy_px, along, _half_px(small, foretold))
+    start, clear = sharp.otherwise(blurred).xy_px, np.sqrt(2) * small * foretold.step_px
+    by_area = crossings(grey, start, along, _half_px(small, foretold), clear)
     measured = _Corners(by_area.xy_px, by_area.covariance_px2, by_area.seen).otherwise(sharp).otherwise(blurred)
     good = measured.seen & _foretold(squares, measured.xy_px).agrees(measured.xy_px)
     if good.sum() < LEAST_CORNERS:

@@ -118,7 +118,8 @@ def _by_area(grey: np.ndarray, grid: np.ndarray, half: int) -> np.ndarray:
     Where edges lie along the pixel rows, gradients place all corners by up to 0.02 px to one side.
     """
     along = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=2).reshape(-1, 2, 2)
-    return crossings(grey, grid.reshape(-1, 2), along, np.full(len(along), half)).xy_px.reshape(grid.shape)
+    clear = np.linalg.norm(along, axis=2).min(1)
+    return crossings(grey, grid.reshape(-1, 2), along, np.full(len(along), half), clear).xy_px.reshape(grid.shape)
 
 
 def _first_is_black(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> bool:

@@ -45,6 +45,9 @@ PIXEL_VARIANCE = 1 / 12
 BLURS, LEAST_INSIDE_PX = 2.5, 1.0
 """Distance from the tag's inner cells, in σ of blur and pixel, from which on pixels are used, and the least width of
 the border's band that is used, px."""
+CLEAR_BLURS = 1.5
+"""Distance from what is beside a crossing, in σ of blur and pixel, up to which pixels are used: less takes in what the
+blur brings from there, more leaves a small window, in which single flaws of a print weigh more."""
 CROSSING_STEPS = 4
 """Number of Gauss–Newton steps to a crossing, which may end :data:`MOST_MOVED_PX` from its start."""
 MOST_LEFT = 0.15
@@ -401,20 +404,23 @@ class Crossings:
     seen: np.ndarray
 
 
-def crossings(grey: np.ndarray, start: np.ndarray, along: np.ndarray, half: np.ndarray) -> Crossings:
+def crossings(
+    grey: np.ndarray, start: np.ndarray, along: np.ndarray, half: np.ndarray, clear_px: np.ndarray
+) -> Crossings:
     """Measure the crossings near ``start`` (n, 2) of edges in the directions ``along`` (n, 2, 2), one edge in a row.
 
-    ``half`` : (n,) half the sides of the square windows, whole px; nothing else may be in a window.
+    ``half`` : (n,) half the sides of the square windows, whole px; ``clear_px`` : (n,) distance to the nearest thing
+    that is none of the two edges. What the blur carries into the window from there is not used.
     """
     n = len(start)
     xy, covariance, seen = start.astype(float), np.full((n, 2, 2), np.nan), np.zeros(n, bool)
     for side in np.unique(half).tolist():
         rows = np.flatnonzero(half == side)
-        xy[rows], covariance[rows], seen[rows] = _of_size(grey, start[rows], along[rows], side)
+        xy[rows], covariance[rows], seen[rows] = _of_size(grey, start[rows], along[rows], side, clear_px[rows])
     return Crossings(np.where(seen[:, None], xy, start), covariance, seen)
 
 
-def _of_size(grey, start, along, half: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the crossings, their covariances and a mask of those seen, for windows of one size."""
     n, q = len(start), 11
     offsets = np.stack(np.meshgrid(*[np.arange(-half, half + 1)] * 2), axis=-1).reshape(-1, 2)
@@ -431,6 +437,9 @@ def _of_size(grey, start, along, half: int) -> tuple[np.ndarray, np.ndarray, np.
     residual = first = second = distance = level
     design, inverse = np.zeros((*level.shape, q)), np.zeros((n, q, q))
     for k in range(CROSSING_STEPS + 1):
+        if k == CROSSING_STEPS - 1:  # the blur is known
+            reach = clear_px - CLEAR_BLURS * np.sqrt(value[:, 4] + PIXEL_VARIANCE)
+            weight = weight * (np.linalg.norm(pixels - (start + value[:, :2])[:, None], axis=2) <= reach[:, None])
         direction = np.stack([np.cos(angle + value[:, 2:4]), np.sin(angle + value[:, 2:4])], axis=-1)
         normal = np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
         off = pixels - (start + value[:, :2])[:, None]
@@ -461,12 +470,20 @@ def _of_size(grey, start, along, half: int) -> tuple[np.ndarray, np.ndarray, np.
         if k < CROSSING_STEPS:
             value += np.where(np.isfinite(change), change, 0.0)
             value[:, 4] = value[:, 4].clip(MIN_VARIANCE, half**2)
-    noise = np.maximum((residual**2).sum(1) / (len(offsets) - q), ROUNDING)
-    pull = (design @ inverse)[..., :2]
-    covariance = noise[:, None, None] * inverse[:, :2, :2]
+    redundancy = weight.sum(1) - q
+    noise = np.maximum((weight * residual**2).sum(1) / np.maximum(redundancy, 1), ROUNDING)
+    pull = weight[..., None] * (design @ inverse)[..., :2]
+    near = np.where(np.abs(distance[0]) <= np.abs(distance[1]), place[0], place[1] + 4 * half)
+    growth = _growth(pull, residual, near, noise, 2 * half + 1)
+    covariance = growth * noise[:, None, None] * inverse[:, :2, :2]
     for displaced, apart in ((first, distance[0]), (second, distance[1])):
         covariance += PRIOR_PX**2 * _common(pull * displaced[..., None], apart, half)
-    seen = inside & np.isfinite(covariance).all((1, 2)) & (np.linalg.norm(value[:, :2], axis=1) <= MOST_MOVED_PX)
+    seen = (
+        inside
+        & (redundancy > q)
+        & np.isfinite(covariance).all((1, 2))
+        & (np.linalg.norm(value[:, :2], axis=1) <= MOST_MOVED_PX)
+    )
     seen &= (np.sqrt(noise) <= MOST_LEFT * np.abs(value[:, 8])) & (np.sqrt(value[:, 4]) <= WIDEST_BLUR * half)
     return start + value[:, :2], covariance, seen
 
@@ -479,3 +496,38 @@ def _common(pull: np.ndarray, distance: np.ndarray, half: int) -> np.ndarray:
     summed = np.stack([np.bincount(row.ravel(), pull[..., i].ravel(), n * bins) for i in (0, 1)], axis=-1)
     summed = summed.reshape(n, bins, 2)
     return np.swapaxes(summed, 1, 2) @ summed
+
+
+def _growth(pull: np.ndarray, residual: np.ndarray, place: np.ndarray, noise: np.ndarray, profiles: int) -> float:
+    """Return the factor of the variances that is due to edges that are not straight, as by print, for all windows.
+
+    All pixels of a profile share the displacement of the edge there. The squares of their common pulls are compared
+    with what the noise of single pixels makes of them.
+
+    Parameters
+    ----------
+    pull : (n, k, 2) array
+        Derivatives of a crossing by the pixels of its window.
+    residual : (n, k) array
+        Grey values.
+    place : (n, k) array
+        Profiles that the pixels belong to, px along the edges; those of both edges have different numbers.
+    noise : (n,) array
+        Variances of the pixels.
+    profiles : int
+        Number of profiles on each edge.
+
+    Returns
+    -------
+    float
+        At least 1; the median over the windows, as a single one tells little.
+    """
+    n = len(pull)
+    number = np.rint(place).astype(int)
+    number -= number.min()
+    bins = number.max() + 1
+    row = (number + bins * np.arange(n)[:, None]).ravel()
+    squares = sum(np.bincount(row, (pull[..., i] * residual).ravel(), n * bins).reshape(n, bins) ** 2 for i in (0, 1))
+    expected = noise * (pull**2).sum((1, 2)) * (1 - 2 / profiles)
+    told = expected > 0
+    return max(float(np.median(squares.sum(1)[told] / expected[told])), 1.0) if told.any() else 1.0
