@@ -11,8 +11,8 @@ from stcal.cli.terminal import print_each, say, write
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
+    from stcal.geometry.camera import Camera
     from stcal.io.cameras.difference import SizedLens
-    from stcal.io.cameras.model import CalibratedCamera
 
 app = typer.Typer(
     name="stcal camera",
@@ -121,14 +121,14 @@ def compare(
         say(f"picture: {plot}")
 
 
-def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
+def _camera(path: Path, name: str, size: str) -> "Camera":
     from stcal.io.cameras.difference import SizedLens
 
     lens = _lens(path, name, size)
     return lens.near.camera if isinstance(lens, SizedLens) else lens
 
 
-def _lens(path: Path, name: str, size: str) -> "CalibratedCamera | SizedLens":
+def _lens(path: Path, name: str, size: str) -> "Camera | SizedLens":
     """Return the camera of a file, or a lens of another model with the fit to it, whose quality is printed."""
     from stcal.io.cameras.difference import SizedLens, fit_lens
     from stcal.io.cameras.model import CameraModel

@@ -8,7 +8,8 @@ from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference
 from stcal.errors import InputError, StcalError
-from stcal.io.cameras.model import CalibratedCamera, CameraModel, camera_prior, model_of, refinable
+from stcal.geometry.camera import Camera
+from stcal.io.cameras.model import CameraModel, camera_prior, model_of, refinable
 from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.cameras.read import read_camera
 from stcal.io.files import save
@@ -167,7 +168,7 @@ def _with_found_camera(
     return detection, labelled, model
 
 
-def guessed_cameras(files: Sequence[ImageFile]) -> list[CalibratedCamera]:
+def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
     """Returns cameras at which the search for an unknown one begins: that of the EXIF of the first photograph that
     states one, or one of medium focal length."""
     (width, height), _ = require_common_size(list(files))
@@ -178,7 +179,7 @@ def guessed_cameras(files: Sequence[ImageFile]) -> list[CalibratedCamera]:
             continue
         if (camera.width, camera.height) == (width, height):
             return [camera]
-    return [CalibratedCamera.of(start_camera(width, height, LENS), LENS)]
+    return [Camera.of(start_camera(width, height, LENS), LENS)]
 
 
 def assumed_camera(files: Sequence[ImageFile], target: TargetDesign) -> CameraModel:

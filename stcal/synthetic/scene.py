@@ -9,9 +9,9 @@ import numpy as np
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import FISHEYE, Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import FISHEYE, CalibratedCamera, CameraModel
+from stcal.io.cameras.model import CameraModel
 from stcal.labels import CircleLabel
 from stcal.synthetic.designs import REFERENCE_GROUPS, nominal_target_from_face, second_design, three_point_frame
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
@@ -111,7 +111,7 @@ class Scene:
 
     target: TargetDesign
     board: BoardDesign
-    camera: CalibratedCamera
+    camera: Camera
     target_from_face: dict[str, Rigid]
     circles_target: dict[CircleLabel, np.ndarray]
     groups: dict[str, Group]
@@ -217,7 +217,7 @@ def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[
     return {face: target_from_any @ frame for face, frame in frames.items()}, circles
 
 
-def _made_camera(options: SceneOptions, rng) -> CalibratedCamera:
+def _made_camera(options: SceneOptions, rng) -> Camera:
     focal = options.focal_px or FOCAL_PER_WIDTH * options.width
     centre = (np.array([options.width, options.height]) - 1) / 2
     centre = centre + options.centre_sigma * options.width * rng.standard_normal(2)
@@ -225,7 +225,7 @@ def _made_camera(options: SceneOptions, rng) -> CalibratedCamera:
     distortion[: len(options.distortion)] = options.distortion
     model = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
     camera = Camera(options.width, options.height, np.array([focal, focal]), centre, distortion)
-    return CalibratedCamera.of(camera, model)
+    return Camera.of(camera, model)
 
 
 def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) -> list[tuple[str, str]]:
@@ -344,4 +344,4 @@ def seen_wide(scene: Scene, field_deg: float, seed: int) -> Scene:
         turns = [Rigid.exp([up, aside, 0, 0, 0, 0]) for aside, up in angles]
         views = tuple(turn @ pose for turn, pose in zip(turns, group.camera_from_target, strict=True))
         groups[name] = replace(group, camera_from_target=views)
-    return replace(scene, camera=CalibratedCamera.of(camera, "OPENCV_FISHEYE"), groups=groups)
+    return replace(scene, camera=Camera.of(camera, "OPENCV_FISHEYE"), groups=groups)

@@ -12,18 +12,11 @@ import numpy as np
 import yaml
 
 from stcal.errors import InputError
+from stcal.geometry.camera import COLMAP_MODELS, parameter_names
 from stcal.io.cameras import forms, matlab, metashape
 from stcal.io.cameras.foreign import ForeignLens, numbered, of_colmap, of_database, one_of
 from stcal.io.cameras.keyed import from_keys
-from stcal.io.cameras.model import (
-    COLMAP_MODELS,
-    CORRELATION,
-    MAX_SIDE_PX,
-    SIGMA,
-    SQUARE_WITHIN,
-    CameraModel,
-    parameter_names,
-)
+from stcal.io.cameras.model import CORRELATION, MAX_SIDE_PX, SIGMA, SQUARE_WITHIN, CameraModel
 from stcal.io.cameras.photograph import is_photograph
 from stcal.io.cameras.texts import values_of, values_of_archive
 from stcal.io.covariance import Rows, require_covariance

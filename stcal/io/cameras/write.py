@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.io.files import require_written
 
@@ -15,7 +15,7 @@ ACROSS = 9
 """Number of points across the image, and down it, by which cameras are compared."""
 
 
-def save_camera(path: str | Path, camera: CalibratedCamera) -> None:
+def save_camera(path: str | Path, camera: Camera) -> None:
     """Write ``cameras.txt`` with one camera, its σ and correlations, and require that it is read as the same camera."""
     write_cameras_txt(path, camera)
     require_camera_written(path, camera)

@@ -9,7 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, known_distances
-from stcal.io.cameras.model import CalibratedCamera, CameraPrior
+from stcal.geometry.camera import Camera
+from stcal.io.cameras.model import CameraPrior
 from stcal.io.json import ByFace, Part
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
@@ -69,7 +70,7 @@ class RunResult:
     ----------
     out : Path
         The run's folder.
-    camera : CalibratedCamera
+    camera : Camera
         The camera as its file states it; refined intrinsics are ``calibration.camera``.
     target_design, board_design : TargetDesign, BoardDesign
         The designs as given.
@@ -100,7 +101,7 @@ class RunResult:
     """
 
     out: Path
-    camera: CalibratedCamera
+    camera: Camera
     target_design: TargetDesign
     board_design: BoardDesign
     options: RunOptions
@@ -153,12 +154,12 @@ class RunResult:
         return rows
 
     @property
-    def refined_camera(self) -> CalibratedCamera | None:
+    def refined_camera(self) -> Camera | None:
         """Camera as adjusted, with covariance; None if the intrinsics were held fixed."""
         joint = self.calibration.joint
         if joint is None or not joint.camera_covariance.size:
             return None
-        return CalibratedCamera.of(joint.camera, self.camera.colmap_model, joint.camera_covariance)
+        return Camera.of(joint.camera, self.camera.colmap_model, joint.camera_covariance)
 
     def observations(self) -> list[ImageObservations]:
         """Returns labelled centres of all images, in the database's order."""
