@@ -25,7 +25,8 @@ from stcal.boards.dictionaries import count_of, known_dictionary
 from stcal.design import BoardDesign, Polarity, reference_board
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.design import BoardEntry, Count, Squares, board_design, board_toml, load_board
+from stcal.io.design import BoardEntry, Count, Squares, board_design, board_toml
+from stcal.io.design import load_board as load_dots
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.json import mistake
 from stcal.io.plain_yaml import load_yaml
@@ -192,7 +193,7 @@ def load_run_board(path: str | Path) -> BoardDesign:
     InputError
         As :func:`load_flat_board`; or it is another board, or its circles have no radius.
     """
-    board = load_flat_board(path) if Path(path).is_file() else load_board(path)
+    board = load_flat_board(path) if Path(path).is_file() else load_dots(path)
     if isinstance(board, BoardDesign):
         return board
     if not isinstance(board, AsymmetricCirclesDesign):
@@ -235,6 +236,10 @@ def save_run_board(path: str | Path, board: BoardDesign) -> None:
     require_same(path, lambda: run_board_toml(load_run_board(path)), text)
 
 
+load_board, save_board = load_run_board, save_run_board
+"""Names of the public interface."""
+
+
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
     """Read a file of one board of any kind (form: ``data_layout.md``); without ``type`` it is a board of dots.
 
@@ -249,7 +254,7 @@ def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
 def design_of(path: str | Path, content: dict[str, Any] | None) -> BoardDesign | FlatBoard:
     """Return the board of a file's content; errors as :func:`load_flat_board`."""
     if content is None:
-        return load_board(path)  # no TOML: the error states why
+        return load_dots(path)  # no TOML: the error states why
     if "type" not in content and not OF_OTHERS.isdisjoint(content):
         raise InputError("E-BOARD-TYPE", f"board file {path}: no type; {REMEDY}")
     return flat_board(content, f"board file {path}")

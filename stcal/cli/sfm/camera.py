@@ -112,7 +112,7 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
         else:
             result = calibrate_camera_by_corners(images, board, model, workers, progress)
     intrinsics = result.intrinsics
-    save_camera(out, Camera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance))
+    save_camera(out, Camera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance), "colmap")
     summary = CalibrationFile.of(result)
     document = calibration_report(result, summary, str(images))
     say(document.text())

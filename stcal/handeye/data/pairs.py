@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
-from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.io.quaternions import Order
+from stcal.geometry.rigid import Order, Poses, Rigid, skew
 from stcal.io.table import Table, read_table
 
 WHAT = "pose file"

@@ -9,6 +9,7 @@ import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -32,6 +33,10 @@ from stcal.io.cameras.keys import require_known
 from stcal.io.cameras.matlab import mat, zhang
 from stcal.io.cameras.model import CameraModel, cameras_txt
 
+CameraForm = Literal[
+    "colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab", "zhang"
+]
+"""Forms in which cameras are written."""
 SUFFIXES = {
     ".txt": "colmap",
     ".bin": "colmap-bin",

@@ -8,8 +8,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, freeze
-from stcal.geometry.rigid import Poses
-from stcal.io.quaternions import Order
+from stcal.geometry.rigid import Order, Poses
 from stcal.io.table import ANGLES, LENGTHS, Table, read_table
 from stcal.robot.kinematics.conditions import (
     PAYLOAD,

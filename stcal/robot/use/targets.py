@@ -9,8 +9,8 @@ from scipy.spatial import KDTree
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
-from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.quaternions import EXPLAINS, READINGS, Order
+from stcal.geometry.rigid import Order, Poses, Rigid
+from stcal.io.quaternions import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, oriented, read_conditions, unread
 from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_convention

@@ -68,8 +68,8 @@ class RunResult:
 
     Parameters
     ----------
-    out : Path
-        The run's folder.
+    out : Path or None
+        The run's folder; None if no file stays.
     camera : Camera
         The camera as its file states it; refined intrinsics are ``calibration.camera``.
     target_design, board_design : TargetDesign, BoardDesign
@@ -100,7 +100,7 @@ class RunResult:
         False if the camera was found from the photographs; ``camera`` is then the start of its adjustment.
     """
 
-    out: Path
+    out: Path | None
     camera: Camera
     target_design: TargetDesign
     board_design: BoardDesign
@@ -130,7 +130,8 @@ class RunResult:
 
     def __repr__(self) -> str:
         faces = "; ".join(", ".join(row) for row in self._summary())
-        return f"<RunResult in {self.out}: {self._verdict()}; face, σ µm, σ mdeg: {faces or 'no face'}>"
+        place = f" in {self.out}" if self.out else ""
+        return f"<RunResult{place}: {self._verdict()}; face, σ µm, σ mdeg: {faces or 'no face'}>"
 
     def _repr_html_(self) -> str:
         """Returns verdict, faces and σ as HTML, which notebooks show."""

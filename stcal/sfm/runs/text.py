@@ -58,11 +58,12 @@ def run_text(result: RunResult) -> str:
         lines += _compared(result.comparison)
     if result.judgement is not None:
         lines += [f"{question} {answer}" for question, answer in result.judgement.answers()]
-    if result.target.target_from_face:
+    if result.out is not None and result.target.target_from_face:
         lines.append(f"faces:  {result.out / 'faces.json'}")
-    if result.refined_camera is not None:
+    if result.out is not None and result.refined_camera is not None:
         lines.append(f"camera: {result.out / REFINED_CAMERA}, as adjusted, with σ")
-    lines.append(f"report: {result.out / 'report.html'}")
+    if result.out is not None:
+        lines.append(f"report: {result.out / 'report.html'}")
     return "\n".join(part for line in lines for part in wrapped(line))
 
 
