@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.boards.dictionaries import known_tags
 from stcal.design import BoardDesign, Polarity
@@ -105,9 +106,9 @@ class TagLayout:
         cls,
         dictionary: str,
         ids: Sequence[int],
-        xy_mm: np.ndarray,
-        size_mm: float | np.ndarray,
-        angle_deg: float | np.ndarray = 0.0,
+        xy_mm: ArrayLike,
+        size_mm: ArrayLike,
+        angle_deg: ArrayLike = 0.0,
         sigma_mm: float = 0.0,
     ) -> "TagLayout":
         """Return the layout of square tags of one dictionary.
