@@ -217,7 +217,7 @@ class Camera:
         jacobian[:, :, 4:] *= self.focal[:, None]
         return jacobian
 
-    def distort(self, xy: np.ndarray) -> np.ndarray:
+    def distort(self, xy: ArrayLike) -> np.ndarray:
         """Apply the lens distortion to ideal normalised coordinates.
 
         Parameters
@@ -303,7 +303,7 @@ class Camera:
             moved_x, moved_y = moved_x + r2 * (s1 + r2 * s2), moved_y + r2 * (s3 + r2 * s4)
         return moved_x, moved_y
 
-    def undistort(self, xy_distorted: np.ndarray) -> np.ndarray:
+    def undistort(self, xy_distorted: ArrayLike) -> np.ndarray:
         """Invert :meth:`distort` by Newton's method to 1e-12.
 
         Raises
@@ -361,15 +361,15 @@ class Camera:
             )
         return xy * np.where(theta > 0, np.tan(theta) / np.where(theta > 0, theta, 1.0), 1.0)[..., None]
 
-    def pixel_from_normalised(self, xy: np.ndarray) -> np.ndarray:
+    def pixel_from_normalised(self, xy: ArrayLike) -> np.ndarray:
         """Return the pixels (..., 2) of ideal normalised coordinates (..., 2), lens distortion applied."""
         return self.distort(xy) * self.focal + self.centre
 
-    def normalised_from_pixel(self, xy_px: np.ndarray) -> np.ndarray:
+    def normalised_from_pixel(self, xy_px: ArrayLike) -> np.ndarray:
         """Return ideal normalised coordinates (..., 2) of pixels (..., 2), lens distortion removed."""
         return self.undistort((np.asarray(xy_px, float) - self.centre) / self.focal)
 
-    def project(self, xyz_camera: np.ndarray) -> np.ndarray:
+    def project(self, xyz_camera: ArrayLike) -> np.ndarray:
         """Return the pixels (..., 2) of points (..., 3) in the camera frame."""
         xyz = np.asarray(xyz_camera, float)
         return self.pixel_from_normalised(xyz[..., :2] / xyz[..., 2:])

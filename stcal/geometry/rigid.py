@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Array, freeze, frozen
+from stcal.geometry.arrays import MYPY, Array, freeze, frozen
 
 Order = Literal["wxyz", "xyzw"]
 """Order of a quaternion's components. For tables ``wxyz`` : as the columns are named; ``xyzw`` : x, y, z, w in the
@@ -69,7 +69,7 @@ class _ByValue:
         return hash(repr(self._values()).replace("-0.0", "0.0"))
 
 
-if TYPE_CHECKING:
+if TYPE_CHECKING and not MYPY:
 
     class Turn(Array):
         """Type of a field of rotation matrices, which accepts SciPy's rotations too."""
@@ -203,6 +203,12 @@ class Similarity(_ByValue):
     def __post_init__(self):
         if not (np.isfinite(self.scale) and self.scale > 0):
             raise InputError("E-SCALE-VALUE", f"similarity: scale {self.scale}, a positive number needed")
+
+    def matrix(self) -> np.ndarray:
+        """Return the homogeneous 4×4 matrix, with the scale in its 3×3 part."""
+        m = self.rigid.matrix()
+        m[:3, :3] *= self.scale
+        return m
 
     def inverse(self) -> "Similarity":
         """Return b_from_a."""
