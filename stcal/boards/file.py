@@ -188,6 +188,16 @@ def load_tags(path: str | Path, what: str) -> TagsFile:
 def load_run_board(path: str | Path) -> BoardDesign:
     """Read the file of a board beside a target: dots, or asymmetric circles as places of a lattice.
 
+    Parameters
+    ----------
+    path : str or Path
+        ``board.toml``, or the file of another kind of board (form: ``data_layout.md``).
+
+    Returns
+    -------
+    BoardDesign
+        Board frame, mm.
+
     Raises
     ------
     InputError
@@ -230,7 +240,15 @@ def run_board_toml(board: BoardDesign) -> str:
 
 
 def save_run_board(path: str | Path, board: BoardDesign) -> None:
-    """Write the file of a board beside a target, and require that it is read as the same board."""
+    """Write the file of a board beside a target, and require that it is read as the same board.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``board.toml`` to write.
+    board : BoardDesign
+        Board of dots.
+    """
     text = run_board_toml(board)
     save(Path(path), text)
     require_same(path, lambda: run_board_toml(load_run_board(path)), text)

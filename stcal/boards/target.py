@@ -24,6 +24,16 @@ KINDS = {CharucoDesign: "charuco", AprilGridDesign: "aprilgrid"}
 def load_body(path: str | Path) -> TargetDesign:
     """Read ``target.toml`` with faces of circles, boards and tags; errors as :func:`stcal.io.design.load_target`.
 
+    Parameters
+    ----------
+    path : str or Path
+        The file (form: ``data_layout.md``).
+
+    Returns
+    -------
+    TargetDesign
+        Faces in their own frames, mm.
+
     Raises
     ------
     InputError
@@ -54,7 +64,15 @@ def body_toml(target: TargetDesign) -> str:
 
 
 def save_body(path: str | Path, target: TargetDesign) -> None:
-    """Write the file of a target, and require that it is read as the same design."""
+    """Write the file of a target, and require that it is read as the same design.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``target.toml`` to write.
+    target : TargetDesign
+        Faces of circles, boards and tags.
+    """
     text = body_toml(target)
     save(Path(path), text)
     require_same(path, lambda: body_toml(load_body(path)), text)

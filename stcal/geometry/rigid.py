@@ -240,7 +240,17 @@ class Similarity(_ByValue):
 class Poses(_ByValue):
     """A stack of m transforms a_from_b.
 
-    ``rotation`` : (m, 3, 3), proper to 1e-6; ``translation`` : (m, 3), origin of b in a, mm.
+    Parameters
+    ----------
+    rotation : (m, 3, 3) array
+        Proper rotations, to 1e-6.
+    translation : (m, 3) array
+        Origins of b in a, mm.
+
+    Raises
+    ------
+    InputError
+        Arrays of other shapes, or matrices that are no rotations.
     """
 
     rotation: Array

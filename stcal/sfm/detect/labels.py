@@ -159,6 +159,11 @@ def detect_circles(
     options : EllipseOptions, optional
         Options of the search; the defaults if None.
 
+    Returns
+    -------
+    Detection
+        Labels, centres and covariances; empty if nothing is recognised, with notes that say why.
+
     Raises
     ------
     InputError
