@@ -173,6 +173,10 @@ def write_dataset(
     ----------
     folder : path
         Folder of the data set. It is created if missing, and must be empty.
+    scene : Scene
+        Target, board, camera and views.
+    render_options : RenderOptions, optional
+        Appearance of the photographs; the defaults if None.
     image_format : {"jpg", "png"}
     jpeg_quality : int
     workers : int, optional

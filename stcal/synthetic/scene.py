@@ -105,8 +105,21 @@ class Group:
 class Scene:
     """Truth of a simulated measurement.
 
-    ``target_from_face`` : three-point frames through the circles as really placed, by face id. The first face of the
-    design is the reference: its frame is the target frame. ``circles_target`` : (3,) mm by label.
+    Parameters
+    ----------
+    target, board : TargetDesign, BoardDesign
+        Designs of what is photographed.
+    camera : Camera
+        The camera, as it really is.
+    target_from_face : dict of Rigid
+        Three-point frames through the circles as really placed, by face id. The first face of the design is the
+        reference: its frame is the target frame.
+    circles_target : dict of (3,) array
+        Centres of the circles as really placed, by label, target frame, mm.
+    groups : dict of Group
+        Board and views of each group, by name.
+    seed : int
+        Of all that is random, noise of the photographs included.
     """
 
     target: TargetDesign
@@ -152,6 +165,11 @@ def make_scene(
         Design of the board; the reference board by default.
     nominal : dict of Rigid, optional
         Nominal pose of every face in one common frame, by face id; the rough poses of ``target`` by default.
+
+    Returns
+    -------
+    Scene
+        Target, board and camera as really made, and the views of each group.
 
     Raises
     ------
