@@ -27,7 +27,7 @@ if TYPE_CHECKING and not MYPY:
         def __set__(self, instance: object, value: ArrayLike) -> None: ...
 
 else:
-    Array = np.ndarray
+    Array = np.ndarray  # pyright: ignore[reportAssignmentType]  # to mypy, and at run time
 
 
 @lru_cache

@@ -77,7 +77,7 @@ if TYPE_CHECKING and not MYPY:
         def __set__(self, instance: object, value: ArrayLike | Rotation) -> None: ...
 
 else:
-    Turn = Array
+    Turn = Array  # pyright: ignore[reportAssignmentType]  # to mypy, and at run time
 
 
 @dataclass(frozen=True, slots=True, eq=False)

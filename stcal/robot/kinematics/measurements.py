@@ -145,9 +145,9 @@ class Measurements:
         m = len(values)
         if targets and len(targets) != m:
             raise InputError("E-NAMES-COUNT", f"{where}: {len(targets)} names of targets for {m} rows; one each needed")
-        optional = {"positions": positions, "rotations": rotations, "covariance": covariance}
-        arrays = {key: np.asarray(value, float) for key, value in optional.items() if value is not None}
-        return cls(where, range(1, m + 1), values, tuple(targets) or ("",) * m, **arrays)
+        given = (positions, rotations, covariance)
+        places, turns, spread = (None if each is None else np.asarray(each, float) for each in given)
+        return cls(where, range(1, m + 1), values, tuple(targets) or ("",) * m, places, turns, spread)
 
     def __len__(self) -> int:
         return len(self.q)

@@ -1,5 +1,6 @@
 """Result of a run, and its comparison with the published method."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -34,6 +35,8 @@ from stcal.sfm.runs.solve import GroupSolution
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+Cells = Mapping[str, str | float]
+"""A row of a table."""
 Rows = Literal["faces", "circles", "images", "observations"]
 """Tables of :meth:`RunResult.to_dataframe`."""
 
@@ -129,7 +132,7 @@ def _images(model: MetricModel, camera: Camera, scale: float) -> list[ImageResul
     ]
 
 
-def _pose_cells(pose: Rigid, sigma: np.ndarray) -> dict[str, object]:
+def _pose_cells(pose: Rigid, sigma: np.ndarray) -> dict[str, float]:
     """Returns the cells of a pose with σ (6,) of rotation and translation."""
     names = ("rx_rad", "ry_rad", "rz_rad", "x_mm", "y_mm", "z_mm")
     values = {name: float(value) for name, value in zip(names, pose.log(), strict=True)}
@@ -261,7 +264,7 @@ class RunResult:
             raise InputError("E-EXTRA-MISSING", "DataFrame: needs pandas; install stcal[pandas]") from error
         return DataFrame(tables[rows]())
 
-    def _faces(self) -> list[dict[str, object]]:
+    def _faces(self) -> list[Cells]:
         table = []
         for face, pose in self.target.target_from_face.items():
             covariance = self.target.face_covariance.get(face)
@@ -269,7 +272,7 @@ class RunResult:
             table.append({"face": face} | _pose_cells(pose, sigma))
         return table
 
-    def _circles(self) -> list[dict[str, object]]:
+    def _circles(self) -> list[Cells]:
         table = []
         for label, xyz in self.target.circles.items():
             covariance = self.target.circle_covariance.get(label)
@@ -279,7 +282,7 @@ class RunResult:
             table.append({"label": str(label), "face": label.face} | cells)
         return table
 
-    def _images(self) -> list[dict[str, object]]:
+    def _images(self) -> list[Cells]:
         return [
             {"image": image.name, "group": image.group}
             | _pose_cells(image.camera_from_target, np.sqrt(np.diag(image.covariance)))
@@ -287,7 +290,7 @@ class RunResult:
             for image in self.images()
         ]
 
-    def _seen(self) -> list[dict[str, object]]:
+    def _seen(self) -> list[Cells]:
         return [
             {"image": image.name, "group": image.group, "label": str(label)}
             | {"x_px": x, "y_px": y, "residual_x_px": dx, "residual_y_px": dy}
