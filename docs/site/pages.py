@@ -22,7 +22,11 @@ SYSTEMS = {
 }
 """Packages whose ``__all__`` is the public interface."""
 BESIDE = {
-    "stcal": tuple(name for name in stcal.__all__ if not inspect.ismodule(getattr(stcal, name))),
+    "stcal": tuple(
+        name
+        for name in stcal.__all__
+        if not inspect.ismodule(value := getattr(stcal, name)) and value.__module__ != "stcal.errors"
+    ),
     "stcal.errors": None,
 }
 """Names that results and arguments are made of; all that a module defines where None."""
