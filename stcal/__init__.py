@@ -1,25 +1,10 @@
 """stcal: calibration of stereo targets from photographs of a single camera, and the use of them.
 
-See :func:`stcal.sfm.run` for the main job and ``docs/explanation/conventions.md`` for conventions. Each system is a
-package, loaded when it is first used.
+See :func:`stcal.sfm.run` for the main job, ``docs/howto/python.md`` for twelve tasks, and
+``docs/explanation/conventions.md`` for conventions. Names are loaded when they are first used.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from stcal import handeye, locate, register, robot, sfm
+import lazy_loader
 
 __version__ = "0.1.0"
-__all__ = ["handeye", "locate", "register", "robot", "sfm"]
-
-
-def __getattr__(name: str):
-    """Imports a system when it is first used."""
-    if name not in __all__:
-        raise AttributeError(f"module stcal has no attribute {name}")
-    return import_module(f"stcal.{name}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

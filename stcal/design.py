@@ -31,18 +31,41 @@ class Printed(Protocol):
 class FaceDesign:
     """One face of the target: circles in the face frame (origin circle at 0, X through the x circle, Z out of the box).
 
-    ``ids`` : n circle ids; ``xy_mm`` : (n, 2); ``radius_mm`` : (n,);
-    ``origin``, ``x``, ``y`` : ids of the circles that define the frame;
-    ``rough_target_from_face`` : approximate pose of the face in a frame that all faces share, or None if the design
-    states none. Plans and simulations use it, a calibration does not;
-    ``outline_mm`` : (k, 2) corners of its plate in order, face frame, for drawings, or None if the design states none;
-    ``rim_mm`` : (n,) heights of the rims in front of the circles, negative for discs that stand out, or None if the
-    circles lie in the surface of the plate;
-    ``printed`` : the board or tags on the face, whose corners are the face's points (radii are then nearly zero), and
-    whose frame is the face frame, Z into the body; None for a face of circles;
-    ``sigma_mm`` : σ of a point's place in the plane about the design if the design is what the face was made by, as
-    print is; None if the design only names the points; ``size_sigma`` : relative σ of the printed size; ``of_tags`` :
-    whether the corners are those of tags, four by four, whose edges light and ink move.
+    Parameters
+    ----------
+    id : str
+        Name of the face.
+    ids : tuple of str
+        Names of its n circles.
+    xy_mm : (n, 2) array
+        Centres, face frame, mm.
+    radius_mm : (n,) array
+        Radii, mm.
+    origin, x, y : str
+        Circles that define the frame.
+    rough_target_from_face : Rigid, optional
+        Approximate pose of the face in a frame that all faces share. Plans and simulations use it, a calibration does
+        not.
+    outline_mm : (k, 2) array, optional
+        Corners of its plate in order, face frame, for drawings.
+    rim_mm : (n,) array, optional
+        Heights of the rims in front of the circles, negative for discs that stand out; if None, the circles lie in the
+        surface of the plate.
+    printed : Printed, optional
+        The board or tags on the face, whose corners are the face's points (radii are then nearly zero), and whose frame
+        is the face frame, Z into the body; None for a face of circles.
+    sigma_mm : float, optional
+        σ of a point's place in the plane about the design if the design is what the face was made by, as print is; None
+        if the design only names the points.
+    size_sigma : float
+        Relative σ of the printed size.
+    of_tags : bool
+        Whether the corners are those of tags, four by four, whose edges light and ink move.
+
+    Raises
+    ------
+    InputError
+        Arrays of other shapes; circles that overlap or occur twice; frame circles that give no frame.
     """
 
     id: str
@@ -98,8 +121,23 @@ class KnownDistance:
 class TargetDesign:
     """Target: its faces, and whether its circles are brighter or darker than their surroundings.
 
-    ``unusual_size`` : whether radii that no hardware has in mm are meant as they stand;
-    ``distances`` : known distances between its points.
+    Parameters
+    ----------
+    name : str
+        For messages and reports.
+    polarity : {"bright", "dark"}
+        Of the circles against their surroundings.
+    faces : tuple of FaceDesign
+        The first one is the reference face.
+    unusual_size : bool
+        Whether radii that no hardware has in mm are meant as they stand.
+    distances : tuple of KnownDistance
+        Known distances between its points.
+
+    Raises
+    ------
+    InputError
+        Another polarity, ids that occur twice, faces that look alike, lengths that are not mm.
     """
 
     name: str
@@ -185,9 +223,29 @@ class StatedSize:
 class BoardDesign:
     """Board with a rectangular grid of dots; X along a row, Y down the columns, Z into the board, origin at dot (0, 0).
 
-    ``corner`` : (row, column) of the one larger dot, with ``corner_radius_mm``, or None for a plain board.
-    ``sigma_mm`` : standard deviation of the dots' positions about the grid, per axis; ``stated`` : its stated size;
-    ``unusual_size`` : whether a pitch or radius that no hardware has in mm is meant as it stands.
+    Parameters
+    ----------
+    rows, columns : int
+        Numbers of dots down and across.
+    pitch_mm, radius_mm : float
+        Distance of neighbouring dots, and their radius, mm.
+    polarity : {"bright", "dark"}
+        Of the dots against the board.
+    sigma_mm : float
+        Standard deviation of the dots' positions about the grid, per axis, mm.
+    corner : (int, int), optional
+        Row and column of the one larger dot; None for a plain board.
+    corner_radius_mm : float, optional
+        Radius of the larger dot, mm.
+    stated : StatedSize
+        What is stated of its size beside the drawing.
+    unusual_size : bool
+        Whether a pitch or radius that no hardware has in mm is meant as it stands.
+
+    Raises
+    ------
+    InputError
+        Numbers that no board has, dots that overlap, a larger dot that is not at a corner.
     """
 
     rows: int
@@ -432,7 +490,11 @@ def _dot_labels(rows: int, columns: int) -> tuple[DotLabel, ...]:
 def reference_target() -> TargetDesign:
     """Returns the reference design: five faces of seven big and three small circles (after Zhang & Wei 2017, fig. 1).
 
-    Rough poses: target frame = frame of face 1; close to table 2 of Zhang & Wei (2017) as far as that is consistent.
+    Returns
+    -------
+    TargetDesign
+        Rough poses: target frame = frame of face 1; close to table 2 of Zhang & Wei (2017) as far as that is
+        consistent.
     """
     common = {"1": (0, 0), "2": (40, 0), "3": (80, 0), "4": (0, 40), "5": (0, 80), "6": (40, 40), "7": (80, 80)}
     small = {"a": (20, 0), "b": (0, 20)}
@@ -456,5 +518,11 @@ def reference_target() -> TargetDesign:
 
 
 def reference_board() -> BoardDesign:
-    """Returns the reference board: 9 columns × 7 rows, 30 mm pitch, radius 7.5 mm, bright, plain, σ 5 µm."""
+    """Returns the reference board.
+
+    Returns
+    -------
+    BoardDesign
+        9 columns × 7 rows, 30 mm pitch, radius 7.5 mm, bright, plain, σ 5 µm.
+    """
     return BoardDesign(7, 9, 30.0, 7.5, "bright", 0.005)

@@ -24,7 +24,7 @@ from stcal.robot import DesignOptions, DHRow, IdentifyOptions, Joint, Robot
 from stcal.sfm import RunOptions
 from tests.outcome import fails_with
 
-SYSTEMS = ("sfm", "robot", "register", "handeye", "locate")
+SYSTEMS = ("sfm", "robot", "register", "handeye", "locate", "synthetic")
 
 
 def public() -> dict[str, object]:

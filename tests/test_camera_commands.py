@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from stcal.cli.cameras import app
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.difference import camera_difference
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from tests.outcome import fails_with
 
@@ -19,7 +19,7 @@ CAMERA = Camera(1280, 960, [900.0, 905.0], [640.0, 475.0], [-0.1, 0.03, 1e-3, -2
 @pytest.fixture
 def folder(tmp_path):
     sigma = np.array([0.1, 0.1, 0.2, 0.2, 1e-4, 1e-3, 1e-5, 1e-5])
-    write_cameras_txt(tmp_path / "a.txt", CalibratedCamera.of(CAMERA, "OPENCV", np.diag(sigma**2)))
+    write_cameras_txt(tmp_path / "a.txt", Camera.of(CAMERA, "OPENCV", np.diag(sigma**2)))
     return tmp_path
 
 
@@ -52,7 +52,7 @@ def test_a_size_that_the_file_does_not_state_is_asked_for(folder):
 def test_what_is_shown_is_the_cameras(folder):
     """Field of view of a lens without distortion: 2 atan(640 / 900) across."""
     plain = Camera(1280, 960, [900.0, 900.0], [639.5, 479.5], np.zeros(8))
-    write_cameras_txt(folder / "p.txt", CalibratedCamera.of(plain, "PINHOLE"))
+    write_cameras_txt(folder / "p.txt", Camera.of(plain, "PINHOLE"))
     said = call("show", folder / "p.txt", "--plot", folder / "p.png")
     assert f"field of view: {2 * np.degrees(np.arctan(640 / 900)):.2f}° across" in said
     assert "moves points by up to 0.00 px" in said
@@ -73,8 +73,6 @@ def test_a_principal_point_is_mostly_a_turn_and_a_focal_length_is_not():
 
 
 def test_cameras_of_two_sizes_are_refused(folder):
-    write_cameras_txt(
-        folder / "b.txt", CalibratedCamera.of(Camera(640, 480, [450, 450], [320, 240], np.zeros(8)), "PINHOLE")
-    )
+    write_cameras_txt(folder / "b.txt", Camera.of(Camera(640, 480, [450, 450], [320, 240], np.zeros(8)), "PINHOLE"))
     with fails_with("E-CAMERA-SIZES-DIFFER … 1280 … 960 … 640 … 480"):
         call("compare", folder / "a.txt", folder / "b.txt")

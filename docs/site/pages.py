@@ -8,6 +8,7 @@ from typing import Any
 
 from typer.main import get_command
 
+import stcal
 from stcal.cli.help import PLAIN, examples_of
 from stcal.cli.main import app
 
@@ -17,13 +18,15 @@ SYSTEMS = {
     "register": "Registration",
     "handeye": "Hand-eye",
     "locate": "Targets of tags",
+    "synthetic": "Simulation",
 }
 """Packages whose ``__all__`` is the public interface."""
 BESIDE = {
-    "stcal.geometry.rigid": ("Rigid",),
-    "stcal.io.cameras.model": ("CameraModel",),
-    "stcal.io.cameras.read": ("read_camera",),
-    "stcal.io.design": ("load_target", "load_board"),
+    "stcal": tuple(
+        name
+        for name in stcal.__all__
+        if not inspect.ismodule(value := getattr(stcal, name)) and value.__module__ != "stcal.errors"
+    ),
     "stcal.errors": None,
 }
 """Names that results and arguments are made of; all that a module defines where None."""

@@ -24,9 +24,9 @@ from scipy.stats import norm
 
 from stcal.design import StatedSize, reference_board
 from stcal.geometry.align import align_rigid
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.cameras.model import CalibratedCamera, CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import CameraPrior
 from stcal.labels import CircleLabel
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import SigmaFactors, calibrate, with_sigma
@@ -68,7 +68,7 @@ class Case:
     refined: bool
 
     @property
-    def camera(self) -> CalibratedCamera:
+    def camera(self) -> Camera:
         """With what its file states."""
         return replace(self.scene.camera, covariance=np.diag(CAMERA_SIGMA**2))
 

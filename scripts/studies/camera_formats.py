@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError, InputNote
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.difference import fit_lens
 from stcal.io.cameras.foreign import ForeignLens
 from stcal.io.cameras.forms import WRITERS, written
-from stcal.io.cameras.model import CalibratedCamera, parameter_names
 from stcal.io.cameras.read import read_lens
 from tests.io import camera_files, reported_cameras
 
@@ -102,12 +101,12 @@ TRIED = (
 """Program, model, and the file of a lens of it."""
 
 
-def camera_of(model: str, k: list[float]) -> CalibratedCamera:
+def camera_of(model: str, k: list[float]) -> Camera:
     camera = Camera(
         WIDTH, HEIGHT, [812.25, 809.5], [640.125, 478.0625], np.pad(k, (0, 12 - len(k))), "FISHEYE" in model
     )
     q = len(parameter_names(model))
-    return CalibratedCamera.of(camera, model, np.diag(np.full(q, 1e-4)))
+    return Camera.of(camera, model, np.diag(np.full(q, 1e-4)))
 
 
 def off_px(one: Camera, two: Camera) -> float:

@@ -37,7 +37,7 @@ import numpy as np
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
 from stcal.labels import BOARD
 from tests.support import degrade
 from tests.support.photograph import Photograph, Plane, RenderedSet, read_set
@@ -500,7 +500,7 @@ def write_case(kind: Kind, case: Case, folder: Path) -> dict[str, Picture]:
         picture.pixels = b""
         pictures[photo.name.rpartition(".")[0]] = picture
     camera = kind.camera(case) if kind.camera else case.data.camera
-    write_cameras_txt(folder / "cameras.txt", CalibratedCamera.of(camera, case.data.camera.colmap_model))
+    write_cameras_txt(folder / "cameras.txt", Camera.of(camera, case.data.camera.colmap_model))
     return pictures
 
 

@@ -19,7 +19,7 @@ from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.report.file import HandEyeFile
 from stcal.handeye.report.page import outcome_report
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.workflows.handeye.calibrate import ALL, Splits, calibrate
 from stcal.workflows.handeye.inputs import read_input
@@ -78,7 +78,7 @@ def dots(data: Path, scratch: Path, splits: Splits = DEFAULT) -> tuple[dict, str
 
 def _camera_file(scratch: Path, camera: Camera, covariance: np.ndarray | None = None) -> Path:
     scratch.mkdir(parents=True, exist_ok=True)
-    write_cameras_txt(scratch / "cameras.txt", CalibratedCamera.of(camera, "OPENCV", covariance))
+    write_cameras_txt(scratch / "cameras.txt", Camera.of(camera, "OPENCV", covariance))
     return scratch / "cameras.txt"
 
 

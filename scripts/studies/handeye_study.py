@@ -17,6 +17,7 @@ from itertools import product
 import numpy as np
 from scipy.stats import chi2
 
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise, handeye
 from stcal.handeye.data.pairs import SETUPS, Loop
@@ -24,7 +25,7 @@ from stcal.handeye.data.views import Views, pairs_of_views
 from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.noise import components
 from stcal.handeye.methods.reprojection import problem
-from stcal.io.cameras.model import CalibratedCamera, camera_prior, intrinsic_basis
+from stcal.io.cameras.model import camera_prior
 from stcal.parallel import one_thread
 from stcal.workflows.cluster import executor_of
 from tests.support.handeye import CAMERA, Truth, simulated, simulated_views
@@ -35,7 +36,7 @@ NOISES = {
     "camera ≈ robot": Noise(5e-4, 0.2, 5e-4, 0.2, **CORNERS),
     "robot ≫ camera": Noise(1e-3, 0.3, 1e-4, 0.03, **CORNERS),
 }
-PRIOR = camera_prior(CalibratedCamera.of(CAMERA, "OPENCV"))
+PRIOR = camera_prior(Camera.of(CAMERA, "OPENCV"))
 """What is stated of the camera."""
 CAMERAS = {
     "pose, camera as filed": ("pose", HandEyeOptions(camera=PRIOR)),

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.io.cameras.model import CameraPrior, intrinsic_basis
+from stcal.geometry.camera import intrinsic_basis
+from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.measurement.pose import TargetPose, pose_from_circles

@@ -13,8 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from stcal.design import reference_board
+from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.cameras.model import CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px

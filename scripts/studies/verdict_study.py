@@ -25,7 +25,6 @@ from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_conic, circle_image_offset, ellipse_of_conic
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import find_images
 from stcal.labels import CircleLabel, DotLabel
@@ -59,7 +58,7 @@ class Case:
 
     scene: Scene
     images: list[ImageObservations]
-    camera: CalibratedCamera
+    camera: Camera
     target: TargetDesign
     board: BoardDesign
     seed: int = 0
@@ -68,7 +67,7 @@ class Case:
         """The case with another camera file."""
         values = {key: getattr(self.camera, key) for key in ("width", "height", "focal", "centre", "distortion")}
         camera = Camera(**values | change)
-        return replace(self, camera=CalibratedCamera.of(camera, "FULL_OPENCV"))
+        return replace(self, camera=Camera.of(camera, "FULL_OPENCV"))
 
     def centres(self, change: Callable[[ImageObservations, int], np.ndarray]) -> "Case":
         """The case with other centres, px, made from each image and its number."""
@@ -97,7 +96,7 @@ def photographed(folder: Path) -> Case:
         groups[name] = Group(name, (), np.eye(3), Rigid(), dots, poses)
     frames = {face: Rigid.from_matrix(m) for face, m in data.truth["target_from_face"].items()}
     circles = {CircleLabel(*label.split(":")): np.array(xyz) for label, xyz in data.truth["circles"].items()}
-    camera = CalibratedCamera.of(data.camera, "FULL_OPENCV")
+    camera = Camera.of(data.camera, "FULL_OPENCV")
     scene = Scene(data.target, data.board, camera, frames, circles, groups, 0)
     with tempfile.TemporaryDirectory() as scratch:
         designs, options = (data.target, data.board), EllipseOptions()
@@ -147,7 +146,7 @@ def simulated(seed: int = 7) -> Case:
     """A set of another target and board, four images in each of three groups, without photographs."""
     options = SceneOptions(seed=seed, width=2400, height=1600, images_per_group=4)
     scene = make_scene(options, *second_design())
-    camera = CalibratedCamera.of(scene.camera, "FULL_OPENCV")
+    camera = Camera.of(scene.camera, "FULL_OPENCV")
     images = observe(scene, NOISE_PX, np.random.default_rng(seed))
     return Case(scene, [shaped(scene, i) for i in images], camera, scene.target, scene.board)
 

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.boards.dictionaries import known_tags
 from stcal.design import BoardDesign, Polarity
@@ -105,9 +106,9 @@ class TagLayout:
         cls,
         dictionary: str,
         ids: Sequence[int],
-        xy_mm: np.ndarray,
-        size_mm: float | np.ndarray,
-        angle_deg: float | np.ndarray = 0.0,
+        xy_mm: ArrayLike,
+        size_mm: ArrayLike,
+        angle_deg: ArrayLike = 0.0,
         sigma_mm: float = 0.0,
     ) -> "TagLayout":
         """Return the layout of square tags of one dictionary.
@@ -134,9 +135,8 @@ class TagLayout:
         """
         n = len(ids)
         middle = frozen(xy_mm, (n, 2), "tags' middles")
-        one_each = np.ones(n)
-        size = frozen(size_mm * one_each if np.ndim(size_mm) == 0 else size_mm, (n,), "tags' sizes")
-        angle = np.radians(frozen(angle_deg * one_each if np.ndim(angle_deg) == 0 else angle_deg, (n,), "tags' angles"))
+        sizes, angles = (np.full(n, each) if np.ndim(each) == 0 else each for each in (size_mm, angle_deg))
+        size, angle = frozen(sizes, (n,), "tags' sizes"), np.radians(frozen(angles, (n,), "tags' angles"))
         if not (size > 0).all():
             raise InputError("E-TAG-SIZE", f"tag layout: size {size.min():g} mm; a positive number needed")
         c, s = np.cos(angle), np.sin(angle)

@@ -25,7 +25,8 @@ from stcal.boards.dictionaries import count_of, known_dictionary
 from stcal.design import BoardDesign, Polarity, reference_board
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.design import BoardEntry, Count, Squares, board_design, board_toml, load_board
+from stcal.io.design import BoardEntry, Count, Squares, board_design, board_toml
+from stcal.io.design import load_board as load_dots
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.json import mistake
 from stcal.io.plain_yaml import load_yaml
@@ -187,12 +188,22 @@ def load_tags(path: str | Path, what: str) -> TagsFile:
 def load_run_board(path: str | Path) -> BoardDesign:
     """Read the file of a board beside a target: dots, or asymmetric circles as places of a lattice.
 
+    Parameters
+    ----------
+    path : str or Path
+        ``board.toml``, or the file of another kind of board (form: ``data_layout.md``).
+
+    Returns
+    -------
+    BoardDesign
+        Board frame, mm.
+
     Raises
     ------
     InputError
         As :func:`load_flat_board`; or it is another board, or its circles have no radius.
     """
-    board = load_flat_board(path) if Path(path).is_file() else load_board(path)
+    board = load_flat_board(path) if Path(path).is_file() else load_dots(path)
     if isinstance(board, BoardDesign):
         return board
     if not isinstance(board, AsymmetricCirclesDesign):
@@ -229,10 +240,22 @@ def run_board_toml(board: BoardDesign) -> str:
 
 
 def save_run_board(path: str | Path, board: BoardDesign) -> None:
-    """Write the file of a board beside a target, and require that it is read as the same board."""
+    """Write the file of a board beside a target, and require that it is read as the same board.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``board.toml`` to write.
+    board : BoardDesign
+        Board of dots.
+    """
     text = run_board_toml(board)
     save(Path(path), text)
     require_same(path, lambda: run_board_toml(load_run_board(path)), text)
+
+
+load_board, save_board = load_run_board, save_run_board
+"""Names of the public interface."""
 
 
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
@@ -249,7 +272,7 @@ def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
 def design_of(path: str | Path, content: dict[str, Any] | None) -> BoardDesign | FlatBoard:
     """Return the board of a file's content; errors as :func:`load_flat_board`."""
     if content is None:
-        return load_board(path)  # no TOML: the error states why
+        return load_dots(path)  # no TOML: the error states why
     if "type" not in content and not OF_OTHERS.isdisjoint(content):
         raise InputError("E-BOARD-TYPE", f"board file {path}: no type; {REMEDY}")
     return flat_board(content, f"board file {path}")

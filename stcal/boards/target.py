@@ -10,7 +10,8 @@ from stcal.boards.design import AprilGridDesign, CharucoDesign, FlatBoard, TagLa
 from stcal.boards.file import flat_board
 from stcal.design import POINT_RADIUS_MM, FaceDesign, TargetDesign, reference_target
 from stcal.errors import InputError
-from stcal.io.design import PrintedFaceFile, load_target, target_toml
+from stcal.io.design import PrintedFaceFile, target_toml
+from stcal.io.design import load_target as load_design
 from stcal.io.files import require_same, save
 from stcal.io.toml import toml_string
 
@@ -23,12 +24,22 @@ KINDS = {CharucoDesign: "charuco", AprilGridDesign: "aprilgrid"}
 def load_body(path: str | Path) -> TargetDesign:
     """Read ``target.toml`` with faces of circles, boards and tags; errors as :func:`stcal.io.design.load_target`.
 
+    Parameters
+    ----------
+    path : str or Path
+        The file (form: ``data_layout.md``).
+
+    Returns
+    -------
+    TargetDesign
+        Faces in their own frames, mm.
+
     Raises
     ------
     InputError
         Also: a tag on two faces, or a board of another kind.
     """
-    target = load_target(path, _printed_face)
+    target = load_design(path, _printed_face)
     face_of_tag: dict[tuple[str, int], str] = {}
     for face in target.with_faces(printed=True).faces:
         for tag in tags_on(face.printed):
@@ -53,10 +64,22 @@ def body_toml(target: TargetDesign) -> str:
 
 
 def save_body(path: str | Path, target: TargetDesign) -> None:
-    """Write the file of a target, and require that it is read as the same design."""
+    """Write the file of a target, and require that it is read as the same design.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``target.toml`` to write.
+    target : TargetDesign
+        Faces of circles, boards and tags.
+    """
     text = body_toml(target)
     save(Path(path), text)
     require_same(path, lambda: body_toml(load_body(path)), text)
+
+
+load_target, save_target = load_body, save_body
+"""Names of the public interface."""
 
 
 def tags_on(printed: Any) -> list[tuple[str, int]]:

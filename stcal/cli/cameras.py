@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.terminal import print_each, say, write
+from stcal.cli.terminal import print_each, say
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
+    from stcal.geometry.camera import Camera
     from stcal.io.cameras.difference import SizedLens
-    from stcal.io.cameras.model import CalibratedCamera
 
 app = typer.Typer(
     name="stcal camera",
@@ -65,21 +65,14 @@ def convert(
     size: SizeOption = "",
 ) -> None:
     """Convert a camera file to the form of another program, and say what that has no place for."""
-    from stcal.io.cameras.forms import SUFFIXES, name_to_write, written
-    from stcal.io.cameras.write import require_camera_written
+    from stcal.io.cameras.write import form_of, save_camera
 
-    kind = form.value if form else SUFFIXES.get(out.suffix.lower())
-    if kind is None:
-        raise InputError(
-            "E-OPTION-FORM",
-            f"{out}: no form of suffix {out.suffix or 'none'}; give --form, or one of {', '.join(SUFFIXES)}",
-        )
+    kind = form_of(out, form.value if form else None)
     camera = _camera(source, name, size)
-    converted = written(camera, kind, name_to_write(name))
+    lost = save_camera(out, camera, kind, name)
     say(f"{source}: {camera.colmap_model}, {camera.width}×{camera.height} px; written as {kind}")
-    print_each(f"note: not in {kind}", converted.lost)
-    write(out, converted.content)
-    require_camera_written(out, camera)
+    print_each(f"note: not in {kind}", lost)
+    say(f"written: {out}")
 
 
 @app.command()
@@ -121,19 +114,19 @@ def compare(
         say(f"picture: {plot}")
 
 
-def _camera(path: Path, name: str, size: str) -> "CalibratedCamera":
+def _camera(path: Path, name: str, size: str) -> "Camera":
     from stcal.io.cameras.difference import SizedLens
 
     lens = _lens(path, name, size)
     return lens.near.camera if isinstance(lens, SizedLens) else lens
 
 
-def _lens(path: Path, name: str, size: str) -> "CalibratedCamera | SizedLens":
+def _lens(path: Path, name: str, size: str) -> "Camera | SizedLens":
     """Return the camera of a file, or a lens of another model with the fit to it, whose quality is printed."""
     from stcal.io.cameras.difference import SizedLens, fit_lens
     from stcal.io.cameras.model import CameraModel
     from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
-    from stcal.io.cameras.read import read_lens
+    from stcal.io.cameras.read import read_lens, sized_camera
     from stcal.report.camera import exif_text, fitted_text
 
     if is_photograph(path):
@@ -145,10 +138,8 @@ def _lens(path: Path, name: str, size: str) -> "CalibratedCamera | SizedLens":
     if len(sides) != 2 or not all(side.isdigit() for side in sides):
         raise InputError("E-OPTION-SIZE", f"--size {size}: two numbers with x between needed, such as 1920x1080")
     width, height = lens.width or int(sides[0]), lens.height or int(sides[1])
-    if not (width and height):
-        raise InputError("E-CAMERA-SIZE", f"camera file {path}: states no image size; give it with --size WxH")
-    if isinstance(lens, CameraModel):
-        return lens.calibrated(width, height)
+    if isinstance(lens, CameraModel) or not (width and height):
+        return sized_camera(lens, path, (width, height))
     fitted = fit_lens(lens, width, height)
     print_each("note", fitted_text(lens.called, fitted, lens.region is not None))
     return SizedLens(lens, width, height, fitted)

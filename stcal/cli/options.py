@@ -19,7 +19,7 @@ from stcal.errors import ChecksFailed, InputError, InputNote, StcalError
 from stcal.io.files import keep_apart
 
 if TYPE_CHECKING:
-    from stcal.io.quaternions import Order
+    from stcal.geometry.rigid import Order
     from stcal.io.table import Table
     from stcal.sfm.detect.circles.candidates import EllipseOptions
 

@@ -10,20 +10,24 @@ from stcal.errors import InputError
 
 Shape = tuple[int | None, ...]
 
-if TYPE_CHECKING:
+MYPY = False
+"""True to mypy, by its name: it knows no descriptors in frozen dataclasses, so that fields are arrays to it."""
+
+if TYPE_CHECKING and not MYPY:
 
     class Array:
         """Type of a dataclass field that accepts any array-like and holds the read-only array of :func:`freeze`.
 
-        To a type checker it is a descriptor: the constructor accepts lists and tuples of numbers, reading returns an
-        ``np.ndarray``. At run time it is ``np.ndarray``. Only for fields; an optional one is ``np.ndarray | None``.
+        To pyright it is a descriptor: the constructor accepts lists and tuples of numbers, reading returns an
+        ``np.ndarray``. At run time, and to mypy, it is ``np.ndarray``. Only for fields; an optional one is
+        ``np.ndarray | None``.
         """
 
         def __get__(self, instance: object, owner: Any) -> np.ndarray: ...
         def __set__(self, instance: object, value: ArrayLike) -> None: ...
 
 else:
-    Array = np.ndarray
+    Array = np.ndarray  # pyright: ignore[reportAssignmentType]  # to mypy, and at run time
 
 
 @lru_cache

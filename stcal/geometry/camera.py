@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.errors import ConvergenceError, InputError
-from stcal.geometry.arrays import Array, freeze
+from stcal.geometry.arrays import Array, freeze, frozen
 
 MAX_NEWTON_STEPS = 50
 COEFFICIENTS = 12
@@ -16,6 +17,28 @@ NEAR_AXIS = 1e-8
 """Largest squared radius at which the series expansion is exact to rounding."""
 UNDISTORT_TOLERANCE = 1e-12
 """Largest error of the inverse distortion, in normalised coordinates (1e-8 px at f = 10 000 px)."""
+COLMAP_PIXEL_ORIGIN = 0.5
+"""COLMAP's coordinate of the centre of the top-left pixel; OpenCV's, and ours, is 0."""
+DISTORTION_COUNTS = (0, 4, 5, 8, 12, 14)
+"""Numbers of distortion coefficients that OpenCV knows."""
+COLMAP_LAYOUT = {
+    "SIMPLE_PINHOLE": [(0, 1), 2, 3],
+    "PINHOLE": [0, 1, 2, 3],
+    "SIMPLE_RADIAL": [(0, 1), 2, 3, 4],
+    "RADIAL": [(0, 1), 2, 3, 4, 5],
+    "OPENCV": list(range(8)),
+    "FULL_OPENCV": list(range(12)),
+    "SIMPLE_RADIAL_FISHEYE": [(0, 1), 2, 3, 4],
+    "RADIAL_FISHEYE": [(0, 1), 2, 3, 4, 5],
+    "OPENCV_FISHEYE": [0, 1, 2, 3, 4, 5, 8, 9],
+    "THIN_PRISM_FISHEYE": [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 14],
+}
+"""Indices of COLMAP's parameters in :data:`PARAMETER_NAMES`, by camera model."""
+COLMAP_MODELS = tuple(COLMAP_LAYOUT)
+"""Camera models that stcal supports."""
+PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+FISHEYE = "FISHEYE"
+"""Part of the names of COLMAP's equidistant models."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +63,15 @@ class Camera:
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 in OpenCV's order; or the first eight.
     fisheye : bool
         True for equidistant projection; k5, k6, s2 and s4 must then be 0.
+    colmap_model : str, optional
+        The COLMAP model that represents the camera exactly; the most general one of its projection if not given.
+    covariance : (q, q) array, optional
+        Covariance of the parameters of ``colmap_model``, in its order; None if unknown.
+
+    Raises
+    ------
+    InputError
+        Numbers that no camera has, an unknown ``colmap_model`` or one of another projection, arrays of other shapes.
     """
 
     width: int
@@ -48,6 +80,8 @@ class Camera:
     centre: Array
     distortion: Array
     fisheye: bool = False
+    colmap_model: str = ""
+    covariance: np.ndarray | None = None
 
     def __post_init__(self):
         freeze(self, "focal", (2,), "focal length")
@@ -65,6 +99,82 @@ class Camera:
             raise InputError(
                 "E-CAMERA-COEFFICIENTS", "camera: k5, k6, s2 or s4 of an equidistant camera, which has none; 0 needed"
             )
+        if not self.colmap_model:
+            object.__setattr__(self, "colmap_model", "THIN_PRISM_FISHEYE" if self.fisheye else "FULL_OPENCV")
+        if self.colmap_model not in COLMAP_LAYOUT or (FISHEYE in self.colmap_model) != self.fisheye:
+            known = [model for model in COLMAP_MODELS if (FISHEYE in model) == self.fisheye]
+            raise InputError(
+                "E-CAMERA-MODEL",
+                f"camera: model {self.colmap_model} of {'an equidistant' if self.fisheye else 'a perspective'} camera; "
+                f"one of {', '.join(known)} needed",
+            )
+        if self.covariance is not None:
+            count = len(COLMAP_LAYOUT[self.colmap_model])
+            freeze(self, "covariance", (count, count), "camera's covariance")
+
+    @classmethod
+    def of(cls, camera: "Camera", colmap_model: str, covariance: np.ndarray | None = None) -> "Camera":
+        """Return ``camera`` as one of a COLMAP model, with the covariance of its parameters."""
+        lens = camera.focal, camera.centre, camera.distortion, FISHEYE in colmap_model
+        return cls(camera.width, camera.height, *lens, colmap_model, covariance)
+
+    @classmethod
+    def from_opencv(
+        cls, matrix: ArrayLike, distortion: ArrayLike, size: tuple[int, int], fisheye: bool = False
+    ) -> "Camera":
+        """Return the camera of OpenCV's matrix and coefficients.
+
+        Parameters
+        ----------
+        matrix : (3, 3) array
+            ``cameraMatrix``: fx, fy, cx, cy, px; without skew.
+        distortion : (k,) array
+            k1, k2, p1, p2, k3, k4, k5, k6, all or the first 4 or 5; none for a lens without distortion. With
+            ``fisheye`` k1, k2, k3, k4 of ``cv2.fisheye``.
+        size : (int, int)
+            Width and height of the images, px.
+        fisheye : bool
+            Equidistant projection, as of ``cv2.fisheye``.
+
+        Raises
+        ------
+        InputError
+            A matrix of another form, numbers of coefficients that OpenCV does not know, a size that is none.
+        """
+        k = frozen(matrix, (3, 3), "camera matrix")
+        if k[0, 1] or k[1, 0] or k[2].tolist() != [0, 0, 1]:
+            raise InputError(
+                "E-CAMERA-MATRIX",
+                f"camera matrix {k.tolist()}: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] needed; skew is not supported",
+            )
+        given = frozen(np.ravel(distortion), None, "distortion")
+        flat, model = opencv_lens(given, fisheye, "camera")
+        return cls(int(size[0]), int(size[1]), k[[0, 1], [0, 1]], k[:2, 2], flat, fisheye, model)
+
+    def to_opencv(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return OpenCV's camera matrix (3, 3) and coefficients: 4, 5, 8 or 12 of them; of a fisheye four.
+
+        Raises
+        ------
+        InputError
+            An equidistant lens with tangential terms or prisms, which ``cv2.fisheye`` does not have.
+        """
+        matrix = np.array([[self.focal[0], 0, self.centre[0]], [0, self.focal[1], self.centre[1]], [0, 0, 1]])
+        if not self.fisheye:
+            count = next(n for n in (4, 5, 8, 12) if not self.distortion[n:].any())
+            return matrix, self.distortion[:count].copy()
+        if self.distortion[[2, 3, 8, 10]].any():
+            raise InputError(
+                "E-CAMERA-MODEL",
+                "camera: tangential terms or prisms, which OpenCV's fisheye lacks; write it in COLMAP's form",
+            )
+        return matrix, self.distortion[[0, 1, 4, 5]]
+
+    def colmap_params(self) -> list[float]:
+        """Return the parameters in COLMAP's order and pixel origin."""
+        flat = self.parameters()
+        flat[2:4] += COLMAP_PIXEL_ORIGIN
+        return [float(flat[p[0] if isinstance(p, tuple) else p]) for p in COLMAP_LAYOUT[self.colmap_model]]
 
     def same_as(self, other: "Camera") -> bool:
         """Return True if size, projection and all parameters are equal."""
@@ -107,7 +217,7 @@ class Camera:
         jacobian[:, :, 4:] *= self.focal[:, None]
         return jacobian
 
-    def distort(self, xy: np.ndarray) -> np.ndarray:
+    def distort(self, xy: ArrayLike) -> np.ndarray:
         """Apply the lens distortion to ideal normalised coordinates.
 
         Parameters
@@ -193,7 +303,7 @@ class Camera:
             moved_x, moved_y = moved_x + r2 * (s1 + r2 * s2), moved_y + r2 * (s3 + r2 * s4)
         return moved_x, moved_y
 
-    def undistort(self, xy_distorted: np.ndarray) -> np.ndarray:
+    def undistort(self, xy_distorted: ArrayLike) -> np.ndarray:
         """Invert :meth:`distort` by Newton's method to 1e-12.
 
         Raises
@@ -251,15 +361,15 @@ class Camera:
             )
         return xy * np.where(theta > 0, np.tan(theta) / np.where(theta > 0, theta, 1.0), 1.0)[..., None]
 
-    def pixel_from_normalised(self, xy: np.ndarray) -> np.ndarray:
+    def pixel_from_normalised(self, xy: ArrayLike) -> np.ndarray:
         """Return the pixels (..., 2) of ideal normalised coordinates (..., 2), lens distortion applied."""
         return self.distort(xy) * self.focal + self.centre
 
-    def normalised_from_pixel(self, xy_px: np.ndarray) -> np.ndarray:
+    def normalised_from_pixel(self, xy_px: ArrayLike) -> np.ndarray:
         """Return ideal normalised coordinates (..., 2) of pixels (..., 2), lens distortion removed."""
         return self.undistort((np.asarray(xy_px, float) - self.centre) / self.focal)
 
-    def project(self, xyz_camera: np.ndarray) -> np.ndarray:
+    def project(self, xyz_camera: ArrayLike) -> np.ndarray:
         """Return the pixels (..., 2) of points (..., 3) in the camera frame."""
         xyz = np.asarray(xyz_camera, float)
         return self.pixel_from_normalised(xyz[..., :2] / xyz[..., 2:])
@@ -283,3 +393,51 @@ def _equidistant_jacobian(xy: np.ndarray) -> np.ndarray:
     share, near = _angle_share(r2), r2 <= NEAR_AXIS
     along = np.where(near, -2 / 3 + 4 / 5 * r2, (1 / (1 + r2) - share) / np.where(near, 1.0, r2))
     return share[..., None, None] * np.eye(2) + along[..., None, None] * xy[..., :, None] * xy[..., None, :]
+
+
+def opencv_lens(given: np.ndarray, fisheye: bool, where: str, tangential: bool = False) -> tuple[np.ndarray, str]:
+    """Return the distortion (12,) of OpenCV's coefficients (k,), and the COLMAP model that holds them exactly.
+
+    ``fisheye`` : k1 to k4 of an equidistant lens, or with ``tangential`` k1, k2, p1, p2, k3, k4.
+
+    Raises
+    ------
+    InputError
+        The number of coefficients is wrong, or no supported model has them. The message begins with ``where``.
+    """
+    distortion = np.zeros(COEFFICIENTS)
+    if fisheye:
+        if len(given) not in ((6,) if tangential else (0, 4)):
+            raise InputError(
+                "E-CAMERA-COEFFICIENTS",
+                f"{where}: {len(given)} coefficients of an equidistant lens; k1 to k4 needed",
+            )
+        distortion[[0, 1, 2, 3, 4, 5] if tangential else [0, 1, 4, 5][: len(given)]] = given
+        return distortion, "THIN_PRISM_FISHEYE" if distortion[2:4].any() else "OPENCV_FISHEYE"
+    if given[8:].any():
+        raise InputError(
+            "E-CAMERA-COEFFICIENTS", f"{where}: {len(given)} distortion coefficients, at most 8 are supported"
+        )
+    if len(given) not in DISTORTION_COUNTS:
+        raise InputError(
+            "E-CAMERA-COEFFICIENTS",
+            f"{where}: {len(given)} distortion coefficients; {', '.join(map(str, DISTORTION_COUNTS))} are possible "
+            "(k1, k2, p1, p2, k3 …)",
+        )
+    distortion[: min(len(given), 8)] = given[:8]
+    return distortion, "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
+
+
+def intrinsic_basis(colmap_model: str) -> np.ndarray:
+    """Return the derivative (16, q) of :data:`PARAMETER_NAMES` by the q parameters of a COLMAP model."""
+    layout = COLMAP_LAYOUT[colmap_model]
+    basis = np.zeros((len(PARAMETER_NAMES), len(layout)))
+    for column, place in enumerate(layout):
+        basis[list(place) if isinstance(place, tuple) else place, column] = 1
+    return basis
+
+
+def parameter_names(colmap_model: str) -> list[str]:
+    """Return the names of the parameters of a COLMAP model, in its order."""
+    layout = COLMAP_LAYOUT[colmap_model]
+    return ["f" if isinstance(place, tuple) else PARAMETER_NAMES[place] for place in layout]

@@ -3,15 +3,18 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Array, freeze, frozen
+from stcal.geometry.arrays import MYPY, Array, freeze, frozen
 
+Order = Literal["wxyz", "xyzw"]
+"""Order of a quaternion's components. For tables ``wxyz`` : as the columns are named; ``xyzw`` : x, y, z, w in the
+order of the columns."""
 UNIT_WITHIN = 1e-3
 """Largest deviation of a quaternion's length from 1, as rounding to four printed digits may cause."""
 
@@ -66,22 +69,35 @@ class _ByValue:
         return hash(repr(self._values()).replace("-0.0", "0.0"))
 
 
+if TYPE_CHECKING and not MYPY:
+
+    class Turn(Array):
+        """Type of a field of rotation matrices, which accepts SciPy's rotations too."""
+
+        def __set__(self, instance: object, value: ArrayLike | Rotation) -> None: ...
+
+else:
+    Turn = Array  # pyright: ignore[reportAssignmentType]  # to mypy, and at run time
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Rigid(_ByValue):
     """A rigid transform a_from_b: ``xyz_a = rotation @ xyz_b + translation``.
 
     Parameters
     ----------
-    rotation : (3, 3) array
-        A proper rotation; checked to 1e-6, then projected onto SO(3).
+    rotation : (3, 3) array or Rotation
+        A proper rotation; checked to 1e-6, then projected onto SO(3). SciPy's rotations are taken too.
     translation : (3,) array
         Origin of b in a, mm.
     """
 
-    rotation: Array = field(default_factory=_no_turn)
+    rotation: Turn = field(default_factory=_no_turn)
     translation: Array = field(default_factory=_no_shift)
 
     def __post_init__(self):
+        if isinstance(self.rotation, Rotation):
+            object.__setattr__(self, "rotation", self.rotation.as_matrix())
         freeze(self, "rotation", (3, 3), "rotation")
         freeze(self, "translation", (3,), "translation")
         deviation = _off_proper(*self.rotation.tolist())
@@ -112,6 +128,28 @@ class Rigid(_ByValue):
         return cls(u @ vt, m[:3, 3])
 
     @classmethod
+    def from_quaternion(cls, quaternion: ArrayLike, translation: ArrayLike = (0, 0, 0), *, order: Order) -> "Rigid":
+        """Return the transform of a quaternion (4,), unit to 1e-3, and a translation (3,), mm.
+
+        ``order`` : ``xyzw`` as of SciPy and ROS, or ``wxyz`` as of Eigen's constructor, COLMAP and ABB; programs
+        differ, so that it must be given.
+
+        Raises
+        ------
+        InputError
+            Another order, or a quaternion that is not of unit length.
+        """
+        if order not in ("wxyz", "xyzw"):
+            raise InputError("E-OPTION-VALUE", f"quaternion: order {order!r}: not a choice; use wxyz or xyzw")
+        values = frozen(quaternion, (4,), "quaternion")
+        wxyz = values if order == "wxyz" else np.roll(values, 1)
+        return Poses.from_quaternions(wxyz[None], frozen(translation, (3,), "translation")[None])[0]
+
+    def as_scipy(self) -> Rotation:
+        """Return the rotation as SciPy's, of which quaternions, Euler angles and rotation vectors can be taken."""
+        return Rotation.from_matrix(np.array(self.rotation))
+
+    @classmethod
     def exp(cls, twist: ArrayLike) -> "Rigid":
         """Return the transform of a rotation vector (rad) and a translation (mm), (6,).
 
@@ -123,7 +161,7 @@ class Rigid(_ByValue):
 
     def log(self) -> np.ndarray:
         """Return rotation vector (rad) and translation (mm), (6,): the inverse of :meth:`exp`."""
-        return np.concatenate([Rotation.from_matrix(np.array(self.rotation)).as_rotvec(), self.translation])
+        return np.concatenate([self.as_scipy().as_rotvec(), self.translation])
 
     def matrix(self) -> np.ndarray:
         """Return the homogeneous 4×4 matrix."""
@@ -149,7 +187,7 @@ class Rigid(_ByValue):
 
     def angle_rad(self) -> float:
         """Return the angle of the rotation, in [0, π]."""
-        return float(Rotation.from_matrix(np.array(self.rotation)).magnitude())
+        return float(self.as_scipy().magnitude())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,6 +203,12 @@ class Similarity(_ByValue):
     def __post_init__(self):
         if not (np.isfinite(self.scale) and self.scale > 0):
             raise InputError("E-SCALE-VALUE", f"similarity: scale {self.scale}, a positive number needed")
+
+    def matrix(self) -> np.ndarray:
+        """Return the homogeneous 4×4 matrix, with the scale in its 3×3 part."""
+        m = self.rigid.matrix()
+        m[:3, :3] *= self.scale
+        return m
 
     def inverse(self) -> "Similarity":
         """Return b_from_a."""
@@ -196,7 +240,17 @@ class Similarity(_ByValue):
 class Poses(_ByValue):
     """A stack of m transforms a_from_b.
 
-    ``rotation`` : (m, 3, 3), proper to 1e-6; ``translation`` : (m, 3), origin of b in a, mm.
+    Parameters
+    ----------
+    rotation : (m, 3, 3) array
+        Proper rotations, to 1e-6.
+    translation : (m, 3) array
+        Origins of b in a, mm.
+
+    Raises
+    ------
+    InputError
+        Arrays of other shapes, or matrices that are no rotations.
     """
 
     rotation: Array
@@ -218,6 +272,23 @@ class Poses(_ByValue):
         transforms = list(transforms)
         rotation = np.array([t.rotation for t in transforms]).reshape(-1, 3, 3)
         return cls(rotation, np.array([t.translation for t in transforms]).reshape(-1, 3))
+
+    @classmethod
+    def from_matrices(cls, matrices: ArrayLike) -> "Poses":
+        """Return the transforms of homogeneous matrices (m, 4, 4), mm; rotations are projected onto SO(3).
+
+        Raises
+        ------
+        InputError
+            Another shape; or a matrix that is not finite, left-handed, scaled or transposed, named by its number.
+        """
+        rigid = []
+        for number, matrix in enumerate(np.asarray(matrices, float), 1):
+            try:
+                rigid.append(Rigid.from_matrix(matrix))
+            except InputError as error:
+                raise InputError(error.code, f"pose {number}: {error}") from error
+        return cls.of(rigid)
 
     @classmethod
     def from_quaternions(cls, wxyz: ArrayLike, translation: ArrayLike) -> "Poses":

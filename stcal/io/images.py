@@ -119,6 +119,8 @@ class Skipped:
     limit: str | None = None
 
 
+ImageFiles = tuple[list[ImageFile], list[Skipped]]
+"""Files to use and files that are left out, as they were when the work began."""
 _bayer: ContextVar[str] = ContextVar("_bayer", default="")
 """Pattern of the mosaics that :func:`find_images` finds."""
 
@@ -233,7 +235,13 @@ def chosen_images(folder: str | Path, exclude: Sequence[str] = ()) -> tuple[list
     InputError
         As for :func:`find_images`; an excluded image does not exist, or no image is left.
     """
-    files, skipped = find_images(folder)
+    return without_excluded(*find_images(folder), exclude, folder)
+
+
+def without_excluded(
+    files: list[ImageFile], skipped: list[Skipped], exclude: Sequence[str], folder: str | Path
+) -> ImageFiles:
+    """Return the files with the images ``exclude`` moved to the skipped ones; errors as :func:`chosen_images`."""
     excluded: set[str] = set()
     for word in exclude:
         matching = {file.name for file in files if word == file.name or Path(word).absolute() == file.path.absolute()}

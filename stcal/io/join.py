@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.rigid import Order
 from stcal.io.poses.columns import read_mapped
-from stcal.io.quaternions import Order
 from stcal.io.table import COVARIANCE, LENGTHS, POSE, Table, read_table
 
 _OF_POSES = re.compile(rf"([xyz]_({'|'.join(LENGTHS)})|{'|'.join((*POSE[3:], *COVARIANCE))}|common\d+_.+)")

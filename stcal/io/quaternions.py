@@ -2,15 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import UNIT_WITHIN, Poses
 
-Order = Literal["wxyz", "xyzw"]
-"""Order of the components. ``wxyz`` : as the columns are named; ``xyzw`` : x, y, z, w in the order of the columns."""
 COLUMNS = ("qw", "qx", "qy", "qz")
 EXPLAINS = 0.2
 """A mistake explains a misfit if its correction reduces the misfit below this share."""

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.io.covariance import OF_POSE, TWIST, Rows, first_fault
 from stcal.io.files import TABLE_BYTES, read_bytes, require_written, text_of
 from stcal.io.quaternions import COLUMNS as QUATERNION
-from stcal.io.quaternions import Order, require_unit
+from stcal.io.quaternions import require_unit
 
 LENGTHS = {"mm": 1.0, "m": 1000.0, "um": 1e-3, "cm": 10.0, "in": 25.4}
 UNIT_WORDS = {"m": "metres", "in": "inches", "cm": "centimetres"}

@@ -11,7 +11,8 @@ from stcal.boards.design import TagLayout
 from stcal.boards.tags import other_dictionaries
 from stcal.errors import InputError, StcalError
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import CameraModel, CameraPrior, model_of
+from stcal.io.cameras.model import CameraModel, CameraPrior
+from stcal.io.cameras.read import camera_model
 from stcal.io.images import decode, grey_8bit, grey_of, size_fault
 from stcal.locate.data.exposures import SceneFiles, SceneTags, detect, read_scenes
 from stcal.locate.data.layout import TargetLayout
@@ -91,7 +92,10 @@ class Located:
 
 
 def run(
-    scenes: Sequence[SceneFiles], layout: TargetLayout, camera: CameraModel, options: LocateOptions | None = None
+    scenes: Sequence[SceneFiles],
+    layout: TargetLayout,
+    camera: Camera | CameraModel,
+    options: LocateOptions | None = None,
 ) -> Iterator[Located]:
     """Yields the target's pose in each scene, with its verdict.
 
@@ -101,7 +105,7 @@ def run(
         Scenes from :func:`~stcal.locate.find_scenes`.
     layout : TargetLayout
         The target.
-    camera : CameraModel
+    camera : Camera
         The camera that took the exposures.
     options : LocateOptions, optional
         Options of the method; the defaults if None.
@@ -112,9 +116,9 @@ def run(
         One result per scene, in their order. Trouble with one scene rejects that scene, with the reason, and never
         ends the run.
     """
-    options = options or LocateOptions()
+    options, model = options or LocateOptions(), camera_model(camera)
     for files, tags in zip(scenes, read_scenes(scenes, layout, options.workers), strict=True):
-        yield _named(locate_scene(tags, layout, camera, options), layout, partial(_first_image, tags, files))
+        yield _named(locate_scene(tags, layout, model, options), layout, partial(_first_image, tags, files))
 
 
 def locate_image(
@@ -132,7 +136,7 @@ def locate_image(
         Grey or RGB, 8 or 16 bit.
     layout : TargetLayout or TagLayout
         The target.
-    camera : CameraModel or Camera
+    camera : Camera
         The camera that took the image.
     options : LocateOptions, optional
         Options of the method; the defaults if None.
@@ -151,7 +155,7 @@ def locate_image(
     """
     grey = grey_of(image, name)
     target = TargetLayout.of(layout) if isinstance(layout, TagLayout) else layout
-    model = camera if isinstance(camera, CameraModel) else model_of(camera)
+    model = camera_model(camera)
     size = grey.shape[1], grey.shape[0]
     wanted = model.width or size[0], model.height or size[1]
     if size != wanted:

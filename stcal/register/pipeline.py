@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.errors import DegenerateError, InputError
 from stcal.io.table import FARTHEST
@@ -42,14 +43,14 @@ frame is tried. Both are met long before a mirrored frame is found; the trial co
 
 @one_thread()
 def register(
-    xyz_a: np.ndarray,
-    xyz_b: np.ndarray,
+    xyz_a: ArrayLike,
+    xyz_b: ArrayLike,
     *,
     model: str = "rigid",
     method: str = "robust",
     threshold_mm: float | None = None,
-    weights: np.ndarray | None = None,
-    covariances: np.ndarray | None = None,
+    weights: ArrayLike | None = None,
+    covariances: ArrayLike | None = None,
     seed: int = 0,
     folds: int = 6,
     allow_ambiguous: bool = False,

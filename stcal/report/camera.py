@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.difference import CameraDifference, FittedLens, image_grid, rays
-from stcal.io.cameras.model import CalibratedCamera, parameter_names
 from stcal.io.cameras.photograph import SIGMA_FOCAL
 from stcal.report.figure import INK, SMALL, calm, new_figure
 from stcal.report.text import NONE, text_table
@@ -15,7 +14,7 @@ hundredths of a pixel."""
 LENGTHS = ("f", "fx", "fy", "cx", "cy")
 
 
-def shown(camera: CalibratedCamera) -> list[str]:
+def shown(camera: Camera) -> list[str]:
     """Return lines with model, parameters with σ (OpenCV's pixel origin), field of view, and largest distortion."""
     names, values = parameter_names(camera.colmap_model), camera.colmap_params()
     sigma = None if camera.covariance is None else np.sqrt(np.diag(camera.covariance))

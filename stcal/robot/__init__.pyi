@@ -17,9 +17,11 @@ from .kinematics.model import Robot as Robot
 from .urdf.read import UrdfRobot as UrdfRobot
 from .urdf.read import load_urdf as load_urdf
 from .urdf.write import robot_urdf as robot_urdf
+from .use.compensation import Compensated as Compensated
 from .use.compensation import compensate as compensate
 from .use.design import DesignOptions as DesignOptions
 from .use.design import design as design
+from .use.targets import Targets as Targets
 from .use.targets import read_targets as read_targets
 from .use.verification import read_measured as read_measured
 from .use.verification import verify as verify

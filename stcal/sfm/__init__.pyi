@@ -1,4 +1,9 @@
 from .camera.calibrate import calibrate_camera as calibrate_camera
+from .checks.verdict import Check as Check
+from .checks.verdict import Trial as Trial
+from .checks.verdict import judge as judge
+from .detect.labels import Detection as Detection
+from .detect.labels import detect_circles as detect_circles
 from .measurement.images import MeasureOptions as MeasureOptions
 from .measurement.images import measure as measure
 from .measurement.target import read_target as read_target
@@ -8,5 +13,6 @@ from .planning.advise import advise as advise
 from .planning.session import PlanOptions as PlanOptions
 from .planning.session import plan as plan
 from .runs.options import RunOptions as RunOptions
+from .runs.result import ImageResult as ImageResult
 from .runs.result import RunResult as RunResult
 from .runs.saved import load_run as load_run

@@ -1,18 +1,23 @@
 """The main job: calibrates a target from a folder of images. Each call is a stage, and its result is saved."""
 
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference
 from stcal.errors import InputError, StcalError
-from stcal.io.cameras.model import CalibratedCamera, CameraModel, camera_prior, model_of, refinable
+from stcal.geometry.camera import Camera
+from stcal.io.cameras.model import CameraModel, camera_prior, model_of, refinable
 from stcal.io.cameras.photograph import camera_of_photograph
-from stcal.io.cameras.read import read_camera
+from stcal.io.cameras.read import camera_model
 from stcal.io.files import save
-from stcal.io.images import TOP_GROUP, ImageFile, Skipped, chosen_images, require_common_size
+from stcal.io.images import TOP_GROUP, ImageFile, ImageFiles, chosen_images, require_common_size
+from stcal.io.photographs.memory import files_of_arrays
 from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
@@ -20,6 +25,7 @@ from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
 from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.suite import run_checks
+from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.detect.board_alone import is_board_alone, label_boards
 from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright, seen_by
@@ -35,36 +41,43 @@ from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.solve import solve_body, solve_groups, ungrouped, unseen_board, usable_groups
 from stcal.sfm.runs.transaction import MarkerFile, RunFolder, run_folder
 
+IN_MEMORY = "images in memory"
+"""What a run's folder states as the folder of its images where there is none."""
 PHOTOGRAPHS = "the photographs"
 """Where a camera that was found is from, for messages."""
-ImageFiles = tuple[list[ImageFile], list[Skipped]]
-"""Files to use and files that are left out, as they were when the work began."""
+Images = str | Path | Mapping[str, Sequence[np.ndarray]]
+"""A folder of images, or grey or RGB arrays by the name of their group."""
+OwnCheck = Callable[[RunResult], Check]
+"""A check of a caller's own."""
 DRAWN_WITH = "matplotlib.backends.backend_svg", "mpl_toolkits.mplot3d.axes3d"
 """Modules that draw the figures of the report. They take half a second to load."""
 
 
 @one_thread()
 def run(
-    images: str | Path,
-    camera: str | Path | CameraModel | None,
-    out: str | Path,
+    images: Images,
+    camera: str | Path | Camera | CameraModel | None = None,
+    out: str | Path | None = None,
     target: str | Path | TargetDesign | None = None,
     board: str | Path | BoardDesign | None = None,
     options: RunOptions | None = None,
     progress: Progress | None = None,
     reload_s: int | None = None,
+    checks: Sequence[OwnCheck] = (),
 ) -> RunResult:
     """Calibrate a target from photographs.
 
     Parameters
     ----------
     images
-        Folder with one folder of images for each group.
+        Folder with one folder of images for each group; or grey or RGB arrays of 8 or 16 bit by the name of their
+        group, which are named ``12/0.png``, ``12/1.png`` … in results.
     camera
-        COLMAP's cameras.txt, OpenCV's YAML or XML, or the result of :func:`stcal.io.cameras.read.read_camera`; if
-        None, it is found from the target's printed faces, and adjusted with all else.
+        Camera from :func:`stcal.load_camera` or :meth:`stcal.Camera.from_opencv`, or a camera file; if None, it is
+        found from the target's printed faces, and adjusted with all else.
     out
-        The run's folder: new, empty, or of an earlier run.
+        The run's folder: new, empty, or of an earlier run. If None, no file stays: a temporary folder holds COLMAP's
+        database meanwhile.
     target, board
         Designs or their TOML files; the reference design if None, or no board if the target tells its own size.
     options
@@ -73,6 +86,9 @@ def run(
         Called with (stage, done, total).
     reload_s
         Seconds after which the page of the report reloads itself, for a run that is repeated; never if None.
+    checks
+        Checks of one's own: functions of the result that return a :class:`stcal.sfm.Check`, such as
+        :func:`stcal.sfm.judge` makes. They count in the answer and stand in the report like all others.
 
     Returns
     -------
@@ -88,25 +104,33 @@ def run(
     if camera is None:
         require_printed(body_of(target))
         options = replace(options, refine_camera=True)
-    files = chosen_images(images, options.exclude)
-    return run_on_files(files, images, camera, out, target, board, options, progress, reload_s)
+    if isinstance(images, Mapping):
+        files, place = files_of_arrays(images, options.exclude), IN_MEMORY
+    else:
+        files, place = chosen_images(images, options.exclude), images
+    if out is not None:
+        return run_on_files(files, place, camera, out, target, board, options, progress, reload_s, checks)
+    with tempfile.TemporaryDirectory(prefix="stcal-run-") as scratch:
+        result = run_on_files(files, place, camera, scratch, target, board, options, progress, reload_s, checks)
+        return replace(result, out=None)
 
 
 @one_thread()
 def run_on_files(
     files: ImageFiles,
     images: str | Path,
-    camera: str | Path | CameraModel | None,
+    camera: str | Path | Camera | CameraModel | None,
     out: str | Path,
     target: str | Path | TargetDesign | None,
     board: str | Path | BoardDesign | None,
     options: RunOptions,
     progress: Progress | None = None,
     reload_s: int | None = None,
+    checks: Sequence[OwnCheck] = (),
 ) -> RunResult:
     """Calibrates a target from some of the photographs in the folder ``images``; see :func:`run`."""
     progress = progress or (lambda *_: None)
-    model = read_camera(camera) if isinstance(camera, str | Path) else camera
+    model = None if camera is None else camera_model(camera)
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
     target_design = body_of(target)
     known = None if board is None and target_design.has_scale else board_of(board)
@@ -124,7 +148,32 @@ def run_on_files(
             result = replace(result, comparison=compare_with_paper(result, published))
         result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera)), progress))
         result = replace(result, calibration=_on_surface(result))
+        result = replace(result, checks=(*result.checks, *own_checks(result, checks)))
         return replace(result, judgement=write_run(result, folder.stage, progress, reload_s))
+
+
+def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:
+    """Returns the checks of a caller's own on a result.
+
+    Raises
+    ------
+    InputError
+        A function returns no check, or one with the key of another.
+    """
+    checks: list[Check] = []
+    for make in makers:
+        check = make(result)
+        name = getattr(make, "__name__", repr(make))
+        if not isinstance(check, Check):
+            raise InputError(
+                "E-CHECK-OWN", f"check {name}: returns {type(check).__name__}; a Check needed, such as judge returns"
+            )
+        if check.key in {other.key for other in (*result.checks, *checks)}:
+            raise InputError(
+                "E-CHECK-OWN", f"check {name}: key {check.key!r} is taken by another; choose one of its own"
+            )
+        checks.append(check)
+    return checks
 
 
 def _calibrated(
@@ -167,7 +216,7 @@ def _with_found_camera(
     return detection, labelled, model
 
 
-def guessed_cameras(files: Sequence[ImageFile]) -> list[CalibratedCamera]:
+def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
     """Returns cameras at which the search for an unknown one begins: that of the EXIF of the first photograph that
     states one, or one of medium focal length."""
     (width, height), _ = require_common_size(list(files))
@@ -178,7 +227,7 @@ def guessed_cameras(files: Sequence[ImageFile]) -> list[CalibratedCamera]:
             continue
         if (camera.width, camera.height) == (width, height):
             return [camera]
-    return [CalibratedCamera.of(start_camera(width, height, LENS), LENS)]
+    return [Camera.of(start_camera(width, height, LENS), LENS)]
 
 
 def assumed_camera(files: Sequence[ImageFile], target: TargetDesign) -> CameraModel:

@@ -13,8 +13,9 @@ from stcal.boards.cells import black_areas, clear_mm
 from stcal.boards.target import body_toml
 from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import InputError
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
 from stcal.parallel import run_parallel
 from stcal.synthetic.dataset import TruthFile
 from stcal.synthetic.render import encode
@@ -54,7 +55,7 @@ class BodyScene:
 
     target: TargetDesign
     target_from_face: dict[str, Rigid]
-    camera: CalibratedCamera
+    camera: Camera
     camera_from_target: tuple[Rigid, ...]
     options: BodyOptions = field(default_factory=BodyOptions)
 
@@ -67,16 +68,16 @@ class BodyScene:
         }
 
 
-def body_camera(width: int) -> CalibratedCamera:
+def body_camera(width: int) -> Camera:
     """Returns a camera of medium focal length with a lens that distorts a little; images of 3:2."""
     height = round(width * 2 / 3)
     focal = 1.1 * width
     distortion = np.array([-0.12, 0.05, 4e-4, -3e-4, 0, 0, 0, 0])
     centre = np.array([width / 2 + 0.006 * width, height / 2 - 0.004 * width])
-    return CalibratedCamera(width, height, np.full(2, focal), centre, distortion, False, "OPENCV")
+    return Camera(width, height, np.full(2, focal), centre, distortion, False, "OPENCV")
 
 
-def make_body_scene(target: TargetDesign, camera: CalibratedCamera, options: BodyOptions) -> BodyScene:
+def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions) -> BodyScene:
     """Returns a body with faces near their rough poses, in random poses in which it shows two faces at least.
 
     Raises

@@ -121,6 +121,40 @@ def _circles(scene: Scene, group: str, image: int) -> dict[str, TrueCircle]:
     }
 
 
+def render_all(
+    scene: Scene, options: RenderOptions | None = None, workers: int | None = None
+) -> dict[str, list[np.ndarray]]:
+    """Renders all photographs of a scene, as :func:`stcal.sfm.run` takes them.
+
+    Parameters
+    ----------
+    scene : Scene
+        Target, board, camera and views.
+    options : RenderOptions, optional
+        Appearance of the photographs; the defaults if None.
+    workers : int, optional
+        Number of processes that render; one per core by default.
+
+    Returns
+    -------
+    dict of list of (height, width) array
+        Grey images, uint8 or uint16, by group.
+
+    Raises
+    ------
+    InputError
+        The lens does not fit the scene.
+    """
+    options = options or RenderOptions()
+    check_lens(scene, options.lens)
+    views = [(name, i) for name, group in scene.groups.items() for i in range(len(group.camera_from_target))]
+    rendered = dict(run_parallel(render, [(scene, *view, options) for view in views], workers))
+    images: dict[str, list[np.ndarray]] = {name: [] for name in scene.groups}
+    for k, (name, _) in enumerate(views):
+        images[name].append(rendered[k])
+    return images
+
+
 IMAGE_FORMATS = ("jpg", "png")
 
 
@@ -139,6 +173,10 @@ def write_dataset(
     ----------
     folder : path
         Folder of the data set. It is created if missing, and must be empty.
+    scene : Scene
+        Target, board, camera and views.
+    render_options : RenderOptions, optional
+        Appearance of the photographs; the defaults if None.
     image_format : {"jpg", "png"}
     jpeg_quality : int
     workers : int, optional

@@ -9,9 +9,9 @@ import numpy as np
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import FISHEYE, Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import FISHEYE, CalibratedCamera, CameraModel
+from stcal.io.cameras.model import CameraModel
 from stcal.labels import CircleLabel
 from stcal.synthetic.designs import REFERENCE_GROUPS, nominal_target_from_face, second_design, three_point_frame
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
@@ -105,13 +105,26 @@ class Group:
 class Scene:
     """Truth of a simulated measurement.
 
-    ``target_from_face`` : three-point frames through the circles as really placed, by face id. The first face of the
-    design is the reference: its frame is the target frame. ``circles_target`` : (3,) mm by label.
+    Parameters
+    ----------
+    target, board : TargetDesign, BoardDesign
+        Designs of what is photographed.
+    camera : Camera
+        The camera, as it really is.
+    target_from_face : dict of Rigid
+        Three-point frames through the circles as really placed, by face id. The first face of the design is the
+        reference: its frame is the target frame.
+    circles_target : dict of (3,) array
+        Centres of the circles as really placed, by label, target frame, mm.
+    groups : dict of Group
+        Board and views of each group, by name.
+    seed : int
+        Of all that is random, noise of the photographs included.
     """
 
     target: TargetDesign
     board: BoardDesign
-    camera: CalibratedCamera
+    camera: Camera
     target_from_face: dict[str, Rigid]
     circles_target: dict[CircleLabel, np.ndarray]
     groups: dict[str, Group]
@@ -152,6 +165,11 @@ def make_scene(
         Design of the board; the reference board by default.
     nominal : dict of Rigid, optional
         Nominal pose of every face in one common frame, by face id; the rough poses of ``target`` by default.
+
+    Returns
+    -------
+    Scene
+        Target, board and camera as really made, and the views of each group.
 
     Raises
     ------
@@ -217,7 +235,7 @@ def _made_target(target, nominal, options, rng) -> tuple[dict[str, Rigid], dict[
     return {face: target_from_any @ frame for face, frame in frames.items()}, circles
 
 
-def _made_camera(options: SceneOptions, rng) -> CalibratedCamera:
+def _made_camera(options: SceneOptions, rng) -> Camera:
     focal = options.focal_px or FOCAL_PER_WIDTH * options.width
     centre = (np.array([options.width, options.height]) - 1) / 2
     centre = centre + options.centre_sigma * options.width * rng.standard_normal(2)
@@ -225,7 +243,7 @@ def _made_camera(options: SceneOptions, rng) -> CalibratedCamera:
     distortion[: len(options.distortion)] = options.distortion
     model = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
     camera = Camera(options.width, options.height, np.array([focal, focal]), centre, distortion)
-    return CalibratedCamera.of(camera, model)
+    return Camera.of(camera, model)
 
 
 def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) -> list[tuple[str, str]]:
@@ -344,4 +362,4 @@ def seen_wide(scene: Scene, field_deg: float, seed: int) -> Scene:
         turns = [Rigid.exp([up, aside, 0, 0, 0, 0]) for aside, up in angles]
         views = tuple(turn @ pose for turn, pose in zip(turns, group.camera_from_target, strict=True))
         groups[name] = replace(group, camera_from_target=views)
-    return replace(scene, camera=CalibratedCamera.of(camera, "OPENCV_FISHEYE"), groups=groups)
+    return replace(scene, camera=Camera.of(camera, "OPENCV_FISHEYE"), groups=groups)

@@ -19,8 +19,9 @@ from stcal.boards.design import (
 )
 from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
+from stcal.geometry.camera import Camera
 from stcal.io.cameras.forms import kalibr_chain
-from stcal.io.cameras.model import CalibratedCamera, CameraModel, cameras_txt
+from stcal.io.cameras.model import CameraModel, cameras_txt
 from stcal.io.cameras.write import require_camera_written
 from stcal.io.files import json_text
 from stcal.io.images import ImageFile, Skipped, find_images, name_fault, require_common_size
@@ -380,7 +381,7 @@ def files_of(rig: RigCalibration) -> tuple[dict[str, str], list[str]]:
     files, cameras = {}, []
     for name, calibration in zip(rig.names, rig.cameras, strict=True):
         intrinsics = calibration.intrinsics
-        camera = CalibratedCamera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance)
+        camera = Camera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance)
         files |= {f"{name}.txt": cameras_txt(camera), f"{name}.json": json_text(CalibrationFile.of(calibration))}
         cameras.append((name, camera))
     summary: ResultFile = RigCalibrationFile.of(rig)

@@ -9,9 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.cameras.forms import written
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import target_toml
 from stcal.io.table import POSE, pose_cells
@@ -147,7 +148,7 @@ def _cameras(folder: Path) -> None:
     rng = np.random.default_rng(1)
     spread = rng.normal(size=(len(given.colmap_params()), 40)) * 1e-3
     write_cameras_txt(forms / "sigma.txt", replace(given, covariance=spread @ spread.T))
-    plain = CalibratedCamera.of(replace(given, distortion=np.zeros(12)), "PINHOLE")
+    plain = Camera.of(replace(given, distortion=np.zeros(12)), "PINHOLE")
     for name, form in (
         ("cameras.bin", "colmap-bin"),
         ("camchain.yaml", "kalibr"),
@@ -270,7 +271,7 @@ def _tags(folder: Path, rng: np.random.Generator) -> None:
     cv2.imwrite(str(folder / "scenes/a/1.png"), image)
     cv2.imwrite(str(folder / "scenes/a/2.png"), cv2.convertScaleAbs(image, alpha=0.6))
     (folder / "layout.toml").write_text(layout_toml(LAYOUT), encoding="utf-8")
-    write_cameras_txt(folder / "cameras.txt", CalibratedCamera.of(CAMERA, "PINHOLE"))
+    write_cameras_txt(folder / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
     hand_eye = {"flange_from_camera": Rigid.exp([0, 0, 1, 0, 0, 50]).matrix().tolist()}
     hand_eye |= {"covariance": np.diag([1e-6] * 3 + [0.01] * 3).tolist()}
     (folder / "handeye.json").write_text(json.dumps(hand_eye))

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.table import POSE, pose_cells
 from tests.boards.drawn import photograph
 from tests.support.handeye import BASE_FROM_BOARD, FLANGE_FROM_CAMERA
@@ -80,6 +80,6 @@ def photographs(folder: Path, sheet: np.ndarray, first_mm: float, seen: Poses, b
         cv2.imwrite(str(found.images / f"{i}.png"), take(sheet, first_mm, pose))
         rows.append(",".join([f"{i}.png", *pose_cells(flange)]))
     found.poses.write_text("\n".join(rows) + "\n")
-    write_cameras_txt(found.camera, CalibratedCamera.of(CAMERA, "PINHOLE"))
+    write_cameras_txt(found.camera, Camera.of(CAMERA, "PINHOLE"))
     found.board.write_text(board_toml)
     return found

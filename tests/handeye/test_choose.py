@@ -11,7 +11,7 @@ from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Noise, Views, handeye, pairs_of_views, splits
 from stcal.handeye.choose import BY_POSES, BY_VIEWS, CLOSED_FORMS, Candidate, choose
 from stcal.handeye.solve import solved
-from stcal.io.cameras.model import CalibratedCamera, camera_prior
+from stcal.io.cameras.model import camera_prior
 from tests.levels import sampled
 from tests.support.handeye import CAMERA, simulated, simulated_views
 
@@ -26,7 +26,7 @@ def filed(truth, camera):
 
 
 def prior_of(camera):
-    return camera_prior(CalibratedCamera.of(camera, "OPENCV"))
+    return camera_prior(Camera.of(camera, "OPENCV"))
 
 
 def chosen(truth, camera=CAMERA, count=10, seed=0):

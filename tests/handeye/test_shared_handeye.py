@@ -13,7 +13,7 @@ import yaml
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, View, Views, cross_validate, handeye, pairs_of_views, splits
-from stcal.io.cameras.model import CalibratedCamera, camera_prior
+from stcal.io.cameras.model import camera_prior
 
 MEAN_MM = 0.75
 """3-D error at the board that held-out poses may have in the mean."""
@@ -36,7 +36,7 @@ def charuco(shared_data):
     poses = np.array(poses)
     flange = Poses.from_quaternions(poses[:, :4], 1000 * poses[:, 4:])
     views = Views(camera, tuple(views))
-    prior = camera_prior(CalibratedCamera.of(camera, "OPENCV"))
+    prior = camera_prior(Camera.of(camera, "OPENCV"))
     return pairs_of_views(flange, views, tuple(f"{i}.png" for i in range(16))), views, prior
 
 

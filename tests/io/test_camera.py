@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from tests.outcome import fails_with
 
@@ -106,7 +106,7 @@ def test_projection_agrees_with_pycolmap(tmp_path, name):
     xyz = np.random.default_rng(0).uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (20, 3))
     theirs = pycolmap.Camera(model=name, width=1000, height=800, params=params).img_from_cam(xyz)
     np.testing.assert_allclose(camera.project(xyz), theirs - 0.5, atol=1e-9)  # rounding at 1000 px
-    np.testing.assert_allclose(CalibratedCamera.of(camera, name).colmap_params(), params, rtol=1e-15)
+    np.testing.assert_allclose(Camera.of(camera, name).colmap_params(), params, rtol=1e-15)
 
 
 @given(
@@ -121,7 +121,7 @@ def test_cameras_txt_round_trip(tmp_path_factory, name, lengths, ratio, coeffici
     fx, fy = lengths[0], lengths[0] * (1 if focal[0] == focal[1] else ratio)
     camera = Camera(6000, 4000, [fx, fy], lengths[1:], k, "FISHEYE" in name)
     path = tmp_path_factory.mktemp("round") / "cameras.txt"
-    write_cameras_txt(path, CalibratedCamera.of(camera, name))
+    write_cameras_txt(path, Camera.of(camera, name))
     found = read_camera(path)
     assert (found.colmap_model, found.width, found.height) == (name, 6000, 4000)
     np.testing.assert_array_equal(found.focal, camera.focal)
@@ -131,7 +131,7 @@ def test_cameras_txt_round_trip(tmp_path_factory, name, lengths, ratio, coeffici
 
 def test_pycolmap_reads_what_is_written(tmp_path):
     camera = Camera(1000, 800, [1000, 1100], [500, 400], COLMAP_CASES["FULL_OPENCV"][2])
-    write_cameras_txt(tmp_path / "cameras.txt", CalibratedCamera.of(camera, "FULL_OPENCV"))
+    write_cameras_txt(tmp_path / "cameras.txt", Camera.of(camera, "FULL_OPENCV"))
     (tmp_path / "images.txt").write_text("")
     (tmp_path / "points3D.txt").write_text("")
     reconstruction = pycolmap.Reconstruction()

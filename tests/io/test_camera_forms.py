@@ -8,7 +8,6 @@ from stcal.cli.cameras import Form
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.forms import SUFFIXES, WRITERS, written
-from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.cameras.read import read_camera
 from tests.outcome import fails_with
 
@@ -35,10 +34,10 @@ REFUSED = {
 """Forms that cannot hold a lens."""
 
 
-def camera_of(model: str) -> CalibratedCamera:
+def camera_of(model: str) -> Camera:
     distortion = np.pad(np.array(LENSES[model], float), (0, 12 - len(LENSES[model])))
     camera = Camera(1280, 961, [812.25, 809.5], [640.125, 478.0625], distortion, "FISHEYE" in model)
-    return CalibratedCamera.of(camera, model)
+    return Camera.of(camera, model)
 
 
 @pytest.mark.parametrize("model", LENSES)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from stcal.geometry.camera import Camera, parameter_names
 from stcal.io.cameras.forms import written
-from stcal.io.cameras.model import CalibratedCamera, camera_prior, parameter_names
+from stcal.io.cameras.model import camera_prior
 from stcal.io.cameras.read import read_camera
 from tests.io.test_camera_forms import camera_of
 from tests.outcome import fails_with
@@ -65,7 +66,7 @@ def test_a_covariance_reads_back(tmp_path, model):
     root = np.random.default_rng(3).standard_normal((count, count)) + 2 * np.eye(count)
     scale = np.array([1.0, 1.0, 0.5, 0.5, *[1e-3] * (count - 4)])
     covariance = (root @ root.T) * np.outer(scale, scale)
-    stated = CalibratedCamera.of(camera, model, covariance)
+    stated = Camera.of(camera, model, covariance)
     made = written(stated, "metashape-cameras", "cam0")
     assert made.lost == ()
     (tmp_path / "cameras.xml").write_text(str(made.content))
@@ -77,7 +78,7 @@ def test_a_covariance_reads_back(tmp_path, model):
 
 def test_what_has_no_place_is_said(tmp_path):
     camera = camera_of("OPENCV")
-    stated = CalibratedCamera.of(camera, "FULL_OPENCV", np.diag(np.full(12, 1e-4)))
+    stated = Camera.of(camera, "FULL_OPENCV", np.diag(np.full(12, 1e-4)))
     made = written(stated, "metashape-cameras", "cam0")
     assert made.lost == ("σ of k4, k5 and k6",)
     (tmp_path / "cameras.xml").write_text(str(made.content))

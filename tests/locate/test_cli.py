@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from stcal.cli.main import main
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.table import POSE, pose_cells, read_table
 from stcal.locate.data.layout import layout_toml, load_layout
 from tests.boards.drawn import photograph
@@ -38,7 +39,7 @@ def files(tmp_path_factory):
         (root / "scenes" / name).mkdir(parents=True)
         cv2.imwrite(str(root / "scenes" / name / "1.png"), image)
     (root / "layout.toml").write_text(layout_toml(LAYOUT), encoding="utf-8")
-    write_cameras_txt(root / "cameras.txt", CalibratedCamera.of(CAMERA, "PINHOLE"))
+    write_cameras_txt(root / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
     (root / "he.json").write_text(json.dumps({"flange_from_camera": Rigid.exp([0, 0, 1, 0, 0, 50]).matrix().tolist()}))
     rows = [",".join([name, *pose_cells(Rigid.exp([1, 0, 0, 400, 0, 300]))]) for name in ("good", "empty")]
     (root / "robot.csv").write_text("\n".join([",".join(["scene", *POSE]), *rows]) + "\n")
@@ -185,7 +186,7 @@ def test_calibrate_with_boards_of_other_kinds(stcal, tmp_path, kind):
     (tmp_path / "board.toml").write_text(BOARDS[kind])
     entries = [f'[[tag]]\ndictionary = "{dictionary}"\nid = {tag}\n' for dictionary, tag in LAYOUT.tags]
     (tmp_path / "plan.toml").write_text('type = "tags"\norigin = 0\n' + "".join(entries))
-    write_cameras_txt(tmp_path / "cameras.txt", CalibratedCamera.of(CAMERA, "PINHOLE"))
+    write_cameras_txt(tmp_path / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
     out, record = tmp_path / "calibrated.toml", tmp_path / "calibrated.json"
     code, shown, _ = stcal(
         *("locate", "calibrate", tmp_path / "images", "--camera", tmp_path / "cameras.txt", "--board"),

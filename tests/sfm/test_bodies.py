@@ -7,7 +7,8 @@ import pytest
 
 from stcal.boards.target import body_toml, load_body
 from stcal.design import scale_reference
-from stcal.io.cameras.model import CalibratedCamera, camera_prior
+from stcal.geometry.camera import Camera
+from stcal.io.cameras.model import camera_prior
 from stcal.io.design import load_target
 from stcal.labels import CircleLabel
 from stcal.sfm import pipeline
@@ -122,7 +123,7 @@ def observed(target, count: int, seed: int):
 
 def calibrated(target, images, size):
     """The calibration of a body from its corners alone, without a camera."""
-    start = CalibratedCamera.of(start_camera(*size, "OPENCV"), "OPENCV")
+    start = Camera.of(start_camera(*size, "OPENCV"), "OPENCV")
     body = place_and_find_camera(images, target.faces, [start])
     camera = body.camera
     images = [

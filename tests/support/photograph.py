@@ -14,7 +14,6 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import load_board, load_target
 from stcal.io.images import decode
@@ -184,7 +183,7 @@ class RenderedSet:
     folder: Path
     target: TargetDesign
     board: BoardDesign
-    camera: CalibratedCamera
+    camera: Camera
     truth: dict
     photographs: tuple[Photograph, ...]
 

@@ -474,7 +474,7 @@ def _evolution(method: str | None, **given) -> "EvolutionOptions":
 
 
 def _save_camera(path: Path, outcome: "Outcome") -> None:
-    from stcal.io.cameras.model import CalibratedCamera
+    from stcal.geometry.camera import Camera
     from stcal.io.cameras.write import save_camera
 
     reprojection = outcome.result.reprojection
@@ -483,7 +483,7 @@ def _save_camera(path: Path, outcome: "Outcome") -> None:
             "E-OPTION-METHOD", f"--camera-out: {outcome.result.method} does not adjust the camera; leave --method out"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    save_camera(path, CalibratedCamera.of(reprojection.camera, outcome.colmap_model, reprojection.camera_covariance))
+    save_camera(path, Camera.of(reprojection.camera, outcome.colmap_model, reprojection.camera_covariance), "colmap")
     say(f"written: {path}")
 
 

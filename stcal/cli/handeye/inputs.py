@@ -9,8 +9,8 @@ import typer
 from stcal.cli.options import one_table
 
 if TYPE_CHECKING:
+    from stcal.geometry.rigid import Order
     from stcal.handeye.data.formats.record import Said
-    from stcal.io.quaternions import Order
     from stcal.workflows.handeye.inputs import Source
     from stcal.workflows.handeye.times import Timing
 

@@ -97,7 +97,7 @@ def calibrate_camera(
 def _one(images: Path, out: Path, target, board, model: str, json_file, report, workers) -> list[str]:
     """Calibrates one camera, and returns the failed checks."""
     from stcal.design import BoardDesign
-    from stcal.io.cameras.model import CalibratedCamera
+    from stcal.geometry.camera import Camera
     from stcal.io.cameras.write import save_camera
     from stcal.sfm.camera.calibrate import calibrate_camera as calibrate
     from stcal.sfm.camera.file import CalibrationFile
@@ -112,7 +112,7 @@ def _one(images: Path, out: Path, target, board, model: str, json_file, report, 
         else:
             result = calibrate_camera_by_corners(images, board, model, workers, progress)
     intrinsics = result.intrinsics
-    save_camera(out, CalibratedCamera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance))
+    save_camera(out, Camera.of(intrinsics.camera, intrinsics.colmap_model, intrinsics.covariance), "colmap")
     summary = CalibrationFile.of(result)
     document = calibration_report(result, summary, str(images))
     say(document.text())

@@ -190,7 +190,7 @@ def run(
         raise ChecksFailed(
             "E-CHECKS-FAILED",
             f"may I use it? {result.judgement.use.removesuffix('.')}; results are written, do not use them, or end "
-            f"with 0 by --no-strict; see {result.out / 'report.html'}",
+            f"with 0 by --no-strict; see {out / 'report.html'}",
         )
 
 

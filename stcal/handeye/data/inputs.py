@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Poses
+from stcal.geometry.rigid import Order, Poses
 from stcal.handeye.data.formats.numeric import read_columns, todays
 from stcal.handeye.data.formats.recognise import read_content
 from stcal.handeye.data.formats.record import FRAMES, Content, Frames, Role, Said, Side
@@ -16,7 +16,6 @@ from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.join import keys_of
 from stcal.io.poses.columns import read_mapped
-from stcal.io.quaternions import Order
 from stcal.io.table import FARTHEST, LENGTHS, Table, read_table
 
 METRES_UP_TO, MILLIMETRES_FROM = 5.0, 50.0

@@ -1,21 +1,26 @@
 """Pose pairs of robot and camera, the loop of transforms AX = ZB, and the motions AX = XB between its poses."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.arrays import frozen
-from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.io.quaternions import Order
-from stcal.io.table import Table, read_table
+from stcal.geometry.rigid import Order, Poses, Rigid, skew
+from stcal.io.table import LENGTHS, Table, read_table
 
 WHAT = "pose file"
 SIDES = (("base_from_flange", "flange_from_base"), ("camera_from_board", "board_from_camera"))
 """Transforms that each row must hold, with the inverse that is accepted in place of each."""
+
+
+LengthUnit = Literal["mm", "m", "cm", "um", "in"]
+"""Units of translations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,24 +68,49 @@ class HandEyePoses:
         self._check_copies()
 
     @classmethod
-    def from_matrices(cls, base_from_flange, camera_from_board, names=(), where: str = "poses") -> "HandEyePoses":
-        """Returns pose pairs from homogeneous matrices (m, 4, 4), mm.
+    def from_matrices(
+        cls,
+        base_from_flange: ArrayLike | Poses,
+        camera_from_board: ArrayLike | Poses,
+        names: Sequence[str] = (),
+        where: str = "poses",
+        *,
+        unit: LengthUnit = "mm",
+    ) -> "HandEyePoses":
+        """Returns pose pairs from homogeneous matrices (m, 4, 4), or from :class:`stcal.Poses`.
+
+        Parameters
+        ----------
+        base_from_flange, camera_from_board : (m, 4, 4) arrays or Poses
+            Row i of both belongs together.
+        names : sequence of str, optional
+            Names of the pairs in messages.
+        where : str
+            Source of the poses.
+        unit : {"mm", "m", "cm", "um", "in"}
+            Unit of the translations.
 
         Raises
         ------
         InputError
-            A matrix that is not finite, left-handed, scaled or transposed; the message names it.
+            A matrix that is not finite, left-handed, scaled or transposed; the message names it. Another unit.
         """
-        sides = []
+        if unit not in LENGTHS:
+            raise InputError("E-OPTION-VALUE", f"{where}: unit {unit!r}: not a choice; use {', '.join(LENGTHS)}")
+        factor, sides = LENGTHS[unit], []
         for side, matrices in (("base_from_flange", base_from_flange), ("camera_from_board", camera_from_board)):
+            if isinstance(matrices, Poses):
+                sides.append(Poses(matrices.rotation, factor * matrices.translation))
+                continue
             rigid = []
-            for i, matrix in enumerate(matrices):
+            for i, matrix in enumerate(np.asarray(matrices, float)):
                 name = names[i] if i < len(names) else f"pose {i + 1}"
                 try:
                     rigid.append(Rigid.from_matrix(matrix))
                 except InputError as error:
                     raise InputError(error.code, f"{where}: {name}: {side}: {error}") from error
-            sides.append(Poses.of(rigid))
+            poses = Poses.of(rigid)
+            sides.append(Poses(poses.rotation, factor * poses.translation))
         return cls(*sides, names=tuple(names), where=where)
 
     def __len__(self) -> int:

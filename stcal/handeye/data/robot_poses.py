@@ -7,14 +7,14 @@ import numpy as np
 import yaml
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Poses
+from stcal.geometry.rigid import Order, Poses
 from stcal.handeye.data.formats.recognise import SUFFIXES, NotToldError
 from stcal.handeye.data.formats.record import Said, require_each_once
 from stcal.handeye.data.inputs import partners, read_robot, require_own, trailing_number
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.plain_yaml import load_yaml
-from stcal.io.quaternions import Order, require_unit
+from stcal.io.quaternions import require_unit
 from stcal.io.table import LENGTHS, read_table
 
 YAML = (".yaml", ".yml")

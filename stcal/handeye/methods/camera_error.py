@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import Loop
@@ -18,7 +19,7 @@ from stcal.handeye.data.views import Views, whitened
 from stcal.handeye.methods.bundle import Bundle, Corners, camera_parts
 from stcal.handeye.methods.noise import Problem, estimated
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution
-from stcal.io.cameras.model import CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import CameraPrior
 
 ROUNDS = 50
 SETTLED = 1e-3

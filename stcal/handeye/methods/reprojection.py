@@ -10,7 +10,7 @@ from scipy.stats import f
 
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import Loop
@@ -20,7 +20,7 @@ from stcal.handeye.methods.bundle import Bundle, Corners
 from stcal.handeye.methods.camera_error import CameraError, of_corners
 from stcal.handeye.methods.noise import LEAST_SIGMA, Noise, Problem, adjust
 from stcal.handeye.methods.pose_adjustment import FALSE_ALARM, LEAST_POSES
-from stcal.io.cameras.model import PARAMETER_NAMES, CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import CameraPrior
 
 GROSS_RAD, GROSS_SHARE = np.radians(10), 0.2
 """Residuals (rotation; translation as share of the distance) above which a pose is wrong from the start. No error of

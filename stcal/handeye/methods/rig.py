@@ -6,6 +6,7 @@ import numpy as np
 from scipy.stats import f
 
 from stcal.errors import DegenerateError
+from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import Loop, Setup
@@ -27,7 +28,6 @@ from stcal.handeye.methods.reprojection import (
     problem,
     scale_hint,
 )
-from stcal.io.cameras.model import intrinsic_basis
 
 LEAST_VIEWS = 1
 """Least number of views of a camera. One image of a board gives the camera's place if other cameras give the

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field
 
 import stcal
+from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
@@ -15,7 +16,6 @@ from stcal.handeye.report.outcome import ArmFound, Outcome, RigOutcome, Verdict,
 from stcal.handeye.result import HandEye
 from stcal.handeye.rig.validate import CameraHeldOut
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
-from stcal.io.cameras.model import PARAMETER_NAMES, parameter_names
 from stcal.io.json import Finite, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Shape, Vector, Vector3
 
 

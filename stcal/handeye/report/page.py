@@ -5,6 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
+from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES
 from stcal.handeye.judge.observability import Observability
@@ -26,7 +27,6 @@ from stcal.handeye.report.outcome import ArmFound, Outcome, RigOutcome, Verdict,
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared
-from stcal.io.cameras.model import PARAMETER_NAMES, parameter_names
 from stcal.report.document import (
     Block,
     Document,

@@ -7,10 +7,9 @@ from scipy.optimize import least_squares
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.align import align_rigid
-from stcal.geometry.camera import WIDEST_RAD, Camera
+from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, parameter_names
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.foreign import ForeignLens
-from stcal.io.cameras.model import FISHEYE, CalibratedCamera, intrinsic_basis, parameter_names
 
 CELLS = 24
 """Number of grid points along the shorter side of the image."""
@@ -179,7 +178,7 @@ class FittedLens:
     within 89° of the axis; ``camera_from_lens`` : the rotation of the camera's axes, the identity unless it helps much.
     """
 
-    camera: CalibratedCamera
+    camera: Camera
     rms_px: float
     most_px: float
     share: float
@@ -260,7 +259,7 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
 
 def _fitted(
     model: str, rays: np.ndarray, pixels: np.ndarray, lens: ForeignLens, size: tuple[int, int], turn: bool
-) -> tuple[CalibratedCamera, Rigid]:
+) -> tuple[Camera, Rigid]:
     """Fit one model by least squares; weights grow with the radius, since outer rays represent a larger area.
 
     Returns the camera, and camera_from_lens, the identity without ``turn``.
@@ -308,4 +307,4 @@ def _fitted(
         ftol=SETTLED,
         gtol=SETTLED,
     )
-    return CalibratedCamera.of(camera_at(solution.x), model), turned(solution.x)
+    return Camera.of(camera_at(solution.x), model), turned(solution.x)

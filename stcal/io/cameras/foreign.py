@@ -12,14 +12,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from stcal.errors import InputError
-from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import (
-    COLMAP_PIXEL_ORIGIN,
-    CalibratedCamera,
-    CameraModel,
-    camera_from_colmap,
-    camera_from_opencv,
-)
+from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
+from stcal.io.cameras.model import CameraModel, camera_from_colmap, camera_from_opencv
 
 COLMAP_FOREIGN = {
     "FOV": (7, 5),
@@ -399,7 +393,7 @@ def of_splines(name: str, numbers: list[float], width: float, height: float, sou
     return ForeignLens(called, project, int(width), int(height), source)
 
 
-def refused(camera: CalibratedCamera, form: str, why: str) -> InputError:
+def refused(camera: Camera, form: str, why: str) -> InputError:
     """Return the error for a camera with a property ``why`` that a form cannot hold."""
     return InputError("E-CAMERA-FORM", f"{form} has no place for {why} of {camera.colmap_model}; write --form colmap")
 

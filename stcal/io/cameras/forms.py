@@ -9,10 +9,12 @@ import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.camera import Camera, parameter_names
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras import metashape
 from stcal.io.cameras.foreign import (
@@ -29,8 +31,12 @@ from stcal.io.cameras.foreign import (
 )
 from stcal.io.cameras.keys import require_known
 from stcal.io.cameras.matlab import mat, zhang
-from stcal.io.cameras.model import CalibratedCamera, CameraModel, cameras_txt, parameter_names
+from stcal.io.cameras.model import CameraModel, cameras_txt
 
+CameraForm = Literal[
+    "colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab", "zhang"
+]
+"""Forms in which cameras are written."""
 SUFFIXES = {
     ".txt": "colmap",
     ".bin": "colmap-bin",
@@ -158,12 +164,12 @@ def name_to_write(name: str) -> str:
     return word if word[0].isalpha() else f"cam{word}"
 
 
-def written(camera: CalibratedCamera, form: str, name: str) -> Written:
+def written(camera: Camera, form: str, name: str) -> Written:
     """Return the file of a camera.
 
     Parameters
     ----------
-    camera : CalibratedCamera
+    camera : Camera
         Camera to write.
     form : str
         One of :data:`WRITERS`.
@@ -187,14 +193,14 @@ def written(camera: CalibratedCamera, form: str, name: str) -> Written:
     return Written(WRITERS[form](camera, name), tuple(lost))
 
 
-def _colmap_binary(camera: CalibratedCamera, _: str) -> bytes:
+def _colmap_binary(camera: Camera, _: str) -> bytes:
     params = camera.colmap_params()
     number = next(number for number, name in NUMBERS.items() if name == camera.colmap_model)
     head = struct.pack("<QIiQQ", 1, 1, number, camera.width, camera.height)
     return head + struct.pack(f"<{len(params)}d", *params)
 
 
-def _fisheye_four(camera: CalibratedCamera, form: str) -> list[float]:
+def _fisheye_four(camera: Camera, form: str) -> list[float]:
     """Return k1 … k4 of an equidistant camera; refuse one with further coefficients."""
     others = [*camera.distortion[2:4], *camera.distortion[8:]]
     if any(others):
@@ -202,18 +208,18 @@ def _fisheye_four(camera: CalibratedCamera, form: str) -> list[float]:
     return [float(camera.distortion[i]) for i in (0, 1, 4, 5)]
 
 
-def _coefficients(camera: CalibratedCamera) -> list[float]:
+def _coefficients(camera: Camera) -> list[float]:
     """Return the first 5 or 8 coefficients of a perspective camera, as few as represent the lens."""
     count = 8 if camera.distortion[5:8].any() else 5
     return [float(k) for k in camera.distortion[:count]]
 
 
-def _matrix(camera: CalibratedCamera) -> list[float]:
+def _matrix(camera: Camera) -> list[float]:
     (fx, fy), (cx, cy) = camera.focal.tolist(), camera.centre.tolist()
     return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
 
 
-def _opencv(camera: CalibratedCamera, _: str) -> str:
+def _opencv(camera: Camera, _: str) -> str:
     values = _fisheye_four(camera, "opencv") if camera.fisheye else _coefficients(camera)
     node = "!!opencv-matrix\n   rows: {}\n   cols: {}\n   dt: d\n   data: {}\n"
     kind = "distortion_model: equidistant\n" if camera.fisheye else ""
@@ -224,7 +230,7 @@ def _opencv(camera: CalibratedCamera, _: str) -> str:
     )
 
 
-def _ros(camera: CalibratedCamera, name: str) -> str:
+def _ros(camera: Camera, name: str) -> str:
     values = _fisheye_four(camera, "ros") if camera.fisheye else _coefficients(camera)
     kind = "equidistant" if camera.fisheye else "rational_polynomial" if len(values) == 8 else "plumb_bob"
     k = _matrix(camera)
@@ -241,7 +247,7 @@ def _ros(camera: CalibratedCamera, name: str) -> str:
     )
 
 
-def _kalibr(camera: CalibratedCamera, name: str) -> str:
+def _kalibr(camera: Camera, name: str) -> str:
     if camera.fisheye:
         kind, values = "equidistant", _fisheye_four(camera, "kalibr")
     else:
@@ -255,7 +261,7 @@ def _kalibr(camera: CalibratedCamera, name: str) -> str:
     )
 
 
-def kalibr_chain(cameras: Sequence[tuple[str, CalibratedCamera, Rigid]]) -> str:
+def kalibr_chain(cameras: Sequence[tuple[str, Camera, Rigid]]) -> str:
     """Return the ``camchain.yaml`` of several cameras, each given by name, camera and camera_from_first.
 
     Kalibr numbers the cameras, and states the pose of each relative to the camera before it, in metres.
@@ -275,7 +281,7 @@ def kalibr_chain(cameras: Sequence[tuple[str, CalibratedCamera, Rigid]]) -> str:
     return "".join(parts)
 
 
-def _mrcal(camera: CalibratedCamera, _: str) -> str:
+def _mrcal(camera: Camera, _: str) -> str:
     if camera.fisheye:
         raise refused(camera, "mrcal", "the equidistant projection")
     values = _coefficients(camera) if camera.distortion.any() else []
@@ -288,7 +294,7 @@ def _mrcal(camera: CalibratedCamera, _: str) -> str:
     )
 
 
-WRITERS: Mapping[str, Callable[[CalibratedCamera, str], str | bytes]] = {
+WRITERS: Mapping[str, Callable[[Camera, str], str | bytes]] = {
     "colmap": lambda camera, _: cameras_txt(camera),
     "colmap-bin": _colmap_binary,
     "opencv": _opencv,

@@ -15,9 +15,10 @@ from scipy.io import loadmat, savemat
 from scipy.io.matlab import MatReadWarning, MatWriteWarning
 
 from stcal.errors import InputError
+from stcal.geometry.camera import Camera
 from stcal.io.cameras.foreign import ForeignLens, of_skewed, one_of
 from stcal.io.cameras.keys import require_known
-from stcal.io.cameras.model import CalibratedCamera, CameraModel
+from stcal.io.cameras.model import CameraModel
 
 HEADS = (b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")
 PIXEL_ORIGIN = 1.0
@@ -200,7 +201,7 @@ def from_script(text: str, source: str) -> CameraModel | ForeignLens:
     return _from_bouguet(values, source)
 
 
-def mat(camera: CalibratedCamera, name: str) -> bytes:
+def mat(camera: Camera, name: str) -> bytes:
     """Return a ``.mat`` file with a structure of the fields of ``cameraIntrinsics`` and ``toStruct(cameraParams)``."""
     k = camera.distortion
     if camera.fisheye or k[5:].any():
@@ -253,7 +254,7 @@ def from_zhang(rows: list[list[str]], source: str) -> CameraModel | ForeignLens:
     return of_skewed([fx, fy, cx, cy], skew, np.array([k1, k2, 0.0, 0.0]), 0.0, 0.0, source)
 
 
-def zhang(camera: CalibratedCamera, _: str) -> str:
+def zhang(camera: Camera, _: str) -> str:
     """Return the text of Zhang's five numbers, and k1, k2."""
     if camera.fisheye or camera.distortion[2:].any():
         lost = "the equidistant projection" if camera.fisheye else "more than k1, k2"

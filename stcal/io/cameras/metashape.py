@@ -12,18 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, FISHEYE, PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.io.cameras.foreign import ForeignLens, one_of, refused
 from stcal.io.cameras.keys import require_known
-from stcal.io.cameras.model import (
-    COLMAP_PIXEL_ORIGIN,
-    FISHEYE,
-    PARAMETER_NAMES,
-    CalibratedCamera,
-    CameraModel,
-    camera_from_opencv,
-    intrinsic_basis,
-)
+from stcal.io.cameras.model import CameraModel, camera_from_opencv
 from stcal.io.covariance import Rows, require_covariance
 
 NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
@@ -189,7 +181,7 @@ def _edge(camera: CameraModel) -> np.ndarray:
     return HELD_PX * np.concatenate([[1 / reach] * 2, [1.0] * 2, reach ** -powers.astype(float) / focal])
 
 
-def _values(camera: CalibratedCamera, form: str) -> dict[str, float]:
+def _values(camera: Camera, form: str) -> dict[str, float]:
     k1, k2, p1, p2, k3, k4, *rest = camera.distortion.tolist()
     if any(rest) or (k4 and not camera.fisheye):
         raise refused(camera, form, "k4 to k6 and prisms")
@@ -198,7 +190,7 @@ def _values(camera: CalibratedCamera, form: str) -> dict[str, float]:
     return dict(zip(NAMES, (fy, *centre, fx - fy, 0.0, k1, k2, k3, k4, p2, p1), strict=True))
 
 
-def calibration(camera: CalibratedCamera) -> str:
+def calibration(camera: Camera) -> str:
     """Return the text of a ``<calibration>`` : the lens only.
 
     Raises
@@ -213,7 +205,7 @@ def calibration(camera: CalibratedCamera) -> str:
     return _text(root)
 
 
-def cameras(camera: CalibratedCamera, name: str) -> str:
+def cameras(camera: Camera, name: str) -> str:
     """Return the text of exported cameras with one sensor and no image; errors as :func:`calibration`."""
     values = _values(camera, "metashape-cameras")
     size = {"width": str(camera.width), "height": str(camera.height)}
@@ -234,7 +226,7 @@ def cameras(camera: CalibratedCamera, name: str) -> str:
     return _text(root)
 
 
-def _covariance(camera: CalibratedCamera, covariance: np.ndarray) -> tuple[list[str], np.ndarray]:
+def _covariance(camera: Camera, covariance: np.ndarray) -> tuple[list[str], np.ndarray]:
     """Return Metashape's names of the parameters of the camera's model, and their covariance."""
     basis = intrinsic_basis(camera.colmap_model)
     rows = np.zeros((len(NAMES), len(PARAMETER_NAMES)))
@@ -250,14 +242,14 @@ def _covariance(camera: CalibratedCamera, covariance: np.ndarray) -> tuple[list[
     return [NAMES[i] for i in present], matrix
 
 
-def without_sigma(camera: CalibratedCamera) -> list[str]:
+def without_sigma(camera: Camera) -> list[str]:
     """Return the parameters, all of them 0, for whose σ Metashape has no place."""
     rational = not camera.fisheye and camera.colmap_model == "FULL_OPENCV"
     prisms = camera.colmap_model == "THIN_PRISM_FISHEYE"
     return ["σ of k4, k5 and k6"] * rational + ["σ of the thin prisms"] * prisms
 
 
-def _kind(camera: CalibratedCamera) -> str:
+def _kind(camera: Camera) -> str:
     return "fisheye" if camera.fisheye else "frame"
 
 

@@ -9,11 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import (
+    COLMAP_LAYOUT,
+    COLMAP_PIXEL_ORIGIN,
+    FISHEYE,
+    PARAMETER_NAMES,
+    Camera,
+    intrinsic_basis,
+    opencv_lens,
+)
 from stcal.io.files import save
-
-COLMAP_PIXEL_ORIGIN = 0.5
-"""COLMAP's coordinate of the centre of the top-left pixel; OpenCV's, and ours, is 0."""
 
 SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
 """Beginnings of the comments of ``cameras.txt`` that state the uncertainty of its parameters."""
@@ -29,27 +34,6 @@ MAX_SIDE_PX = 1_000_000
 
 EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt")
 """Names of ``distortion_model`` for OpenCV's fisheye."""
-DISTORTION_COUNTS = (0, 4, 5, 8, 12, 14)
-"""Numbers of distortion coefficients that OpenCV knows."""
-
-# Indices of COLMAP's parameters in fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4.
-_COLMAP_LAYOUT = {
-    "SIMPLE_PINHOLE": [(0, 1), 2, 3],
-    "PINHOLE": [0, 1, 2, 3],
-    "SIMPLE_RADIAL": [(0, 1), 2, 3, 4],
-    "RADIAL": [(0, 1), 2, 3, 4, 5],
-    "OPENCV": list(range(8)),
-    "FULL_OPENCV": list(range(12)),
-    "SIMPLE_RADIAL_FISHEYE": [(0, 1), 2, 3, 4],
-    "RADIAL_FISHEYE": [(0, 1), 2, 3, 4, 5],
-    "OPENCV_FISHEYE": [0, 1, 2, 3, 4, 5, 8, 9],
-    "THIN_PRISM_FISHEYE": [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 14],
-}
-COLMAP_MODELS = tuple(_COLMAP_LAYOUT)
-"""Camera models that stcal supports."""
-PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
-FISHEYE = "FISHEYE"
-"""Part of the names of COLMAP's equidistant models."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,11 +58,12 @@ class CameraModel:
     def sized(self, width: int, height: int) -> Camera:
         """Return the camera; the arguments give the size if the file does not state it."""
         size = self.width or width, self.height or height
-        return Camera(*size, self.focal, self.centre, self.distortion, FISHEYE in self.colmap_model)
+        fisheye = FISHEYE in self.colmap_model
+        return Camera(*size, self.focal, self.centre, self.distortion, fisheye, self.colmap_model)
 
-    def calibrated(self, width: int, height: int) -> "CalibratedCamera":
-        """Return the camera of :meth:`sized` with its model and covariance."""
-        return CalibratedCamera.of(self.sized(width, height), self.colmap_model, self.covariance)
+    def calibrated(self, width: int, height: int) -> Camera:
+        """Return the camera of :meth:`sized` with its covariance."""
+        return replace(self.sized(width, height), covariance=self.covariance)
 
     def require_inside(self, width: int, height: int, image: str) -> None:
         """Refuse an image without the principal point: a file that states no size may belong to another camera.
@@ -97,38 +82,10 @@ class CameraModel:
             )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CalibratedCamera(Camera):
-    """A camera of known size with the covariance of its parameters.
-
-    ``colmap_model`` : the COLMAP model that represents the camera exactly;
-    ``covariance`` : (q, q) of the parameters of ``colmap_model``, in its order, or None if unknown.
-    """
-
-    colmap_model: str = "FULL_OPENCV"
-    covariance: np.ndarray | None = None
-
-    @classmethod
-    def of(cls, camera: Camera, colmap_model: str, covariance: np.ndarray | None = None) -> "CalibratedCamera":
-        """Return ``camera`` with its model and covariance."""
-        lens = camera.focal, camera.centre, camera.distortion, FISHEYE in colmap_model
-        return cls(camera.width, camera.height, *lens, colmap_model, covariance)
-
-    def colmap_params(self) -> list[float]:
-        """Return the parameters in COLMAP's order and pixel origin."""
-        flat = self.parameters()
-        flat[2:4] += COLMAP_PIXEL_ORIGIN
-        return [float(flat[p[0] if isinstance(p, tuple) else p]) for p in _COLMAP_LAYOUT[self.colmap_model]]
-
-
 def model_of(camera: Camera, source: str = "camera") -> CameraModel:
     """Return a camera of known size as a file would state it; ``source`` : where it is from, for messages."""
-    colmap_model = "THIN_PRISM_FISHEYE" if camera.fisheye else "FULL_OPENCV"
-    covariance = None
-    if isinstance(camera, CalibratedCamera):
-        colmap_model, covariance = camera.colmap_model, camera.covariance
     lens = camera.focal, camera.centre, camera.distortion
-    return CameraModel(*lens, colmap_model, camera.width, camera.height, source, covariance)
+    return CameraModel(*lens, camera.colmap_model, camera.width, camera.height, source, camera.covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +108,7 @@ PRIOR_TANGENTIAL = 1e-3
 """σ of p1, p2, s1 … s4 if the camera file states none."""
 
 
-def camera_prior(camera: CalibratedCamera) -> CameraPrior:
+def camera_prior(camera: Camera) -> CameraPrior:
     """Return a prior of the intrinsics, with the covariance of the camera file or else of an old calibration."""
     if camera.covariance is not None:
         return CameraPrior(camera.colmap_model, camera.covariance)
@@ -162,7 +119,7 @@ def camera_prior(camera: CalibratedCamera) -> CameraPrior:
     return CameraPrior(camera.colmap_model, np.diag(flat[first] ** 2))
 
 
-def refinable(camera: CalibratedCamera) -> CalibratedCamera:
+def refinable(camera: Camera) -> Camera:
     """Return the camera with the model to refine.
 
     A camera without distortion and without covariance is refined as OPENCV, starting from zero distortion: its file
@@ -173,27 +130,12 @@ def refinable(camera: CalibratedCamera) -> CalibratedCamera:
     return camera
 
 
-def intrinsic_basis(colmap_model: str) -> np.ndarray:
-    """Return the derivative (16, q) of :data:`PARAMETER_NAMES` by the q parameters of a COLMAP model."""
-    layout = _COLMAP_LAYOUT[colmap_model]
-    basis = np.zeros((len(PARAMETER_NAMES), len(layout)))
-    for column, place in enumerate(layout):
-        basis[list(place) if isinstance(place, tuple) else place, column] = 1
-    return basis
-
-
-def parameter_names(colmap_model: str) -> list[str]:
-    """Return the names of the parameters of a COLMAP model, in its order."""
-    layout = _COLMAP_LAYOUT[colmap_model]
-    return ["f" if isinstance(place, tuple) else PARAMETER_NAMES[place] for place in layout]
-
-
-def write_cameras_txt(path: str | Path, camera: CalibratedCamera) -> None:
+def write_cameras_txt(path: str | Path, camera: Camera) -> None:
     """Write ``cameras.txt`` with one camera of id 1; σ and correlations of its parameters as comments."""
     save(Path(path), cameras_txt(camera))
 
 
-def cameras_txt(camera: CalibratedCamera) -> str:
+def cameras_txt(camera: Camera) -> str:
     """Return the text of the file that :func:`write_cameras_txt` writes."""
     params, covariance = " ".join(map(repr, camera.colmap_params())), camera.covariance
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] (centre of the first pixel at 0.5, 0.5)"]
@@ -244,12 +186,12 @@ def camera_from_colmap(colmap_model: str, width: float, height: float, params, s
     InputError
         The camera model is not supported, the number of parameters is wrong, or values are impossible.
     """
-    if colmap_model not in _COLMAP_LAYOUT:
-        known = ", ".join(_COLMAP_LAYOUT)
+    if colmap_model not in COLMAP_LAYOUT:
+        known = ", ".join(COLMAP_LAYOUT)
         raise InputError(
             "E-CAMERA-MODEL", f"camera file {source}: model {colmap_model} is not supported; use one of {known}"
         )
-    layout = _COLMAP_LAYOUT[colmap_model]
+    layout = COLMAP_LAYOUT[colmap_model]
     if len(params) != len(layout):
         raise InputError(
             "E-CAMERA-COEFFICIENTS",
@@ -291,29 +233,5 @@ def camera_from_opencv(
     InputError
         The number of coefficients is wrong, no supported model has them, or values are impossible.
     """
-    path, size = Path(path), (width or None, height or None)
-    if fisheye:
-        if len(given) not in ((6,) if tangential else (0, 4)):
-            raise InputError(
-                "E-CAMERA-COEFFICIENTS",
-                f"camera file {path}: {len(given)} coefficients of an equidistant lens; k1 to k4 needed",
-            )
-        distortion = np.zeros(12)
-        distortion[[0, 1, 2, 3, 4, 5] if tangential else [0, 1, 4, 5][: len(given)]] = given
-        kind = "THIN_PRISM_FISHEYE" if distortion[2:4].any() else "OPENCV_FISHEYE"
-        return camera_model(np.concatenate([lens, distortion]), kind, *size, path)
-    if given[8:].any():
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS",
-            f"camera file {path}: {len(given)} distortion coefficients, at most 8 are supported",
-        )
-    if len(given) not in DISTORTION_COUNTS:
-        raise InputError(
-            "E-CAMERA-COEFFICIENTS",
-            f"camera file {path}: {len(given)} distortion coefficients; {', '.join(map(str, DISTORTION_COUNTS))} "
-            "are possible (k1, k2, p1, p2, k3 …)",
-        )
-    distortion = np.zeros(8)
-    distortion[: min(len(given), 8)] = given[:8]
-    kind = "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
-    return camera_model(np.concatenate([lens, distortion]), kind, *size, path)
+    distortion, kind = opencv_lens(given, fisheye, f"camera file {path}", tangential)
+    return camera_model(np.concatenate([lens, distortion]), kind, width or None, height or None, Path(path))

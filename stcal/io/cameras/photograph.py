@@ -8,7 +8,8 @@ import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from stcal.errors import InputError
-from stcal.io.cameras.model import CalibratedCamera, camera_from_opencv
+from stcal.geometry.camera import Camera
+from stcal.io.cameras.model import camera_from_opencv
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.photographs.extras import heic_turns, is_heic, require_heic
 
@@ -35,7 +36,7 @@ class Photograph:
     entries that were used, in words.
     """
 
-    camera: CalibratedCamera
+    camera: Camera
     told: str
 
 
@@ -98,7 +99,7 @@ def camera_of_photograph(path: str | Path) -> Photograph:
     sigma = np.array([1, 1, *[SIGMA_CENTRE * width] * 2, *[SIGMA_RADIAL] * 2, *[SIGMA_TANGENTIAL] * 2])
     covariance = np.diag(sigma**2)
     covariance[:2, :2] = SIGMA_FOCAL**2 * focal**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 * focal**2 / 2 * np.eye(2)
-    return Photograph(CalibratedCamera.of(camera, "OPENCV", covariance), source)
+    return Photograph(Camera.of(camera, "OPENCV", covariance), source)
 
 
 def _focal_px(exif: dict, width: int, height: int) -> tuple[float | None, str]:

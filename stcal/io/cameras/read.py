@@ -12,18 +12,11 @@ import numpy as np
 import yaml
 
 from stcal.errors import InputError
+from stcal.geometry.camera import COLMAP_MODELS, Camera, parameter_names
 from stcal.io.cameras import forms, matlab, metashape
 from stcal.io.cameras.foreign import ForeignLens, numbered, of_colmap, of_database, one_of
 from stcal.io.cameras.keyed import from_keys
-from stcal.io.cameras.model import (
-    COLMAP_MODELS,
-    CORRELATION,
-    MAX_SIDE_PX,
-    SIGMA,
-    SQUARE_WITHIN,
-    CameraModel,
-    parameter_names,
-)
+from stcal.io.cameras.model import CORRELATION, MAX_SIDE_PX, SIGMA, SQUARE_WITHIN, CameraModel, model_of
 from stcal.io.cameras.photograph import is_photograph
 from stcal.io.cameras.texts import values_of, values_of_archive
 from stcal.io.covariance import Rows, require_covariance
@@ -67,11 +60,66 @@ def read_camera(path: str | Path, name: str = "") -> CameraModel:
     lens = read_lens(path, name)
     if isinstance(lens, CameraModel):
         return lens
-    raise InputError(
+    raise unsupported(lens, path)
+
+
+def unsupported(lens: ForeignLens, path: str | Path) -> InputError:
+    """Return the error of a lens whose model is not supported."""
+    return InputError(
         "E-CAMERA-MODEL",
         f"camera file {path}: {lens.called} is none of {', '.join(COLMAP_MODELS)}; fit one of them to it with "
         "`stcal camera convert`",
     )
+
+
+def camera_model(camera: str | Path | Camera | CameraModel) -> CameraModel:
+    """Return a camera as a file states it; it may be given as a file, or as either class."""
+    if isinstance(camera, str | Path):
+        return read_camera(camera)
+    return model_of(camera) if isinstance(camera, Camera) else camera
+
+
+def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None = None) -> Camera:
+    """Load a camera from a file of any supported kind, which is recognised by the content.
+
+    Parameters
+    ----------
+    path : str or Path
+        File of COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape, MATLAB and others (``data_layout.md``).
+    name : str
+        Name of the camera in a file of several, such as ``cam1``.
+    size : (int, int), optional
+        Width and height of the images, px, for a file that does not state them.
+
+    Returns
+    -------
+    Camera
+        With its covariance if the file states one.
+
+    Raises
+    ------
+    InputError
+        The file is missing or malformed, holds more than one camera, a lens of an unsupported model, or no size.
+    """
+    return sized_camera(read_camera(path, name), path, size)
+
+
+def sized_camera(model: CameraModel | ForeignLens, path: str | Path, size: tuple[int, int] | None) -> Camera:
+    """Return the camera of a file; ``size`` is taken where the file states none.
+
+    Raises
+    ------
+    InputError
+        No size is known.
+    """
+    width, height = size or (0, 0)
+    if not (model.width or width) or not (model.height or height):
+        raise InputError(
+            "E-CAMERA-SIZE", f"camera file {path}: states no image size; give it (--size), width and height in px"
+        )
+    if isinstance(model, ForeignLens):
+        raise unsupported(model, path)
+    return model.calibrated(width, height)
 
 
 def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
+from stcal.geometry.rigid import Order
 from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.poses.rotations import (
     ROTATION_VECTOR,
@@ -23,7 +24,6 @@ from stcal.io.poses.rotations import (
     turned_values,
 )
 from stcal.io.quaternions import COLUMNS as QUATERNION
-from stcal.io.quaternions import Order
 from stcal.io.table import ANGLES, Table, is_comment
 from stcal.io.toml import Strict, load_toml
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.design import UNIT_SQUARE, TagLayout
+from stcal.boards.design import UNIT_SQUARE
+from stcal.boards.design import TagLayout as TagLayout
 from stcal.boards.dictionaries import known_tags
 from stcal.boards.file import TagsFile, load_tags, require_sizes
 from stcal.errors import InputError

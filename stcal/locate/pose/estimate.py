@@ -10,7 +10,7 @@ from stcal.boards.edges import corners_by_edges
 from stcal.errors import DegenerateError
 from stcal.geometry import least_squares
 from stcal.geometry.arrays import frozen
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import (
     Minima,
     Normal,
@@ -34,7 +34,7 @@ from stcal.geometry.plane import (
 )
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.geometry.uncertain import ImageFit
-from stcal.io.cameras.model import CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import CameraPrior
 from stcal.locate.data.layout import TargetLayout
 
 SETTLED = 1e-5

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.join import table_of
 from stcal.io.json import Matrix, Matrix4, Part, Pose, PoseCovariance, read_result
-from stcal.io.quaternions import READINGS, Order
+from stcal.io.quaternions import READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS
 
 MOVING, FIXED = "flange_from_camera", "base_from_camera"

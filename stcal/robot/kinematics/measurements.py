@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, freeze
-from stcal.geometry.rigid import Poses
-from stcal.io.quaternions import Order
+from stcal.geometry.arrays import Array, freeze, frozen
+from stcal.geometry.rigid import Order, Poses
 from stcal.io.table import ANGLES, LENGTHS, Table, read_table
 from stcal.robot.kinematics.conditions import (
     PAYLOAD,
@@ -100,6 +100,54 @@ class Measurements:
         if self.distances is not None:
             freeze(self, "distances", (m,), "distances")
             freeze(self, "from_row", (m,), "rows", int)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        q: ArrayLike,
+        positions: ArrayLike | None = None,
+        rotations: ArrayLike | None = None,
+        *,
+        poses: Poses | None = None,
+        covariance: ArrayLike | None = None,
+        targets: Sequence[str] = (),
+        where: str = "measurements",
+    ) -> "Measurements":
+        """Returns measurements in memory.
+
+        Parameters
+        ----------
+        q : (m, n) array
+            Values of the controller, rad or mm.
+        positions : (m, 3) array, optional
+            Of the target in the instrument's frame, mm.
+        rotations : (m, 3, 3) array, optional
+            instrument_from_target, where poses were measured.
+        poses : Poses, optional
+            instrument_from_target, in place of positions and rotations.
+        covariance : (m, 6, 6) array, optional
+            Of the poses, rad and mm, left perturbation.
+        targets : sequence of str, optional
+            (m,) names of the targets seen; the robot's only one if not given.
+        where : str
+            Source of the data, for messages.
+
+        Raises
+        ------
+        InputError
+            Neither positions nor poses, or arrays of other shapes.
+        """
+        if poses is not None:
+            positions, rotations = poses.translation, poses.rotation
+        if positions is None:
+            raise InputError("E-MEASURED-KIND", f"{where}: neither positions (m, 3) nor poses; give one of them")
+        values = frozen(q, (None, None), f"{where}: joint values")
+        m = len(values)
+        if targets and len(targets) != m:
+            raise InputError("E-NAMES-COUNT", f"{where}: {len(targets)} names of targets for {m} rows; one each needed")
+        given = (positions, rotations, covariance)
+        places, turns, spread = (None if each is None else np.asarray(each, float) for each in given)
+        return cls(where, range(1, m + 1), values, tuple(targets) or ("",) * m, places, turns, spread)
 
     def __len__(self) -> int:
         return len(self.q)

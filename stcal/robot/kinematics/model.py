@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen, require_choices
@@ -285,6 +286,52 @@ class Robot:
                 "E-ROBOT-ENTRIES",
                 f"robot {self.name}: elasticity of {len(self.elasticity.moment)} joints, {n} needed, as many as rows",
             )
+
+    @classmethod
+    def from_dh(
+        cls,
+        table: ArrayLike,
+        convention: Convention,
+        limits: ArrayLike | None = None,
+        *,
+        types: Sequence[JointType] = (),
+        name: str = "robot",
+    ) -> "Robot":
+        """Returns the robot of a table of Denavit–Hartenberg parameters.
+
+        Parameters
+        ----------
+        table : (n, 4) or (n, 5) array
+            a (mm), α (rad), d (mm), θ (rad) of each joint, from the base; and Hayati's β (rad).
+        convention : {"standard", "modified"}
+            Of all rows; see :class:`DHRow`.
+        limits : (n, 2) array, optional
+            Lowest and highest value of each joint, rad or mm; unlimited if not given.
+        types : sequence of {"revolute", "prismatic"}, optional
+            One for each joint; all revolute if not given.
+        name : str
+            For messages and reports.
+
+        Raises
+        ------
+        InputError
+            Arrays of other shapes, and whatever :class:`Robot`, :class:`DHRow` and :class:`Joint` refuse.
+        """
+        rows = frozen(table, None, f"robot {name}: D-H table")
+        if rows.ndim != 2 or rows.shape[1] not in (4, 5):
+            raise InputError(
+                "E-ARRAY-SHAPE", f"robot {name}: D-H table of shape {rows.shape}; (n, 4) needed: a, alpha, d, theta"
+            )
+        n = len(rows)
+        ends = np.tile([-np.inf, np.inf], (n, 1)) if limits is None else np.asarray(limits, float)
+        kinds = tuple(types) or ("revolute",) * n
+        if ends.shape != (n, 2) or len(kinds) != n:
+            raise InputError(
+                "E-ARRAY-SHAPE",
+                f"robot {name}: limits of shape {ends.shape}, types of {len(kinds)} joints; ({n}, 2) and {n} needed",
+            )
+        joints = tuple(Joint(kind, *pair) for kind, pair in zip(kinds, ends.tolist(), strict=True))
+        return cls(name, convention, tuple(DHRow(*row) for row in rows.tolist()), joints)
 
     @property
     def prismatic(self) -> np.ndarray:

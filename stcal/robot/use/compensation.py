@@ -228,7 +228,7 @@ def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple
 
 
 @one_thread()
-def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None) -> Compensated:
+def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | None = None) -> Compensated:
     """Returns joint values for the commanded poses, by the identified robot and by the nominal one.
 
     Of several branches the one nearest to the nominal joint values, or without a nominal robot to the commanded ones;
@@ -239,8 +239,8 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
     ----------
     identified : Robot
         As it is; mm, rad.
-    targets : Targets
-        m commanded poses base_from_tool.
+    targets : Targets or Poses
+        m commanded poses base_from_tool; of files from :func:`read_targets`.
     nominal : Robot, optional
         As its controller believes it to be.
 
@@ -256,6 +256,8 @@ def compensate(identified: Robot, targets: Targets, nominal: Robot | None = None
         Joint values without poses need the nominal robot; robots of different joints, or too far apart to be one; an
         unknown tool; poses to which their joint values lead in another unit or convention only.
     """
+    if isinstance(targets, Poses):
+        targets = Targets.from_poses(targets)
     if nominal is not None and _built(nominal) != _built(identified):
         raise InputError(
             "E-ROBOT-MISMATCH",

@@ -5,12 +5,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import freeze
-from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.quaternions import EXPLAINS, READINGS, Order
+from stcal.geometry.rigid import Order, Poses, Rigid
+from stcal.io.quaternions import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
 from stcal.robot.kinematics.conditions import PAYLOAD, USUAL, Conditions, oriented, read_conditions, unread
 from stcal.robot.kinematics.dh import FITS, TURNED_RAD, require_convention
@@ -60,6 +61,34 @@ class Targets:
     def __post_init__(self):
         if self.q is not None:
             freeze(self, "q", (len(self), None), "joint values")
+
+    @classmethod
+    def from_poses(
+        cls, poses: Poses, q: ArrayLike | None = None, tools: Sequence[str] = (), where: str = "targets"
+    ) -> "Targets":
+        """Returns targets in memory.
+
+        Parameters
+        ----------
+        poses : Poses
+            m poses base_from_tool, mm.
+        q : (m, n) array, optional
+            Joint values near to which the solutions are wanted, rad or mm.
+        tools : sequence of str, optional
+            (m,) names of the robot's tools; the only one if not given.
+        where : str
+            Source of the poses, for messages.
+
+        Raises
+        ------
+        InputError
+            Other numbers of joint values or tools.
+        """
+        m, values = len(poses), None if q is None else np.asarray(q, float)
+        names = tuple(tools) or ("",) * m
+        if len(names) != m or (values is not None and len(values) != m):
+            raise InputError("E-NAMES-COUNT", f"{where}: {m} poses, other numbers of joint values or tools; {m} needed")
+        return cls(where, range(1, m + 1), names, poses, values)
 
     def __len__(self) -> int:
         return len(self.lines)

@@ -8,9 +8,9 @@ import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
 from stcal.geometry.arrays import frozen
+from stcal.geometry.camera import PARAMETER_NAMES
 from stcal.geometry.normal_equations import constrained_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
-from stcal.io.cameras.model import PARAMETER_NAMES
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.equations import (
     Block,

@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
-from stcal.io.cameras.model import CalibratedCamera
+from stcal.geometry.camera import Camera
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
@@ -163,7 +163,7 @@ def _rims(run: SavedRun, found: Contributions, own: Derivatives) -> tuple[Source
 def budget(
     found: Contributions,
     own: Derivatives,
-    camera: CalibratedCamera,
+    camera: Camera,
     board,
     flatness_mm: float | None,
     refined: bool,

@@ -11,7 +11,7 @@ from pydantic import Field
 from stcal.design import BoardDesign, StatedSize
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
-from stcal.io.cameras.model import CalibratedCamera, intrinsic_basis
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.io.design import BoardSizeEntry, SizeEntry
 from stcal.io.toml import Strict, load_toml
 from stcal.sfm.adjust.uncertainty import BOARD, CIRCLES, DOTS, FLATNESS, INTRINSICS, Contributions
@@ -124,7 +124,7 @@ class Source:
 
 def sources_of(
     found: Contributions,
-    camera: CalibratedCamera,
+    camera: Camera,
     board: BoardDesign,
     flatness_mm: float | None,
     refined: bool,
@@ -193,7 +193,7 @@ def _flatness(found: Contributions, flatness_mm: float | None) -> Source:
     return Source("flatness", "flatness of faces", "B", origin, words, sigma, "µm", found.covariance_mm2[FLATNESS])
 
 
-def _intrinsics(found: Contributions, camera: CalibratedCamera, refined: bool) -> Source:
+def _intrinsics(found: Contributions, camera: Camera, refined: bool) -> Source:
     stated = camera.covariance is not None
     origin: Origin = "stated" if stated else "assumed" if refined else "not stated"
     if refined:

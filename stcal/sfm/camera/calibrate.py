@@ -9,8 +9,8 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, StcalError
-from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import COLMAP_MODELS, CameraModel
+from stcal.geometry.camera import COLMAP_MODELS, Camera
+from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
 from stcal.labels import unseen_lines
 from stcal.parallel import Progress, counted, one_thread

@@ -12,8 +12,7 @@ from scipy.special import chdtrc
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError, StcalError
 from stcal.geometry.arrays import frozen
-from stcal.geometry.camera import Camera
-from stcal.io.cameras.model import FISHEYE, intrinsic_basis, parameter_names
+from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis, parameter_names
 from stcal.labels import Label
 from stcal.parallel import run_parallel
 from stcal.sfm.adjust.refine import eccentricity_px, moved_poses

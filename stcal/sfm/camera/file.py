@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from stcal.io.cameras.model import parameter_names
+from stcal.geometry.camera import parameter_names
 from stcal.io.json import ByName, Matrix, NamedReason, Part, Pose, PoseCovariance, ResultFile
 from stcal.sfm.camera.calibrate import CORNERS, OUTLIER_WEIGHT, CameraCalibration, residual_rms_px
 from stcal.sfm.camera.checks import Verdict

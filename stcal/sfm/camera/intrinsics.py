@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.design import BoardDesign
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import HUBER, robust_sigma
 from stcal.geometry.variances import sigma_factor
-from stcal.io.cameras.model import FISHEYE, intrinsic_basis
 from stcal.labels import DotLabel, Label
 from stcal.sfm.adjust.equations import robust_weights
 from stcal.sfm.adjust.refine import eccentricity_px

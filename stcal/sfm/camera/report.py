@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stcal.io.cameras.model import COLMAP_PIXEL_ORIGIN, CalibratedCamera
+from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
 from stcal.report.camera import distortion_figure
 from stcal.report.document import (
     Block,
@@ -32,7 +32,7 @@ ARROW_SHARE = 0.7
 
 def calibration_report(result: CameraCalibration, summary: CalibrationFile, where: str) -> Document:
     """Returns the report of ``calibrate-camera``."""
-    lens = CalibratedCamera.of(result.intrinsics.camera, result.intrinsics.colmap_model)
+    lens = Camera.of(result.intrinsics.camera, result.intrinsics.colmap_model)
     parameters = [
         [name, number(each.value, 4 if name[0] in "fc" else 7), number(each.sigma, 4 if name[0] in "fc" else 7)]
         for name, each in summary.parameters.items()

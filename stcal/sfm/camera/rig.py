@@ -8,9 +8,8 @@ import numpy as np
 
 from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import intrinsic_basis
 from stcal.labels import DotLabel
 from stcal.parallel import one_thread
 from stcal.sfm.camera.calibrate import CameraCalibration, rejudged, residual_rms_px

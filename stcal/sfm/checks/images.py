@@ -8,10 +8,10 @@ from itertools import combinations
 import numpy as np
 from scipy.special import bdtrc, chdtri
 
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import ratio_limit, robust_sigma
-from stcal.io.cameras.model import PARAMETER_NAMES, CalibratedCamera, CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import CameraPrior
 from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, solve_score
@@ -35,7 +35,7 @@ FIELD_FLOOR_PX = 0.002
 
 
 def camera_check(
-    networks: Sequence[Network], camera: CalibratedCamera, calibration: Calibration, prior: CameraPrior | None
+    networks: Sequence[Network], camera: Camera, calibration: Calibration, prior: CameraPrior | None
 ) -> Check:
     """Tests whether the intrinsics are those of the images.
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign, faces_of_known_shape
 from stcal.errors import StcalError
-from stcal.io.cameras.model import CalibratedCamera, CameraPrior
+from stcal.geometry.camera import Camera
+from stcal.io.cameras.model import CameraPrior
 from stcal.labels import Label
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factors, with_sigma
@@ -66,7 +67,7 @@ class Evidence:
     models: tuple[WorldModel, ...]
     outliers: tuple[Outlier, ...]
     images: tuple[ImageObservations, ...]
-    camera: CalibratedCamera
+    camera: Camera
     target: TargetDesign
     board: BoardDesign
     options: AdjustOptions

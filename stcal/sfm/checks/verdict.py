@@ -53,9 +53,24 @@ class Measured:
 class Check:
     """Result of a check.
 
-    ``reason`` : the verdict in words; ``measured`` : values, the worst first; ``tested`` : number of values tested;
-    ``names`` : names of the values beyond their limits, the worst first; ``remedy`` : what to do about it, empty if
-    there is nothing to do.
+    Parameters
+    ----------
+    key : str
+        Short name by which files and programs know the check.
+    title : str
+        Its name for people.
+    verdict : {"passed", "suspicious", "failed", "not possible"}
+        A failed check makes the answer of the run "no".
+    reason : str
+        The verdict in words.
+    measured : tuple of Measured
+        Values, the worst first.
+    tested : int
+        Number of values tested.
+    names : tuple of str
+        Names of the values beyond their limits, the worst first.
+    remedy : str
+        What to do about it; empty if there is nothing to do.
     """
 
     key: str
@@ -72,9 +87,22 @@ class Check:
 class Trial:
     """One value to be tested.
 
-    ``value`` in ``unit`` is for people; it grows with the root of ``statistic`` (if ``ratio``, its logarithm does). By
-    chance the statistic follows χ² with ``freedom`` degrees of freedom. Its σ is estimated with ``redundancy`` degrees
-    of freedom (F test).
+    Parameters
+    ----------
+    name : str
+        Image, label, face, group …
+    value : float
+        For people; it grows with the root of ``statistic`` (if ``ratio``, its logarithm does).
+    unit : str
+        Of ``value``.
+    statistic : float
+        By chance it follows χ² with ``freedom`` degrees of freedom: the square of a value over its σ, with 1.
+    freedom : int
+        Degrees of freedom of ``statistic``.
+    redundancy : float
+        Degrees of freedom with which its σ is estimated (F test); a stated σ if not given.
+    ratio : bool
+        Whether ``value`` is a ratio.
     """
 
     name: str
@@ -97,7 +125,23 @@ class Trial:
 def judge(key: str, title: str, trials: Sequence[Trial], what: str, remedy: str, worst: Verdict = "failed") -> Check:
     """Returns the check with its verdict over all trials.
 
-    ``what`` : kind of thing tested, for the reason; ``worst`` : worst possible verdict, for faults that do no harm.
+    Parameters
+    ----------
+    key, title : str
+        As of :class:`Check`.
+    trials : sequence of Trial
+        What is tested. The probability of the worst one by chance, times their number (Bonferroni), gives the verdict.
+    what : str
+        Kind of thing tested, in the plural, for the reason.
+    remedy : str
+        What to do if it is not passed.
+    worst : str
+        Worst possible verdict, for faults that do no harm.
+
+    Returns
+    -------
+    Check
+        "not possible" without trials.
     """
     if not trials:
         return impossible(key, title, f"no {what} to test", "")

@@ -158,7 +158,7 @@ def _fingerprint(
         CACHE_VERSION,
         made_by(),
         cv2.__version__,
-        asdict(camera),
+        {key: value for key, value in asdict(camera).items() if key not in ("colmap_model", "covariance")},
         asdict(target.patterns_alone()),
         dots,
         asdict(options),

@@ -8,11 +8,13 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.camera import Camera
+from stcal.io.images import grey_of
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import Centres, ImageObservations
 from stcal.sfm.data.patterns import MAX_TILT_RAD, Pattern, patterns_of
@@ -26,6 +28,7 @@ from stcal.sfm.detect.group_geometry import (
     arrange,
     mirrored_images,
 )
+from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.outliers import outlying_circles
 from stcal.sfm.detect.predict import (
     PredictedCircles,
@@ -36,6 +39,9 @@ from stcal.sfm.detect.predict import (
     predict_circles,
 )
 from stcal.sfm.detect.sightings import ImageDetection, PlaneView, Readings, likely_views, open_face_note, readings_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 MIN_EXPECTED = 6
 """Least number of circles that other images must show for their absence to count: as many as identify a face."""
@@ -87,6 +93,89 @@ def labelled_image(
     )
     times = Counter(notes)
     return LabelledImage(observations, tuple(f"{note} ({n} times)" if n > 1 else note for note, n in times.items()))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detection:
+    """The labelled circles of one image.
+
+    Parameters
+    ----------
+    labels : tuple of Label
+        n labels: ``face:circle``, or ``board:row:column`` from 0.
+    xy_px : (n, 2) array
+        Centres of the ellipses, px, with the centre of the top-left pixel at (0, 0).
+    covariance_px2 : (n, 2, 2) array
+        Covariances of the centres.
+    notes : tuple of str
+        What was left out, and why.
+    """
+
+    labels: tuple[Label, ...]
+    xy_px: np.ndarray
+    covariance_px2: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sigma_px(self) -> np.ndarray:
+        """Standard deviation of each centre per axis (RMS over both axes), (n,)."""
+        return np.sqrt(np.trace(self.covariance_px2, axis1=1, axis2=2) / 2)
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __repr__(self) -> str:
+        planes = ", ".join(f"{plane}: {n}" for plane, n in Counter(label.plane for label in self.labels).items())
+        return f"<Detection of {len(self)} circles ({planes or 'none'}), {len(self.notes)} notes>"
+
+    def plot(self, ax: "Axes") -> None:
+        """Draws the centres with their labels into axes of matplotlib, over an image shown there."""
+        ax.plot(*self.xy_px.T, "+", color="tab:red")
+        for label, (x, y) in zip(self.labels, self.xy_px.tolist(), strict=True):
+            ax.annotate(str(label), (x, y), (3, 3), textcoords="offset points", fontsize=6, color="tab:red")
+
+
+def detect_circles(
+    image: np.ndarray,
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign | None = None,
+    options: EllipseOptions | None = None,
+) -> Detection:
+    """Returns the labelled circles of one image.
+
+    A run decides by all images of a group what a single one leaves open, and looks a second time for what it missed.
+
+    Parameters
+    ----------
+    image : (height, width) or (height, width, 3) array
+        Grey or RGB, 8 or 16 bit, of the camera's size.
+    camera : Camera
+        The camera that took the image.
+    target : TargetDesign
+        Design of the target.
+    board : BoardDesign, optional
+        The dot board, if it may be in view.
+    options : EllipseOptions, optional
+        Options of the search; the defaults if None.
+
+    Returns
+    -------
+    Detection
+        Labels, centres and covariances; empty if nothing is recognised, with notes that say why.
+
+    Raises
+    ------
+    InputError
+        The array is no image, or not of the camera's size.
+    """
+    found = detect_image(grey_of(image, "image"), camera, target, board, options or EllipseOptions())
+    circles = target.with_faces(printed=False)
+    focal_px = float(np.sqrt(camera.focal.prod()))
+    labelled, _ = label_groups([[("image", "", found)]], circles, board, focal_px)[0]
+    sharp = without_defocus([_with_corners(labelled[0], found, target)], camera, patterns_of(target, board))[0]
+    seen = sharp.observations
+    return Detection(seen.labels, seen.centre_px, seen.covariance_px2, sharp.notes)
 
 
 def without_defocus(

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.io.cameras.model import CalibratedCamera
+from stcal.geometry.camera import Camera
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import colmap_camera, image_ids, match_labels, to_colmap_px, write_database
@@ -140,7 +140,7 @@ def ranked_pairs(run: SavedRun) -> dict[str, list[PairScore]]:
 def group_gates(
     group: Sequence[ImageObservations],
     ranked: Sequence[PairScore],
-    camera: CalibratedCamera,
+    camera: Camera,
     options: PairOptions,
 ) -> list[PairGates]:
     """Returns the gates of ranked pairs of a group's images.

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.io.cameras.model import COLMAP_PIXEL_ORIGIN, CalibratedCamera
+from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, Camera
 from stcal.labels import CircleLabel
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.colmap import pycolmap
@@ -20,7 +20,7 @@ RIG_ID = 1
 LOG_FATAL_ALONE = 3
 
 
-def colmap_camera(camera: CalibratedCamera) -> pycolmap.Camera:
+def colmap_camera(camera: Camera) -> pycolmap.Camera:
     """Returns the camera in COLMAP's form, with COLMAP's pixel origin."""
     return pycolmap.Camera(
         camera_id=CAMERA_ID,
@@ -61,7 +61,7 @@ def match_labels(a: ImageObservations, b: ImageObservations) -> np.ndarray:
 
 def write_database(
     path: str | Path,
-    camera: CalibratedCamera,
+    camera: Camera,
     observations: Sequence[ImageObservations],
     pairs: np.ndarray,
     keypoints_px: Sequence[np.ndarray] | None = None,

@@ -13,7 +13,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.cameras.model import CalibratedCamera, camera_from_colmap
+from stcal.io.cameras.model import camera_from_colmap
 from stcal.io.files import MODEL_BYTES, TABLE_BYTES, read_bytes, require_size
 from stcal.io.poses.colmap_images import image_lines
 from stcal.labels import DotLabel, Label
@@ -41,7 +41,7 @@ def to_reconstruction(
     models: Sequence[GroupModel],
     observations: Sequence[ImageObservations],
     ids: dict[str, int],
-    camera: CalibratedCamera,
+    camera: Camera,
 ) -> tuple[pycolmap.Reconstruction, dict[int, tuple[str, str]]]:
     """Returns models that share one world in COLMAP's form, and (group, label) by point id.
 
@@ -83,7 +83,7 @@ def write_model(
     models: Sequence[GroupModel],
     observations: Sequence[ImageObservations],
     ids: dict[str, int],
-    camera: CalibratedCamera,
+    camera: Camera,
 ) -> None:
     """Writes models that share one world as COLMAP's binary files.
 

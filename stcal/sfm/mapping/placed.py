@@ -8,9 +8,8 @@ import numpy as np
 
 from stcal.design import FaceDesign
 from stcal.errors import ConvergenceError, DegenerateError, MappingError
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CalibratedCamera, intrinsic_basis
 from stcal.labels import Label
 from stcal.sfm.data.model import ImageObservations, WorldModel
 from stcal.sfm.mapping.body import FOCAL_STEPS, Body, Corners, adjust_body, place_body, settled_body
@@ -39,11 +38,11 @@ class PlacedBody:
     body_from_face: dict[str, Rigid]
     camera_from_body: dict[str, Rigid]
     faces: tuple[FaceDesign, ...]
-    camera: CalibratedCamera
+    camera: Camera
     unlinked: tuple[str, ...]
 
 
-def unknown_lens(camera: Camera) -> CalibratedCamera:
+def unknown_lens(camera: Camera) -> Camera:
     """Returns a camera with the covariance of what any camera fulfils, about its own values."""
     side = max(camera.width, camera.height)
     reach = float(np.hypot(camera.width, camera.height) / 2 / camera.focal.mean())
@@ -51,11 +50,11 @@ def unknown_lens(camera: Camera) -> CalibratedCamera:
     sigma = np.concatenate([[1.0, 1.0], [SIGMA_CENTRE * side] * 2, radial, [tangential] * 2])
     covariance, focal = np.diag(sigma**2), float(camera.focal.mean())
     covariance[:2, :2] = focal**2 * (SIGMA_FOCAL**2 * np.ones((2, 2)) + SIGMA_SQUARE**2 / 2 * np.eye(2))
-    return CalibratedCamera.of(camera, LENS, covariance)
+    return Camera.of(camera, LENS, covariance)
 
 
 def place_with_camera(
-    observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], camera: CalibratedCamera
+    observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], camera: Camera
 ) -> PlacedBody:
     """Returns the body by its faces of known shape, with a known camera.
 
@@ -123,7 +122,7 @@ def _better(body: Body, other: Body) -> bool:
     return images[0] > images[1] or (images[0] == images[1] and body.cost < other.cost)
 
 
-def _named(body: Body, corners: Corners, camera: CalibratedCamera) -> PlacedBody:
+def _named(body: Body, corners: Corners, camera: Camera) -> PlacedBody:
     placed = np.flatnonzero(body.placed_faces).tolist()
     return PlacedBody(
         {corners.faces[f].id: body.body_from_face.rigid(f) for f in placed},

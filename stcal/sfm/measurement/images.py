@@ -13,6 +13,7 @@ from stcal.errors import ConvergenceError, DetectionError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, CameraPrior
+from stcal.io.cameras.read import camera_model
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import ImageFile, Skipped, find_images
 from stcal.parallel import Progress, counted, one_thread
@@ -88,7 +89,7 @@ class MeasureResult:
 @one_thread()
 def measure(
     images: str | Path,
-    camera: CameraModel,
+    camera: Camera | CameraModel,
     target: TargetCircles,
     design: TargetDesign,
     board: BoardDesign | None = None,
@@ -104,8 +105,8 @@ def measure(
     ----------
     images : path
         Folder of photographs, with its subfolders.
-    camera : CameraModel
-        Camera from :func:`stcal.io.cameras.read.read_camera`. Its covariance, if any, is part of the poses'
+    camera : Camera
+        Camera from :func:`stcal.load_camera`, or of the run. Its covariance, if any, is part of the poses'
         covariances.
     target : TargetCircles
         Circles of the target, target frame, mm; see :func:`read_target`.
@@ -131,7 +132,7 @@ def measure(
     DetectionError
         If no image shows a face.
     """
-    options, progress = options or MeasureOptions(), progress or (lambda *_: None)
+    options, progress, camera = options or MeasureOptions(), progress or (lambda *_: None), camera_model(camera)
     files, unreadable = find_images(images)
     step = counted(progress, "detect", len(files))
     if options.sequence:

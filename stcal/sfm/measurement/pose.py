@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.arrays import frozen
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import Minima, PoseStack, block_diagonal
 from stcal.geometry.plane import (
     MAX_SIGMA_RAD,
@@ -22,7 +22,7 @@ from stcal.geometry.plane import (
 )
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import ImageFit
-from stcal.io.cameras.model import CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import CameraPrior
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.labels import CircleLabel, circle_labels, parse_labels
 from stcal.sfm.data.model import ImageObservations, Outlier

@@ -12,6 +12,7 @@ from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, CameraPrior
+from stcal.io.cameras.read import camera_model
 from stcal.io.images import grey_8bit, grey_fine, require_grey
 from stcal.labels import Label
 from stcal.sfm.data.model import ImageObservations
@@ -56,9 +57,9 @@ class Tracker:
     Parameters
     ----------
     target : TargetCircles
-        Calibrated target with its design, from :func:`stcal.sfm.read_target`.
-    camera : CameraModel
-        Camera from :func:`stcal.io.cameras.read.read_camera`. Its covariance, if any, is part of the poses'
+        Calibrated target with its design: :meth:`stcal.sfm.RunResult.circles`, or :func:`stcal.sfm.read_target`.
+    camera : Camera
+        Camera from :func:`stcal.load_camera`, or of the run. Its covariance, if any, is part of the poses'
         covariances.
     board : BoardDesign, optional
         A dot board that may be in view, so that its dots are not taken for circles of the target.
@@ -86,14 +87,21 @@ class Tracker:
     def __init__(
         self,
         target: TargetCircles,
-        camera: CameraModel,
+        camera: Camera | CameraModel,
         board: BoardDesign | None = None,
         pose: PoseOptions | None = None,
         ellipses: EllipseOptions | None = None,
     ):
+        if not isinstance(target, TargetCircles):
+            raise InputError(
+                "E-FACES-DESIGN",
+                f"target: {type(target).__name__}; give the circles of a run, result.circles(), or those that "
+                "stcal.sfm.read_target reads",
+            )
         if target.design is None:
             raise InputError("E-FACES-DESIGN", "target: circles without a design; read it with stcal.sfm.read_target")
         self.target, self.design, self.board = target, target.design, board
+        camera = camera_model(camera)
         self.model, self.pose_options, self.ellipses = camera, pose or PoseOptions(), ellipses or EllipseOptions()
         self.prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
         self.camera: Camera | None = None

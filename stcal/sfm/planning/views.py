@@ -8,7 +8,6 @@ from stcal.design import TargetDesign
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CalibratedCamera
 from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.data.model import MetricModel
@@ -108,7 +107,7 @@ def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setu
     return Scene(
         target=target,
         board=setup.board,
-        camera=CalibratedCamera.of(setup.camera, colmap_model),
+        camera=Camera.of(setup.camera, colmap_model),
         target_from_face=setup.start.target_from_face,
         circles_target=circles,
         groups=groups,

@@ -16,7 +16,7 @@ from stcal.boards.file import save_run_board
 from stcal.boards.target import save_body
 from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
-from stcal.io.cameras.model import CalibratedCamera
+from stcal.geometry.camera import Camera
 from stcal.io.cameras.write import save_camera
 from stcal.io.files import BOARD, CAMERA, REFINED_CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, json_text, read_bytes, save
 from stcal.io.json import checked, read_json
@@ -116,7 +116,7 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
     for name, model in models.items():
         folder = out / "models" / name  # "models/." where the images lie directly in their folder
         write_model(folder, [model], observations, ids, result.camera)
-    adjusted = CalibratedCamera.of(result.calibration.camera, result.camera.colmap_model)
+    adjusted = Camera.of(result.calibration.camera, result.camera.colmap_model)
     write_model(out / "target_model", result.calibration.models, observations, ids, adjusted)
     save_camera(out / CAMERA, result.camera)
     if (refined := result.refined_camera) is not None:

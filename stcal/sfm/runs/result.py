@@ -1,28 +1,44 @@
 """Result of a run, and its comparison with the published method."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from pydantic import Field
 
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, known_distances
-from stcal.io.cameras.model import CalibratedCamera, CameraPrior
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.model import CameraPrior
 from stcal.io.json import ByFace, Part
+from stcal.labels import Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain
+from stcal.sfm.adjust.equations import without_cameras
+from stcal.sfm.adjust.joint import basis_of
 from stcal.sfm.adjust.scale import ScaleSource
 from stcal.sfm.checks.suite import Evidence
 from stcal.sfm.checks.verdict import Check
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.model import ImageObservations, MetricModel
 from stcal.sfm.detect.files import DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
 from stcal.sfm.mapping.pairs import ImageGraph
+from stcal.sfm.measurement.target import TargetCircles
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.solve import GroupSolution
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+Cells = Mapping[str, str | float]
+"""A row of a table."""
+Rows = Literal["faces", "circles", "images", "observations"]
+"""Tables of :meth:`RunResult.to_dataframe`."""
 
 
 class FaceOff(Part):
@@ -62,14 +78,76 @@ class Comparison(Part):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ImageResult:
+    """An image that the result rests on.
+
+    Parameters
+    ----------
+    name, group : str
+        Of the image, as in all results.
+    camera_from_target : Rigid
+        Its pose as adjusted, mm.
+    covariance : (6, 6) array
+        Covariance of the pose from this image's circles, rad and mm, left perturbation in the camera frame: target,
+        board and camera are taken as they were calibrated. ``stcal.sfm.measure`` adds the target's own uncertainty.
+    labels : tuple of Label
+        n circles and dots of the image that were used.
+    xy_px : (n, 2) array
+        Their measured centres, corrected for the eccentricity, px.
+    residuals_px : (n, 2) array
+        Measured minus projected, px.
+    """
+
+    name: str
+    group: str
+    camera_from_target: Rigid
+    covariance: np.ndarray
+    labels: tuple[Label, ...]
+    xy_px: np.ndarray
+    residuals_px: np.ndarray
+
+    @property
+    def rms_px(self) -> float:
+        """RMS of the residuals per axis, px."""
+        return float(np.sqrt((self.residuals_px**2).mean()))
+
+
+def _images(model: MetricModel, camera: Camera, scale: float) -> list[ImageResult]:
+    """Returns the images of a group; ``scale`` : factor on the centres' σ."""
+    alone = without_cameras(model, camera, basis_of(None), np.inf)[2].inverse
+    corrected, residuals = model.corrected_px(), model.residuals_px(camera)
+    return [
+        ImageResult(
+            name,
+            model.group,
+            pose,
+            scale**2 * covariance,
+            tuple(model.labels[k] for k in model.point_index[rows]),
+            corrected[rows],
+            residuals[rows],
+        )
+        for name, pose, covariance, rows in zip(
+            model.images, model.camera_from_model, alone, model.rows_by_image(), strict=True
+        )
+    ]
+
+
+def _pose_cells(pose: Rigid, sigma: np.ndarray) -> dict[str, float]:
+    """Returns the cells of a pose with σ (6,) of rotation and translation."""
+    names = ("rx_rad", "ry_rad", "rz_rad", "x_mm", "y_mm", "z_mm")
+    values = {name: float(value) for name, value in zip(names, pose.log(), strict=True)}
+    return values | {f"sigma_{name}": float(value) for name, value in zip(names, sigma, strict=True)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
     """All results of a run; :attr:`target` is the calibrated target.
 
     Parameters
     ----------
-    out : Path
-        The run's folder.
-    camera : CalibratedCamera
+    out : Path or None
+        The run's folder; None if no file stays.
+    camera : Camera
         The camera as its file states it; refined intrinsics are ``calibration.camera``.
     target_design, board_design : TargetDesign, BoardDesign
         The designs as given.
@@ -99,8 +177,8 @@ class RunResult:
         False if the camera was found from the photographs; ``camera`` is then the start of its adjustment.
     """
 
-    out: Path
-    camera: CalibratedCamera
+    out: Path | None
+    camera: Camera
     target_design: TargetDesign
     board_design: BoardDesign
     options: RunOptions
@@ -129,7 +207,8 @@ class RunResult:
 
     def __repr__(self) -> str:
         faces = "; ".join(", ".join(row) for row in self._summary())
-        return f"<RunResult in {self.out}: {self._verdict()}; face, σ µm, σ mdeg: {faces or 'no face'}>"
+        place = f" in {self.out}" if self.out else ""
+        return f"<RunResult{place}: {self._verdict()}; face, σ µm, σ mdeg: {faces or 'no face'}>"
 
     def _repr_html_(self) -> str:
         """Returns verdict, faces and σ as HTML, which notebooks show."""
@@ -152,13 +231,82 @@ class RunResult:
             rows.append((face, f"{1e3 * place:.2f}", f"{1e3 * np.degrees(rotation):.2f}"))
         return rows
 
+    def circles(self) -> TargetCircles:
+        """Returns the calibrated circles with their joint covariance, as :class:`stcal.sfm.Tracker` takes them."""
+        return TargetCircles.of(self.target, self.target_design, self.calibration.sigma_factors.circles)
+
+    def images(self) -> tuple["ImageResult", ...]:
+        """Returns the images that the result rests on, each with its pose and residuals, in the order of the groups."""
+        calibration = self.calibration
+        scale = 1.0 if calibration.joint is None else calibration.joint.sigma_scale
+        return tuple(image for model in calibration.models for image in _images(model, calibration.camera, scale))
+
+    def to_dataframe(self, rows: Rows = "faces") -> "DataFrame":
+        """Returns a table of the result as a DataFrame of pandas (``pip install stcal[pandas]``).
+
+        Parameters
+        ----------
+        rows : {"faces", "circles", "images", "observations"}
+            ``faces``: place, rotation vector and σ of each face, target frame; ``circles``: the calibrated circles;
+            ``images``: pose of each image; ``observations``: each circle in each image, with its residual.
+
+        Raises
+        ------
+        InputError
+            pandas is not installed, or there is no such table.
+        """
+        tables = {"faces": self._faces, "circles": self._circles, "images": self._images, "observations": self._seen}
+        if rows not in tables:
+            raise InputError("E-OPTION-VALUE", f"table of {rows!r}: not a choice; use {', '.join(tables)}")
+        try:
+            from pandas import DataFrame
+        except ImportError as error:
+            raise InputError("E-EXTRA-MISSING", "DataFrame: needs pandas; install stcal[pandas]") from error
+        return DataFrame(tables[rows]())
+
+    def _faces(self) -> list[Cells]:
+        table = []
+        for face, pose in self.target.target_from_face.items():
+            covariance = self.target.face_covariance.get(face)
+            sigma = np.full(6, np.nan) if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0))
+            table.append({"face": face} | _pose_cells(pose, sigma))
+        return table
+
+    def _circles(self) -> list[Cells]:
+        table = []
+        for label, xyz in self.target.circles.items():
+            covariance = self.target.circle_covariance.get(label)
+            sigma = np.full(3, np.nan) if covariance is None else np.sqrt(np.diag(covariance))
+            cells = {f"{axis}_mm": float(value) for axis, value in zip("xyz", xyz, strict=True)}
+            cells |= {f"sigma_{axis}_mm": float(value) for axis, value in zip("xyz", sigma, strict=True)}
+            table.append({"label": str(label), "face": label.face} | cells)
+        return table
+
+    def _images(self) -> list[Cells]:
+        return [
+            {"image": image.name, "group": image.group}
+            | _pose_cells(image.camera_from_target, np.sqrt(np.diag(image.covariance)))
+            | {"circles": len(image.labels), "rms_px": image.rms_px}
+            for image in self.images()
+        ]
+
+    def _seen(self) -> list[Cells]:
+        return [
+            {"image": image.name, "group": image.group, "label": str(label)}
+            | {"x_px": x, "y_px": y, "residual_x_px": dx, "residual_y_px": dy}
+            for image in self.images()
+            for label, (x, y), (dx, dy) in zip(
+                image.labels, image.xy_px.tolist(), image.residuals_px.tolist(), strict=True
+            )
+        ]
+
     @property
-    def refined_camera(self) -> CalibratedCamera | None:
+    def refined_camera(self) -> Camera | None:
         """Camera as adjusted, with covariance; None if the intrinsics were held fixed."""
         joint = self.calibration.joint
         if joint is None or not joint.camera_covariance.size:
             return None
-        return CalibratedCamera.of(joint.camera, self.camera.colmap_model, joint.camera_covariance)
+        return Camera.of(joint.camera, self.camera.colmap_model, joint.camera_covariance)
 
     def observations(self) -> list[ImageObservations]:
         """Returns labelled centres of all images, in the database's order."""

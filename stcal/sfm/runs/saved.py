@@ -17,7 +17,7 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CalibratedCamera, CameraPrior, camera_prior
+from stcal.io.cameras.model import CameraPrior, camera_prior
 from stcal.io.cameras.read import read_camera
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.io.files import BOARD, CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, read_bytes
@@ -55,7 +55,7 @@ class SavedRun:
     folder: Path
     images: Path
     options: RunOptions
-    camera: CalibratedCamera
+    camera: Camera
     target: TargetDesign
     board: BoardDesign
     observations: tuple[ImageObservations, ...]
@@ -95,12 +95,12 @@ class SavedRun:
                 "E-RUN-DAMAGED", f"{path}: damaged, or of another version ({error}); run it again"
             ) from error
 
-    def adjusted_camera(self, own: ReportCamera) -> CalibratedCamera:
+    def adjusted_camera(self, own: ReportCamera) -> Camera:
         """Returns the camera of the final model, refined if it was, else as given; ``own`` : that of the report."""
         if not self.options.refine_camera:
             return self.camera
         camera = Camera(self.camera.width, self.camera.height, own.focal_px, own.centre_px, own.distortion)
-        return CalibratedCamera.of(camera, self.camera.colmap_model)
+        return Camera.of(camera, self.camera.colmap_model)
 
 
 def load_run(folder: str | Path, printed: bool = False) -> SavedRun:

@@ -14,7 +14,6 @@ from stcal.errors import ConvergenceError, DegenerateError, MappingError, ScaleE
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cache import keep, kept, made_by
-from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, parse_labels, unseen_lines
 from stcal.parallel import Progress
@@ -309,7 +308,7 @@ def solve_groups(
     graph: ImageGraph,
     scratch: Path,
     cache: Path,
-    camera: CalibratedCamera,
+    camera: Camera,
     target: TargetDesign,
     board: BoardDesign,
     options: RunOptions,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.design import faces_of_known_shape, known_distances
-from stcal.io.cameras.model import CalibratedCamera
+from stcal.geometry.camera import Camera
 from stcal.io.files import REFINED_CAMERA
 from stcal.io.images import Skipped
 from stcal.labels import DotLabel
@@ -58,15 +58,16 @@ def run_text(result: RunResult) -> str:
         lines += _compared(result.comparison)
     if result.judgement is not None:
         lines += [f"{question} {answer}" for question, answer in result.judgement.answers()]
-    if result.target.target_from_face:
+    if result.out is not None and result.target.target_from_face:
         lines.append(f"faces:  {result.out / 'faces.json'}")
-    if result.refined_camera is not None:
+    if result.out is not None and result.refined_camera is not None:
         lines.append(f"camera: {result.out / REFINED_CAMERA}, as adjusted, with σ")
-    lines.append(f"report: {result.out / 'report.html'}")
+    if result.out is not None:
+        lines.append(f"report: {result.out / 'report.html'}")
     return "\n".join(part for line in lines for part in wrapped(line))
 
 
-def _camera_taken_as_exact(camera: CalibratedCamera) -> str:
+def _camera_taken_as_exact(camera: Camera) -> str:
     """Returns the note on a camera file that states σ which the run does not use."""
     assert camera.covariance is not None
     focal = float(np.sqrt(camera.covariance[0, 0]))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, handeye
 from stcal.handeye.data.formats.record import require_each_once
 from stcal.handeye.data.pairs import SIDES, read_side
@@ -15,7 +15,6 @@ from stcal.handeye.data.robot_poses import RobotPoses
 from stcal.handeye.report.outcome import ArmFound, Outcome
 from stcal.handeye.validate import cross_validate, widened_by_scatter
 from stcal.io.cameras.model import CameraPrior
-from stcal.io.quaternions import Order
 from stcal.io.table import read_table
 from stcal.robot import Robot
 from stcal.robot.kinematics.dh import robot_from_chain

@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.boards.several import load_boards
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, handeye, pairs_of_views, read_poses
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
@@ -21,7 +21,6 @@ from stcal.handeye.methods import closed_form
 from stcal.io.cameras.model import CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
-from stcal.io.quaternions import Order
 from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot

@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.boards.several import load_boards
 from stcal.errors import DegenerateError, InputError, StcalError
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.rig import RigCamera, RigFiles, RigPoses
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
@@ -17,7 +17,6 @@ from stcal.handeye.report.outcome import Outcome, RigOutcome
 from stcal.handeye.rig.solve import Rig, RigOptions, alone_or_none, handeye_rig, of_places, same_numbering
 from stcal.handeye.rig.validate import RigHeldOut, cross_validate_rig, widened_by_scatter
 from stcal.handeye.validate import LEAST_LEFT, splits
-from stcal.io.quaternions import Order
 from stcal.parallel import Progress, one_thread
 from stcal.workflows.handeye.calibrate import Splits
 from stcal.workflows.handeye.inputs import Photographed, photographed, pitch_of

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, Views, handeye, pairs_of_views
-from stcal.io.cameras.model import CalibratedCamera, CameraPrior, camera_prior, intrinsic_basis
+from stcal.io.cameras.model import CameraPrior, camera_prior
 from tests.support.handeye import CAMERA, simulated_views
 
-PRIOR = camera_prior(CalibratedCamera.of(CAMERA, "OPENCV"))
+PRIOR = camera_prior(Camera.of(CAMERA, "OPENCV"))
 TRIALS = 12
 
 

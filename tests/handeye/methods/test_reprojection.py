@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from stcal.geometry.camera import Camera
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, handeye, pairs_of_views
 from stcal.handeye.data.pairs import Loop
 from stcal.handeye.methods.bundle import Bundle
 from stcal.handeye.methods.reprojection import problem
-from stcal.io.cameras.model import CalibratedCamera, camera_prior, intrinsic_basis
+from stcal.io.cameras.model import camera_prior
 from tests.handeye.derivatives import assert_derivatives
 from tests.outcome import fails_with
 from tests.support.handeye import simulated_views
@@ -25,7 +25,7 @@ def error(found, truth):
 
 def prior(camera, model):
     """Intrinsics of a calibration of some age."""
-    return camera_prior(CalibratedCamera.of(camera, model))
+    return camera_prior(Camera.of(camera, model))
 
 
 def normalised(errors, covariances):

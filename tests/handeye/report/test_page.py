@@ -9,13 +9,14 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from stcal.geometry.camera import Camera
 from stcal.handeye import HandEyeOptions, handeye
 from stcal.handeye.report.file import HandEyeFile
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.report.page import outcome_report
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
-from stcal.io.cameras.model import CalibratedCamera, camera_prior
+from stcal.io.cameras.model import camera_prior
 from stcal.io.files import json_text
 from tests.support.handeye import simulated, simulated_views
 
@@ -98,7 +99,7 @@ def test_every_sigma_that_there_is_has_a_name():
     camera = truth.views.camera
     wrong = replace(camera, focal=1.02 * camera.focal)
     views = replace(truth.views, camera=wrong)
-    prior = camera_prior(CalibratedCamera.of(wrong, "PINHOLE"))
+    prior = camera_prior(Camera.of(wrong, "PINHOLE"))
     result = handeye(truth.pairs, truth.setup, None, views, HandEyeOptions(intrinsics=prior))
     outcome = Outcome("images", result, colmap_model="PINHOLE")
     assert "camera file, focal length" in outcome_report(outcome).text()

@@ -5,8 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.cameras.model import CalibratedCamera, write_cameras_txt
+from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.table import POSE, pose_cells
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import CAMERA, looks, take
@@ -26,7 +27,7 @@ def photographed_rig(folder: Path, count: int = 8, robot: tuple[float, float] = 
     reported = disturbed(rng, flange, *robot)
     write_poses(folder / "robot.csv", {f"{i:02d}": pose for i, pose in enumerate(reported)})
     (folder / "board.toml").write_text(BOARD)
-    write_cameras_txt(folder / "cameras.txt", CalibratedCamera.of(CAMERA, "PINHOLE"))
+    write_cameras_txt(folder / "cameras.txt", Camera.of(CAMERA, "PINHOLE"))
     sheet, lines = chessboard_mm(5, 8, 20.0), ['setup = "eye-in-hand"', 'board = "board.toml"', 'poses = "robot.csv"']
     for name, pose in LEFT_FROM.items():
         (folder / name).mkdir()

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import Noise, RigCamera, RigOptions, RigPoses, View, Views, handeye_rig
 from stcal.handeye.data.pairs import Loop
 from stcal.handeye.methods.bundle import RigBundle, RigCorners
 from stcal.handeye.methods.reprojection import board_of, problem
 from stcal.handeye.rig.solve import alone, of_places
-from stcal.io.cameras.model import CalibratedCamera, camera_prior, intrinsic_basis
+from stcal.io.cameras.model import camera_prior
 from tests.handeye.derivatives import assert_derivatives
 from tests.outcome import fails_with
 from tests.support.handeye_rig import NAMES, RigTruth, simulated_rig
@@ -72,7 +73,7 @@ def test_derivatives_of_a_rig():
     board = board_of([camera.views for camera in given.cameras])
     each = []
     for i, camera in enumerate(given.cameras):
-        prior = camera_prior(CalibratedCamera.of(camera.views.camera, "OPENCV"))
+        prior = camera_prior(Camera.of(camera.views.camera, "OPENCV"))
         loop = Loop.of(given.pairs(i), truth.setup)
         flange, own = given.base_from_flange, {"rows": camera.rows, "designed": board}
         each.append(problem(loop, flange, camera.views, noise, prior, True, **own)[0])
@@ -154,7 +155,7 @@ def test_intrinsics_that_are_wrong_are_mended():
     given = truth.given
     for i, camera in enumerate(given.cameras):
         lens = camera.views.camera
-        prior = camera_prior(CalibratedCamera.of(lens, "OPENCV"))
+        prior = camera_prior(Camera.of(lens, "OPENCV"))
         off = 3 * np.sqrt(np.diag(prior.covariance)) * np.random.default_rng(i).choice([-1, 1], 8)
         moved = lens.with_parameters(lens.parameters() + intrinsic_basis("OPENCV") @ off)
         given = with_views(given, i, Views(moved, camera.views.views))

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
-from stcal.io.cameras.model import CalibratedCamera, camera_prior
+from stcal.io.cameras.model import camera_prior
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.planning.nominal import observe, true_models
@@ -25,7 +26,7 @@ def position_error_um(scene, observations, camera, refine_camera: bool) -> float
         refine(m.in_world(Similarity(1.0, Rigid())), camera, scene.target, scene.board).model
         for m in true_models(scene, seen)
     ]
-    given = CalibratedCamera.of(camera, scene.camera.colmap_model)
+    given = Camera.of(camera, scene.camera.colmap_model)
     options = RunOptions(refine_camera=refine_camera).adjustment(scene.target)
     result = calibrate(models, camera, scene.target, scene.board, options, camera_prior(given))
     poses = result.target.target_from_face

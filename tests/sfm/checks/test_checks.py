@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
+from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CalibratedCamera
 from stcal.sfm.adjust import joint
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.joint import SETTLED_PX
@@ -64,7 +64,7 @@ class Lab:
         refined, calibration, options = self.calibrate(scene, images, camera, board, solve)
         models = tuple(each.model for each in refined)
         outliers = tuple(o for each in refined for o in each.outliers)
-        own = CalibratedCamera.of(camera, "OPENCV")
+        own = Camera.of(camera, "OPENCV")
         evidence = Evidence(models, outliers, tuple(images), own, scene.target, board, options, calibration, None, {})
         return {check.key: check for check in run_checks(evidence)}
 

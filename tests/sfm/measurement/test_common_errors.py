@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.io.cameras.model import CameraPrior, intrinsic_basis
+from stcal.geometry.camera import intrinsic_basis
+from stcal.io.cameras.model import CameraPrior
 from stcal.sfm.measurement.pose import MOST, common_errors, pose_from_circles
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.support.image_poses import faces_view, known_target, pose_error, see, view

@@ -13,8 +13,9 @@ from scipy.stats import chi2
 
 from stcal.design import reference_target
 from stcal.errors import ConvergenceError, DegenerateError
+from stcal.geometry.camera import intrinsic_basis
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraPrior, intrinsic_basis
+from stcal.io.cameras.model import CameraPrior
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import Skipped
 from stcal.io.table import read_table

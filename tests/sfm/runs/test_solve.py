@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.io.cameras.model import CalibratedCamera
+from stcal.geometry.camera import Camera
 from stcal.io.images import Skipped
 from stcal.sfm.runs.solve import require_usable, usable_groups
 from stcal.sfm.runs.text import run_text
@@ -62,7 +62,7 @@ def test_a_folder_of_copies_or_of_notes_is_no_group(group):
 def test_a_run_that_takes_a_camera_with_sigma_as_exact_says_so(small_result):
     assert "--refine-camera" not in run_text(small_result)
     camera = small_result.camera
-    stated = CalibratedCamera.of(camera, camera.colmap_model, np.diag([1.44] * len(camera.colmap_params())))
+    stated = Camera.of(camera, camera.colmap_model, np.diag([1.44] * len(camera.colmap_params())))
     said = (
         "the camera file states σ of its parameters (1.2 px of the focal length), and this run takes them as exact: no "
         "σ below holds them; --refine-camera adjusts the intrinsics within them"

@@ -8,6 +8,7 @@ from pathlib import Path
 import yaml
 
 from stcal.errors import InputError
+from stcal.geometry.rigid import Order
 from stcal.handeye.data.formats import colmap
 from stcal.handeye.data.formats.arrays import NPY, NPZ, load_npy, load_npz
 from stcal.handeye.data.formats.numeric import TABLE, read_columns, read_numbers, todays
@@ -15,7 +16,6 @@ from stcal.handeye.data.formats.record import Content, Said, Side, require_each_
 from stcal.handeye.data.formats.tree import read_tree
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
 from stcal.io.plain_yaml import load_yaml
-from stcal.io.quaternions import Order
 from stcal.io.table import is_comment, read_table, separator_stated
 
 KNOWN = (

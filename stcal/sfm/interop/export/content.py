@@ -6,8 +6,8 @@ import numpy as np
 
 import stcal
 from stcal.errors import InputError
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CalibratedCamera
 from stcal.io.json import Part
 from stcal.io.poses.static import Static
 from stcal.labels import CircleLabel, parse_label
@@ -70,7 +70,7 @@ class Content:
 
     root: str
     run: SavedRun
-    camera: CalibratedCamera
+    camera: Camera
     faces: dict[str, Rigid]
     covariances: dict[str, np.ndarray]
     circles: tuple[Circle, ...]
