@@ -1,9 +1,11 @@
 """The main job: calibrates a target from a folder of images. Each call is a stage, and its result is saved."""
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+from stcal.boards.design import CornerBoard
 from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference
@@ -12,7 +14,7 @@ from stcal.io.cameras.model import CalibratedCamera, CameraModel, camera_prior, 
 from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.cameras.read import read_camera
 from stcal.io.files import save
-from stcal.io.images import TOP_GROUP, ImageFile, Skipped, chosen_images, require_common_size
+from stcal.io.images import TOP_GROUP, ImageFile, Skipped, chosen_images, mosaic_of, require_common_size
 from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
@@ -88,7 +90,8 @@ def run(
     if camera is None:
         require_printed(body_of(target))
         options = replace(options, refine_camera=True)
-    files = chosen_images(images, options.exclude)
+    with mosaic_of(options.bayer) if options.bayer else nullcontext():
+        files = chosen_images(images, options.exclude)
     return run_on_files(files, images, camera, out, target, board, options, progress, reload_s)
 
 
@@ -113,7 +116,9 @@ def run_on_files(
     designs = target_design, scale_reference(known, target_design)
     if target_design.with_faces(printed=True).faces:
         _require_for_printed(options)
-    options = options.settled(target_design)
+    if options.compare:
+        require_dots(known, f"--compare {options.compare}")
+    options = replace(options, bayer=next((file.bayer for file in files[0] if file.bayer), "")).settled(target_design)
     if options.compare:
         require_comparable(options.adjustment(designs[0]))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
@@ -211,6 +216,20 @@ def _require_for_printed(options: RunOptions) -> None:
         raise InputError(
             "E-OPTION-CONFLICT",
             f"{name}: for targets of circles alone, and faces here have boards or tags; leave it out",
+        )
+
+
+def require_dots(board: BoardDesign | None, option: str) -> None:
+    """Refuses a board of corners for an option whose method finds dots.
+
+    Raises
+    ------
+    InputError
+        The board is one of corners; the message begins with the option.
+    """
+    if isinstance(board, CornerBoard):
+        raise InputError(
+            "E-OPTION-CONFLICT", f"{option}: finds boards of dots, and --board is one of squares or tags; leave it out"
         )
 
 
@@ -401,6 +420,7 @@ def _labelled(
     dots = board if board is not None and board.rows else None
     published = options.solve == "paper"
     if published:
+        require_dots(dots, "--solve paper")
         PublishedPattern.of(target)
     detector = detect_published if published else None
     detection = detect_files(
