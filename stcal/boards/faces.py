@@ -10,7 +10,8 @@ from stcal.boards.cells import UNKNOWN_BITS
 from stcal.boards.charuco import find_charuco
 from stcal.boards.chessboard import find_chessboard, why_no_chessboard
 from stcal.boards.design import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
-from stcal.boards.tags import dictionary_of, find_tags, view_of_tags
+from stcal.boards.dictionaries import cells_of
+from stcal.boards.tags import find_tags, view_of_tags
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.labels import BOARD
@@ -75,7 +76,7 @@ def _floored(view: BoardView | None, board: TagLayout | AprilGridDesign) -> Boar
     diagonal = corners[:, 2:] - corners[:, :2]
     area = np.abs(diagonal[:, 0, 0] * diagonal[:, 1, 1] - diagonal[:, 0, 1] * diagonal[:, 1, 0]) / 2
     width = area / np.linalg.norm(side, axis=2).max(1)
-    cells = np.array([dictionary_of(layout.tags[row][0]).markerSize + 2 * border for row in view.ids[::4] // 4])
+    cells = np.array([cells_of(layout.tags[row][0], border) for row in view.ids[::4] // 4])
     narrow = np.repeat(width < NARROW_CELL_PX * cells, 4)
     variance = np.where(narrow, NARROW_PX**2, FLOOR_PX**2)
     return replace(view, covariance_px2=view.covariance_px2 + variance[:, None, None] * np.eye(2))

@@ -19,7 +19,7 @@ from stcal.boards.design import (
     LatticePart,
     TagLayout,
 )
-from stcal.boards.dictionaries import count_of, known_dictionary
+from stcal.boards.dictionaries import count_of, known_dictionary, of_opencv
 from stcal.boards.foreign import KEYS as BUNDLE_KEYS
 from stcal.boards.foreign import Few, bundle_content, kalibr_board_of, kalibr_content, tags_of_bundle
 from stcal.design import BoardDesign, Polarity, reference_board
@@ -49,6 +49,7 @@ OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_m
 
 
 Dictionary = Annotated[str, AfterValidator(known_dictionary)]
+OpenCvDictionary = Annotated[str, AfterValidator(of_opencv)]
 TagId = Annotated[int, Field(ge=0, strict=True)]
 
 
@@ -66,7 +67,7 @@ class _Charuco(Sized):
     columns: Squares
     square_mm: Positive
     marker_mm: Positive
-    dictionary: Dictionary
+    dictionary: OpenCvDictionary
     legacy: bool = False
     sigma_mm: Positive = 0.01
     first_id: TagId = 0
@@ -80,7 +81,7 @@ class _AprilGrid(Sized):
     spacing: Annotated[float, Field(gt=0, le=10, strict=True)]
     border_bits: Annotated[int, Field(ge=1, le=2, strict=True)] | None = None
     first_id: TagId = 0
-    dictionary: Dictionary = "DICT_APRILTAG_36h11"
+    dictionary: OpenCvDictionary = "DICT_APRILTAG_36h11"
     upright: bool = False
     sigma_mm: Positive = 0.01
 

@@ -10,7 +10,7 @@ import yaml
 from pydantic import AfterValidator, ConfigDict, Field
 
 from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, ChessboardDesign
-from stcal.boards.dictionaries import count_of
+from stcal.boards.dictionaries import count_of, is_of_apriltag
 from stcal.errors import InputError
 from stcal.io.design import Count, Squares
 from stcal.io.plain_yaml import load_yaml
@@ -28,7 +28,7 @@ CORNERS = np.array([[1, -1], [-1, -1], [-1, 1], [1, 1]]) / 2
 """Corners of a tag of side 1 in its frame (X right, Y up), in the order of OpenCV, which draws tags of this family half
 a turn from AprilTag's own pictures."""
 UPRIGHT = np.roll(CORNERS, 2, axis=0)
-"""The same of a tag that stands as OpenCV draws it."""
+"""The same of a tag that stands as OpenCV draws it, and of families that OpenCV lacks."""
 
 
 class _Tag(Strict):
@@ -105,8 +105,9 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
                 "allowed: targets are flat here; give the tags of one plane",
             )
     tags = []
+    as_printed = data.upright or is_of_apriltag(data.tag_family)
     for tag, rotation, middle in zip(bundle.layout, turn, at, strict=True):
-        corners = METRE_MM * tag.size * (UPRIGHT if data.upright else CORNERS) @ rotation[:2, :2].T + middle[:2]
+        corners = METRE_MM * tag.size * (UPRIGHT if as_printed else CORNERS) @ rotation[:2, :2].T + middle[:2]
         tags.append({"dictionary": data.tag_family, "id": tag.id, "corners_mm": (corners * [1, -1]).tolist()})
     return {"type": "tags", "name": bundle.name, "tag": tags}
 

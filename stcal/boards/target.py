@@ -101,7 +101,11 @@ def corner_ids(board: FlatBoard) -> tuple[str, ...]:
         return tuple(f"{i}.{j}" for i, j in zip(row.tolist(), column.tolist(), strict=True))
     tags = tags_on(board)
     numbers = [tag for _, tag in tags]
-    names = [f"{tag}" if numbers.count(tag) == 1 else f"{dictionary[5:]}.{tag}" for dictionary, tag in tags]
+    families = [dictionary.removeprefix("DICT_") for dictionary, _ in tags]
+    names = [
+        f"{tag}" if numbers.count(tag) == 1 else f"{family}.{tag}"
+        for family, tag in zip(families, numbers, strict=True)
+    ]
     return tuple(f"{name}.{corner}" for name in names for corner in range(4))
 
 
