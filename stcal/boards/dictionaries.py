@@ -140,7 +140,13 @@ def cells_of(name: str, border_bits: int = 1) -> int:
 def _detector(family: str):
     from pupil_apriltags import Detector
 
-    return Detector(families=family, nthreads=1, quad_decimate=1.0)
+    class Kept(Detector):
+        """Left to the end of the process: the package's own way frees the family twice, which may end in an abort."""
+
+        def __del__(self):
+            pass
+
+    return Kept(families=family, nthreads=1, quad_decimate=1.0)
 
 
 def find_family(grey: np.ndarray, family: str) -> list[tuple[int, np.ndarray]]:
