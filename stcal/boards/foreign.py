@@ -132,6 +132,8 @@ def _metres(value: float) -> float:
 
 LEAST_M, MOST_M = LEAST_SIDE_MM / METRE_MM, MOST_SIDE_MM / METRE_MM
 """Tags, squares and spacings that hardware has, m; another value is in a wrong unit, for Kalibr's are metres."""
+LEAST_GAP = 0.1
+"""Smallest gap between tags over their side that grids have: with less white about them tags are not found."""
 SAME_WITHIN = 1e-6
 """Largest relative difference between the sides of a square."""
 KALIBR_FAMILY = "DICT_APRILTAG_36h11"
@@ -189,6 +191,12 @@ def kalibr_board_of(
                 f"{where}: tags up to {count - 1}, tag36h11 has 0 … {available - 1}; correct tagRows, tagCols",
             )
         size = METRE_MM * data.tagSize
+        if data.tagSpacing < LEAST_GAP <= (ratio := data.tagSpacing / data.tagSize) <= 1:
+            raise InputError(
+                "E-BOARD-SPACING",
+                f"{where}: tagSpacing {data.tagSpacing:g}, at least {LEAST_GAP:g} usual: it is the gap over tagSize, no "
+                f"length; of a gap of {data.tagSpacing:g} m it is {ratio:.4g}",
+            )
         return AprilGridDesign(data.tagRows, data.tagCols, size, data.tagSpacing, None, data.codeOffset, KALIBR_FAMILY)
     if kind == "checkerboard":
         data = validated(content, _Checkerboard, where)

@@ -147,6 +147,12 @@ def test_a_run_reads_every_kind_of_board_and_writes_it_as_it_was(tmp_path, text)
     np.testing.assert_allclose(again.xy_mm(), flat.xy_mm(), atol=1e-12)
 
 
+def test_a_gap_in_metres_is_no_ratio(tmp_path):
+    text = "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.088\ntagSpacing: 0.0264\n"
+    with fails_with("E-BOARD-SPACING … tagSpacing 0.0264 … 0.1 … 0.3"):
+        load_run_board(written(tmp_path, text))
+
+
 def test_points_are_numbered_by_rows_and_columns_of_equal_places():
     board = CornerBoard.of(AprilGridDesign(2, 3, 40.0, 0.25, 2))
     assert (board.rows, board.columns) == (4, 6)
