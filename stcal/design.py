@@ -465,7 +465,8 @@ def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDes
     if board is not None and type(board) is not BoardDesign:
         raise InputError(
             "E-BOARD-TYPE",
-            "--board: asymmetric circles beside a target that tells its own size; a board of dots needed, or none",
+            "--board: circles of a lattice or corners beside a target that tells its own size; a rectangular board of "
+            "dots needed, or none",
         )
     known = {} if board is None else {entry.name: getattr(board, entry.name) for entry in fields(BoardDesign)}
     none = {"rows": 0, "columns": 0, "pitch_mm": 1.0, "radius_mm": 0.25, "polarity": "bright", "sigma_mm": 1.0}

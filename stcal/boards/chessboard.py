@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from stcal.boards.design import BoardView, ChessboardDesign, view_of
-from stcal.boards.edges import crossings
+from stcal.boards.edges import Crossings, crossings
 from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit
 
@@ -22,6 +22,8 @@ REFINE_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-5)
 LEAST_WINDOW, MOST_WINDOW, MOST_AT_FIRST = 2.0, 20.0, 100.0
 MOST_BY_AREA = 10.0
 """Limits of half that window's side, px: smallest, largest, largest in the first pass, and largest for areas."""
+UNSEEN_PX = 0.1
+"""σ of a corner that is where the gradients of its edges meet, as the areas in its window do not fit."""
 SMOOTHED_SHARE, LEAST_SMOOTHING = 0.05, 0.3
 """σ of the smoothing before refinement, as a share of half the window's side, and its lower limit in px. Smoothing does
 not move a saddle, but removes noise of the gradients, which would hold a corner at its start."""
@@ -38,16 +40,21 @@ PX_A_SQUARE = 25.0
 third of it has squares of 8 px."""
 
 
-def find_chessboard(image: np.ndarray, name: str, board: ChessboardDesign) -> BoardView | None:
+def find_chessboard(
+    image: np.ndarray, name: str, board: ChessboardDesign, with_sigma: bool = False
+) -> BoardView | None:
     """Return all inner corners, or None; they are numbered so that the square between (0, 0) and (1, 1) is black.
 
     A board that looks the same after half a turn may be returned rotated: :meth:`ChessboardDesign.symmetries`.
+    ``with_sigma`` : whether the view states the covariances of its corners.
     """
     grey = grey_8bit(image)
     for detected in _found(grey, board):
         grid = _refined(grey, detected)
         if _is_a_grid(detected, grid):
-            return view_of(name, board, np.arange(board.rows * board.columns), _numbered(grey, grid, board))
+            corners = _numbered(grey, grid, board)
+            covariance = _covariances(grey, corners.reshape(grid.shape)) if with_sigma else None
+            return view_of(name, board, np.arange(board.rows * board.columns), corners, covariance)
     return None
 
 
@@ -96,8 +103,7 @@ def _refined(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
 
     The first windows are large enough for blurred edges; the second are so small that lens distortion bends no edge.
     """
-    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
-    window = max(WINDOW_SHARE * min(steps), LEAST_WINDOW)
+    window = _window(grid)
     margin = MARGIN * min(window, MOST_AT_FIRST) + LEAST_MARGIN
     first = np.floor(np.maximum(grid.min((0, 1)) - margin, 0)).astype(int)
     last = np.ceil(grid.max((0, 1)) + margin).astype(int) + 1
@@ -109,17 +115,30 @@ def _refined(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
         grid = cv2.cornerSubPix(smooth, places, (half, half), (-1, -1), REFINE_STEPS).reshape(grid.shape).astype(float)
         if window <= MOST_WINDOW:
             break
-    return _by_area(grey, grid, int(min(window, MOST_BY_AREA))) + first
+    return _by_area(grey, grid).xy_px.reshape(grid.shape) + first
 
 
-def _by_area(grey: np.ndarray, grid: np.ndarray, half: int) -> np.ndarray:
+def _by_area(grey: np.ndarray, grid: np.ndarray) -> Crossings:
     """Return the corners by the areas of black and white in their windows, or unchanged where these do not fit.
 
     Where edges lie along the pixel rows, gradients place all corners by up to 0.02 px to one side.
     """
     along = np.stack([np.gradient(grid, axis=1), np.gradient(grid, axis=0)], axis=2).reshape(-1, 2, 2)
+    half = int(min(_window(grid), MOST_BY_AREA))
     clear = np.linalg.norm(along, axis=2).min(1)
-    return crossings(grey, grid.reshape(-1, 2), along, np.full(len(along), half), clear).xy_px.reshape(grid.shape)
+    return crossings(grey, grid.reshape(-1, 2), along, np.full(len(along), half), clear)
+
+
+def _window(grid: np.ndarray) -> float:
+    """Return half the side of a window that holds no neighbour of a corner, px."""
+    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
+    return max(WINDOW_SHARE * min(steps), LEAST_WINDOW)
+
+
+def _covariances(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return the covariances (n, 2, 2) of refined corners, px²; :data:`UNSEEN_PX` where areas do not fit."""
+    measured = _by_area(grey, grid)
+    return np.where(measured.seen[:, None, None], measured.covariance_px2, UNSEEN_PX**2 * np.eye(2))
 
 
 def _first_is_black(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> bool:

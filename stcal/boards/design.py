@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.boards.dictionaries import known_tags
-from stcal.design import BoardDesign, Polarity
+from stcal.design import POINT_RADIUS_MM, BoardDesign, Polarity
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen, require_choices
 from stcal.geometry.rigid import Rigid
@@ -220,26 +220,6 @@ class LatticePart(BoardDesign):
         return [DotLabel(row, column) for row, column in self.cells().tolist()]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class UnevenGrid(BoardDesign):
-    """A grid of points whose rows and columns are not equally spaced.
-
-    ``y_mm``, ``x_mm`` : places of the rows and of the columns, mm.
-    """
-
-    y_mm: tuple[float, ...] = ()
-    x_mm: tuple[float, ...] = ()
-
-    def xy_mm(self) -> np.ndarray:
-        """Return the positions, (rows·columns, 2), row-major, mm."""
-        return self.places_mm(self.labels())[:, :2]
-
-    def places_mm(self, labels: Iterable[Label]) -> np.ndarray:
-        """Return the positions of these points, (n, 3), board frame."""
-        row, column = dot_cells(labels).T
-        return np.column_stack([np.array(self.x_mm)[column], np.array(self.y_mm)[row], np.zeros(len(row))])
-
-
 @dataclass(frozen=True, slots=True)
 class AsymmetricCirclesDesign:
     """OpenCV's asymmetric circle grid: ``rows`` rows of ``columns`` circles, every second row shifted by half a step.
@@ -298,6 +278,66 @@ class AsymmetricCirclesDesign:
 
 
 FlatBoard = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign | AsymmetricCirclesDesign
+
+
+TAG_SIGMA_MM = 0.05
+"""σ of a corner of a tag if its file states none: print on paper that is glued on."""
+PLACE_DIGITS = 6
+"""Decimals, mm, to which the places of points are the same row or column."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CornerBoard(LatticePart):
+    """The points of a board of any kind as a board of dots without extent.
+
+    Points of one Y are a row, points of one X a column; these need not be equally spaced, and not every place of the
+    grid has a point. ``y_mm``, ``x_mm`` : places of the rows and of the columns; ``printed`` : the board itself.
+    """
+
+    y_mm: tuple[float, ...] = ()
+    x_mm: tuple[float, ...] = ()
+    printed: FlatBoard | None = None
+
+    @classmethod
+    def of(cls, board: FlatBoard) -> "CornerBoard":
+        """Return the points of a board; ``cells()`` are in the order of its ``xy_mm``."""
+        xy = board.xy_mm()
+        (x, column), (y, row) = (_ranked(values) for values in xy.T)
+        apart = np.linalg.norm(xy[:, None] - xy, axis=2)
+        np.fill_diagonal(apart, np.inf)
+        step = float(np.median(apart.min(1)))
+        common = {
+            "sigma_mm": board.sigma_mm or TAG_SIGMA_MM,
+            "unusual_size": True,
+            "printed": board,
+            "y_mm": y,
+            "x_mm": x,
+        }
+        return cls(len(y), len(x), step, POINT_RADIUS_MM, "dark", taken=np.column_stack([row, column]), **common)
+
+    def xy_mm(self) -> np.ndarray:
+        """Return the positions of the points, (n, 2), mm."""
+        row, column = self.cells().T
+        return np.column_stack([np.array(self.x_mm)[column], np.array(self.y_mm)[row]])
+
+    def places_mm(self, labels: Iterable[Label]) -> np.ndarray:
+        """Return the positions of these points, (n, 3), board frame."""
+        row, column = dot_cells(labels).T
+        return np.column_stack([np.array(self.x_mm)[column], np.array(self.y_mm)[row], np.zeros(len(row))])
+
+    def numberings(self, ids: np.ndarray) -> np.ndarray:
+        """Return row and column of these points, (k, n, 2): as they are, and after each turn that looks the same."""
+        xyz = np.pad(self.xy_mm(), ((0, 0), (0, 1)))
+        turns_of_board = [] if self.printed is None else self.printed.symmetries()
+        places = [xyz[ids], *(turn @ xyz[ids] for turn in turns_of_board)]
+        nearest = [np.linalg.norm(place[:, None] - xyz, axis=2).argmin(1) for place in places]
+        return self.cells()[np.array(nearest)]
+
+
+def _ranked(values: np.ndarray) -> tuple[tuple[float, ...], np.ndarray]:
+    """Return the different values in ascending order, and the rank of each value."""
+    _, first, rank = np.unique(np.round(values, PLACE_DIGITS), return_index=True, return_inverse=True)
+    return tuple(values[first].tolist()), rank
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,27 +1,27 @@
 """Readers of board files: dots (``stcal.io.design``), chessboards, ChArUco boards, AprilGrids, and Kalibr's YAML."""
 
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-import cv2
 import numpy as np
-import yaml
 from pydantic import AfterValidator, Field, model_validator
 
-from stcal.boards.bundle import KEYS as BUNDLE_KEYS
-from stcal.boards.bundle import bundle_content, tags_of_bundle
 from stcal.boards.design import (
     UNIT_SQUARE,
     AprilGridDesign,
     AsymmetricCirclesDesign,
     CharucoDesign,
     ChessboardDesign,
+    CornerBoard,
     FlatBoard,
     LatticePart,
     TagLayout,
 )
-from stcal.boards.dictionaries import count_of, known_dictionary
+from stcal.boards.dictionaries import count_of, known_dictionary, of_opencv
+from stcal.boards.foreign import KEYS as BUNDLE_KEYS
+from stcal.boards.foreign import Few, bundle_content, kalibr_board_of, kalibr_content, tags_of_bundle
 from stcal.design import BoardDesign, Polarity, reference_board
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
@@ -29,9 +29,8 @@ from stcal.io.design import BoardEntry, Count, Squares, board_design, board_toml
 from stcal.io.design import load_board as load_dots
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.json import mistake
-from stcal.io.plain_yaml import load_yaml
-from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, validated
-from stcal.lengths import LEAST_SIDE_MM, MOST_SIDE_MM, Length, radius, require_millimetres, side, stated_unusual
+from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_string, validated
+from stcal.lengths import Length, radius, require_millimetres, side, stated_unusual
 
 KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles")
 """Types of flat boards."""
@@ -51,8 +50,8 @@ OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_m
 
 
 Dictionary = Annotated[str, AfterValidator(known_dictionary)]
+OpenCvDictionary = Annotated[str, AfterValidator(of_opencv)]
 TagId = Annotated[int, Field(ge=0, strict=True)]
-Few = Annotated[int, Field(ge=1, le=1000, strict=True)]
 
 
 class _Chessboard(Sized):
@@ -69,7 +68,7 @@ class _Charuco(Sized):
     columns: Squares
     square_mm: Positive
     marker_mm: Positive
-    dictionary: Dictionary
+    dictionary: OpenCvDictionary
     legacy: bool = False
     sigma_mm: Positive = 0.01
     first_id: TagId = 0
@@ -83,7 +82,7 @@ class _AprilGrid(Sized):
     spacing: Annotated[float, Field(gt=0, le=10, strict=True)]
     border_bits: Annotated[int, Field(ge=1, le=2, strict=True)] | None = None
     first_id: TagId = 0
-    dictionary: Dictionary = "DICT_APRILTAG_36h11"
+    dictionary: OpenCvDictionary = "DICT_APRILTAG_36h11"
     upright: bool = False
     sigma_mm: Positive = 0.01
 
@@ -186,7 +185,8 @@ def load_tags(path: str | Path, what: str) -> TagsFile:
 
 
 def load_run_board(path: str | Path) -> BoardDesign:
-    """Read the file of a board beside a target: dots, or asymmetric circles as places of a lattice.
+    """Read the file of a board beside a target: dots, asymmetric circles as places of a lattice, or points of a board
+    of squares or tags.
 
     Parameters
     ----------
@@ -201,17 +201,13 @@ def load_run_board(path: str | Path) -> BoardDesign:
     Raises
     ------
     InputError
-        As :func:`load_flat_board`; or it is another board, or its circles have no radius.
+        As :func:`load_flat_board`; or its circles have no radius.
     """
     board = load_flat_board(path) if Path(path).is_file() else load_dots(path)
     if isinstance(board, BoardDesign):
         return board
     if not isinstance(board, AsymmetricCirclesDesign):
-        raise InputError(
-            "E-BOARD-TYPE",
-            f"board file {path}: a board of dots or of asymmetric circles needed here: `calibrate-camera`, `handeye` "
-            "and `locate` take others",
-        )
+        return CornerBoard.of(board)
     if board.radius_mm is None:
         raise InputError(
             "E-BOARD-RADIUS",
@@ -226,17 +222,59 @@ def run_board_of(given: str | Path | BoardDesign | None) -> BoardDesign:
     return reference_board() if given is None else given if isinstance(given, BoardDesign) else load_run_board(given)
 
 
+TYPES = {
+    ChessboardDesign: "chessboard",
+    CharucoDesign: "charuco",
+    AprilGridDesign: "aprilgrid",
+    AsymmetricCirclesDesign: "asymmetric-circles",
+    TagLayout: "tags",
+}
+"""The word of each kind of board in files."""
+
+
 def run_board_toml(board: BoardDesign) -> str:
     """Return the text of a board file that :func:`load_run_board` reads."""
-    circles = board.circles if isinstance(board, LatticePart) else None
-    if circles is None:
-        return board_toml(board)
-    return (
-        f'type = "asymmetric-circles"\nrows = {circles.rows}\ncolumns = {circles.columns}\n'
-        f"spacing_mm = {circles.spacing_mm!r}\nradius_mm = {circles.radius_mm!r}\n"
-        f'polarity = "{circles.polarity}"\nsigma_mm = {circles.sigma_mm!r}\n'
-        + "".join(f"{line}\n" for line in stated_unusual([side("", circles.spacing_mm), radius("", board.radius_mm)]))
+    printed = (
+        board.printed if isinstance(board, CornerBoard) else board.circles if isinstance(board, LatticePart) else None
     )
+    if printed is None:
+        return board_toml(board)
+    rows = tag_rows(printed) if isinstance(printed, TagLayout) else []
+    lines = [f'type = "{TYPES[type(printed)]}"', *stated_unusual(_lengths(printed)), *keys_of(printed)]
+    return "".join(f"{line}\n" for line in [*lines, *(["tag = [", *rows, "]"] if rows else [])])
+
+
+def keys_of(board: FlatBoard) -> list[str]:
+    """Return ``key = value`` for each number and word of a board of squares, tags or circles, as its file has them."""
+    skipped = ("tags", "corners_mm") if isinstance(board, TagLayout) else ()
+    stated = {entry.name: getattr(board, entry.name) for entry in fields(board) if entry.name not in skipped}
+    return [f"{key} = {_toml_value(value)}" for key, value in stated.items() if value is not None]
+
+
+def tag_rows(layout: TagLayout) -> list[str]:
+    """Return a line of a file for each tag of a layout, with its corners."""
+    rows = []
+    for (dictionary, tag), corners in zip(layout.tags, layout.corners_mm.tolist(), strict=True):
+        places = ", ".join(f"[{x!r}, {y!r}]" for x, y in corners)
+        rows.append(f"  {{ dictionary = {toml_string(dictionary)}, id = {tag}, corners_mm = [{places}] }},")
+    return rows
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return toml_string(value) if isinstance(value, str) else repr(value)
+
+
+def _lengths(board: FlatBoard) -> list[Length]:
+    """Return the lengths of a board by which the unit of its file is judged."""
+    if isinstance(board, AsymmetricCirclesDesign):
+        return [side("spacing_mm", board.spacing_mm), radius("radius_mm", board.radius_mm or 0.0)]
+    if isinstance(board, TagLayout):
+        sides = np.linalg.norm(board.corners_mm - np.roll(board.corners_mm, 1, axis=1), axis=2).mean(1)
+        return [side("side of a tag", float(mm)) for mm in sides]
+    names = ("square_mm", "marker_mm", "tag_mm")
+    return [side(name, getattr(board, name)) for name in names if hasattr(board, name)]
 
 
 def save_run_board(path: str | Path, board: BoardDesign) -> None:
@@ -322,15 +360,7 @@ def board_content(path: str | Path) -> dict[str, Any] | None:
     except UnicodeDecodeError:
         return None
     except (ValueError, RecursionError):
-        return _kalibr_content(text) if "target_type" in text else bundle_content(text)
-
-
-def _kalibr_content(text: str) -> dict[str, Any] | None:
-    try:
-        content = load_yaml(text)
-    except (yaml.YAMLError, ValueError, RecursionError):
-        return None
-    return content if isinstance(content, dict) and "target_type" in content else None
+        return kalibr_content(text) if "target_type" in text else bundle_content(text)
 
 
 def _charuco(data: _Charuco, where: str) -> CharucoDesign:
@@ -469,94 +499,3 @@ def _asymmetric(data: _AsymmetricCircles, where: str) -> AsymmetricCirclesDesign
             "neighbours in a row are apart",
         )
     return AsymmetricCirclesDesign(data.rows, data.columns, data.spacing_mm, radius_mm, data.polarity, data.sigma_mm)
-
-
-METRE_MM = 1000.0
-
-
-def _metres(value: float) -> float:
-    if not LEAST_M <= value <= MOST_M:
-        raise ValueError(f"{LEAST_M:g} … {MOST_M:g} m needed: Kalibr's lengths are metres, not mm")
-    return value
-
-
-LEAST_M, MOST_M = LEAST_SIDE_MM / METRE_MM, MOST_SIDE_MM / METRE_MM
-"""Tags, squares and spacings that hardware has, m; another value is in a wrong unit, for Kalibr's are metres."""
-SAME_WITHIN = 1e-6
-"""Largest relative difference between the sides of a square."""
-FAMILY = "DICT_APRILTAG_36h11"
-KALIBR_KINDS = ("aprilgrid", "checkerboard", "circlegrid")
-
-Metres = Annotated[Positive, AfterValidator(_metres)]
-
-
-class _KalibrAprilGrid(Strict):
-    target_type: Literal["aprilgrid"]
-    tagCols: Few
-    tagRows: Few
-    tagSize: Metres
-    tagSpacing: Annotated[float, Field(gt=0, le=10, strict=True)]
-    codeOffset: Annotated[int, Field(ge=0, strict=True)] = 0
-
-
-class _Checkerboard(Strict):
-    target_type: Literal["checkerboard"]
-    targetCols: Squares
-    targetRows: Squares
-    rowSpacingMeters: Metres
-    colSpacingMeters: Metres
-
-
-class _CircleGrid(Strict):
-    target_type: Literal["circlegrid"]
-    targetCols: Count
-    targetRows: Count
-    spacingMeters: Metres
-    asymmetricGrid: bool
-
-
-def kalibr_board_of(
-    content: dict[str, Any], where: str
-) -> AprilGridDesign | ChessboardDesign | AsymmetricCirclesDesign:
-    """Return the board of a file of Kalibr; the message of an InputError begins with ``where``.
-
-    Kalibr's frame of an AprilGrid differs by half a turn about X (:class:`AprilGridDesign`). Its asymmetric circle
-    grids do not state the radius of circles, which is determined from images.
-
-    Raises
-    ------
-    InputError
-        Keys are missing or unknown, the kind is another one, squares are oblong, or a grid of circles is not
-        asymmetric.
-    """
-    kind = content["target_type"]
-    if kind == "aprilgrid":
-        data = validated(content, _KalibrAprilGrid, where)
-        available = len(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11).bytesList)
-        if (count := data.codeOffset + data.tagRows * data.tagCols) > available:
-            raise InputError(
-                "E-TAG-ID-RANGE",
-                f"{where}: tags up to {count - 1}, tag36h11 has 0 … {available - 1}; correct tagRows, tagCols",
-            )
-        size = METRE_MM * data.tagSize
-        return AprilGridDesign(data.tagRows, data.tagCols, size, data.tagSpacing, None, data.codeOffset, FAMILY)
-    if kind == "checkerboard":
-        data = validated(content, _Checkerboard, where)
-        across, down = data.colSpacingMeters, data.rowSpacingMeters
-        if abs(across - down) > SAME_WITHIN * across:
-            raise InputError(
-                "E-BOARD-SPACING",
-                f"{where}: colSpacingMeters {across:g}, rowSpacingMeters {down:g}; squares needed, both the same",
-            )
-        return ChessboardDesign(data.targetRows, data.targetCols, METRE_MM * across)
-    if kind == "circlegrid":
-        data = validated(content, _CircleGrid, where)
-        if not data.asymmetricGrid:
-            raise InputError(
-                "E-BOARD-RADIUS",
-                f"{where}: asymmetricGrid false, a grid whose circles have no radius; write a board.toml with rows, "
-                "columns, pitch_mm, radius_mm and polarity",
-            )
-        spacing = METRE_MM * data.spacingMeters
-        return AsymmetricCirclesDesign(data.targetRows, data.targetCols, spacing, None, "dark")
-    raise InputError("E-BOARD-TYPE", f"{where}: target_type {kind!r}; one of {', '.join(KALIBR_KINDS)} needed")

@@ -1,4 +1,4 @@
-"""Detection of tags (through ``cv2.aruco``)."""
+"""Detection of tags (through ``cv2.aruco``; families that it lacks through ``pupil_apriltags``)."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from stcal.boards.design import BoardView, TagLayout, view_of
-from stcal.boards.dictionaries import dictionary_of
+from stcal.boards.dictionaries import FAMILIES, cells_of, dictionary_of, find_family
 from stcal.boards.edges import corners_by_edges, corners_from_edges
 from stcal.geometry.arrays import frozen
 from stcal.geometry.least_squares import block_diagonal
@@ -75,6 +75,10 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str], border_bits: int =
     grey = grey_8bit(image)
     places_of: dict[tuple[str, int], list[np.ndarray]] = {}
     for name in dict.fromkeys(dictionaries):
+        if name in FAMILIES:
+            for tag, place in find_family(grey, name):
+                places_of.setdefault((name, tag), []).append(place.astype(np.float32))
+            continue
         detector = cv2.aruco.ArucoDetector(dictionary_of(name), detector_settings(name, border_bits))
         for look in _looks(grey, joined):
             corners, ids, _ = detector.detectMarkers(look.grey)
@@ -85,11 +89,12 @@ def find_tags(image: np.ndarray, dictionaries: Sequence[str], border_bits: int =
                     places_of.setdefault((name, int(tag)), []).append(place)
     places_of = _outermost(places_of)
     once = {tag: places[0] for tag, places in sorted(places_of.items()) if len(places) == 1}
-    cells = np.array([dictionary_of(name).markerSize + 2 * border_bits for name, _ in once])
-    corners, covariance = _refined(grey, np.array(list(once.values()), float).reshape(-1, 4, 2), cells)
+    cells = np.array([cells_of(name, border_bits) for name, _ in once])
+    white = np.array([name in FAMILIES for name, _ in once], bool)
+    corners, covariance = _refined(grey, np.array(list(once.values()), float).reshape(-1, 4, 2), cells, white)
     if joined:  # places from larger and dilated images are less accurate
-        corners, covariance = _refined(grey, corners, cells)
-    saturated = _saturated(grey, corners, cells)
+        corners, covariance = _refined(grey, corners, cells, white)
+    saturated = _saturated(grey, corners, np.where(white, -cells, cells))
     # If the white is partly saturated, each edge shifts by a different amount.
     uneven = SATURATED_EDGE_PX**2 * saturated * (1 - saturated)
     joint = covariance + uneven[:, None, None] * np.eye(8)
@@ -193,7 +198,10 @@ def _outermost(found: dict[tuple[str, int], list[np.ndarray]]) -> dict[tuple[str
 
 
 def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Return the saturated share (n,) of the white half a cell outside of tags with ``cells`` cells per side."""
+    """Return the saturated share (n,) of the white half a cell outside of tags with ``cells`` cells per side.
+
+    Of tags with a negative number of cells it is the white half a cell inside.
+    """
     if not len(corners):
         return np.zeros(0)
     middle = corners.mean(1, keepdims=True)
@@ -205,8 +213,19 @@ def _saturated(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> np.n
     return (level.reshape(len(corners), -1) >= SATURATED).mean(1)
 
 
-def _refined(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners and covariances; a corner that moves too far, or lacks a visible edge, is not refined."""
+def _refined(
+    grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, white: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners and covariances; a corner that moves too far, or lacks a visible edge, is not refined.
+
+    ``white`` : (n,) True for tags that are white inside their edges and black outside.
+    """
+    if white.any():
+        refined, covariance = np.array(corners), np.zeros((len(corners), 8, 8))
+        for colour, picture in ((~white, grey), (white, 255 - grey)):
+            own = np.zeros(int(colour.sum()), bool)
+            refined[colour], covariance[colour] = _refined(picture, corners[colour], cells[colour], own)
+        return refined, covariance
     measured = corners_from_edges(grey, corners, cells)
     side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(1, initial=np.inf)
     away = np.linalg.norm(np.where(measured.seen[:, None, None], measured.corners_px - corners, 0), axis=2).max(

@@ -1,13 +1,12 @@
 """Target files whose faces may be boards or tags: reader and writer over those of ``stcal.io.design``."""
 
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from stcal.boards.design import AprilGridDesign, CharucoDesign, FlatBoard, TagLayout
-from stcal.boards.file import flat_board
+from stcal.boards.design import TAG_SIGMA_MM, AprilGridDesign, CharucoDesign, FlatBoard, TagLayout
+from stcal.boards.file import TYPES, flat_board, keys_of, tag_rows
 from stcal.design import POINT_RADIUS_MM, FaceDesign, TargetDesign, reference_target
 from stcal.errors import InputError
 from stcal.io.design import PrintedFaceFile, target_toml
@@ -15,10 +14,7 @@ from stcal.io.design import load_target as load_design
 from stcal.io.files import require_same, save
 from stcal.io.toml import toml_string
 
-TAG_SIGMA_MM = 0.05
-"""σ of a corner of a tag if its face states none: print on paper that is glued on."""
 ON_FACES = (CharucoDesign, AprilGridDesign, TagLayout)
-KINDS = {CharucoDesign: "charuco", AprilGridDesign: "aprilgrid"}
 
 
 def load_body(path: str | Path) -> TargetDesign:
@@ -128,7 +124,11 @@ def corner_ids(board: FlatBoard) -> tuple[str, ...]:
         return tuple(f"{i}.{j}" for i, j in zip(row.tolist(), column.tolist(), strict=True))
     tags = tags_on(board)
     numbers = [tag for _, tag in tags]
-    names = [f"{tag}" if numbers.count(tag) == 1 else f"{dictionary[5:]}.{tag}" for dictionary, tag in tags]
+    families = [dictionary.removeprefix("DICT_") for dictionary, _ in tags]
+    names = [
+        f"{tag}" if numbers.count(tag) == 1 else f"{family}.{tag}"
+        for family, tag in zip(families, numbers, strict=True)
+    ]
     return tuple(f"{name}.{corner}" for name in names for corner in range(4))
 
 
@@ -166,18 +166,6 @@ def _printed_lines(face: FaceDesign) -> list[str]:
     if face.size_sigma:
         lines.append(f"size_sigma_mm = {face.size_sigma * _size_mm(board)!r}  # of the side of a square or tag")  # type: ignore
     if isinstance(board, TagLayout):
-        rows = []
-        for (dictionary, tag), corners in zip(board.tags, board.corners_mm.tolist(), strict=True):
-            places = ", ".join(f"[{x!r}, {y!r}]" for x, y in corners)
-            rows.append(f"  {{ dictionary = {toml_string(dictionary)}, id = {tag}, corners_mm = [{places}] }},")
-        return [*lines, "tags = [", *rows, "]"]
+        return [*lines, "tags = [", *tag_rows(board), "]"]
     assert isinstance(board, CharucoDesign | AprilGridDesign)
-    keys = [(entry.name, getattr(board, entry.name)) for entry in fields(board)]
-    values = [f"{key} = {_value(value)}" for key, value in keys if value is not None]
-    return [*lines, f"board = {{ type = {toml_string(KINDS[type(board)])}, {', '.join(values)} }}"]
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return toml_string(value) if isinstance(value, str) else repr(value)
+    return [*lines, f"board = {{ type = {toml_string(TYPES[type(board)])}, {', '.join(keys_of(board))} }}"]

@@ -59,7 +59,9 @@ TargetFile = Annotated[
 ]
 BoardFile = Annotated[
     Path | None,
-    typer.Option("--board", help="Read the board's design from this board.toml, in place of the reference board."),
+    typer.Option(
+        "--board", help="Read the board from this file (TOML, or Kalibr's YAML), in place of the reference board."
+    ),
 ]
 FlatBoardFile = Annotated[
     Path, typer.Option("--board", help="Read the board from this file: dots, chessboard, ChArUco or tags (TOML).")

@@ -127,14 +127,14 @@ _bayer: ContextVar[str] = ContextVar("_bayer", default="")
 
 @contextlib.contextmanager
 def mosaic_of(pattern: str) -> Iterator[None]:
-    """Read images as mosaics of this pattern; for a command's option, which applies to all images it finds.
+    """Read images as mosaics of this pattern, or as they are if it is empty; for all images that are found meanwhile.
 
     Raises
     ------
     InputError
         The pattern is unknown.
     """
-    if pattern.upper() not in PATTERNS:
+    if pattern and pattern.upper() not in PATTERNS:
         raise InputError("E-OPTION-VALUE", f"--bayer {pattern[:20]}: one of {', '.join(PATTERNS)} needed")
     token = _bayer.set(pattern.upper())
     try:

@@ -2,11 +2,13 @@
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.design import CornerBoard
 from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference
@@ -16,7 +18,7 @@ from stcal.io.cameras.model import CameraModel, camera_prior, model_of, refinabl
 from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.cameras.read import camera_model
 from stcal.io.files import save
-from stcal.io.images import TOP_GROUP, ImageFile, ImageFiles, chosen_images, require_common_size
+from stcal.io.images import TOP_GROUP, ImageFile, ImageFiles, chosen_images, mosaic_of, require_common_size
 from stcal.io.photographs.memory import files_of_arrays
 from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
@@ -104,10 +106,11 @@ def run(
     if camera is None:
         require_printed(body_of(target))
         options = replace(options, refine_camera=True)
-    if isinstance(images, Mapping):
-        files, place = files_of_arrays(images, options.exclude), IN_MEMORY
-    else:
-        files, place = chosen_images(images, options.exclude), images
+    with mosaic_of(options.bayer) if options.bayer else nullcontext():
+        if isinstance(images, Mapping):
+            files, place = files_of_arrays(images, options.exclude), IN_MEMORY
+        else:
+            files, place = chosen_images(images, options.exclude), images
     if out is not None:
         return run_on_files(files, place, camera, out, target, board, options, progress, reload_s, checks)
     with tempfile.TemporaryDirectory(prefix="stcal-run-") as scratch:
@@ -137,7 +140,9 @@ def run_on_files(
     designs = target_design, scale_reference(known, target_design)
     if target_design.with_faces(printed=True).faces:
         _require_for_printed(options)
-    options = options.settled(target_design)
+    if options.compare:
+        require_dots(known, f"--compare {options.compare}")
+    options = replace(options, bayer=next((file.bayer for file in files[0] if file.bayer), "")).settled(target_design)
     if options.compare:
         require_comparable(options.adjustment(designs[0]))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
@@ -260,6 +265,20 @@ def _require_for_printed(options: RunOptions) -> None:
         raise InputError(
             "E-OPTION-CONFLICT",
             f"{name}: for targets of circles alone, and faces here have boards or tags; leave it out",
+        )
+
+
+def require_dots(board: BoardDesign | None, option: str) -> None:
+    """Refuses a board of corners for an option whose method finds dots.
+
+    Raises
+    ------
+    InputError
+        The board is one of corners; the message begins with the option.
+    """
+    if isinstance(board, CornerBoard):
+        raise InputError(
+            "E-OPTION-CONFLICT", f"{option}: finds boards of dots, and --board is one of squares or tags; leave it out"
         )
 
 
@@ -450,6 +469,7 @@ def _labelled(
     dots = board if board is not None and board.rows else None
     published = options.solve == "paper"
     if published:
+        require_dots(dots, "--solve paper")
         PublishedPattern.of(target)
     detector = detect_published if published else None
     detection = detect_files(

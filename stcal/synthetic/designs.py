@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from stcal.boards.design import TagLayout
-from stcal.boards.target import TAG_SIGMA_MM, printed_face
+from stcal.boards.design import TAG_SIGMA_MM, TagLayout
+from stcal.boards.target import printed_face
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_target
 from stcal.geometry.rigid import Rigid
 

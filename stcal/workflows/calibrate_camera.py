@@ -12,12 +12,11 @@ from stcal.boards.design import (
     AsymmetricCirclesDesign,
     BoardView,
     CharucoDesign,
+    CornerBoard,
     FlatBoard,
-    LatticePart,
     TagLayout,
-    UnevenGrid,
 )
-from stcal.design import POINT_RADIUS_MM, BoardDesign, TargetDesign
+from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.forms import kalibr_chain
@@ -53,8 +52,6 @@ LEAST_CORNERS = 6
 """Smallest number of corners of a view of which others were left out: they still check one another."""
 LEAST_SHARE = 0.5
 """Smallest share of the corners of a view that are no gross errors; with fewer of them the view is not used."""
-PLACE_DIGITS = 6
-"""Decimals, mm, to which the places of points are the same row or column."""
 
 
 @one_thread()
@@ -90,8 +87,7 @@ def calibrate_camera_by_corners(
     StcalError
         One of its subclasses, with a one-line message that says what to do.
     """
-    points = point_grid(board)
-    grid = points.grid
+    grid = corner_grid(board)
     if colmap_model == AUTO:
         return of_chosen_model(
             lambda model: calibrate_camera_by_corners(images, board, model, workers, progress), grid, workers
@@ -104,7 +100,7 @@ def calibrate_camera_by_corners(
     for done in range(1, rounds + 1):
         model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
         detections = detect_boards(files, model, board, (), workers, partial(progress, f"detect {done}"))
-        views = _observations(files, detections.views(), points, camera)
+        views = _observations(files, detections.views(), grid, camera)
         skipped = (*skipped_files, *detections.skipped)
         require_views(views, files, skipped)
         result = adjust_intrinsics(views, grid, camera if done > 1 else closed_form(views, grid, camera), colmap_model)
@@ -183,19 +179,8 @@ ROUNDS = {AprilGridDesign: 2, AsymmetricCirclesDesign: 3}
 eccentricity shrinks to less than a tenth with each round. Corners of chessboards and ChArUco boards need one."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PointGrid:
-    """The points of a board as dots without extent.
-
-    ``grid`` : rows and columns of all points; ``cells`` : (n, 2), row and column of each point of the board's views.
-    """
-
-    grid: BoardDesign
-    cells: np.ndarray
-
-
-def point_grid(board: FlatBoard) -> PointGrid:
-    """Returns the points of a board, sorted into rows and columns.
+def corner_grid(board: FlatBoard) -> CornerBoard:
+    """Returns the points of a board as a board of dots without extent.
 
     Raises
     ------
@@ -208,28 +193,14 @@ def point_grid(board: FlatBoard) -> PointGrid:
             f"--board: {kind_of(board)}; a board of dots, a chessboard, a ChArUco board, an AprilGrid or asymmetric "
             "circles needed to calibrate a camera",
         )
-    xy = np.round(board.xy_mm(), PLACE_DIGITS)
-    (x, column), (y, row) = (np.unique(values, return_inverse=True) for values in xy.T)
-    cells = np.column_stack([row, column])
-    common = {"radius_mm": POINT_RADIUS_MM, "polarity": "bright", "sigma_mm": board.sigma_mm, "unusual_size": True}
-    if isinstance(board, AprilGridDesign):
-        pitch = float(np.ptp(x) / (len(x) - 1))
-        return PointGrid(UnevenGrid(len(y), len(x), pitch, **common, y_mm=tuple(y), x_mm=tuple(x)), cells)
-    if isinstance(board, AsymmetricCirclesDesign):
-        return PointGrid(LatticePart(len(y), len(x), board.spacing_mm, **common, taken=cells), cells)
-    return PointGrid(BoardDesign(len(y), len(x), board.square_mm, **common), cells)
+    return CornerBoard.of(board)
 
 
-def corner_grid(board: FlatBoard) -> BoardDesign:
-    """Returns the points of a board as a board of dots without extent; errors as :func:`point_grid`."""
-    return point_grid(board).grid
-
-
-def _observations(files: list[ImageFile], views: dict[str, BoardView], points: PointGrid, camera):
+def _observations(files: list[ImageFile], views: dict[str, BoardView], grid: CornerBoard, camera):
     group = {file.name: file.group for file in files}
     observations = []
     for name, view in views.items():
-        labels = tuple(DotLabel(*cell) for cell in points.cells[view.ids].tolist())
+        labels = tuple(DotLabel(*cell) for cell in grid.cells()[view.ids].tolist())
         covariance = view.covariance_px2
         if covariance is None:
             covariance = np.tile(CORNER_SIGMA_PX**2 * np.eye(2), (len(view), 1, 1))

@@ -1,5 +1,7 @@
 """Camera files: each kind with its pixel origin, and one test per way in which a file can be wrong."""
 
+import json
+
 import cv2
 import numpy as np
 import pycolmap
@@ -382,4 +384,13 @@ def test_a_parameter_out_of_all_bounds_is_named(tmp_path, place):
     path = tmp_path / "cameras.txt"
     path.write_text(f"1 FULL_OPENCV 800 600 {' '.join(map(str, values))}\n")
     with fails_with("E-CAMERA-TOO-FAR … 1e+308 … 1e+12"):
+        read_camera(path)
+
+
+@pytest.mark.parametrize("numbers", [(12.02, 12.02, 6.1, 4.2), (0.8, 1.07, 0.5, 0.5)])
+def test_a_camera_in_millimetres_or_shares_is_refused(tmp_path, numbers):
+    fx, fy, cx, cy = numbers
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps({"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": 1280, "height": 960}))
+    with fails_with(f"E-CAMERA-FOCAL … {fx:g} … ({cx:g}, {cy:g}) … 1280×960 px"):
         read_camera(path)

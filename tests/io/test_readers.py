@@ -10,14 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stcal.boards.file import load_flat_board
-from stcal.errors import InputNote, StcalError
+from stcal.boards.file import load_flat_board, load_run_board
+from stcal.boards.several import load_boards
+from stcal.boards.target import load_body
+from stcal.errors import InputError, InputNote, StcalError
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import read_pairs, require_own
+from stcal.handeye.data.robot_poses import read_robot_poses
 from stcal.io.design import load_target
+from stcal.io.files import text_of
 from stcal.io.table import read_table
 from stcal.locate.data.layout import load_plan
 from stcal.robot.kinematics.file import load_robot, robot_toml
+from stcal.robot.urdf.universal import kinematics_content, robot_of_kinematics
 
 TABLE = "name,x_mm,y_mm,z_mm\n" + "".join(f"P{i},{i}.25,{-i}.5,{10 * i}\n" for i in range(1, 5))
 CIRCLES = "\n".join(
@@ -32,6 +37,20 @@ ROBOT = 'name = "a"\nconvention = "standard"\n' + "".join(
     f"\n[[joint]]\na_mm = {a}\nalpha_deg = {alpha}\nd_mm = {d}\ntheta_deg = 0.0\n"
     for a, alpha, d in ((0, 90, 300), (400, 0, 0), (350, 0, 0), (0, 90, 100), (0, -90, 90), (0, 0, 80))
 )
+LINKS = (
+    ("shoulder", 0, 0, 0.1807, 0),
+    ("upper_arm", 0, 0, 0, 1.570796326794897),
+    ("forearm", -0.6127, 0, 0, 0),
+    ("wrist_1", -0.57155, 0, 0.17415, 0),
+    ("wrist_2", 0, -0.11985, 0, 1.570796326794897),
+    ("wrist_3", 0, 0.11655, 0, -1.570796326794897),
+)
+UR = "kinematics: {hash: calib_1,\n" + ",\n".join(
+    f"  {link}: {{x: {x}, y: {y}, z: {z}, roll: {roll}, pitch: 0, yaw: 0}}" for link, x, y, z, roll in LINKS
+)
+UR += "}\n"
+"""A UR10e's kinematics as ur_calibration writes them, with its nominal numbers."""
+SINES = ((1, 0.0, 1.0), (2, 0.6, 0.8), (3, -0.6, 0.8), (4, 0.8, 0.6))
 EASY = "parameters: {eye_on_hand: true}\nsamples:\n" + "".join(
     f"- robot: {{translation: {{x: {x}, y: 0.1, z: 0.5}}, rotation: {{x: {s}, y: 0.0, z: 0.0, w: {c}}}}}\n"
     f"  optical: {{translation: {{x: 0.0, y: {x}, z: 0.7}}, rotation: {{x: 0.0, y: {s}, z: 0.0, w: {c}}}}}\n"
@@ -55,6 +74,20 @@ def of_target(path: Path) -> np.ndarray:
 
 def of_robot(path: Path) -> np.ndarray:
     return np.array(robot_toml(load_robot(path)).splitlines())
+
+
+def of_kinematics(path: Path) -> np.ndarray:
+    try:
+        content = kinematics_content(text_of(path.read_bytes()))
+    except UnicodeDecodeError as error:  # named by the command
+        raise InputError("E-FILE-UNREADABLE", f"{path}: {error}") from error
+    assert content is not None
+    return np.array(robot_toml(robot_of_kinematics(content, str(path), "standard")[0]).splitlines())
+
+
+def of_robot_poses(path: Path) -> np.ndarray:
+    poses = read_robot_poses(path).base_from_flange
+    return np.hstack([poses.translation, poses.rotation.reshape(-1, 9)])
 
 
 def of_pairs(path: Path) -> np.ndarray:
@@ -103,10 +136,50 @@ READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
     ),
     "robot": (ROBOT, of_robot),
     "easy_handeye": (EASY, of_pairs),
+    "body": (
+        'name = "a"\n\n[[face]]\nid = "1"\n'
+        'board = { type = "charuco", rows = 5, columns = 5, square_mm = 10, marker_mm = 7, dictionary = "4X4_50" }\n'
+        '\n[[face]]\nid = "2"\ntags = [{ dictionary = "tag36h11", id = 3, size_mm = 40, x_mm = 0, y_mm = 0 }]\n',
+        lambda path: np.concatenate([face.xy_mm for face in load_body(path).faces]),
+    ),
+    "board of a run": (
+        'type = "aprilgrid"\nrows = 3\ncolumns = 4\ntag_mm = 30.0\nspacing = 0.3\nfirst_id = 5\n',
+        lambda path: load_run_board(path).xy_mm(),
+    ),
+    "several boards": (
+        'type = "boards"\n\n[[board]]\ntype = "aprilgrid"\nrows = 2\ncolumns = 2\ntag_mm = 30.0\nspacing = 0.3\n'
+        '\n[[board]]\ntype = "chessboard"\nrows = 5\ncolumns = 8\nsquare_mm = 20.0\nx_mm = 300.0\n'
+        "y_mm = 0.0\nz_mm = 0.0\nqw = 0.8\nqx = 0.6\nqy = 0.0\nqz = 0.0\n",
+        lambda path: load_boards(path).xyz_mm(),
+    ),
+    "tags": (LAYOUT.replace("origin = 0\n", ""), of_board),
+    "apriltag_ros": (
+        "tag_family: tag36h11\ntag_bundles: [{name: a, layout: [{id: 0, size: 0.08, x: 0.1, y: 0, z: 0, qw: 1.0}]}]\n",
+        of_board,
+    ),
+    "Universal Robots": (UR, of_kinematics),
+    "poses, rows of TUM": (
+        "".join(f"{10 + i}.5 {0.1 * i:.1f} 0.2 0.3 0.0 0.0 {s} {c}\n" for i, s, c in SINES),
+        of_robot_poses,
+    ),
+    "poses, table": (
+        ",".join(["image", *(f"base_from_flange_{c}" for c in ["x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"])])
+        + "\n"
+        + "".join(f"{i}.png,{i}.5,2,{-i},{c},{s},0,0\n" for i, s, c in SINES),
+        of_robot_poses,
+    ),
+    "poses, table of decimal commas": (
+        "image;X;Y;Z;qw;qx;qy;qz\n"
+        + "".join(
+            f"{i}.png;{i}00,5;200,25;-{i}00;{c};{s};0;0\n".replace(".", ",").replace(",png", ".png")
+            for i, s, c in SINES
+        ),
+        of_robot_poses,
+    ),
     "layout": (LAYOUT, lambda path: np.array([repr(load_plan(path))])),
 }
-OF_YAML = [name for name in READERS if name.startswith(("Kalibr", "easy"))]
-OF_ROWS = [name for name in READERS if "table" in name or name == "SpatialAnalyzer"]
+OF_YAML = [name for name in READERS if name.startswith(("Kalibr", "easy", "apriltag_ros", "Universal"))]
+OF_ROWS = [name for name in READERS if "table" in name or "rows" in name or name == "SpatialAnalyzer"]
 OF_KEYS = [name for name in READERS if name not in OF_ROWS]
 
 
@@ -159,7 +232,7 @@ def test_an_unknown_key_is_named(tmp_path, name):
     text, read = READERS[name]
     more = "operator_42: 7\n" if name in OF_YAML else "operator_42 = 7\n"
     found, said = outcome(read, tmp_path / "file", f"{more}{text}".encode())
-    if name == "easy_handeye":  # its other keys are settings of the program, and change nothing
+    if name in ("easy_handeye", "apriltag_ros"):  # their other keys are settings of the program, and change nothing
         np.testing.assert_array_equal(found, outcome(read, tmp_path / "file", text.encode())[0])
     else:
         assert any("operator_42" in each for each in said), said
@@ -169,6 +242,9 @@ def test_an_unknown_key_is_named(tmp_path, name):
 def test_another_order_of_keys_changes_nothing(tmp_path, name):
     text, read = READERS[name]
     head, bracket, rest = text.partition("\n[[")
+    if name == "Universal Robots":
+        first, *links = text.removesuffix("}\n").split(",\n")
+        head, bracket, rest = "", "", ",\n".join([first, *reversed(links)]) + "}\n"
     if name == "easy_handeye":
         head, bracket, rest = "", "", "samples:" + text.split("samples:")[1] + text.split("samples:")[0]
     lines = head.splitlines(keepends=True)

@@ -39,8 +39,8 @@ def test_the_lattice_holds_the_circles_and_no_others(tmp_path):
     ("text", "error"),
     [
         (
-            'type = "aprilgrid"\nrows = 3\ncolumns = 4\ntag_mm = 30.0\nspacing = 0.3\n',
-            "E-BOARD-TYPE … calibrate-camera",
+            'type = "boards"\n[[board]]\nfile = "other.toml"\n',
+            "E-BOARD-SINGLE … several boards",
         ),
         (
             "target_type: 'circlegrid'\ntargetCols: 4\ntargetRows: 11\nspacingMeters: 0.02\nasymmetricGrid: True\n",

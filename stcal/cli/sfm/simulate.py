@@ -220,11 +220,21 @@ def _lens(
 
 def _designs(target: Path | None, board: Path | None, second_design: bool) -> "tuple[TargetDesign, BoardDesign]":
     """Returns the designs of the files, the reference designs, or the second designs."""
+    from stcal.boards.design import CornerBoard
     from stcal.boards.file import run_board_of as board_of
     from stcal.io.design import target_of
     from stcal.synthetic.scene import second_design as other
 
-    return other()[:2] if second_design else (target_of(target), board_of(board))
+    if second_design:
+        return other()[:2]
+    board_design = board_of(board)
+    if isinstance(board_design, CornerBoard):
+        raise InputError(
+            "E-BOARD-TYPE",
+            f"--board {board}: squares or tags, which are not drawn beside a target; a board of dots or of asymmetric "
+            "circles needed here (`run` takes this one)",
+        )
+    return target_of(target), board_design
 
 
 def _scene(

@@ -148,6 +148,10 @@ def cameras_txt(camera: Camera) -> str:
     return "\n".join(lines) + "\n"
 
 
+LEAST_SHARE_OF_SIDE = 0.05
+"""Share of the longer side that focal length or principal point of every lens exceed; lengths in mm do not."""
+
+
 def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:
     flat = np.pad(flat, (0, len(PARAMETER_NAMES) - len(flat)))
     if not np.isfinite(flat).all():
@@ -174,6 +178,12 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path)
             raise InputError(
                 "E-CAMERA-SIZE", f"camera file {path}: image side {side:g} px; a whole number in 1…{MAX_SIDE_PX} needed"
             )
+    if width and height and flat[:4].max() < LEAST_SHARE_OF_SIDE * max(width, height):
+        raise InputError(
+            "E-CAMERA-FOCAL",
+            f"camera file {path}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}) of an image "
+            f"of {width:g}×{height:g} px; px needed: are they mm, or shares of a side?",
+        )
     width, height = (None if side is None else int(side) for side in (width, height))
     return CameraModel(flat[:2], flat[2:4], flat[4:], colmap_model, width, height, str(path))
 

@@ -247,13 +247,13 @@ def _board_gap(network: Network, dots: np.ndarray, board: BoardDesign):
 def _lines(name, gap, weight, cells, board: BoardDesign, inflation: float, redundancy: float) -> list[Trial]:
     """Tests the stretch of each row along X and of each column along Y, in ppm."""
     trials = []
-    for kind, across, along, axis in (("row", 0, 1, 0), ("column", 1, 0, 1)):
+    for kind, across, axis in (("row", 0, 0), ("column", 1, 1)):
         for line in np.unique(cells[:, across]):
             members = np.flatnonzero(cells[:, across] == line)
             if len(members) < 3:
                 continue
             pattern = np.zeros((len(cells), 3))
-            place = board.pitch_mm * cells[members, along]
+            place = board.places_mm([DotLabel(*cell) for cell in cells[members].tolist()])[:, axis]
             pattern[members, axis] = place - place.mean()
             information = float(pattern.ravel() @ weight @ pattern.ravel())
             stretch = float(pattern.ravel() @ weight @ gap) / information

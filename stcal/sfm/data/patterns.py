@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from stcal.design import BoardDesign, Polarity, TargetDesign
+from stcal.design import POINT_RADIUS_MM, BoardDesign, Polarity, TargetDesign
 from stcal.errors import DegenerateError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
@@ -167,8 +167,10 @@ def measured_pitch_mm(images: Sequence[ImageObservations], board: BoardDesign) -
     """Returns the distance of neighbouring dots, mm, if their radius in the board file is right.
 
     The homography of each image's grid gives the step between neighbours in units of the dot's ellipse radius; the
-    result is the median over all dots. None if no image shows enough dots.
+    result is the median over all dots. None if no image shows enough dots, or they are corners without extent.
     """
+    if board.radius_mm <= POINT_RADIUS_MM:
+        return None
     radius, pitches = board.radius_of(), []
     for image in images:
         dots = [i for i, label in enumerate(image.labels) if isinstance(label, DotLabel)]

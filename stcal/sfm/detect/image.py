@@ -4,13 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import cv2
 import numpy as np
 
+from stcal.boards.design import BoardView, CornerBoard
 from stcal.boards.faces import find_on_faces
 from stcal.design import BoardDesign, Polarity, TargetDesign
 from stcal.geometry.camera import Camera
+from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit, grey_fine, require_grey
-from stcal.labels import Label
+from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.board import BoardReading, find_boards
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, find_ellipses
@@ -48,18 +51,24 @@ class ImageReading:
 
 
 def read_image(
-    grey: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+    grey: np.ndarray,
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: EllipseOptions,
+    aside: np.ndarray | None = None,
 ) -> ImageReading:
     """Finds outlines of one polarity or both in an 8-bit image, and the boards and faces among them.
 
-    If the board, or enough faces for an image of a group, are not recognised, fainter outlines are used too.
+    If the board, or enough faces for an image of a group, are not recognised, fainter outlines are used too. Outlines
+    in the polygon ``aside`` : (k, 2) px are left out.
     """
-    reading = _read_once(grey, camera, target, board, options)
+    reading = _read_once(grey, camera, target, board, options, aside)
     wanted = min(len(target.faces), 1 if board is None else 2)
     short = len(reading.face_ids()) < wanted or (board is not None and not reading.boards)
     if short and not reading.untried:
         faint = replace(options, min_contrast=FAINT * options.min_contrast)
-        second_reading = _read_once(grey, camera, target, board, faint)
+        second_reading = _read_once(grey, camera, target, board, faint, aside)
         better = (len(second_reading.boards) > 0, len(second_reading.face_ids())) > (
             len(reading.boards) > 0,
             len(reading.face_ids()),
@@ -69,10 +78,15 @@ def read_image(
 
 
 def _read_once(
-    grey: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+    grey: np.ndarray,
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: EllipseOptions,
+    aside: np.ndarray | None,
 ) -> ImageReading:
     polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
-    found: dict[Polarity, Ellipses] = {p: find_ellipses(grey, p, options) for p in polarities}
+    found: dict[Polarity, Ellipses] = {p: _outside(find_ellipses(grey, p, options), aside) for p in polarities}
     boards: list[BoardReading] = []
     free = {p: np.ones(len(e), bool) for p, e in found.items()}
     if board is not None:
@@ -87,12 +101,22 @@ def _read_once(
     return ImageReading(found, tuple(boards), ellipses, faces, mirrored, len(all_free) - len(ellipses))
 
 
+def _outside(ellipses: Ellipses, polygon: np.ndarray | None) -> Ellipses:
+    """Returns the ellipses whose centres lie outside of a polygon (k, 2), px."""
+    if polygon is None:
+        return ellipses
+    outline = polygon.astype(np.float32)
+    inside = [cv2.pointPolygonTest(outline, centre, False) > 0 for centre in ellipses.centre_px.tolist()]
+    return ellipses.select(~np.array(inside, bool))
+
+
 def detect_image(
     image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
 ) -> ImageDetection:
     """Finds and measures all points of the target and the board in one grey image of the camera's size.
 
-    Circles are searched where the design has any; the corners of printed faces are taken as they are found.
+    Circles are searched where the design has any, outside of a board of corners; corners of printed faces and of such a
+    board are taken as they are found.
 
     Raises
     ------
@@ -102,22 +126,41 @@ def detect_image(
     require_grey(image, (camera.width, camera.height))
     image = np.ascontiguousarray(image)
     circles, printed = target.with_faces(printed=False), target.with_faces(printed=True)
-    if not printed.faces:
+    corners = board if isinstance(board, CornerBoard) else None
+    if not printed.faces and corners is None:
         return _detect_circles(image, camera, target, board, options)
-    boards = {face.id: face.printed for face in printed.faces}
+    boards = {face.id: face.printed for face in printed.faces} | ({} if corners is None else {BOARD: corners.printed})
     views, notes = find_on_faces(image, "", boards, camera)  # type: ignore[arg-type]
     detection = ImageDetection(_corners(np.zeros((0, 2)), np.zeros((0, 2, 2)), camera), ())
-    if circles.faces or board is not None:
-        detection = _detect_circles(image, camera, circles, board, options)
-    parts, sightings, first = [detection.centres], [], len(detection.centres)
+    if circles.faces or (board is not None and corners is None):
+        aside = None if corners is None or BOARD not in views else _outline_px(views[BOARD], corners)
+        detection = _detect_circles(image, camera, circles, None if corners else board, options, aside)
+    parts, sightings, board_sightings, first = [detection.centres], [], [*detection.boards], len(detection.centres)
     for face, view in views.items():
         assert view.covariance_px2 is not None, "detectors of boards on faces state σ"
         parts.append(_corners(view.xy_px, view.covariance_px2, camera))
-        sightings.append(FaceSighting(face, first + np.arange(len(view)), view.ids))
+        rows = first + np.arange(len(view))
+        if face == BOARD and corners is not None:
+            board_sightings.append(BoardSighting(rows, corners.numberings(view.ids)))
+        else:
+            sightings.append(FaceSighting(face, rows, view.ids))
         first += len(view)
     return replace(
-        detection, centres=Centres.concatenate(parts), printed=tuple(sightings), notes=(*detection.notes, *notes)
+        detection,
+        centres=Centres.concatenate(parts),
+        boards=tuple(board_sightings),
+        printed=tuple(sightings),
+        notes=(*detection.notes, *notes),
+        candidates=detection.candidates + sum(len(sighting.rows) for sighting in board_sightings),
     )
+
+
+def _outline_px(view: BoardView, board: CornerBoard) -> np.ndarray:
+    """Returns the outline (4, 2), px, of a board of corners and a step about it, as one image shows it."""
+    xy = board.xy_mm()
+    (x0, y0), (x1, y1) = xy.min(0) - board.pitch_mm, xy.max(0) + board.pitch_mm
+    image_from_board = fit_homography(view.xyz_board[:, :2], view.xy_px)
+    return apply_homography(image_from_board, np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
 
 
 def _corners(xy_px: np.ndarray, covariance_px2: np.ndarray, camera: Camera) -> Centres:
@@ -129,10 +172,16 @@ def _corners(xy_px: np.ndarray, covariance_px2: np.ndarray, camera: Camera) -> C
 
 
 def _detect_circles(
-    image: np.ndarray, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+    image: np.ndarray,
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: EllipseOptions,
+    aside: np.ndarray | None = None,
 ) -> ImageDetection:
-    """Finds and measures all circles of the target and the board in one grey image of the camera's size."""
-    reading = read_image(grey_8bit(image), camera, target, board, options)
+    """Finds and measures all circles of the target and the board in one grey image of the camera's size; those in the
+    polygon ``aside`` are left out."""
+    reading = read_image(grey_8bit(image), camera, target, board, options, aside)
     grey = grey_fine(image)
     named, refused, boards = reading.faces.faces, reading.faces.refused, reading.boards
     of_board = board.polarity if board else target.polarity

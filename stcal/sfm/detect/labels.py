@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stcal.boards.design import CornerBoard
 from stcal.design import BoardDesign, TargetDesign
 from stcal.geometry.camera import Camera
 from stcal.io.images import grey_of
@@ -248,6 +249,7 @@ def _label_circles(
     """Returns the labelled circles of all images, in the order of their groups."""
     camera = detection.camera
     groups = _groups(detection)
+    dots = None if isinstance(board, CornerBoard) else board  # corners are not searched at predicted places
     patterns = patterns_of(target, board)
     first_looks: list[tuple[list[LabelledImage], Arrangement]] = []
     jobs: list[tuple[DetectedImage, PredictedCircles]] = []
@@ -258,7 +260,7 @@ def _label_circles(
         for i, (image, image_labels) in enumerate(zip(members, images_of_group, strict=True)):
             seen = image_labels.observations
             predicted, steep = (
-                predict_circles(arrangement, i, seen.labels, target, board, camera, tilt)
+                predict_circles(arrangement, i, seen.labels, target, dots, camera, tilt)
                 for tilt in (MAX_TILT_RAD, STEEP_RAD)
             )
             if predicted is None or steep is None:

@@ -165,9 +165,8 @@ def likely_views(readings: list[Readings]) -> list[Readings]:
 def _board_views(
     each: BoardSighting, numberings: np.ndarray, board: BoardDesign, detection: ImageDetection
 ) -> list[PlaneView | None]:
-    places = board.pitch_mm * numberings[:, :, ::-1].astype(float)
     labels = [tuple(DotLabel(*cell) for cell in cells.tolist()) for cells in numberings]
-    return [_view(BOARD, own, each.rows, xy, detection) for own, xy in zip(labels, places, strict=True)]
+    return [_view(BOARD, own, each.rows, board.places_mm(own)[:, :2], detection) for own in labels]
 
 
 def flipped_pose(view: PlaneView, design_mm: np.ndarray) -> Rigid | None:

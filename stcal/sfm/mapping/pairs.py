@@ -303,7 +303,8 @@ def _direction(image: ImageObservations, board: BoardDesign) -> np.ndarray:
             camera_from_board = camera_from_plane(fit_homography(design, image.centre[dots]))
         except DegenerateError:
             return np.full(3, np.nan)
-        middle = board.pitch_mm * np.array([board.columns - 1, board.rows - 1, 0]) / 2
+        xy = board.xy_mm()
+        middle = np.append((xy.min(0) + xy.max(0)) / 2, 0.0)
         offset = camera_from_board.inverse().translation - middle
         return offset / np.linalg.norm(offset)
     return np.full(3, np.nan)

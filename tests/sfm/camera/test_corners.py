@@ -15,7 +15,7 @@ from stcal.boards.design import (
     TagLayout,
 )
 from stcal.labels import DotLabel
-from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid, point_grid
+from stcal.workflows.calibrate_camera import calibrate_camera_by_corners, corner_grid
 from tests.boards.drawn import aprilgrid_mm, chessboard_mm, photograph
 from tests.outcome import fails_with
 
@@ -94,9 +94,9 @@ def test_asymmetric_circles_give_the_camera(tmp_path, stcal_sfm):
 )
 def test_points_keep_their_places(board):
     """The label of each point of a view stands where the board has the point."""
-    points = point_grid(board)
-    labels = [DotLabel(*cell) for cell in points.cells.tolist()]
-    places = points.grid.places_mm(labels)[:, :2]
+    grid = corner_grid(board)
+    labels = [DotLabel(*cell) for cell in grid.cells().tolist()]
+    places = grid.places_mm(labels)[:, :2]
     np.testing.assert_allclose(places - places[0], board.xy_mm() - board.xy_mm()[0], atol=1e-5)
     assert len(set(labels)) == len(board.xy_mm())
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
-from stcal.io.images import find_images
+from stcal.io.images import find_images, mosaic_of
 from stcal.io.poses.static import metres, xyzw
 from stcal.sfm.interop.export.content import BOARD_RGB, Circle, Content, ellipsoid, exaggeration
 from stcal.sfm.interop.export.solids import camera_depth_mm, disc, pyramid
@@ -267,7 +267,8 @@ def write_rrd(content: Content, path: Path) -> list[str]:
 def _photographs(content: Content, recording, rr) -> list[str]:
     files = {}
     if content.run.images.is_dir():
-        files = {item.name: item.path for item in find_images(content.run.images)[0]}
+        with mosaic_of(content.run.options.bayer):
+            files = {item.name: item for item in find_images(content.run.images)[0]}
     camera, depth = content.camera, camera_depth_mm(content)
     observations = {item.name: item for item in content.run.observations}
     missing, unreadable = [], []
@@ -294,13 +295,14 @@ def _photographs(content: Content, recording, rr) -> list[str]:
             radii=3.0,
         )
         recording.log(f"{entity}/image/circles", centres)
-        path = files.get(photograph.name)
-        if path is None:
+        file = files.get(photograph.name)
+        suffix = "" if file is None else ".png" if file.bayer else file.path.suffix.lower()  # as it is read
+        if file is None:
             missing.append(photograph.name)
-        elif path.suffix.lower() not in MEDIA:
+        elif suffix not in MEDIA:
             unreadable.append(photograph.name)
         else:
-            picture = rr.EncodedImage(contents=path.read_bytes(), media_type=MEDIA[path.suffix.lower()])
+            picture = rr.EncodedImage(contents=file.read(), media_type=MEDIA[suffix])
             recording.log(f"{entity}/image", picture)
     lines = []
     if missing:

@@ -1,0 +1,117 @@
+"""Families of AprilTag that OpenCV lacks, drawn from the cells that AprilTag's own library draws."""
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.boards import dictionaries
+from stcal.boards.dictionaries import dictionary_of, known_dictionary, of_opencv
+from stcal.boards.file import load_flat_board
+from stcal.boards.tags import find_tags
+from tests.outcome import fails_with
+
+CELLS = {
+    (
+        "tagStandard41h12",
+        0,
+    ): "110111100 000000000 101111100 001111101 001001100 001010101 101111100 000000000 110100100",
+    ("tagStandard41h12", 2114): (
+        "111101111 000000000 001111100 101000100 101000100 001111100 001111100 100000000 001010101"
+    ),
+    ("tagCircle21h7", 37): "000111000 000000000 001111100 001100101 001110101 101011100 001111100 000000000 000100000",
+}
+"""Printed tags by family and id, from ``apriltag_to_image`` of AprilTag 3: 1 is white, the white ring 5 cells wide."""
+RING = 5
+SHARPER, PER_CELL = 8, 16
+LAYOUT = """type = "tags"
+tag = [{ dictionary = "TagStandard41h12", id = 3, size_mm = 40, x_mm = 0, y_mm = 0 }]
+"""
+
+
+def view_of_tag(tag: tuple[str, int], seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A photograph of the tag with noise, and the places of its corners as printed, from top left, px."""
+    rng = np.random.default_rng(seed)
+    cells = 255 * np.array([list(row) for row in CELLS[tag].split()]).astype(np.uint8)
+    sheet = np.kron(np.pad(cells, 1, constant_values=255), np.ones((PER_CELL, PER_CELL), np.uint8))
+    cell_px, angle = rng.uniform(5.5, 12), rng.uniform(0, 2 * np.pi)
+    across = cell_px * np.array([np.cos(angle), np.sin(angle)])
+    down = cell_px * rng.uniform(0.7, 1) * np.array([-np.sin(angle), np.cos(angle)])
+    image_from_cells = np.column_stack([np.append(c, rng.uniform(-0.01, 0.01)) for c in (across, down)])
+    image_from_cells = np.column_stack([image_from_cells, [*(90 + rng.uniform(size=2)), 1]])
+    middle = sheet.shape[0] / PER_CELL / 2
+    cells_from_sheet = np.array([[1, 0, 0.5 - middle * PER_CELL], [0, 1, 0.5 - middle * PER_CELL], [0, 0, PER_CELL]])
+    fine = np.array([[SHARPER, 0, (SHARPER - 1) / 2], [0, SHARPER, (SHARPER - 1) / 2], [0, 0, 1.0]])
+    size = (180 * SHARPER,) * 2
+    seen = cv2.warpPerspective(sheet, fine @ image_from_cells @ cells_from_sheet, size, borderValue=255)
+    seen = cv2.resize(cv2.GaussianBlur(seen, (0, 0), 0.6 * SHARPER), (180, 180), interpolation=cv2.INTER_AREA)
+    image = np.clip(0.75 * seen + 25 + rng.normal(0, 1.5, seen.shape), 0, 255).astype(np.uint8)
+    half = RING / 2
+    corners = np.array([[-half, -half, 1], [half, -half, 1], [half, half, 1], [-half, half, 1]]) @ image_from_cells.T
+    return image, corners[:, :2] / corners[:, 2:]
+
+
+@pytest.mark.parametrize("tag", CELLS)
+def test_tags_of_other_families_have_their_corners_and_sigma(tag):
+    pytest.importorskip("pupil_apriltags")
+    squares = []
+    for seed in range(6):
+        image, corners = view_of_tag(tag, seed)
+        tags = find_tags(image, (tag[0],))
+        assert tags.tags == (tag,)
+        off = tags.corners_px[0] - corners
+        assert np.abs(off).max() < 0.1
+        squares.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(tags.covariance_px2[0]), off) / 2)
+    assert 0.4 < np.mean(squares) < 2.5  # 24 corners, and the four of a tag share its edges
+
+
+def test_both_kinds_of_tags_are_read_in_one_image():
+    pytest.importorskip("pupil_apriltags")
+    first, corners = view_of_tag(("tagStandard41h12", 0), 1)
+    second = np.full((180, 180), 210, np.uint8)
+    second[50:130, 50:130] = cv2.aruco.generateImageMarker(dictionary_of("4X4_50"), 7, 80)
+    tags = find_tags(np.hstack([first, second]), ("tagStandard41h12", "DICT_4X4_50"))
+    assert sorted(tags.tags) == [("DICT_4X4_50", 7), ("tagStandard41h12", 0)]
+    found = dict(zip(tags.tags, tags.corners_px, strict=True))
+    np.testing.assert_allclose(found["tagStandard41h12", 0], corners, atol=0.1)
+    np.testing.assert_allclose(found["DICT_4X4_50", 7][0], [229.5, 49.5], atol=0.1)
+
+
+@pytest.mark.parametrize("family", ["tagStandard41h12", "TAGCIRCLE21H7", "tag_standard_41h12"])
+def test_without_the_package_its_extra_is_offered(monkeypatch, tmp_path, family):
+    monkeypatch.setattr(dictionaries, "find_spec", lambda _: None)
+    known_dictionary.cache_clear()
+    (tmp_path / "b.toml").write_text(LAYOUT.replace("TagStandard41h12", family))
+    with fails_with("E-KEY-VALUE … dictionary … pip install 'stcal[apriltag]' … tag36h11"):
+        load_flat_board(tmp_path / "b.toml")
+    known_dictionary.cache_clear()
+
+
+def test_tags_of_a_bundle_of_such_a_family_stand_as_printed(monkeypatch, tmp_path):
+    monkeypatch.setattr(dictionaries, "find_spec", lambda _: True)
+    known_dictionary.cache_clear()
+    bundle = "tag_bundles: [{name: one, layout: [{id: 3, size: 0.04, x: 0.1, y: 0.02, z: 0, qw: 1}]}]\n"
+    (tmp_path / "tags.yaml").write_text("tag_family: tagStandard41h12\n" + bundle)
+    layout = load_flat_board(tmp_path / "tags.yaml")  # Y of apriltag_ros goes up
+    np.testing.assert_allclose(layout.corners_mm[0], [[80, -40], [120, -40], [120, 0], [80, 0]], atol=1e-9)
+    known_dictionary.cache_clear()
+
+
+def test_families_are_known_by_name(monkeypatch, tmp_path):
+    monkeypatch.setattr(dictionaries, "find_spec", lambda _: True)
+    known_dictionary.cache_clear()
+    (tmp_path / "b.toml").write_text(LAYOUT)
+    assert load_flat_board(tmp_path / "b.toml").tags == (("tagStandard41h12", 3),)
+    (tmp_path / "b.toml").write_text(LAYOUT.replace("id = 3", "id = 2115"))
+    with fails_with("E-TAG-ID-RANGE … 2115 … tagStandard41h12 has 0 … 2114"):
+        load_flat_board(tmp_path / "b.toml")
+    with pytest.raises(ValueError, match="only a layout of tags"):
+        of_opencv("tagStandard41h12")
+    with fails_with("E-TAG-DICTIONARY … tagStandard41h12 … not drawn here"):
+        dictionary_of("tagStandard41h12")
+    known_dictionary.cache_clear()
+
+
+@pytest.mark.parametrize("name", ["tagStandard52h13", "tagCircle49h12", "tagCustom48h12"])
+def test_families_with_huge_tables_are_refused(name):
+    with pytest.raises(ValueError, match="gigabyte"):
+        known_dictionary(name)
