@@ -206,7 +206,7 @@ def cameras_txt(camera: CalibratedCamera) -> str:
     return "\n".join(lines) + "\n"
 
 
-LEAST_SHARE_OF_SIDE = 0.05
+LEAST_SHARE_OF_SIDE = 0.015
 """Share of the longer side that focal length or principal point of every lens exceed; lengths in mm do not."""
 
 
