@@ -194,8 +194,8 @@ def kalibr_board_of(
         if data.tagSpacing < LEAST_GAP <= (ratio := data.tagSpacing / data.tagSize) <= 1:
             raise InputError(
                 "E-BOARD-SPACING",
-                f"{where}: tagSpacing {data.tagSpacing:g}, at least {LEAST_GAP:g} usual: it is the gap over tagSize, no "
-                f"length; of a gap of {data.tagSpacing:g} m it is {ratio:.4g}",
+                f"{where}: tagSpacing {data.tagSpacing:g}, at least {LEAST_GAP:g} usual: it is the gap over tagSize, "
+                f"no length; of a gap of {data.tagSpacing:g} m it is {ratio:.4g}",
             )
         return AprilGridDesign(data.tagRows, data.tagCols, size, data.tagSpacing, None, data.codeOffset, KALIBR_FAMILY)
     if kind == "checkerboard":

@@ -148,7 +148,7 @@ def cameras_txt(camera: Camera) -> str:
     return "\n".join(lines) + "\n"
 
 
-LEAST_SHARE_OF_SIDE = 0.05
+LEAST_SHARE_OF_SIDE = 0.015
 """Share of the longer side that focal length or principal point of every lens exceed; lengths in mm do not."""
 
 

@@ -152,7 +152,7 @@ def require_usable(group: list[ImageObservations], board_alone: bool = False, ne
         raise MappingError(
             "E-GROUP-NO-BOARD",
             f"{where}: no board recognised in {len(group)} images; keep the whole board in view, "
-            "check its file (rows, columns, sizes; radius and polarity of dots, dictionary and ids of tags)",
+            "check board.toml (rows, columns, sizes; radius and polarity of dots, dictionary and ids of tags)",
         )
 
 
