@@ -18,7 +18,6 @@ from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
 from stcal.drawing.shapes import Area, Disc, Line, Shape, extent, said_mm
 from stcal.geometry.rigid import Rigid
 
-
 NAMED_TAGS = 6
 """Largest number of tags that the name of a part lists."""
 

@@ -167,8 +167,8 @@ def made_text(target: TargetDesign, camera: Camera, distance_mm: float) -> str:
     tags = [tag for each in target.with_faces(printed=True).faces for tag in tags_on(each.printed)]
     cells = dictionary_of(tags[0][0]).markerSize + 2
     lines = [
-        f"{len(target.faces)} faces, tags {tags[0][1]} to {tags[-1][1]} of {tags[0][0]}, {tag_mm:g} mm; {tag_px:.0f} px "
-        f"at {distance_mm:g} mm, {tag_px / cells:.1f} px a cell"
+        f"{len(target.faces)} faces, tags {tags[0][1]} to {tags[-1][1]} of {tags[0][0]}, {tag_mm:g} mm; "
+        f"{tag_px:.0f} px at {distance_mm:g} mm, {tag_px / cells:.1f} px a cell"
     ]
     if tag_px < 2 * MIN_CELL_PX * cells:
         nearest = distance_mm * tag_px / (2 * MIN_CELL_PX * cells)
@@ -199,7 +199,12 @@ def _body(
         pose = Rigid(np.column_stack([x, np.cross(z, x), z]), distance_mm * normal)
         layout = TagLayout(((dictionary, first_id + k),), corners, TAG_SIGMA_MM)
         face = printed_face(
-            str(k + 1), layout, TAG_SIGMA_MM, size_sigma_mm, rough_target_from_face=pose, outline_mm=_outline(k, normals, distance_mm, pose)
+            str(k + 1),
+            layout,
+            TAG_SIGMA_MM,
+            size_sigma_mm,
+            rough_target_from_face=pose,
+            outline_mm=_outline(k, normals, distance_mm, pose),
         )
         faces.append(face)
     return TargetDesign(name, "bright", tuple(faces))

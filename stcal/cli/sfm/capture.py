@@ -63,8 +63,8 @@ def plan(
     out: JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
-    from stcal.io.cameras.read import read_camera
     from stcal.boards.target import body_of
+    from stcal.io.cameras.read import read_camera
     from stcal.io.design import board_of
     from stcal.sfm.planning.bodies import plan_body
     from stcal.sfm.planning.file import PlanFile, plan_text

@@ -68,7 +68,8 @@ def design(
         str,
         typer.Option(
             "--size",
-            help="Make it for a box of this width, height and depth: W,H,D in mm; with --tags W, between opposite faces.",
+            help="Make it for a box of this width, height and depth: W,H,D in mm; with --tags this width between "
+            "opposite faces.",
         ),
     ],
     tags: Annotated[

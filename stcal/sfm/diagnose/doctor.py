@@ -206,7 +206,9 @@ def _unread(run: SavedRun, models: Sequence[MetricModel]) -> list[Finding]:
     for face in run.target.with_faces(printed=True).faces:
         if face.id not in poses:
             continue
-        for name, pose in ((name, pose) for m in models for name, pose in zip(m.images, m.camera_from_model, strict=True)):
+        for name, pose in (
+            (name, pose) for m in models for name, pose in zip(m.images, m.camera_from_model, strict=True)
+        ):
             camera_from_face = pose @ poses[face.id]
             xyz = camera_from_face @ face.places_mm(face.ids)
             ray = xyz.mean(0) / np.linalg.norm(xyz.mean(0))

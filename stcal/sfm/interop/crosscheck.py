@@ -22,7 +22,7 @@ from stcal.sfm.interop.export import FORMS, ExportedRun
 from stcal.sfm.interop.export_database import Exported, export_database
 from stcal.sfm.interop.export_model import ExportedModel
 from stcal.sfm.interop.external import faces_from_models
-from stcal.sfm.interop.gates import Gate, GateVerdict, PairGates
+from stcal.sfm.interop.gates import MIN_INLIERS, Gate, GateVerdict, PairGates
 from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable
 from stcal.sfm.interop.schema import schema_of_version
 from stcal.sfm.mapping.colmap import pycolmap

@@ -1,8 +1,8 @@
 """Forecast of photographs of a body with boards or tags on its faces, which is turned before a camera; no board."""
 
 from collections import Counter
-from itertools import combinations, product
 from dataclasses import replace
+from itertools import combinations, product
 
 import numpy as np
 
@@ -122,9 +122,7 @@ def _planned(options: PlanOptions, target: TargetDesign) -> tuple[BodyScene, Met
     return scene, model, Setup(target, size, camera, start, run.frame, run.flatness_mm, prior, 0)
 
 
-def corners_seen(
-    scene: BodyScene, sigma_px: float
-) -> tuple[list[ImageObservations], dict[CircleLabel, np.ndarray]]:
+def corners_seen(scene: BodyScene, sigma_px: float) -> tuple[list[ImageObservations], dict[CircleLabel, np.ndarray]]:
     """Returns exact corners with this σ of the faces that two photographs show, and their places, (3,) mm by label."""
     shown = [scene.faces_in_view(image) for image in range(len(scene.camera_from_target))]
     often = Counter(face.id for faces in shown for face in faces)
@@ -135,7 +133,9 @@ def corners_seen(
             label: xyz
             for face in faces
             if often[face.id] > 1
-            for label, xyz in zip(face.labels(), scene.target_from_face[face.id] @ face.places_mm(face.ids), strict=True)
+            for label, xyz in zip(
+                face.labels(), scene.target_from_face[face.id] @ face.places_mm(face.ids), strict=True
+            )
         }
         xy, n = scene.camera.project(pose @ np.array(list(own.values())).reshape(-1, 3)), len(own)
         covariance = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))

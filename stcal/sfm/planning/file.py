@@ -243,11 +243,12 @@ def _shares_text(shares: dict[str, float]) -> str:
 
 def plan_text(plan: Plan, noise: str) -> str:
     """Returns the forecast as a table. ``noise`` : where the σ of the centres comes from."""
-    camera, options = plan.setup.camera, plan.options
+    options = plan.options
+    points = "centres" if plan.setup.board.rows else "corners"
     worst, sigma = plan.forecast.worst()
     lines = [
         _photographs_said(plan),
-        f"{plan.observations} {'centres' if plan.setup.board.rows else 'corners'}, σ {plan.centre_sigma_px:.4f} px RMS: {noise}",
+        f"{plan.observations} {points}, σ {plan.centre_sigma_px:.4f} px RMS: {noise}",
         *forecast_table(plan.forecast, plan.shares),
         f"scale: σ {PPM * plan.forecast.scale_sigma:.1f} ppm; worst is face {worst}, {MICRO * sigma:.2f} µm, against "
         f"face {plan.setup.start.reference_face}",
@@ -281,7 +282,7 @@ def _photographs_said(plan: Plan) -> str:
         prints = sorted({f"{MICRO * (face.sigma_mm or 0.0):g}" for face in faces}, key=float)
         found = "found from them" if options.camera is None else "of the file"
         return (
-            f"{options.images} images, {size}, of a body in random poses that show two of {len(faces)} faces each; "
+            f"{options.images} images, {size}, of a body in random poses that show two or more of {len(faces)} faces; "
             f"camera {found}, σ of print {' to '.join(prints[:: max(1, len(prints) - 1)])} µm"
         )
     boards = "the same board in all groups" if options.one_board else "a board of its own in each group"

@@ -158,13 +158,13 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
         labels = set(model.labels) & shown(scene, model.group, i, limit)
         if not _worth_it(labels, model):
             continue
-        single = single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup.camera)
+        view_model = single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup.camera)
         position = poses[i].inverse().translation
         cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
         views.append(
             PlannedView(
                 model.group,
-                noise.applied(single, setup.camera, setup.radius_mm()),
+                noise.applied(view_model, setup.camera, setup.radius_mm()),
                 *place,
                 stand.distance_mm,
                 _tilts_deg(scene, model.group, position, labels),
