@@ -456,6 +456,15 @@ class ScaleReference(BoardDesign):
         if self.rows:
             BoardDesign.__post_init__(self)
 
+    def with_sigma_times(self, factor: float) -> "ScaleReference":
+        """Returns what the scale is taken from with all of its σ multiplied by a factor."""
+        faces = (
+            replace(face, sigma_mm=factor * (face.sigma_mm or 0.0), size_sigma=factor * face.size_sigma)
+            for face in self.faces
+        )
+        distances = tuple(replace(known, sigma_mm=factor * known.sigma_mm) for known in self.distances)
+        return replace(self, sigma_mm=factor * self.sigma_mm, faces=tuple(faces), distances=distances)
+
 
 def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDesign:
     """Returns the board, with the faces and distances of the target that tell its size if there are any."""

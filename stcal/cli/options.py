@@ -450,7 +450,7 @@ def designs_told(
 
     if target is not None:
         design = body_of(target)
-        print_each("note", likeness_notes(design.with_faces(printed=False)))
+        print_each("note", likeness_notes(design))
         with_board = with_board and not design.has_scale
     assumed = assumed_designs(target is None and with_target, board is None and with_board)
     for design in assumed:

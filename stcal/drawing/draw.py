@@ -8,6 +8,7 @@ import numpy as np
 from stcal.boards.design import BoardSet, FlatBoard
 from stcal.boards.file import board_content
 from stcal.boards.several import load_boards
+from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign
 from stcal.drawing.formats import dxf, pdf, svg
 from stcal.drawing.net import net_parts
@@ -15,7 +16,6 @@ from stcal.drawing.parts import Part, board_parts, target_parts
 from stcal.drawing.shapes import said_mm
 from stcal.drawing.sheets import MOST_MM, PAPERS, Sheet, one_sheet, paper_sheets
 from stcal.errors import InputError
-from stcal.io.design import load_target
 from stcal.io.files import save
 
 SUFFIXES = (".pdf", ".svg", ".dxf")
@@ -78,7 +78,7 @@ def load_design(path: str | Path) -> TargetDesign | BoardDesign | FlatBoard | Bo
             "E-DRAW-DESIGN", f"{path}: no such file; give a target.toml or a board file (`stcal-sfm init` writes both)"
         )
     content = board_content(path)
-    return load_target(path) if content is not None and "face" in content else load_boards(path)
+    return load_body(path) if content is not None and "face" in content else load_boards(path)
 
 
 def sheets_of(parts: list[Part], paper: str, title: str, apart: bool) -> list[Sheet]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
-from stcal.drawing.parts import Part, face_part
+from stcal.drawing.parts import Part, as_seen, face_part
 from stcal.drawing.shapes import Area, Disc, Line, Shape, Text
 from stcal.errors import InputError
 from stcal.io.design import ROUGH_KEYS
@@ -58,6 +58,7 @@ def net_parts(target: TargetDesign) -> list[Part]:
                 f"--net: face {face.id} has no {'outline_mm' if face.outline_mm is None else ROUGH_KEYS}; add it to "
                 "the target file, or draw plates one by one without --net",
             )
+    target = replace(target, faces=tuple(as_seen(face) for face in target.faces))
     shared = _shared_edges(target)
     if not shared:
         raise InputError(

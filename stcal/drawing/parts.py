@@ -1,6 +1,6 @@
 """Parts of a drawing: a plate for each face of a target, a sheet for each board."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,9 +12,14 @@ from stcal.boards.design import (
     CharucoDesign,
     ChessboardDesign,
     FlatBoard,
+    TagLayout,
 )
 from stcal.design import BoardDesign, FaceDesign, Polarity, TargetDesign
 from stcal.drawing.shapes import Area, Disc, Line, Shape, extent, said_mm
+from stcal.geometry.rigid import Rigid
+
+NAMED_TAGS = 6
+"""Largest number of tags that the name of a part lists."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +49,11 @@ def target_parts(target: TargetDesign, margin_mm: float) -> list[Part]:
 
 
 def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Part:
-    """Return the plate of a face, in the face's frame."""
+    """Return the plate of a face, in the face's frame as seen from outside, Y upwards."""
+    if face.printed is not None:
+        part = board_part(face.printed, f"face {face.id}", margin_mm)  # type: ignore[arg-type]
+        outline = as_seen(face).outline_mm
+        return part if outline is None else replace(part, outline=outline)
     shapes = _discs(face.xy_mm, face.radius_mm, face.labels(), polarity)
     head = ("circle", "x", "y", "diameter")
     rows = [
@@ -54,6 +63,15 @@ def face_part(face: FaceDesign, polarity: Polarity, margin_mm: float) -> Part:
     frame = (f"mm from circle {face.origin},", f"X through {face.x}", "", "")
     table = (frame, head, *rows)
     return _part(f"face {face.id}", shapes, polarity, margin_mm, table=table, outline=face.outline_mm)
+
+
+def as_seen(face: FaceDesign) -> FaceDesign:
+    """Return a face with outline and pose in the frame of its drawing; the Y and Z of printed faces are inverted."""
+    if face.printed is None:
+        return face
+    turn, pose = Rigid(np.diag([1.0, -1.0, -1.0])), face.rough_target_from_face
+    outline = None if face.outline_mm is None else face.outline_mm * [1, -1]
+    return replace(face, outline_mm=outline, rough_target_from_face=None if pose is None else pose @ turn)
 
 
 def board_parts(board: BoardDesign | FlatBoard | BoardSet, margin_mm: float) -> list[Part]:
@@ -105,13 +123,26 @@ def _squares_said(board: SquaresOrTags) -> tuple[str, tuple[tuple[int, float, fl
         )
         return description, ((0, 0.0, board.tag_mm, words), (1, 0.0, board.tag_mm, words))
     else:
-        return f"{len(board.tags)} tags", ()
+        return _tags_said(board)
     side = board.square_mm
     across = (0, first, first + side * columns, f"{columns} × {said_mm(side)} = {said_mm(side * columns)}")
     return description, (
         across,
         (1, -first - side * rows, -first, f"{rows} × {said_mm(side)} = {said_mm(side * rows)}"),
     )
+
+
+def _tags_said(layout: TagLayout) -> tuple[str, tuple[tuple[int, float, float, str], ...]]:
+    """Return as :func:`_squares_said`; the side of a tag that lies along the axes is what to measure."""
+    names = ", ".join(f"{tag}" for _, tag in layout.tags) if len(layout.tags) <= NAMED_TAGS else f"{len(layout.tags)}"
+    families = ", ".join(dict.fromkeys(family for family, _ in layout.tags))
+    description = f"tag{'s' if len(layout.tags) > 1 else ''} {names} of {families}"
+    for corners in layout.corners_mm * [1, -1]:
+        low, high = corners.min(0), corners.max(0)
+        if np.abs(np.abs(corners - (low + high) / 2) - (high - low) / 2).max() < 1e-6:
+            (left, below), (right, above) = low.tolist(), high.tolist()
+            return description, ((0, left, right, said_mm(right - left)), (1, below, above, said_mm(above - below)))
+    return description, ()
 
 
 def _discs(xy, radii, names, polarity: Polarity) -> list[Shape]:

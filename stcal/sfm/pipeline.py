@@ -215,7 +215,7 @@ def _with_found_camera(
     model = model_of(found, PHOTOGRAPHS)
     if board.rows or len(printed.faces) < len(target.faces):
         return *labelled_images(files, model, folder, target, board, options, progress), model
-    detection = seen_by(detection, found)
+    detection = seen_by(detection, found, target)
     labelled = label_images(detection, target, None, options.ellipses, folder.cache, options.workers)
     save(folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
     return detection, labelled, model

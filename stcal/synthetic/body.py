@@ -67,6 +67,10 @@ class BodyScene:
             for label, xyz in zip(face.labels(), self.target_from_face[face.id] @ face.places_mm(face.ids), strict=True)
         }
 
+    def faces_in_view(self, image: int) -> list[FaceDesign]:
+        """Returns the faces that a photograph shows well."""
+        return [face for face in self.target.faces if _looks_here(self, face, self.camera_from_target[image])]
+
 
 def body_camera(width: int) -> Camera:
     """Returns a camera of medium focal length with a lens that distorts a little; images of 3:2."""
@@ -143,9 +147,11 @@ def _looks_here(scene: BodyScene, face: FaceDesign, pose: Rigid) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawing:
-    """A face as a picture of brightness: ``grey`` (h, w); ``px_mm`` pixels in a mm; ``origin`` (2,) its first pixel."""
+    """A face as a picture: ``grey`` (h, w) its brightness, ``solid`` (h, w) where its plate is; ``px_mm`` pixels in a
+    mm; ``origin`` (2,) its first pixel."""
 
     grey: np.ndarray
+    solid: np.ndarray
     px_mm: float
     origin: np.ndarray
 
@@ -154,18 +160,19 @@ def drawing_of(face: FaceDesign) -> Drawing:
     """Returns the drawing of a printed face with the white about it."""
     areas = black_areas(face.printed)  # type: ignore[arg-type]
     every = np.concatenate([line for area in areas for line in area])
-    if face.outline_mm is not None:
-        low, high = np.asarray(face.outline_mm).min(0), np.asarray(face.outline_mm).max(0)
-    else:
+    plate = face.outline_mm
+    if plate is None:
         margin = clear_mm(face.printed)  # type: ignore[arg-type]
-        low, high = every.min(0) - margin, every.max(0) + margin
+        (left, top), (right, bottom) = every.min(0) - margin, every.max(0) + margin
+        plate = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+    low, high = plate.min(0), plate.max(0)
     px_mm = DRAWING_PX / float((high - low).max())
     width, height = np.ceil((high - low) * px_mm).astype(int)
-    grey = np.full((height, width), WHITE, np.float32)
-    for area in areas:
-        lines = [np.round(((line - low) * px_mm - 0.5) * 16).astype(np.int32) for line in area]
-        cv2.fillPoly(grey, lines, BLACK, lineType=cv2.LINE_8, shift=4)
-    return Drawing(grey, px_mm, low)
+    grey, solid = np.full((height, width), WHITE, np.float32), np.zeros((height, width), np.float32)
+    for picture, lines_mm, value in [(solid, [plate], 1.0), *((grey, area, BLACK) for area in areas)]:
+        lines = [np.round(((line - low) * px_mm - 0.5) * 16).astype(np.int32) for line in lines_mm]
+        cv2.fillPoly(picture, lines, value, lineType=cv2.LINE_8, shift=4)
+    return Drawing(grey, solid, px_mm, low)
 
 
 def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> np.ndarray:
@@ -198,7 +205,11 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> n
         at = start[:2] + depth[..., None] * rays[..., :2]
         place = ((at - drawing.origin) * drawing.px_mm - 0.5).astype(np.float32)
         inside = ((at >= drawing.origin) & (at <= drawing.origin + extent)).all(2)
-        value = cv2.remap(drawing.grey, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        value, solid = (
+            cv2.remap(picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for picture in (drawing.grey, drawing.solid)
+        )
+        inside &= solid > 0.5
         light = 0.75 + 0.25 * float(camera_from_face.rotation[:, 2] @ (LIGHT / np.linalg.norm(LIGHT)) * -1)
         part = total[rows, columns]
         part[inside] = light * value[inside]

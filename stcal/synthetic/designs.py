@@ -1,12 +1,16 @@
 """Designs to simulate: the reference target's poses, a quite different target, a cube and a dodecahedron of tags."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from stcal.boards.design import TAG_SIGMA_MM, TagLayout
-from stcal.boards.target import printed_face
+from stcal.boards.dictionaries import dictionary_of, known_tags
+from stcal.boards.target import printed_face, tags_on
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_target
+from stcal.errors import InputError
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 
 REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))
@@ -104,14 +108,15 @@ CUBE_SHARE, PENTAGON_SHARE = 0.75, 0.7
 """Side of the tag over the edge of the body. A square face keeps a white border of an eighth, a pentagon about one of
 0.14 edges at the tag's corners."""
 GOLDEN = (1 + np.sqrt(5)) / 2
+DODECAHEDRON_WIDTH = float(np.sqrt(2.5 + 1.1 * np.sqrt(5)))
+"""Distance of opposite faces of a dodecahedron over its edge."""
 
 
 def tag_cube(edge_mm: float, dictionary: str = FAMILY, first_id: int = 0, size_sigma_mm: float = 0.0) -> TargetDesign:
     """Return a cube of this edge with six tags; ids count up from ``first_id``."""
     normals = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, -1]], float)
-    half = edge_mm / 2
-    square = half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    return _body("cube of tags", normals, half, CUBE_SHARE * edge_mm, square, dictionary, first_id, size_sigma_mm)
+    tag_mm = CUBE_SHARE * edge_mm
+    return _body("cube of tags", normals, edge_mm / 2, tag_mm, dictionary, first_id, size_sigma_mm)
 
 
 def tag_dodecahedron(
@@ -122,11 +127,55 @@ def tag_dodecahedron(
     corners = [np.roll([0.0, a, b * GOLDEN], k) for k in range(3) for a, b in signs]
     normals = np.array(corners) / np.sqrt(1 + GOLDEN**2)
     order = np.argsort(-normals @ normals[0], kind="stable")
-    distance = edge_mm / 2 * np.sqrt(2.5 + 1.1 * np.sqrt(5))
-    return _body(
-        "dodecahedron of tags", normals[order], distance, PENTAGON_SHARE * edge_mm, None, dictionary, first_id,
-        size_sigma_mm,
-    )  # fmt: skip
+    distance, tag_mm = edge_mm * DODECAHEDRON_WIDTH / 2, PENTAGON_SHARE * edge_mm
+    return _body("dodecahedron of tags", normals[order], distance, tag_mm, dictionary, first_id, size_sigma_mm)
+
+
+MOST_WIDTH_MM = 10_000.0
+MIN_CELL_PX = 2.0
+"""Width of a tag's cell below which its corners are several times less exact."""
+
+
+def tag_body(kind: Literal["cube", "dodecahedron"], size: str, dictionary: str, first_id: int) -> TargetDesign:
+    """Return a body of tags by its width between opposite faces, a text in mm.
+
+    Raises
+    ------
+    InputError
+        The width is not a number above 0, or the dictionary or an id in it does not exist.
+    """
+    try:
+        width = float(size)
+    except ValueError:
+        width = 0.0
+    if not 0 < width <= MOST_WIDTH_MM:
+        raise InputError(
+            "E-OPTION-VALUE", f"--size {size}: one width between opposite faces, mm, such as 60, needed with --tags"
+        )
+    faces = 6 if kind == "cube" else 12
+    family = known_tags([(dictionary, first_id + face) for face in range(faces)], "--tags, --dictionary")[0][0]
+    if kind == "cube":
+        return tag_cube(width, family, first_id)
+    return tag_dodecahedron(width / DODECAHEDRON_WIDTH, family, first_id)
+
+
+def made_text(target: TargetDesign, camera: Camera, distance_mm: float) -> str:
+    """Return the size of the tags of a body, on paper and in photographs, with a warning where they are small."""
+    face = target.faces[0]
+    tag_mm = float(np.linalg.norm(face.xy_mm[1] - face.xy_mm[0]))
+    tag_px = tag_mm / distance_mm * float(np.sqrt(camera.focal.prod()))
+    tags = [tag for each in target.with_faces(printed=True).faces for tag in tags_on(each.printed)]
+    cells = dictionary_of(tags[0][0]).markerSize + 2
+    lines = [
+        f"{len(target.faces)} faces, tags {tags[0][1]} to {tags[-1][1]} of {tags[0][0]}, {tag_mm:g} mm; "
+        f"{tag_px:.0f} px at {distance_mm:g} mm, {tag_px / cells:.1f} px a cell"
+    ]
+    if tag_px < 2 * MIN_CELL_PX * cells:
+        nearest = distance_mm * tag_px / (2 * MIN_CELL_PX * cells)
+        lines.append(
+            f"warning: cells tilted by 60° are under {MIN_CELL_PX:g} px; photograph it from {nearest:.0f} mm or nearer"
+        )
+    return "\n".join(lines)
 
 
 def _body(
@@ -134,7 +183,6 @@ def _body(
     normals: np.ndarray,
     distance_mm: float,
     tag_mm: float,
-    outline: np.ndarray | None,
     dictionary: str,
     first_id: int,
     size_sigma_mm: float,
@@ -151,7 +199,25 @@ def _body(
         pose = Rigid(np.column_stack([x, np.cross(z, x), z]), distance_mm * normal)
         layout = TagLayout(((dictionary, first_id + k),), corners, TAG_SIGMA_MM)
         face = printed_face(
-            str(k + 1), layout, TAG_SIGMA_MM, size_sigma_mm, rough_target_from_face=pose, outline_mm=outline
+            str(k + 1),
+            layout,
+            TAG_SIGMA_MM,
+            size_sigma_mm,
+            rough_target_from_face=pose,
+            outline_mm=_outline(k, normals, distance_mm, pose),
         )
         faces.append(face)
     return TargetDesign(name, "bright", tuple(faces))
+
+
+def _outline(face: int, normals: np.ndarray, distance_mm: float, pose: Rigid) -> np.ndarray:
+    """Return the corners (k, 2) of a face of a regular body in its own frame: where it meets two neighbours."""
+    cosine = normals @ normals[face]
+    beside = np.flatnonzero(np.isclose(cosine, cosine[cosine < 1 - 1e-6].max()))
+    across = normals[beside] @ pose.rotation[:, :2]
+    beside = beside[np.argsort(np.arctan2(across[:, 1], across[:, 0]))]
+    corners = [
+        np.linalg.solve(normals[[face, one, other]], np.full(3, distance_mm))
+        for one, other in zip(beside, np.roll(beside, -1), strict=True)
+    ]
+    return (pose.inverse() @ np.array(corners))[:, :2].round(6)

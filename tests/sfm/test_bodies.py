@@ -1,28 +1,36 @@
 """Bodies whose faces are boards or tags: no dot board and no camera file are needed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stcal.boards.faces import shift_by_curves
 from stcal.boards.target import body_toml, load_body
-from stcal.design import scale_reference
+from stcal.design import KnownDistance, scale_reference
+from stcal.drawing.net import net_parts
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import camera_prior
 from stcal.io.design import load_target
 from stcal.labels import CircleLabel
 from stcal.sfm import pipeline
 from stcal.sfm.adjust.calibration import calibrate
+from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import refine
+from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, contributions_of
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera
+from stcal.sfm.planning.bodies import plan_body
+from stcal.sfm.planning.session import PlanOptions
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
-from stcal.synthetic.designs import tag_cube, tag_dodecahedron
+from stcal.synthetic.designs import tag_body, tag_cube, tag_dodecahedron
 from tests.outcome import fails_with
 
 CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
@@ -159,6 +167,57 @@ def test_a_body_of_tags_gives_faces_and_camera(target):
         )
         normalised = off @ np.linalg.solve(result.target.face_covariance[face], off)
         assert normalised < 30  # χ² of 6: by chance in 4 of 100 000
+
+
+def test_contributions_of_a_body_add_up_to_its_covariance():
+    target = tag_cube(60, size_sigma_mm=0.1)
+    scene, images = observed(target, 12, 8)
+    start = Camera.of(scene.camera, "OPENCV")
+    body = place_and_find_camera(images, target.faces, [start])
+    model = refine(model_of_body(body, images, body.camera), body.camera, target, scale_reference(None, target)).model
+    distance = KnownDistance(CircleLabel("1", "0.0"), CircleLabel("6", "5.1"), 75.0, 0.02)
+    board = replace(scale_reference(None, target), distances=(distance,))
+    scale = find_scale(model, board)
+    metric = model.metric(scale.group_from_world())
+    found = contributions_of(adjusted([metric], board, body.camera, 0.02, camera_prior(body.camera)))
+    total = sum(found.covariance_mm2.values())
+    np.testing.assert_allclose(total, found.joint.covariance_mm2, atol=1e-8 * np.abs(total).max())
+    assert all(np.trace(found.covariance_mm2[kind]) > 0 for kind in (PRINT, SIZES, DISTANCES, INTRINSICS))
+
+
+def test_more_images_and_a_known_distance_help_a_planned_body():
+    target = tag_cube(60)
+    plan = plan_body(PlanOptions(images=12, distance_mm=300, width=900), target, target.rough_poses())
+    worst = plan.forecast.worst()[1]
+    remedies = {remedy.what: remedy.sigma_mm for remedy in plan.remedies}
+    assert set(plan.shares["2"]) == {"image noise", "print", "intrinsics"}
+    assert all(sigma < worst for sigma in remedies.values())
+    assert remedies["a distance known to 20 µm"] < 0.6 * worst  # the edges of tags leave the size open
+
+
+def test_straight_lines_along_curved_edges_meet_beside_the_corners():
+    camera = body_camera(900)
+    square = np.array([[[700.0, 60], [820, 60], [820, 180], [700, 180]]])
+    shift = shift_by_curves(square, camera)
+    assert 0.1 < np.abs(shift).max() < 0.5
+    assert np.abs(shift_by_curves(square, replace(camera, distortion=np.zeros(8)))).max() < 1e-9
+
+
+@pytest.mark.parametrize("body", ["cube", "dodecahedron"])
+def test_neighbouring_faces_of_a_designed_body_share_their_corners(body):
+    target = tag_body(body, "60", "APRILTAG_36h11", 3)
+    corners = np.concatenate([f.rough_target_from_face @ np.pad(f.outline_mm, ((0, 0), (0, 1))) for f in target.faces])
+    apart = np.linalg.norm(corners[:, None] - corners, axis=2)
+    assert (np.sort(apart, axis=1)[:, :3] < 1e-5).all()  # three faces meet in each corner
+    assert np.sort(apart, axis=1)[:, 3].min() > 10
+    assert len(net_parts(target)) == 1
+
+
+def test_widths_that_are_none_are_refused():
+    with fails_with("E-OPTION-VALUE … 60,60 … width"):
+        tag_body("cube", "60,60", "APRILTAG_36h11", 0)
+    with fails_with("E-TAG-ID-RANGE … 50"):
+        tag_body("cube", "60", "4X4_50", 47)
 
 
 @pytest.mark.slow

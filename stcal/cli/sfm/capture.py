@@ -63,8 +63,10 @@ def plan(
     out: JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
+    from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import board_of, target_of
+    from stcal.io.design import board_of
+    from stcal.sfm.planning.bodies import plan_body
     from stcal.sfm.planning.file import PlanFile, plan_text
     from stcal.sfm.planning.noise import expected_noise, noise_of_run, stated_noise
     from stcal.sfm.planning.nominal import nominal_poses
@@ -73,7 +75,12 @@ def plan(
     from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.saved import load_run
 
-    design = target_of(target)
+    design = body_of(target)
+    printed = bool(design.with_faces(printed=True).faces)
+    if printed and (unfit := [name for name, value in {"--groups": groups, "--board": board}.items() if value]):
+        raise InputError(
+            "E-OPTION-CONFLICT", f"{unfit[0]}: not for a body with boards or tags on its faces; leave it out"
+        )
     if noise is not None and run is not None:
         raise InputError(
             "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: two sources of one σ; give one of them"
@@ -81,7 +88,7 @@ def plan(
     if noise is not None:
         centre_noise, source = stated_noise(noise)
     else:
-        centre_noise, source = noise_of_run(load_run(run)) if run else expected_noise()
+        centre_noise, source = noise_of_run(load_run(run, printed)) if run else expected_noise(of_corners=printed)
     options = PlanOptions(
         images,
         spread,
@@ -95,7 +102,8 @@ def plan(
         seed,
     )
     with designs_told(target, board):
-        result = planned(options, design, board_of(board), nominal_poses(design, faces))
+        nominal = nominal_poses(design, faces)
+        result = plan_body(options, design, nominal) if printed else planned(options, design, board_of(board), nominal)
     say(plan_text(result, source))
     write_if(out, lambda: PlanFile.of_plan(result), "as JSON")
 

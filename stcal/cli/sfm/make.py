@@ -1,9 +1,11 @@
 """Commands ``stcal-sfm draw`` and ``design``: targets and boards to be made."""
 
 import os
+from dataclasses import replace
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,7 +14,15 @@ from stcal.cli.terminal import StageProgress, print_each, say
 from stcal.errors import InputError
 from stcal.io.files import BOARD, TARGET
 
+if TYPE_CHECKING:
+    from stcal.sfm.planning.session import PlanOptions
+
 app = typer.Typer()
+
+
+class TagBody(StrEnum):
+    cube = "cube"
+    dodecahedron = "dodecahedron"
 
 
 @app.command()
@@ -55,8 +65,18 @@ def design(
         Path, typer.Argument(help="Write target.toml to this folder, and board.toml where there is none.")
     ],
     size: Annotated[
-        str, typer.Option("--size", help="Make it for a box of this width, height and depth: W,H,D in mm.")
+        str,
+        typer.Option(
+            "--size",
+            help="Make it for a box of this width, height and depth: W,H,D in mm; with --tags this width between "
+            "opposite faces.",
+        ),
     ],
+    tags: Annotated[
+        TagBody | None, typer.Option("--tags", help="Make a cube or dodecahedron with a tag on each face, no board.")
+    ] = None,
+    dictionary: Annotated[str, typer.Option(help="Take the tags of --tags from this dictionary.")] = "APRILTAG_36h11",
+    first_id: Annotated[int, typer.Option(min=0, max=100_000, help="Count the tags of --tags up from this id.")] = 0,
     circles: Annotated[int, typer.Option(min=9, max=40, help="Place this many circles on each face.")] = 10,
     radius: Annotated[
         float | None,
@@ -82,7 +102,8 @@ def design(
     images: Annotated[int, typer.Option("--images", min=2, max=500, help="Plan this many images in each group.")] = 10,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw everything random with this seed.")] = 0,
 ) -> None:
-    """Make a target for a box: circles on five sides that name each face with any three hidden; and forecast its σ."""
+    """Make a target for a box: circles on five sides that name each face with any three hidden; or a cube or
+    dodecahedron of tags; and forecast its σ."""
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, save_design
     from stcal.sfm.detect.sightings import likeness_notes
@@ -95,6 +116,19 @@ def design(
     target_file, board_file = folder / TARGET, folder / BOARD
     if os.path.lexists(target_file):
         raise InputError("E-OUTPUT-EXISTS", f"{target_file}: exists; move it away, or give another folder")
+    if tags is not None:
+        if unfit := [
+            name
+            for name, given in {"--circles": circles != 10, "--radius-mm": radius, "--bright": bright}.items()
+            if given
+        ]:
+            raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of circles, not of --tags; leave it out")
+        planned = PlanOptions(
+            images=max(images, 2), distance_mm=distance, width=width, camera=read_camera(camera) if camera else None,
+            seed=seed,
+        )  # fmt: skip
+        say(_tag_body(target_file, tags, size, (dictionary, first_id), planned))
+        return
     board = load_board(board_file) if os.path.lexists(board_file) else None
     model = read_camera(camera) if camera else None
     options = MakeOptions(size_of(size), circles, radius, distance, width, model, "bright" if bright else "dark", seed)
@@ -111,3 +145,18 @@ def design(
         save_design(board_file, product.board)
         say(board_file)
     say(f"\n{plan_text(forecast, source)}")
+
+
+def _tag_body(path: Path, kind: TagBody, size: str, tags: "tuple[str, int]", planned: "PlanOptions") -> str:
+    """Writes the file of a cube or dodecahedron of tags, and returns what it is and the forecast of its σ."""
+    from stcal.boards.target import save_body
+    from stcal.sfm.planning.bodies import plan_body
+    from stcal.sfm.planning.file import plan_text
+    from stcal.sfm.planning.noise import expected_noise
+    from stcal.synthetic.designs import made_text, tag_body
+
+    target = tag_body(kind.value, size, *tags)
+    noise, source = expected_noise(of_corners=True)
+    forecast = plan_body(replace(planned, noise=noise), target, target.rough_poses())
+    save_body(path, target)
+    return f"{made_text(target, forecast.setup.camera, planned.distance_mm)}\n{path}\n\n{plan_text(forecast, source)}"

@@ -501,6 +501,14 @@ class Shape:
         blocks = inner.reshape(n, 3, n, 3)
         return np.einsum("ai,minj,bj->manb", self.rotation, blocks, self.rotation, optimize=True).reshape(3 * n, 3 * n)
 
+    def by_size(self) -> np.ndarray:
+        """Returns the force (3n,) on the points, model frame, of an error of the stated size of one σ; 0 if exact."""
+        if not np.isfinite(self.size_weight):
+            return np.zeros(self.off_mm.size)
+        weighted = self.weight.reshape(-1, 1) * self.by_pose
+        force = weighted @ self._to_pose()[1][:, 6] * np.sqrt(self.size_weight)
+        return (force.reshape(-1, 3) @ self.rotation.T).ravel()
+
     def leverage(self, covariance_mm2: np.ndarray) -> np.ndarray:
         """Returns what the adjustment takes of each deviation's variance, (n, 3), of 1, from the covariance (3n, 3n)
         of the points."""

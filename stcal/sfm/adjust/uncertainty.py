@@ -17,10 +17,12 @@ from stcal.sfm.adjust.equations import (
     Reduced,
     Setting,
     Shared,
+    bars,
     free_directions,
     normal_equations,
     planes,
     robust_weights,
+    shapes,
 )
 from stcal.sfm.adjust.faces import (
     FrameKind,
@@ -240,9 +242,10 @@ def _moves(
 
 
 CIRCLES, DOTS, BOARD, FLATNESS, INTRINSICS = "circles", "dots", "board", "flatness", "intrinsics"
-OBSERVED = (CIRCLES, DOTS, BOARD, FLATNESS, INTRINSICS)
+PRINT, SIZES, DISTANCES = "print", "sizes", "distances"
+OBSERVED = (CIRCLES, DOTS, BOARD, FLATNESS, INTRINSICS, PRINT, SIZES, DISTANCES)
 """Kinds of observations: centres of circles and of dots in the images, positions of the dots on the board, flatness of
-the faces, and the given intrinsics if they are adjusted."""
+the faces, the given intrinsics if they are adjusted; shapes and sizes of faces of known shape, known distances."""
 AT_ONCE = 10_000
 """Number of observations that are processed together; it bounds the memory."""
 
@@ -297,6 +300,14 @@ def contributions_of(state: Adjusted) -> Contributions:
         heights = inverse[:c].reshape(-1, 3, c)[members]
         rows = across @ np.einsum("j,mjk->mk", plane_normal, heights) / setting.flatness_mm
         covariance[FLATNESS] += rows.T @ rows
+    for shape in shapes(shared, setting):
+        rows = inverse[(3 * shape.members[:, None] + np.arange(3)).ravel()]
+        by_size = rows.T @ shape.by_size()
+        covariance[SIZES] += np.outer(by_size, by_size)
+        covariance[PRINT] += rows.T @ shape.normal() @ rows - np.outer(by_size, by_size)
+    for members, along, _, sigma in bars(shared, setting):
+        row = along @ (inverse[3 * members[0] + np.arange(3)] - inverse[3 * members[1] + np.arange(3)]) / sigma
+        covariance[DISTANCES] += np.outer(row, row)
     variance = joint.sigma_scale**2
     return Contributions(
         joint,
@@ -359,6 +370,8 @@ class _Answer:
 
     def board(self, block: Block, shared: Shared) -> np.ndarray:
         """Returns the whitened rows (3d, k) of the positions of the dots."""
+        if not len(block.dots):
+            return np.zeros((0, self.points.shape[2]))
         rotation = block.model_from_board.rotation
         turned = block.expected_dots(shared) @ rotation.T
         rows = self.points[block.dots] + skew(turned) @ self.pose[:3] - self.pose[3:]

@@ -8,13 +8,23 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from stcal.design import BoardDesign, StatedSize
+from stcal.design import BoardDesign, StatedSize, faces_of_known_shape, known_distances
 from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.io.design import BoardSizeEntry, SizeEntry
 from stcal.io.toml import Strict, load_toml
-from stcal.sfm.adjust.uncertainty import BOARD, CIRCLES, DOTS, FLATNESS, INTRINSICS, Contributions
+from stcal.sfm.adjust.uncertainty import (
+    BOARD,
+    CIRCLES,
+    DISTANCES,
+    DOTS,
+    FLATNESS,
+    INTRINSICS,
+    PRINT,
+    SIZES,
+    Contributions,
+)
 
 FIELDS = ("instrument", "operator", "date", "traceability")
 """Fields in the head of every budget, empty if not given. Other fields follow them."""
@@ -140,48 +150,51 @@ def sources_of(
     common = found.joint.board_common
     shape = f"{100 * common:.0f} % of it common to all groups" if common else "each group its own"
     by_dots = f"sigma_mm of board.toml × σ₀ {found.joint.sigma_scale:.3f}; {shape}"
+    corners = bool(faces_of_known_shape(board))
+    centres = ("circle_centres", "corners and centres of faces" if corners else "centres of circles", CIRCLES)
+    dots = ("dot_centres", "centres of dots", DOTS)
     rows = [
-        Source(
-            "circle_centres",
-            "centres of circles",
-            "A",
-            "estimated",
-            "residuals; RMS per axis",
-            found.centre_sigma_px[CIRCLES],
-            "px",
-            found.covariance_mm2[CIRCLES],
-        ),
-        Source(
-            "dot_centres",
-            "centres of dots",
-            "A",
-            "estimated",
-            "residuals; RMS per axis",
-            found.centre_sigma_px[DOTS],
-            "px",
-            found.covariance_mm2[DOTS],
-        ),
-        Source(
-            "board_dots",
-            "places of dots",
-            "B",
-            "stated",
-            by_dots,
-            1e3 * board.sigma_mm * found.joint.sigma_scale,
-            "µm",
-            found.covariance_mm2[BOARD],
-        ),
-        _flatness(found, flatness_mm),
-        _intrinsics(found, camera, refined),
-        _scale(found.by_scale, zero, statement),
-    ]
+        Source(key, title, "A", "estimated", "residuals; RMS per axis", found.centre_sigma_px[kind], "px",
+               found.covariance_mm2[kind])
+        for key, title, kind in (centres, dots)[: 2 if board.rows else 1]
+    ]  # fmt: skip
+    if board.rows:
+        sigma_um = 1e3 * board.sigma_mm * found.joint.sigma_scale
+        covariance = found.covariance_mm2[BOARD]
+        rows.append(Source("board_dots", "places of dots", "B", "stated", by_dots, sigma_um, "µm", covariance))
+    rows += _own_size(found, board)
+    if not corners or found.covariance_mm2[FLATNESS].any():
+        rows.append(_flatness(found, flatness_mm))
+    rows.append(_intrinsics(found, camera, refined))
+    if board.rows:
+        rows.append(_scale(found.by_scale, zero, statement))
     grown = found.joint.xyz_model - found.joint.xyz_model.mean(0)
     for body, stated, effect in (
         ("board", statement.board, found.by_scale),
         ("target", statement.target, grown.ravel()),
     ):
-        rows += _temperature(body, stated, effect, statement)
+        if body == "target" or board.rows:
+            rows += _temperature(body, stated, effect, statement)
     return tuple(rows)
+
+
+def _own_size(found: Contributions, board: BoardDesign) -> Iterator[Source]:
+    """Yields the rows of faces of known shape and of known distances."""
+    factor = found.joint.sigma_scale
+    if faces := faces_of_known_shape(board):
+        within = max(face.sigma_mm or 0.0 for face in faces) * found.joint.print_factor * factor
+        words = f"sigma_mm of target.toml × {found.joint.print_factor * factor:.2f}, in the plane; off it --flatness"
+        yield Source("print", "print of faces", "B", "stated", words, 1e3 * within, "µm", found.covariance_mm2[PRINT])
+        sigma = max(face.size_sigma for face in faces)
+        stated: Origin = "stated" if sigma else "not stated"
+        words = "size_sigma_mm, and what moves the edges of tags" if sigma else "no size_sigma_mm; taken as exact"
+        ppm = 1e6 * sigma if sigma else None
+        yield Source("print_size", "size of print", "B", stated, words, ppm, "ppm", found.covariance_mm2[SIZES])
+    if known := known_distances(board):
+        sigma_um = 1e3 * max(each.sigma_mm for each in known) * factor
+        words = f"[[scale]] of target.toml, {len(known)} in all; the largest σ"
+        covariance = found.covariance_mm2[DISTANCES]
+        yield Source("distances", "known distances", "B", "stated", words, sigma_um, "µm", covariance)
 
 
 def _flatness(found: Contributions, flatness_mm: float | None) -> Source:

@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from stcal.boards.faces import shift_by_curves
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, InputError
 from stcal.geometry.camera import Camera
@@ -37,7 +38,7 @@ from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.predict import PredictedCircles, SecondLook, measure_predicted
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
-CACHE_VERSION = 8
+CACHE_VERSION = 9
 """Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
 LOSSY = (".jpg", ".jpeg")
@@ -126,12 +127,20 @@ def detect_files(
     return DetectionResult(tuple(images), tuple(skipped), camera)
 
 
-def seen_by(detection: DetectionResult, camera: Camera) -> DetectionResult:
-    """Returns the detections of corners alone for another camera, which moves none of them."""
+def seen_by(detection: DetectionResult, camera: Camera, target: TargetDesign) -> DetectionResult:
+    """Returns the detections of corners alone, made with a camera without distortion, for another camera.
+
+    It moves those of tags, see :func:`stcal.boards.faces.shift_by_curves`.
+    """
     images = []
     for image in detection.images:
         centres = image.detection.centres
-        seen = replace(centres, centre=camera.normalised_from_pixel(centres.centre_px))
+        centre_px = centres.centre_px.copy()
+        for sighting in image.detection.printed:
+            if target.face(sighting.face).of_tags:
+                corners = centre_px[sighting.rows].reshape(-1, 4, 2)
+                centre_px[sighting.rows] = (corners - shift_by_curves(corners, camera)).reshape(-1, 2)
+        seen = replace(centres, centre_px=centre_px, centre=camera.normalised_from_pixel(centre_px))
         images.append(replace(image, detection=replace(image.detection, centres=seen)))
     return replace(detection, images=tuple(images), camera=camera)
 

@@ -244,7 +244,11 @@ def is_named(face: FaceDesign, found: np.ndarray, target: TargetDesign) -> bool:
 
 
 def likeness_notes(target: TargetDesign) -> list[str]:
-    """Returns notes about faces that only one circle distinguishes, and about mirror images among the faces."""
+    """Returns notes about faces that only one circle distinguishes, and about mirror images among the faces.
+
+    Tags name the faces that they are printed on, and no reflection is read as a tag.
+    """
+    target = target.with_faces(printed=False)
     near = [telling for face in target.faces for other in target.faces for telling in _telling(face, other)]
     notes = []
     if near:

@@ -105,7 +105,7 @@ def diagnose(
     models = read_model(run.folder / "target_model", run.observations, ids, run.corrected_px).in_mm()
     mapped = {name for model in models for name in model.images}
     try:
-        findings = [*_files(run), *_images(run, mapped), *_circles(run), *_faces(run)]
+        findings = [*_files(run), *_images(run, mapped), *_circles(run), *_faces(run), *_unread(run, models)]
         files, circles = run.report["summary"]["files"], run.faces.circles
     except (KeyError, TypeError) as error:
         raise InputError("E-RUN-VERSION", f"run {run.folder}: of another version ({error}); run it again") from error
@@ -194,6 +194,34 @@ def _faces(run: SavedRun) -> list[Finding]:
     return findings + [Finding("", (), "note", None, None, "", note) for note in notes]
 
 
+MAX_TILT_DEG = 60.0
+"""Largest tilt of a face at which its tags are to be read."""
+
+
+def _unread(run: SavedRun, models: Sequence[MetricModel]) -> list[Finding]:
+    """Returns findings on faces with boards or tags that an image shows whole, at a moderate tilt, without a corner."""
+    poses, size = run.faces.poses(), np.array([run.camera.width, run.camera.height])
+    seen = {image.name: {str(label).partition(":")[0] for label in image.labels} for image in run.observations}
+    findings = []
+    for face in run.target.with_faces(printed=True).faces:
+        if face.id not in poses:
+            continue
+        for name, pose in (
+            (name, pose) for m in models for name, pose in zip(m.images, m.camera_from_model, strict=True)
+        ):
+            camera_from_face = pose @ poses[face.id]
+            xyz = camera_from_face @ face.places_mm(face.ids)
+            ray = xyz.mean(0) / np.linalg.norm(xyz.mean(0))
+            tilt = float(np.degrees(np.arccos(np.clip(-face.outward * camera_from_face.rotation[:, 2] @ ray, -1, 1))))
+            if face.id in seen[name] or tilt > MAX_TILT_DEG or (xyz[:, 2] <= 0).any():
+                continue
+            pixels = run.camera.project(xyz)
+            if ((pixels > 0) & (pixels < size - 1)).all():
+                labels = tuple(str(label) for label in face.labels())
+                findings.append(Finding(name, labels, "tags", round(tilt), None, "° tilt", advice("tags")))
+    return findings
+
+
 def _depth_of_field(run: SavedRun) -> list[str]:
     """Returns which f-number and distance keep what depth of field moves centres by below their σ, if more is moved.
 
@@ -241,11 +269,14 @@ class _Job:
 def _jobs(run: SavedRun, images: Path, models: Sequence[MetricModel], circles: dict[str, np.ndarray]) -> list[_Job]:
     """Returns jobs for mapped images that lack visible circles, and for images without a pose. Groups without a model
     have no jobs."""
-    settings = run.camera, run.target, run.board, run.options.ellipses
+    target = run.target.with_faces(printed=False)
+    settings = run.camera, target, run.board, run.options.ellipses
+    if not (target.faces or run.board.rows):
+        return []  # corners are not circles, and no option for circles lets them in
     observations = {image.name: image for image in run.observations}
     jobs = []
     for model in models:
-        missing = missing_circles(model, circles, observations, run.camera, run.target, run.board)
+        missing = missing_circles(model, circles, observations, run.camera, target, run.board)
         jobs += [_Job(images / name, name, *settings, planes, frozenset()) for name, planes in missing.items()]
         jobs += [
             _Job(images / name, name, *settings, [], frozenset(model.labels))

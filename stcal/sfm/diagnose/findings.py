@@ -34,6 +34,7 @@ ADVICE = {
     "board_dots": "found, but too few of the board: let in dots that have lines of their own",
     "board_grid": "found, but not joined to the board's grid: show the dots between, cover what is like a dot",
     "board_numbering": "found, but the board's numbering stays open: show a face that the group's other images show",
+    "tags": "none of its tags is read: show it whole with the white about it, less obliquely, sharper, evenly lit",
     "rim": "partly hidden, reflecting or disturbed: uncover it",
     "not_examined": "give the folder of the images with --images",
     "found_now": "found now: the image or the program has changed since the run; run it again",

@@ -22,7 +22,7 @@ from stcal.sfm.interop.export import FORMS, ExportedRun
 from stcal.sfm.interop.export_database import Exported, export_database
 from stcal.sfm.interop.export_model import ExportedModel
 from stcal.sfm.interop.external import faces_from_models
-from stcal.sfm.interop.gates import Gate, GateVerdict, PairGates
+from stcal.sfm.interop.gates import MIN_INLIERS, Gate, GateVerdict, PairGates
 from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable
 from stcal.sfm.interop.schema import schema_of_version
 from stcal.sfm.mapping.colmap import pycolmap
@@ -117,6 +117,7 @@ def crosscheck(
             pair = _initial_pair(run, name, ids)
             work = folder / f"group{index}"
             options = mapper_options(native, names, pair)
+            _require_enough(name, pair, ids, run)
             map_natively(native, folder / "native.db", work, names, options, timeout_s)
             path, model = _native_model(work / "models", name, native, run, ids)
             native_models.append(model)
@@ -126,6 +127,18 @@ def crosscheck(
         of_native, of_pycolmap = faces_from_models(native_models, run), faces_from_models(pycolmap_models, run)
     readjusted = calibrate(adjusted, run.camera, run.target, run.board, run.options.adjustment(run.target))
     return _comparison(run, native, schema, of_native, of_pycolmap, readjusted, tolerances)
+
+
+def _require_enough(group: str, pair: tuple[int, int], ids: dict[str, int], run: SavedRun) -> None:
+    """Refuses a group whose initial pair shares fewer labels than COLMAP starts with: few tags have few corners."""
+    first, second = (image for image in run.observations if ids[image.name] in pair)
+    shared = len(set(first.labels) & set(second.labels))
+    if shared < MIN_INLIERS:
+        raise MappingError(
+            "E-CROSSCHECK-FEW",
+            f"group {group}: {first.name} and {second.name} share {shared} labels, {MIN_INLIERS} needed to begin with; "
+            "COLMAP cannot map it, check the run with the checks of its report",
+        )
 
 
 def mapper_options(native: NativeColmap, names: list[str], pair: tuple[int, int]) -> dict[str, str]:
@@ -567,7 +580,7 @@ def faces_text(calibration: Calibration, run: SavedRun) -> str:
         scale = calibration.scales[model.group]
         lines.append(
             f"group {model.group}: {len(model.images)} images, {len(model.labels)} circles, {scale.mm_per_unit:.6g} mm "
-            f"per unit, board within {1e3 * scale.rms_mm():.1f} µm RMS"
+            f"per unit, {'board' if scale.source == 'board' else scale.source} within {1e3 * scale.rms_mm():.1f} µm RMS"
         )
     difference = face_differences(calibration.target, run)
     rows = [["face", "x", "y", "z", "mm   against the run: µm", "mdeg"]]

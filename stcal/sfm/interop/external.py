@@ -23,7 +23,7 @@ Chained = Literal["chain", "paper"]
 
 
 def _options(run: SavedRun, solve: Chained) -> AdjustOptions:
-    options = replace(run.options, solve=solve)
+    options = replace(run.options, solve=solve, refine_camera=False)
     if solve == "paper":
         options = replace(options, frame="three-point", eccentricity=False)
     return options.adjustment(run.target)

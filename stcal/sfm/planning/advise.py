@@ -11,6 +11,7 @@ from stcal.parallel import Progress, kept_processes, one_thread, run_briefly
 from stcal.sfm.adjust.equations import rows_of_view
 from stcal.sfm.adjust.joint import JointResult, basis_of, photographs_of
 from stcal.sfm.data.model import MetricModel
+from stcal.sfm.planning.bodies import body_views
 from stcal.sfm.planning.forecast import (
     CentreNoise,
     Forecast,
@@ -80,9 +81,14 @@ class Advice:
     tried: int
 
     @property
+    def has_board(self) -> bool:
+        """Whether the size is from a board."""
+        return any("board" in shares for shares in self.shares.values())
+
+    @property
     def board_dominates(self) -> bool:
         """Whether most of the worst face's variance is the board's, so that more views help little."""
-        return self.shares[self.now.worst()[0]]["board"] > BOARD_DOMINATES
+        return self.shares[self.now.worst()[0]].get("board", 0.0) > BOARD_DOMINATES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,18 +163,24 @@ def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Ad
     now = forecast(known.models, setup, photographs=photographs)
     shares = variance_shares(now, without_sources(known.models, setup, now.derivatives, photographs))
     with kept_processes():
-        by_group = run_briefly(candidates, [(known.scene, model, setup, known.noise) for model in known.models])
-        views = [view for views_of_group in by_group for view in views_of_group]
+        views = [view for views_of_group in _candidates(known) for view in views_of_group]
         chosen = _greedy(known, views, now, photographs, count, progress or (lambda *_: None))
     return Advice(
         now,
         shares,
         known.noise,
         tuple(chosen),
-        tuple(_new_groups(known, now, photographs, max(count, MIN_NEW_GROUP))),
+        tuple(_new_groups(known, now, photographs, max(count, MIN_NEW_GROUP))) if setup.board.rows else (),
         forecast(known.models, setup.better_board(0.5), now.derivatives, photographs),
         len(views),
     )
+
+
+def _candidates(known: Known) -> list[list[PlannedView]]:
+    """Returns the views that are compared, by group."""
+    if not known.setup.board.rows:
+        return [body_views(model, known.setup, known.noise) for model in known.models]
+    return run_briefly(candidates, [(known.scene, model, known.setup, known.noise) for model in known.models])
 
 
 def _greedy(

@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from stcal.design import faces_of_known_shape
 from stcal.io.json import ByFace, Pair, Part, Pose, ResultFile, Vector3
 from stcal.sfm.planning.advise import Advice, Choice
 from stcal.sfm.planning.forecast import Forecast
@@ -242,14 +243,12 @@ def _shares_text(shares: dict[str, float]) -> str:
 
 def plan_text(plan: Plan, noise: str) -> str:
     """Returns the forecast as a table. ``noise`` : where the σ of the centres comes from."""
-    camera, options = plan.setup.camera, plan.options
-    boards = "the same board in all groups" if options.one_board else "a board of its own in each group"
+    options = plan.options
+    points = "centres" if plan.setup.board.rows else "corners"
     worst, sigma = plan.forecast.worst()
     lines = [
-        f"groups {', '.join(plan.groups)}, {options.images} images each, {camera.width}×{camera.height} px, "
-        f"{options.distance_mm:g} mm away, spread ±{options.spread_deg:g}°; {boards}, σ "
-        f"{MICRO * plan.setup.board.sigma_mm:g} µm",
-        f"{plan.observations} centres, σ {plan.centre_sigma_px:.4f} px RMS: {noise}",
+        _photographs_said(plan),
+        f"{plan.observations} {points}, σ {plan.centre_sigma_px:.4f} px RMS: {noise}",
         *forecast_table(plan.forecast, plan.shares),
         f"scale: σ {PPM * plan.forecast.scale_sigma:.1f} ppm; worst is face {worst}, {MICRO * sigma:.2f} µm, against "
         f"face {plan.setup.start.reference_face}",
@@ -267,8 +266,41 @@ def plan_text(plan: Plan, noise: str) -> str:
         f"{plan.aperture_mm:.2g} mm across ({lens}), and up to "
         "one 2.8 times as wide from twice as far; what it moves is corrected to about 15 %"
     )
-    lines.append("where board and cameras happen to stand (--seed) makes about ±3 %")
+    if plan.setup.board.rows:
+        lines.append("where board and cameras happen to stand (--seed) makes about ±3 %")
+    else:
+        lines.append("which faces the photographs happen to show (--seed) makes about ±20 %")
     return "\n".join(lines)
+
+
+def _photographs_said(plan: Plan) -> str:
+    """Returns what is photographed, and what tells its size."""
+    options, camera, board = plan.options, plan.setup.camera, plan.setup.board
+    size = f"{camera.width}×{camera.height} px, {options.distance_mm:g} mm away"
+    if not board.rows:
+        faces = faces_of_known_shape(board)
+        prints = sorted({f"{MICRO * (face.sigma_mm or 0.0):g}" for face in faces}, key=float)
+        found = "found from them" if options.camera is None else "of the file"
+        return (
+            f"{options.images} images, {size}, of a body in random poses that show two or more of {len(faces)} faces; "
+            f"camera {found}, σ of print {' to '.join(prints[:: max(1, len(prints) - 1)])} µm"
+        )
+    boards = "the same board in all groups" if options.one_board else "a board of its own in each group"
+    return (
+        f"groups {', '.join(plan.groups)}, {options.images} images each, {size}, spread ±{options.spread_deg:g}°; "
+        f"{boards}, σ {MICRO * board.sigma_mm:g} µm"
+    )
+
+
+_HOW_TO_GO = (
+    "go right and up as seen in the photograph named, about the middle of board and faces, which is to be in the",
+    "middle of the image, mm away; degrees of board and faces are from their normal. If board or target have",
+    "been moved since, photograph a new group.",
+)
+_HOW_TO_TURN = (
+    "go right and up as seen in the photograph named, about the middle of the body, or turn the body the other way;",
+    "it is to be in the middle of the image, mm away; degrees of faces are from their normal",
+)
 
 
 def advice_text(advice: Advice) -> str:
@@ -295,11 +327,7 @@ def advice_text(advice: Advice) -> str:
         before = after
     if not advice.choices:
         lines.append("none: no other view within ±50° shows the whole board and a face")
-    lines += [
-        "go right and up as seen in the photograph named, about the middle of board and faces, which is to be in the",
-        "middle of the image, mm away; degrees of board and faces are from their normal. If board or target have",
-        "been moved since, photograph a new group.",
-    ]
+    lines += _HOW_TO_GO if advice.has_board else _HOW_TO_TURN
     if advice.new_groups:
         lines += ["", "faces not photographed together yet, with the board beside them, as a new group:"]
         for pair in advice.new_groups:
@@ -336,7 +364,7 @@ def where(view: PlannedView) -> str:
 def _verdict(advice: Advice) -> str:
     """Returns the worst face after each kind of remedy, the best first."""
     board = advice.better_board.worst()[1]
-    ways = [(board, "a board of half the σ")]
+    ways = [(board, "a board of half the σ" if advice.has_board else "print and size of half the σ")]
     if advice.choices:
         count = len(advice.choices)
         ways.append((advice.choices[-1].sigma_mm, f"the {count} views together" if count > 1 else "the one view"))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ellipe, ellipk
 
-from stcal.design import BoardDesign, TargetDesign
+from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
@@ -31,6 +31,8 @@ BLUR_PX = 0.76
 PRACTICE = 1.3
 """Ratio of the σ of centres to the Cramér–Rao bound in runs on rendered photographs. It is due to estimated brightness
 gradients, quantisation and neighbouring edges."""
+CORNER_SIGMA_PX = 0.06
+"""σ of the corner of a tag or square in a good photograph: 0.05 px of its surroundings, and that of its edges."""
 ONE_PLATE = 0.99
 """Share of the board's variance that all groups have in common if the same plate is in all of them."""
 ENOUGH = 10_000
@@ -50,12 +52,13 @@ class CentreNoise:
     perimeter.
 
     ``edge`` : px^1.5; ``narrow_px`` : minor semi-axis at which half of the information is lost, 0 for no loss;
-    ``floor_px`` : σ per axis that does not depend on the size.
+    ``floor_px`` : σ per axis that does not depend on the size; ``corner_px`` : σ per axis of corners, which have none.
     """
 
     edge: float
     narrow_px: float = 0.0
     floor_px: float = 0.0
+    corner_px: float = CORNER_SIGMA_PX
 
     @classmethod
     def expected(cls) -> "CentreNoise":
@@ -68,6 +71,12 @@ class CentreNoise:
         evenly."""
         step = max(1, sum(len(model.point_index) for model in models) // ENOUGH)
         sampled = [model.observed(np.arange(0, len(model.point_index), step)) for model in models]
+        corner = [_is_corner(model, radius_mm) for model in sampled]
+        corners = [m.sigma_px()[own] for m, own in zip(sampled, corner, strict=True) if own.any()]
+        corner_px = float(np.sqrt((np.concatenate(corners) ** 2).mean())) if corners else CORNER_SIGMA_PX
+        sampled = [model.observed(np.flatnonzero(~own)) for model, own in zip(sampled, corner, strict=True)]
+        if not any(len(model.point_index) for model in sampled):
+            return replace(cls.expected(), corner_px=corner_px)
         rims = [_Rims.of(model, camera, radius_mm) for model in sampled]
         ratio = np.concatenate(
             [
@@ -79,19 +88,25 @@ class CentreNoise:
         usual = ratio <= 4 * np.median(ratio)
         slope, level = np.polyfit(narrow[usual], ratio[usual], 1)
         if slope <= 0 or level <= 0:
-            return cls(float(np.sqrt(ratio[usual].mean())))
-        return cls(float(np.sqrt(level)), float(np.sqrt(slope / level)))
+            return cls(float(np.sqrt(ratio[usual].mean())), corner_px=corner_px)
+        return cls(float(np.sqrt(level)), float(np.sqrt(slope / level)), corner_px=corner_px)
 
     def scaled(self, factor: float) -> "CentreNoise":
         """Returns the same noise with all σ multiplied by a factor."""
-        return replace(self, edge=factor * self.edge, floor_px=factor * self.floor_px)
+        return CentreNoise(factor * self.edge, self.narrow_px, factor * self.floor_px, factor * self.corner_px)
 
     def applied(self, model: MetricModel, camera: Camera, radius_mm: dict[Label, float]) -> MetricModel:
         """Returns the metric model with the covariances that this noise gives its observations."""
         rims = _Rims.of(model, camera, radius_mm)
         size = self.edge**2 * (1 + (self.narrow_px / rims.minor_px) ** 2)
         covariance = size[:, None, None] * np.linalg.inv(rims.information) + self.floor_px**2 * np.eye(2)
+        covariance[_is_corner(model, radius_mm)] = self.corner_px**2 * np.eye(2)
         return replace(model, covariance_px2=covariance)
+
+
+def _is_corner(model: MetricModel, radius_mm: dict[Label, float]) -> np.ndarray:
+    """Returns the mask of the observations that are of corners, not of circles, (n,)."""
+    return np.array([radius_mm[label] <= POINT_RADIUS_MM for label in model.labels])[model.point_index]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,8 +166,15 @@ class Setup:
         return self.target.radius_of() | self.board.radius_of()
 
     def better_board(self, factor: float) -> "Setup":
-        """Returns the same setup with the σ of the board multiplied by a factor."""
+        """Returns the same setup with the σ of the board, and of print and distances, multiplied by a factor."""
+        if isinstance(self.board, ScaleReference):
+            return replace(self, board=self.board.with_sigma_times(factor))
         return replace(self, board=replace(self.board, sigma_mm=factor * self.board.sigma_mm))
+
+    @property
+    def size_source(self) -> str:
+        """What tells the size: ``board``, or ``print`` of a body without one."""
+        return "board" if self.board.rows else "print"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -255,7 +277,7 @@ def without_sources(
         quiet, quieter = {group: normal / OFF**2 for group, normal in photographs.items()}, models
     forecasts = {
         "image noise": forecast(quieter, setup, known, quiet),
-        "board": forecast(models, setup.better_board(OFF), known, photographs),
+        setup.size_source: forecast(models, setup.better_board(OFF), known, photographs),
     }
     if setup.prior is not None:
         forecasts["intrinsics"] = forecast(models, replace(setup, prior=None), known, fixed)

@@ -6,8 +6,8 @@ from stcal.sfm.runs.saved import SavedRun
 
 
 def stated_noise(sigma_px: float) -> tuple[CentreNoise, str]:
-    """Returns the same σ for every circle."""
-    return CentreNoise(0.0, floor_px=sigma_px), "--noise, whatever the size of a circle"
+    """Returns the same σ for every circle and corner."""
+    return CentreNoise(0.0, floor_px=sigma_px, corner_px=sigma_px), "--noise, whatever the size of a circle"
 
 
 def noise_of_run(run: SavedRun) -> tuple[CentreNoise, str]:
@@ -16,8 +16,10 @@ def noise_of_run(run: SavedRun) -> tuple[CentreNoise, str]:
     return known.noise.scaled(known.setup.sigma0), f"by size and tilt as in {run.folder}"
 
 
-def expected_noise() -> tuple[CentreNoise, str]:
-    """Returns the σ to expect in good photographs."""
+def expected_noise(of_corners: bool = False) -> tuple[CentreNoise, str]:
+    """Returns the σ to expect in good photographs; ``of_corners`` : of tags and squares, not of circles."""
+    if of_corners:
+        return CentreNoise.expected(), "what corners of tags have in rendered photographs (--noise, --run)"
     return CentreNoise.expected(), (
         f"image noise {100 * IMAGE_NOISE:g} % and contrast {100 * CONTRAST:g} % of full scale, edges "
         f"blurred by {BLUR_PX:g} px, {PRACTICE:g} × the Cramér–Rao bound (--noise, --run)"

@@ -73,23 +73,33 @@ class _Stand:
         directions = from_centre / distance[:, None]
         towards = directions.mean(0) / np.linalg.norm(directions.mean(0))
         middle = int(np.argmax(directions @ towards))
-        up = -model.camera_from_model[middle].rotation[1]
-        right = np.cross(up, towards)
-        right /= np.linalg.norm(right)
-        axes = np.array([right, np.cross(towards, right), towards])
+        axes = axes_of(model.camera_from_model[middle], towards)
         return cls(centre, axes, float(np.median(distance)), directions, model.images[middle])
 
     def pose(self, azimuth_deg: float, elevation_deg: float, roll_deg: float) -> Rigid:
         """Returns camera_from_target of a camera that looks at the centre."""
         azimuth, elevation, roll = np.radians([azimuth_deg, elevation_deg, roll_deg])
         local = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
-        forward = -np.array(local) @ self.axes
-        x = np.cross(forward, self.axes[1])
-        x /= np.linalg.norm(x)
-        y = np.cross(forward, x)
-        c, s = np.cos(roll), np.sin(roll)
-        rotation = np.array([c * x + s * y, c * y - s * x, forward])
-        return Rigid(rotation, -rotation @ (self.centre - self.distance_mm * forward))
+        return looking_at(self.centre, np.array(local) @ self.axes, self.axes[1], self.distance_mm, roll)
+
+
+def axes_of(camera_from_target: Rigid, towards: np.ndarray) -> np.ndarray:
+    """Returns the axes (3, 3) rows right, up, towards the camera, as a photograph shows right and up."""
+    towards = towards / np.linalg.norm(towards)
+    right = np.cross(-camera_from_target.rotation[1], towards)
+    right /= np.linalg.norm(right)
+    return np.array([right, np.cross(towards, right), towards])
+
+
+def looking_at(centre: np.ndarray, direction: np.ndarray, up: np.ndarray, distance_mm: float, roll: float) -> Rigid:
+    """Returns camera_from_target of a camera that looks at the centre from a direction (3,), rolled by rad."""
+    forward = -direction
+    x = np.cross(forward, up)
+    x /= np.linalg.norm(x)
+    y = np.cross(forward, x)
+    c, s = np.cos(roll), np.sin(roll)
+    rotation = np.array([c * x + s * y, c * y - s * x, forward])
+    return Rigid(rotation, -rotation @ (centre - distance_mm * forward))
 
 
 def known_scene(models: tuple[MetricModel, ...], joint: JointResult, setup: Setup, colmap_model: str) -> Scene:
@@ -147,13 +157,13 @@ def candidates(scene: Scene, model: MetricModel, setup: Setup, noise: CentreNois
         labels = set(model.labels) & shown(scene, model.group, i, limit)
         if not _worth_it(labels, model):
             continue
-        single = _single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup.camera)
+        view_model = single(model, f"{model.group}/view {place}", poses[i], sorted(labels), setup.camera)
         position = poses[i].inverse().translation
         cosine = stand.directions @ (position - stand.centre) / stand.distance_mm
         views.append(
             PlannedView(
                 model.group,
-                noise.applied(single, setup.camera, setup.radius_mm()),
+                noise.applied(view_model, setup.camera, setup.radius_mm()),
                 *place,
                 stand.distance_mm,
                 _tilts_deg(scene, model.group, position, labels),
@@ -216,7 +226,7 @@ def _tilts_deg(scene: Scene, group: str, position: np.ndarray, seen: set[Label])
     }
 
 
-def _single(model: MetricModel, name: str, pose: Rigid, labels: list[Label], camera: Camera) -> MetricModel:
+def single(model: MetricModel, name: str, pose: Rigid, labels: list[Label], camera: Camera) -> MetricModel:
     """Returns the model of one image of the group that shows these points."""
     place = {label: i for i, label in enumerate(model.labels)}
     points = np.array([place[label] for label in labels])

@@ -332,7 +332,8 @@ def _scene(result: RunResult) -> dict:
                 }
             )
         dots = [i for i, label in enumerate(model.labels) if isinstance(label, DotLabel)]
-        boards[model.group] = model.xyz_model[dots]
+        if dots:
+            boards[model.group] = model.xyz_model[dots]
     return {
         "cameras": cameras,
         "boards": boards,

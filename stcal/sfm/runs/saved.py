@@ -154,12 +154,6 @@ def load_run(folder: str | Path, printed: bool = False) -> SavedRun:
             f"run {folder}: unfinished, or of another version: no {', '.join(missing)}; run it again",
         )
     assert target is not None
-    if not printed and target.with_faces(printed=True).faces:
-        raise InputError(
-            "E-RUN-PRINTED",
-            f"run {folder}: its target has boards or tags on its faces, which this command does not take yet; "
-            "`measure`, `compare`, `report` and `verify` do",
-        )
     marker, faces, report = (read_json(folder / n, "", AGAIN) for n in (RUN_MARKER, "faces.json", "report.json"))
     camera = read_camera(folder / CAMERA).calibrated(0, 0)
     board = scale_reference(None if without_board else load_run_board(folder / BOARD), target)

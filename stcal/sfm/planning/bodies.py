@@ -1,0 +1,201 @@
+"""Forecast of photographs of a body with boards or tags on its faces, which is turned before a camera; no board."""
+
+from collections import Counter
+from dataclasses import replace
+from itertools import combinations, product
+
+import numpy as np
+
+from stcal.design import FaceDesign, KnownDistance, ScaleReference, TargetDesign, scale_reference
+from stcal.errors import InputError
+from stcal.geometry.rigid import Rigid
+from stcal.io.cameras.model import camera_prior, refinable
+from stcal.labels import CircleLabel
+from stcal.parallel import one_thread
+from stcal.sfm.adjust.chain import CalibratedTarget
+from stcal.sfm.adjust.scale import with_edge_sigma
+from stcal.sfm.data.model import ImageObservations, MetricModel
+from stcal.sfm.mapping.incremental import assemble
+from stcal.sfm.mapping.placed import unknown_lens
+from stcal.sfm.planning.forecast import CentreNoise, Setup, forecast, variance_shares, without_sources
+from stcal.sfm.planning.session import NEARER, Plan, PlanOptions, Remedy, widest_aperture_mm
+from stcal.sfm.planning.views import PlannedView, axes_of, looking_at, single
+from stcal.synthetic.body import BodyOptions, BodyScene, body_camera, make_body_scene
+
+GROUP = "."
+DISTANCE_SIGMA_MM = 0.02
+"""σ of a distance that is measured with a caliper, as a remedy."""
+LEAST_COSINE = -0.2
+"""Smallest cosine of the angle between two faces that one view is to show."""
+MAX_TILT_RAD = float(np.radians(60))
+"""Largest tilt of a face whose corners count as seen."""
+
+
+@one_thread()
+def plan_body(options: PlanOptions, target: TargetDesign, nominal: dict[str, Rigid]) -> Plan:
+    """Returns the forecast of photographs of a body in random poses, each of which shows two faces at least.
+
+    Parameters
+    ----------
+    options : PlanOptions
+        Images, distance, camera and noise. Without a camera it is found from the photographs, as ``run`` does.
+    target : TargetDesign
+        Design of the body, mm.
+    nominal : dict of Rigid
+        Pose of every face in one common frame, mm, by face id.
+
+    Returns
+    -------
+    Plan
+        σ to expect of every face against the reference face, mm and rad, their sources, and what would help most.
+
+    Raises
+    ------
+    InputError
+        A face has circles, or the body does not fit into the image at this distance.
+    """
+    placed = replace(
+        target, faces=tuple(replace(face, rough_target_from_face=nominal[face.id]) for face in target.faces)
+    )
+    scene, model, setup = _planned(options, placed)
+    expected = forecast([model], setup)
+    half_print = forecast([model], setup.better_board(0.5), expected.derivatives)
+    measured = forecast([model], _with_distance(setup, model), expected.derivatives)
+    remedies = [
+        _remedy("twice the images", replace(options, images=2 * options.images), placed),
+        Remedy("print and size of half the σ", half_print.worst()[1]),
+        Remedy(f"a distance known to {1e3 * DISTANCE_SIGMA_MM:g} µm", measured.worst()[1]),
+        _remedy("nearer by 20 %", replace(options, distance_mm=NEARER * options.distance_mm), placed),
+    ]
+    return Plan(
+        options,
+        setup,
+        (GROUP,),
+        len(model.image_index),
+        float(np.sqrt((model.sigma_px() ** 2).mean())),
+        widest_aperture_mm([model], scene.camera),
+        expected,
+        variance_shares(expected, without_sources([model], setup, expected.derivatives)),
+        tuple(remedies),
+    )
+
+
+def _with_distance(setup: Setup, model: MetricModel) -> Setup:
+    """Returns the setup with the distance of two corners known, those that are farthest apart."""
+    away = np.linalg.norm(model.xyz_model[:, None] - model.xyz_model, axis=2)
+    one, two = (model.labels[i] for i in np.unravel_index(int(away.argmax()), away.shape))
+    assert isinstance(setup.board, ScaleReference)
+    assert isinstance(one, CircleLabel)
+    assert isinstance(two, CircleLabel)
+    known = KnownDistance(one, two, float(away.max()), DISTANCE_SIGMA_MM)
+    return replace(setup, board=replace(setup.board, distances=(*setup.board.distances, known)))
+
+
+def _remedy(what: str, options: PlanOptions, target: TargetDesign) -> Remedy:
+    try:
+        _, model, setup = _planned(options, target)
+    except InputError as error:
+        return Remedy(what, None, str(error))
+    return Remedy(what, forecast([model], setup).worst()[1])
+
+
+def _planned(options: PlanOptions, target: TargetDesign) -> tuple[BodyScene, MetricModel, Setup]:
+    """Returns the photographs of a plan: scene, model with the σ of its corners, and input of a forecast."""
+    file = options.camera
+    camera = body_camera(options.width) if file is None else file.calibrated(0, 0)
+    shape = BodyOptions(options.images, options.distance_mm, seed=options.seed, pose_sigma_mm=0, pose_sigma_deg=0)
+    scene = make_body_scene(target, camera, shape)
+    run = options.run.adjustment(target)
+    images, place = corners_seen(scene, options.noise.corner_px)
+    model = assemble(MetricModel, GROUP, images, list(scene.camera_from_target), place)
+    faces = {label.face for label in model.labels if isinstance(label, CircleLabel)}
+    if unseen := [face.id for face in target.faces if face.id not in faces]:
+        raise InputError(
+            "E-PLAN-UNLINKED",
+            f"plan: {options.images} images of which fewer than two show face {unseen[0]}; plan more images",
+        )
+    start = CalibratedTarget(run.reference_face, scene.target_from_face, place, {GROUP: Rigid()})
+    prior = camera_prior(unknown_lens(camera)) if file is None else None
+    if file is not None and run.refine_camera:
+        prior = camera_prior(refinable(camera))
+    size = with_edge_sigma(scale_reference(None, target), images)
+    return scene, model, Setup(target, size, camera, start, run.frame, run.flatness_mm, prior, 0)
+
+
+def corners_seen(scene: BodyScene, sigma_px: float) -> tuple[list[ImageObservations], dict[CircleLabel, np.ndarray]]:
+    """Returns exact corners with this σ of the faces that two photographs show, and their places, (3,) mm by label."""
+    shown = [scene.faces_in_view(image) for image in range(len(scene.camera_from_target))]
+    often = Counter(face.id for faces in shown for face in faces)
+    images: list[ImageObservations] = []
+    place: dict[CircleLabel, np.ndarray] = {}
+    for i, (faces, pose) in enumerate(zip(shown, scene.camera_from_target, strict=True)):
+        own = {
+            label: xyz
+            for face in faces
+            if often[face.id] > 1
+            for label, xyz in zip(
+                face.labels(), scene.target_from_face[face.id] @ face.places_mm(face.ids), strict=True
+            )
+        }
+        xy, n = scene.camera.project(pose @ np.array(list(own.values())).reshape(-1, 3)), len(own)
+        covariance = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))
+        images.append(ImageObservations(f"{i:04d}", GROUP, tuple(own), xy, xy, np.zeros((n, 2, 2)), covariance))
+        place |= own
+    return images, place
+
+
+SHARES = (0.35, 0.5, 0.65)
+"""Where candidates stand between the normals of two faces."""
+ROLLS_DEG = (0.0, 90.0)
+
+
+def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[PlannedView]:
+    """Returns candidates for further photographs of a body: each shows two faces that one view can show together.
+
+    A view is told from the nearest photograph, as the way of the camera about the middle of the body. To turn the body
+    the other way is the same.
+    """
+    target_from_face = setup.start.target_from_face
+    faces = [face for face in setup.target.faces if face.id in target_from_face]
+    normals = {face.id: face.outward * target_from_face[face.id].rotation[:, 2] for face in faces}
+    centre = (model.xyz_model.min(0) + model.xyz_model.max(0)) / 2
+    towards = np.array([pose.inverse().translation for pose in model.camera_from_model]) - centre
+    distance = float(np.median(np.linalg.norm(towards, axis=1)))
+    views = []
+    for one, two in combinations(faces, 2):
+        if normals[one.id] @ normals[two.id] < LEAST_COSINE:
+            continue
+        for share, roll in product(SHARES, ROLLS_DEG):
+            direction = share * normals[one.id] + (1 - share) * normals[two.id]
+            direction /= np.linalg.norm(direction)
+            cosine = towards @ direction / np.linalg.norm(towards, axis=1)
+            near = int(cosine.argmax())
+            axes = axes_of(model.camera_from_model[near], towards[near])
+            right, up, ahead = (axes @ direction).tolist()
+            pose = looking_at(centre, direction, axes[1], distance, np.radians(roll))
+            position = centre + distance * direction
+            tilts = {face.id: _tilt(position, target_from_face[face.id], normals[face.id], face) for face in faces}
+            shown = {face for face, tilt in tilts.items() if tilt < MAX_TILT_RAD}
+            labels = [label for label in model.labels if isinstance(label, CircleLabel) and label.face in shown]
+            name = f"{model.group}/view {one.id} {two.id} {share} {roll}"
+            views.append(
+                PlannedView(
+                    model.group,
+                    noise.applied(single(model, name, pose, labels, setup.camera), setup.camera, setup.radius_mm()),
+                    float(np.degrees(np.arctan2(right, ahead)).round()),
+                    float(np.degrees(np.arcsin(np.clip(up, -1, 1))).round()),
+                    roll,
+                    distance,
+                    {face: float(np.degrees(tilts[face])) for face in sorted(shown)},
+                    model.images[near],
+                    model.images[near],
+                    float(np.degrees(np.arccos(np.clip(cosine[near], -1, 1)))),
+                )
+            )
+    return views
+
+
+def _tilt(position: np.ndarray, target_from_face: Rigid, normal: np.ndarray, face: FaceDesign) -> float:
+    """Returns the angle between the normal of a face and the line of sight from a position, rad."""
+    ray = position - target_from_face @ np.append(face.xy_mm.mean(0), 0.0)
+    return float(np.arccos(np.clip(normal @ ray / np.linalg.norm(ray), -1, 1)))
