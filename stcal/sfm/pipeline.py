@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference
@@ -18,6 +20,7 @@ from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
 from stcal.sfm.adjust.scale import with_edge_sigma
+from stcal.sfm.camera.calibrate import MAX_FOCAL_SIGMA, camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.data.model import by_group, detections_csv
@@ -27,7 +30,7 @@ from stcal.sfm.detect.labels import LabelledImage, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
-from stcal.sfm.mapping.placed import LENS, PlacedBody, place_and_find_camera, place_with_camera
+from stcal.sfm.mapping.placed import LENS, PlacedBody, place_and_find_camera, place_with_camera, unknown_lens
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
@@ -62,7 +65,7 @@ def run(
         Folder with one folder of images for each group.
     camera
         COLMAP's cameras.txt, OpenCV's YAML or XML, or the result of :func:`stcal.io.cameras.read.read_camera`; if
-        None, it is found from the target's printed faces, and adjusted with all else.
+        None, it is found from the target's printed faces or the dots of the board, and adjusted with all else.
     out
         The run's folder: new, empty, or of an earlier run.
     target, board
@@ -86,7 +89,6 @@ def run(
     """
     options = options or RunOptions()
     if camera is None:
-        require_printed(body_of(target))
         options = replace(options, refine_camera=True)
     files = chosen_images(images, options.exclude)
     return run_on_files(files, images, camera, out, target, board, options, progress, reload_s)
@@ -113,12 +115,18 @@ def run_on_files(
     designs = target_design, scale_reference(known, target_design)
     if target_design.with_faces(printed=True).faces:
         _require_for_printed(options)
+    if model is None and not (designs[1].rows or target_design.with_faces(printed=True).faces):
+        raise InputError(
+            "E-CAMERA-NEEDED",
+            "missing option '--camera': circles without a board of dots need a camera file, which `stcal-sfm "
+            "calibrate-camera` makes; a board in view, or faces with a board or tags, tell the camera too",
+        )
     options = options.settled(target_design)
     if options.compare:
         require_comparable(options.adjustment(designs[0]))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
         result = _calibrated(files, model, folder, *designs, options, progress)
-        result = replace(result, camera_given=model is not None)
+        result = replace(result, camera_given=model is not None and not is_rough(model, options))
         if options.compare and result.target.target_from_face and model is not None:
             published = _published(files, model, folder, *designs, options, progress)
             result = replace(result, comparison=compare_with_paper(result, published))
@@ -136,9 +144,11 @@ def _calibrated(
     options: RunOptions,
     progress: Progress,
 ) -> RunResult:
-    if model is None:
+    if model is None and target.with_faces(printed=True).faces:
         detection, labelled, model = _with_found_camera(files, folder, target, board, options, progress)
     else:
+        if model is None or (board.rows and is_rough(model, options)):
+            model = _camera_of_dots(files, model, folder, target, board, options, progress)
         detection, labelled = labelled_images(files, model, folder, target, board, options, progress)
     with overlays_beside(detection, labelled, target, folder.stage, progress):
         return _solved(detection, labelled, model, folder, target, board, options, progress)
@@ -167,6 +177,41 @@ def _with_found_camera(
     return detection, labelled, model
 
 
+def is_rough(model: CameraModel, options: RunOptions) -> bool:
+    """Returns whether a camera is too rough to map the groups with: one to be refined whose focal length is known less
+    well than the boards tell it, as that of EXIF."""
+    if not options.refine_camera or model.covariance is None or model.colmap_model != LENS:
+        return False
+    return bool(np.sqrt(model.covariance[0, 0]) > MAX_FOCAL_SIGMA * model.focal[0])
+
+
+def _camera_of_dots(
+    files: ImageFiles,
+    rough: CameraModel | None,
+    folder: RunFolder,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    progress: Progress,
+) -> CameraModel:
+    """Returns the camera by which the dots of the board lie on their grid, with the covariance of what any camera
+    fulfils: the adjustment of all groups estimates it again, from the same dots.
+
+    Raises
+    ------
+    DetectionError, DegenerateError
+        Boards in too few images, or a lens that the boards do not tell.
+    """
+    start = guessed_cameras(files[0])[0] if rough is None else rough.calibrated(*require_common_size(files[0])[0])
+
+    def told(stage: str, done: int, total: int) -> None:
+        progress(f"{stage} for the camera", done, total)
+
+    detection, _ = _labelled(files, model_of(start, PHOTOGRAPHS), folder, target, board, options, told)
+    found = camera_of_dots(files[0], detection, board, start, LENS).camera
+    return model_of(unknown_lens(found), PHOTOGRAPHS)
+
+
 def guessed_cameras(files: Sequence[ImageFile]) -> list[CalibratedCamera]:
     """Returns cameras at which the search for an unknown one begins: that of the EXIF of the first photograph that
     states one, or one of medium focal length."""
@@ -181,16 +226,9 @@ def guessed_cameras(files: Sequence[ImageFile]) -> list[CalibratedCamera]:
     return [CalibratedCamera.of(start_camera(width, height, LENS), LENS)]
 
 
-def assumed_camera(files: Sequence[ImageFile], target: TargetDesign) -> CameraModel:
-    """Returns the camera with which corners of printed faces are detected where none is given: it moves none of them.
-
-    Raises
-    ------
-    InputError
-        The target has other faces, whose circles need a camera.
-    """
-    if len(target.with_faces(printed=True).faces) < len(target.faces):
-        require_printed(target.with_faces(printed=False))
+def assumed_camera(files: Sequence[ImageFile]) -> CameraModel:
+    """Returns the camera with which images are detected for a look where none is given. It moves no corner of a printed
+    face, and the centres of circles a little."""
     return model_of(guessed_cameras(files)[0], PHOTOGRAPHS)
 
 
@@ -211,22 +249,6 @@ def _require_for_printed(options: RunOptions) -> None:
         raise InputError(
             "E-OPTION-CONFLICT",
             f"{name}: for targets of circles alone, and faces here have boards or tags; leave it out",
-        )
-
-
-def require_printed(target: TargetDesign) -> None:
-    """Refuses a target without a face that a camera could be found from.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
-    if not target.with_faces(printed=True).faces:
-        raise InputError(
-            "E-CAMERA-NEEDED",
-            "missing option '--camera': circles need a camera file, which `stcal-sfm calibrate-camera` makes; only "
-            "faces with a board or tags tell the camera (see `stcal-sfm run --help`)",
         )
 
 

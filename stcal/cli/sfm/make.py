@@ -57,6 +57,13 @@ def design(
     size: Annotated[
         str, typer.Option("--size", help="Make it for a box of this width, height and depth: W,H,D in mm.")
     ],
+    faces: Annotated[
+        str,
+        typer.Option(
+            help="Place circles on these sides, of front, right, back, left and top; on all five if not given. The "
+            "first is the reference face."
+        ),
+    ] = "",
     circles: Annotated[int, typer.Option(min=9, max=40, help="Place this many circles on each face.")] = 10,
     radius: Annotated[
         float | None,
@@ -82,11 +89,11 @@ def design(
     images: Annotated[int, typer.Option("--images", min=2, max=500, help="Plan this many images in each group.")] = 10,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw everything random with this seed.")] = 0,
 ) -> None:
-    """Make a target for a box: circles on five sides that name each face with any three hidden; and forecast its σ."""
+    """Make a target for a box: circles on its sides that name each face with any three hidden; and forecast its σ."""
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, save_design
     from stcal.sfm.detect.sightings import likeness_notes
-    from stcal.sfm.make.box import size_of
+    from stcal.sfm.make.box import faces_of, size_of
     from stcal.sfm.make.design import MakeOptions, made_text, make_target
     from stcal.sfm.planning.file import plan_text
     from stcal.sfm.planning.noise import expected_noise
@@ -97,7 +104,8 @@ def design(
         raise InputError("E-OUTPUT-EXISTS", f"{target_file}: exists; move it away, or give another folder")
     board = load_board(board_file) if os.path.lexists(board_file) else None
     model = read_camera(camera) if camera else None
-    options = MakeOptions(size_of(size), circles, radius, distance, width, model, "bright" if bright else "dark", seed)
+    polarity = "bright" if bright else "dark"
+    options = MakeOptions(size_of(size), circles, radius, distance, width, model, polarity, seed, faces_of(faces))
     with StageProgress() as progress:
         product = make_target(options, partial(progress, "hide"))
     target = product.pattern.target
