@@ -5,10 +5,16 @@ package, loaded when it is first used.
 """
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from stcal.alone import fault
 
 if TYPE_CHECKING:
     from stcal import handeye, locate, register, robot, sfm
+
+if _fault := fault(Path(__file__).parent):
+    raise ImportError(_fault)
 
 __version__ = "0.1.0"
 __all__ = ["handeye", "locate", "register", "robot", "sfm"]

@@ -267,7 +267,9 @@ def verify(run: Run, out: JsonFile = None) -> None:
 @app.command()
 def report(
     run: Run,
-    pdf: Annotated[bool, typer.Option("--pdf", help="Also write the page as PDF, beside it (stcal[pdf]).")] = False,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Also write the page as PDF, beside it (needs the extra `pdf`).")
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option("--out", writable=True, help="Write the page to this file (HTML), not into the run's folder."),
