@@ -67,7 +67,7 @@ PlateMargin = Annotated[
         "--margin-mm",
         min=0,
         max=1e4,
-        help="Let plates without outline_mm in target.toml end this far beyond the rims of their circles.",
+        help="Assume that plates without outline_mm in target.toml end this far beyond the rims of their circles.",
     ),
 ]
 FlatBoardFile = Annotated[
