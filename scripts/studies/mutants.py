@@ -9,7 +9,7 @@ spread over all folders of the package; a fault changes one line of a function's
 `run` applies each to a copy of the repository and runs the tests that reach its line by `.coverage`, and those of its
 folder and the folders above that the coverage was not measured with: of both the shortest (by `build/tests.xml`) that
 together take `--seconds`, until one fails. Results are added to the file; a second call goes on where the first ended.
-Needs `pip install "stcal[mutants]"`.
+Needs `pip install "stereo-target-calibration[mutants]"`.
 """
 
 import argparse

@@ -32,7 +32,7 @@ class Family:
 FAMILIES = MappingProxyType({"tagStandard41h12": Family(2115, 5, 2), "tagCircle21h7": Family(38, 5, 0)})
 TOO_LARGE = ("tagStandard52h13", "tagCircle49h12", "tagCustom48h12")
 """Families of 42 000 to 66 000 tags: a detector needs a table of 1 to 2 GB in each process."""
-EXTRA = "pip install 'stcal[apriltag]'"
+EXTRA = "pip install 'stereo-target-calibration[apriltag]'"
 _APRILTAG = re.compile(r"(?:april)?[_ -]?t(?:ag)?[_ -]?(standard|circle|custom)?[_ -]?(\d{2}h\d{1,2})", re.I)
 
 

@@ -527,7 +527,8 @@ def _growth(pull: np.ndarray, residual: np.ndarray, place: np.ndarray, noise: np
     number -= number.min()
     bins = number.max() + 1
     row = (number + bins * np.arange(n)[:, None]).ravel()
-    squares = sum(np.bincount(row, (pull[..., i] * residual).ravel(), n * bins).reshape(n, bins) ** 2 for i in (0, 1))
+    pulls = [np.bincount(row, (pull[..., i] * residual).ravel(), n * bins).reshape(n, bins) for i in (0, 1)]
+    squares = (np.square(pulls[0]) + np.square(pulls[1])).sum(1)
     expected = noise * (pull**2).sum((1, 2)) * (1 - 2 / profiles)
     told = expected > 0
-    return max(float(np.median(squares.sum(1)[told] / expected[told])), 1.0) if told.any() else 1.0
+    return max(float(np.median(squares[told] / expected[told])), 1.0) if told.any() else 1.0

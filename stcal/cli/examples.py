@@ -10,7 +10,7 @@ EXAMPLES = {
     "sfm compare": ("result set/truth.json",),
     "sfm demo": ("--out demo",),
     "sfm draw": ("design/target.toml --out target.pdf",),
-    "sfm design": ("box --size 160,140,120 --circles 10",),
+    "sfm design": ("box --size 160,140,120 --faces front,right,top",),
     "sfm export-database": ("result old.db --schema 3.8",),
     "sfm export-model": ("result model --format colmap-txt",),
     "sfm export": ("result target.urdf", "result target.csv"),

@@ -37,7 +37,7 @@ OptionalCamera = Annotated[
     typer.Option(
         "--camera",
         help="Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB; found from "
-        "the target's printed faces if not given.",
+        "the board's dots or the target's printed faces if not given.",
     ),
 ]
 CAMERA = "--camera"
@@ -61,6 +61,15 @@ BoardFile = Annotated[
     Path | None,
     typer.Option(
         "--board", help="Read the board from this file (TOML, or Kalibr's YAML), in place of the reference board."
+    ),
+]
+PlateMargin = Annotated[
+    float,
+    typer.Option(
+        "--margin-mm",
+        min=0,
+        max=1e4,
+        help="Assume that plates without outline_mm in target.toml end this far beyond the rims of their circles.",
     ),
 ]
 FlatBoardFile = Annotated[

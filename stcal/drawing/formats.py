@@ -84,13 +84,13 @@ def new_drawing():
     Raises
     ------
     InputError
-        ``stcal[cad]`` is not installed.
+        ``stereo-target-calibration[cad]`` is not installed.
     """
     try:
         from ezdxf import units
         from ezdxf.filemanagement import new
     except ImportError as error:
-        raise InputError("E-EXTRA-MISSING", "DXF: needs ezdxf; install stcal[cad]") from error
+        raise InputError("E-EXTRA-MISSING", "DXF: needs ezdxf; install stereo-target-calibration[cad]") from error
     return new("R2010", units=units.MM)
 
 
@@ -110,7 +110,7 @@ def dxf(sheet: Sheet) -> str:
     Raises
     ------
     InputError
-        ``stcal[cad]`` is not installed.
+        ``stereo-target-calibration[cad]`` is not installed.
     """
     drawing = new_drawing()
     drawing.appids.add(APPLICATION)

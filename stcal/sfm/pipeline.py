@@ -25,6 +25,7 @@ from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
 from stcal.sfm.adjust.scale import with_edge_sigma
+from stcal.sfm.camera.calibrate import MAX_FOCAL_SIGMA, camera_of_dots
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.checks.verdict import Check
@@ -35,7 +36,7 @@ from stcal.sfm.detect.labels import LabelledImage, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
-from stcal.sfm.mapping.placed import LENS, PlacedBody, place_and_find_camera, place_with_camera
+from stcal.sfm.mapping.placed import LENS, PlacedBody, place_and_find_camera, place_with_camera, unknown_lens
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
@@ -76,7 +77,7 @@ def run(
         group, which are named ``12/0.png``, ``12/1.png`` … in results.
     camera
         Camera from :func:`stcal.load_camera` or :meth:`stcal.Camera.from_opencv`, or a camera file; if None, it is
-        found from the target's printed faces, and adjusted with all else.
+        found from the target's printed faces or the dots of the board, and adjusted with all else.
     out
         The run's folder: new, empty, or of an earlier run. If None, no file stays: a temporary folder holds COLMAP's
         database meanwhile.
@@ -104,7 +105,6 @@ def run(
     """
     options = options or RunOptions()
     if camera is None:
-        require_printed(body_of(target))
         options = replace(options, refine_camera=True)
     with mosaic_of(options.bayer) if options.bayer else nullcontext():
         if isinstance(images, Mapping):
@@ -140,6 +140,12 @@ def run_on_files(
     designs = target_design, scale_reference(known, target_design)
     if target_design.with_faces(printed=True).faces:
         _require_for_printed(options)
+    if model is None and not (designs[1].rows or target_design.with_faces(printed=True).faces):
+        raise InputError(
+            "E-CAMERA-NEEDED",
+            "missing option '--camera': circles without a board of dots need a camera file, which `stcal-sfm "
+            "calibrate-camera` makes; a board in view, or faces with a board or tags, tell the camera too",
+        )
     if options.compare:
         require_dots(known, f"--compare {options.compare}")
     options = replace(options, bayer=next((file.bayer for file in files[0] if file.bayer), "")).settled(target_design)
@@ -147,7 +153,7 @@ def run_on_files(
         require_comparable(options.adjustment(designs[0]))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
         result = _calibrated(files, model, folder, *designs, options, progress)
-        result = replace(result, camera_given=model is not None)
+        result = replace(result, camera_given=model is not None and not is_rough(model, options))
         if options.compare and result.target.target_from_face and model is not None:
             published = _published(files, model, folder, *designs, options, progress)
             result = replace(result, comparison=compare_with_paper(result, published))
@@ -190,9 +196,11 @@ def _calibrated(
     options: RunOptions,
     progress: Progress,
 ) -> RunResult:
-    if model is None:
+    if model is None and target.with_faces(printed=True).faces:
         detection, labelled, model = _with_found_camera(files, folder, target, board, options, progress)
     else:
+        if model is None or (board.rows and is_rough(model, options)):
+            model = _camera_of_dots(files, model, folder, target, board, options, progress)
         detection, labelled = labelled_images(files, model, folder, target, board, options, progress)
     with overlays_beside(detection, labelled, target, folder.stage, progress):
         return _solved(detection, labelled, model, folder, target, board, options, progress)
@@ -221,6 +229,41 @@ def _with_found_camera(
     return detection, labelled, model
 
 
+def is_rough(model: CameraModel, options: RunOptions) -> bool:
+    """Returns whether a camera is too rough to map the groups with: one to be refined whose focal length is known less
+    well than the boards tell it, as that of EXIF."""
+    if not options.refine_camera or model.covariance is None or model.colmap_model != LENS:
+        return False
+    return bool(np.sqrt(model.covariance[0, 0]) > MAX_FOCAL_SIGMA * model.focal[0])
+
+
+def _camera_of_dots(
+    files: ImageFiles,
+    rough: CameraModel | None,
+    folder: RunFolder,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    progress: Progress,
+) -> CameraModel:
+    """Returns the camera by which the dots of the board lie on their grid, with the covariance of what any camera
+    fulfils: the adjustment of all groups estimates it again, from the same dots.
+
+    Raises
+    ------
+    DetectionError, DegenerateError
+        Boards in too few images, or a lens that the boards do not tell.
+    """
+    start = guessed_cameras(files[0])[0] if rough is None else rough.calibrated(*require_common_size(files[0])[0])
+
+    def told(stage: str, done: int, total: int) -> None:
+        progress(f"{stage} for the camera", done, total)
+
+    detection, _ = _labelled(files, model_of(start, PHOTOGRAPHS), folder, target, board, options, told)
+    found = camera_of_dots(files[0], detection, board, start, LENS).camera
+    return model_of(unknown_lens(found), PHOTOGRAPHS)
+
+
 def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
     """Returns cameras at which the search for an unknown one begins: that of the EXIF of the first photograph that
     states one, or one of medium focal length."""
@@ -235,16 +278,9 @@ def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
     return [Camera.of(start_camera(width, height, LENS), LENS)]
 
 
-def assumed_camera(files: Sequence[ImageFile], target: TargetDesign) -> CameraModel:
-    """Returns the camera with which corners of printed faces are detected where none is given: it moves none of them.
-
-    Raises
-    ------
-    InputError
-        The target has other faces, whose circles need a camera.
-    """
-    if len(target.with_faces(printed=True).faces) < len(target.faces):
-        require_printed(target.with_faces(printed=False))
+def assumed_camera(files: Sequence[ImageFile]) -> CameraModel:
+    """Returns the camera with which images are detected for a look where none is given. It moves no corner of a printed
+    face, and the centres of circles a little."""
     return model_of(guessed_cameras(files)[0], PHOTOGRAPHS)
 
 
@@ -279,22 +315,6 @@ def require_dots(board: BoardDesign | None, option: str) -> None:
     if isinstance(board, CornerBoard):
         raise InputError(
             "E-OPTION-CONFLICT", f"{option}: finds boards of dots, and --board is one of squares or tags; leave it out"
-        )
-
-
-def require_printed(target: TargetDesign) -> None:
-    """Refuses a target without a face that a camera could be found from.
-
-    Raises
-    ------
-    InputError
-        There is none.
-    """
-    if not target.with_faces(printed=True).faces:
-        raise InputError(
-            "E-CAMERA-NEEDED",
-            "missing option '--camera': circles need a camera file, which `stcal-sfm calibrate-camera` makes; only "
-            "faces with a board or tags tell the camera (see `stcal-sfm run --help`)",
         )
 
 

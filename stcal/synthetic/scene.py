@@ -19,6 +19,7 @@ from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 __all__ = ["Group", "Scene", "SceneOptions", "make_scene", "nominal_target_from_face", "second_design"]
 
 FACE_MARGIN_MM = 15.0
+"""How far a plate of which the design states no outline is assumed to reach beyond the rims of its circles."""
 BOARD_MARGIN_MM = 15.0
 SENSOR_WIDTH_MM = 22.3
 FOCAL_PER_WIDTH = 24 / SENSOR_WIDTH_MM
@@ -52,6 +53,8 @@ class SceneOptions:
         σ of the in-plane placement of the target's circles, per axis. That of the board's dots is in its design.
     face_shift_mm, face_turn_deg : float
         RMS length and angle of the deviations of true face poses from nominal ones.
+    margin_mm : float
+        How far plates without ``outline_mm`` reach beyond the rims of their circles.
     """
 
     seed: int = 0
@@ -67,6 +70,7 @@ class SceneOptions:
     circle_sigma_mm: float = 0.02
     face_shift_mm: float = 0.5
     face_turn_deg: float = 0.5
+    margin_mm: float = FACE_MARGIN_MM
 
     def __post_init__(self):
         for name in ("width", "height", "images_per_group", "distance_mm", "spread_deg"):
@@ -120,6 +124,8 @@ class Scene:
         Board and views of each group, by name.
     seed : int
         Of all that is random, noise of the photographs included.
+    margin_mm : float
+        As in the options.
     """
 
     target: TargetDesign
@@ -129,6 +135,7 @@ class Scene:
     circles_target: dict[CircleLabel, np.ndarray]
     groups: dict[str, Group]
     seed: int
+    margin_mm: float = FACE_MARGIN_MM
 
     @property
     def reference_face(self) -> str:
@@ -141,7 +148,7 @@ class Scene:
 
     def face_outline(self, face_id: str) -> np.ndarray:
         """Returns the corners of the visible side of a face, (k, 3), target frame."""
-        return self.target_from_face[face_id] @ _face_corners(self.target.face(face_id))
+        return self.target_from_face[face_id] @ _face_corners(self.target.face(face_id), self.margin_mm)
 
     def board_outline(self, group: str) -> np.ndarray:
         """Returns the corners of the board's plate, (4, 3), target frame."""
@@ -186,7 +193,7 @@ def make_scene(
         raise InputError("E-TARGET-ROUGH-POSE", f"scene: no nominal pose of face {missing[0]}; give one pose per face")
     rng = np.random.default_rng(options.seed)
     target_from_face, circles = _made_target(target, nominal, options, rng)
-    _check_convex(target, target_from_face)
+    _check_convex(target, target_from_face, options.margin_mm)
     camera = _made_camera(options, rng)
     groups = {}
     for pair in options.groups or _default_groups(target, target_from_face):
@@ -194,7 +201,7 @@ def make_scene(
         if group.name in groups:
             raise InputError("E-SCENE-GROUP", f"scene: group {group.name} occurs twice; give different pairs")
         groups[group.name] = group
-    return Scene(target, board, camera, target_from_face, circles, groups, options.seed)
+    return Scene(target, board, camera, target_from_face, circles, groups, options.seed, options.margin_mm)
 
 
 def seen_by(options: SceneOptions, file: CameraModel) -> SceneOptions:
@@ -276,7 +283,7 @@ def _made_group(pair, target, board, camera, target_from_face, circles, options,
         np.array([circles[label] for row in labels for label in row]),
         np.repeat(normals, [len(row) for row in labels], axis=0),
         axes,
-        np.vstack([target_from_face[face.id] @ _face_corners(face) for face in target.faces]),
+        np.vstack([target_from_face[face.id] @ _face_corners(face, options.margin_mm) for face in target.faces]),
         dots,
         _board_rectangle(board),
     )
@@ -300,10 +307,10 @@ def _rectangle(xy: np.ndarray, radius: np.ndarray, margin: float) -> np.ndarray:
 
 
 @lru_cache(maxsize=32)
-def _face_corners(face: FaceDesign) -> np.ndarray:
+def _face_corners(face: FaceDesign, margin_mm: float) -> np.ndarray:
     if face.outline_mm is not None:
         return frozen(np.pad(face.outline_mm, ((0, 0), (0, 1))), (None, 3), "outline")
-    return _rectangle(face.xy_mm, face.radius_mm, FACE_MARGIN_MM)
+    return _rectangle(face.xy_mm, face.radius_mm, margin_mm)
 
 
 @lru_cache(maxsize=4)
@@ -311,16 +318,22 @@ def _board_rectangle(board: BoardDesign) -> np.ndarray:
     return _rectangle(board.xy_mm(), board.radii_mm(), BOARD_MARGIN_MM)
 
 
-def _check_convex(target: TargetDesign, target_from_face: dict[str, Rigid]) -> None:
+def _check_convex(target: TargetDesign, target_from_face: dict[str, Rigid], margin_mm: float) -> None:
     for front in target.faces:
         for face in target.faces:
             face_from_target = target_from_face[front.id].inverse()
-            height = (face_from_target @ (target_from_face[face.id] @ _face_corners(face)))[:, 2].max()
+            height = (face_from_target @ (target_from_face[face.id] @ _face_corners(face, margin_mm)))[:, 2].max()
             if height > CONVEX_TOLERANCE_MM:
+                plate = (
+                    f"its plate is assumed to reach {margin_mm:g} mm beyond its circles; state its outline_mm in the "
+                    "target file, or a smaller --margin-mm, or"
+                    if face.outline_mm is None
+                    else "simulated targets must be convex;"
+                )
                 raise DegenerateError(
                     "E-SCENE-FACES",
-                    f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may cover it; "
-                    "simulated targets must be convex, check the rough poses",
+                    f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may cover it: "
+                    f"{plate} check the rough poses",
                 )
 
 

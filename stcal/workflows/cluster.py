@@ -40,7 +40,7 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
     Raises
     ------
     InputError
-        ``stcal[dask]`` is not installed, no scheduler answers, it has no workers, or a worker has other versions.
+        The extra ``dask`` is not installed, no scheduler answers, it has no workers, or a worker has other versions.
     """
     with _connected(address) as workers, spread(workers, AT_ONCE * workers.threads, send_images):
         yield
@@ -64,7 +64,7 @@ def _connected(address: str) -> Iterator["_Workers"]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise InputError("E-EXTRA-MISSING", "--scheduler: needs Dask; install stcal[dask]") from error
+        raise InputError("E-EXTRA-MISSING", "--scheduler: needs Dask; pip install distributed") from error
     _require_address(address)
     with _silent("distributed"), Client(address, timeout=ANSWER_S, set_as_default=False) as client:
         try:

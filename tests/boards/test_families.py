@@ -81,7 +81,7 @@ def test_without_the_package_its_extra_is_offered(monkeypatch, tmp_path, family)
     monkeypatch.setattr(dictionaries, "find_spec", lambda _: None)
     known_dictionary.cache_clear()
     (tmp_path / "b.toml").write_text(LAYOUT.replace("TagStandard41h12", family))
-    with fails_with("E-KEY-VALUE … dictionary … pip install 'stcal[apriltag]' … tag36h11"):
+    with fails_with("E-KEY-VALUE … dictionary … pip install 'stereo-target-calibration[apriltag]' … tag36h11"):
         load_flat_board(tmp_path / "b.toml")
     known_dictionary.cache_clear()
 

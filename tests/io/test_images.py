@@ -219,10 +219,10 @@ def test_photographs_of_other_kinds_are_named_with_what_to_do(tmp_path, monkeypa
     monkeypatch.setattr(images, "SUFFIXES", images.USUAL)
     for name in ("a.HEIC", "b.dng", "c.txt"):
         (tmp_path / name).write_bytes(b"x")
-    with fails_with("E-IMAGES-NONE … a.HEIC: a HEIC photograph … pip install 'stcal[heic]' … export it as JPEG"):
+    with fails_with("E-IMAGES-NONE … a.HEIC: a HEIC photograph … [heic]' … export it as JPEG"):
         find_images(tmp_path)
     cv2.imwrite(str(tmp_path / "d.png"), np.zeros((4, 4), np.uint8))
     reasons = {each.name: each.reason for each in find_images(tmp_path)[1]}
-    assert "stcal[raw]" in reasons["b.dng"]
+    assert "stereo-target-calibration[raw]" in reasons["b.dng"]
     assert "develop it to TIFF" in reasons["b.dng"]
     assert reasons["c.txt"] == "not an image file"

@@ -5,14 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stcal.boards.faces import shift_by_curves
 from stcal.boards.target import body_toml, load_body
-from stcal.design import KnownDistance, scale_reference
+from stcal.design import KnownDistance, reference_target, scale_reference
 from stcal.drawing.net import net_parts
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import camera_prior
-from stcal.io.design import load_target
+from stcal.io.design import load_target, target_toml
 from stcal.labels import CircleLabel
 from stcal.sfm import pipeline
 from stcal.sfm.adjust.calibration import calibrate
@@ -101,9 +102,14 @@ def test_commands_without_such_faces_say_so(tmp_path):
         load_target(written(tmp_path, TARGET))
 
 
-def test_circles_need_a_camera(tmp_path):
+def test_circles_without_a_board_need_a_camera(tmp_path):
+    (tmp_path / "images").mkdir()
+    Image.new("L", (640, 480)).save(tmp_path / "images" / "1.png")
+    distance = '\nscale = [{ from = "1:1", to = "1:2", mm = 60, sigma_mm = 0.1 }]\n'
+    head, faces = target_toml(reference_target()).split("[[face]]", 1)
+    target = written(tmp_path, f"{head}{distance}[[face]]{faces}")
     with fails_with("E-CAMERA-NEEDED … --camera"):
-        pipeline.run(tmp_path, None, tmp_path / "r")
+        pipeline.run(tmp_path / "images", None, tmp_path / "r", target)
 
 
 def observed(target, count: int, seed: int):

@@ -165,6 +165,22 @@ def test_errors_say_what_to_do():
         SceneOptions(images_per_group=0)
 
 
+def test_a_plate_of_which_nothing_is_stated_says_what_is_assumed():
+    """Plates of two faces at a right angle, circles 20 mm from the edge: 30 mm about them reach over it by 10 mm."""
+    target = reference_target()
+    front, right = target.faces[:2]
+    pair = TargetDesign("pair", "bright", (front, right))
+    across = (front.xy_mm[:, 0] + front.radius_mm).max() + 20.0
+    inward = (right.xy_mm[:, 0] - right.radius_mm).min() - 20.0
+    turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    nominal = {"1": Rigid(), "2": Rigid(turn, np.array([across, 0, 0]) - turn @ np.array([inward, 0, 0]))}
+    exact = replace(OPTIONS, face_shift_mm=0.0, face_turn_deg=0.0, circle_sigma_mm=0.0, width=5184, height=3456)
+    with fails_with("E-SCENE-FACES … 10 mm … 30 mm … outline_mm … --margin-mm"):
+        make_scene(replace(exact, margin_mm=30.0), pair, nominal=nominal)
+    scene = make_scene(replace(exact, margin_mm=20.0), pair, nominal=nominal)
+    assert scene.face_outline("1")[:, 0].max() == pytest.approx(across)
+
+
 def _centroid(polygon: np.ndarray) -> np.ndarray:
     middle = polygon.mean(0)
     p, q = polygon - middle, np.roll(polygon - middle, -1, axis=0)

@@ -51,7 +51,9 @@ def budget(
         typer.Option("--lengths-statement", help="Read what is stated of that run from this file; --statement if not."),
     ] = None,
     page: ReportFile = None,
-    pdf: Annotated[bool, typer.Option("--pdf", help="Also write the page as PDF, beside it (stcal[pdf]).")] = False,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Also write the page as PDF, beside it (needs the extra `pdf`).")
+    ] = False,
     out: JsonFile = None,
 ) -> None:
     """Compute the uncertainty budget of faces and of the target's longest distances (GUM), each contribution apart."""
@@ -101,7 +103,7 @@ def _require_pdf(page: Path | None, run: Path) -> None:
     Raises
     ------
     InputError
-        If there is no page, the page itself has the suffix of a PDF, or ``stcal[pdf]`` is not installed.
+        If there is no page, the page itself has the suffix of a PDF, or the extra ``pdf`` is not installed.
     """
     from stcal.report.page import require_pdf
 

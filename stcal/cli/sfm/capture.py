@@ -13,6 +13,7 @@ from stcal.cli.options import (
     JsonFile,
     MaxDiameter,
     MinDiameter,
+    PlateMargin,
     Run,
     TargetFile,
     Workers,
@@ -51,7 +52,8 @@ def plan(
     ] = None,
     board: BoardFile = None,
     groups: Annotated[
-        str | None, typer.Option(help="Photograph these pairs of faces together, such as 12,14,15,23.")
+        str | None,
+        typer.Option(help="Photograph these pairs of faces together, such as 12,14,15,23 or front-right,front-top."),
     ] = None,
     refine_camera: Annotated[bool, typer.Option("--refine-camera", help="Adjust the intrinsics too.")] = False,
     one_board: Annotated[
@@ -60,6 +62,7 @@ def plan(
     seed: Annotated[
         int, typer.Option(min=0, max=MOST_SEED, help="Place board and cameras at random with this seed.")
     ] = 0,
+    margin: PlateMargin = 15.0,
     out: JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
@@ -100,6 +103,7 @@ def plan(
         one_board,
         RunOptions(refine_camera=refine_camera),
         seed,
+        margin,
     )
     with designs_told(target, board):
         nominal = nominal_poses(design, faces)

@@ -77,6 +77,13 @@ def design(
     ] = None,
     dictionary: Annotated[str, typer.Option(help="Take the tags of --tags from this dictionary.")] = "APRILTAG_36h11",
     first_id: Annotated[int, typer.Option(min=0, max=100_000, help="Count the tags of --tags up from this id.")] = 0,
+    faces: Annotated[
+        str,
+        typer.Option(
+            help="Place circles on these sides, of front, right, back, left and top; on all five if not given. The "
+            "first is the reference face."
+        ),
+    ] = "",
     circles: Annotated[int, typer.Option(min=9, max=40, help="Place this many circles on each face.")] = 10,
     radius: Annotated[
         float | None,
@@ -102,12 +109,12 @@ def design(
     images: Annotated[int, typer.Option("--images", min=2, max=500, help="Plan this many images in each group.")] = 10,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw everything random with this seed.")] = 0,
 ) -> None:
-    """Make a target for a box: circles on five sides that name each face with any three hidden; or a cube or
+    """Make a target for a box: circles on its sides that name each face with any three hidden; or a cube or
     dodecahedron of tags; and forecast its σ."""
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, save_design
     from stcal.sfm.detect.sightings import likeness_notes
-    from stcal.sfm.make.box import size_of
+    from stcal.sfm.make.box import faces_of, size_of
     from stcal.sfm.make.design import MakeOptions, made_text, make_target
     from stcal.sfm.planning.file import plan_text
     from stcal.sfm.planning.noise import expected_noise
@@ -131,7 +138,8 @@ def design(
         return
     board = load_board(board_file) if os.path.lexists(board_file) else None
     model = read_camera(camera) if camera else None
-    options = MakeOptions(size_of(size), circles, radius, distance, width, model, "bright" if bright else "dark", seed)
+    polarity = "bright" if bright else "dark"
+    options = MakeOptions(size_of(size), circles, radius, distance, width, model, polarity, seed, faces_of(faces))
     with StageProgress() as progress:
         product = make_target(options, partial(progress, "hide"))
     target = product.pattern.target

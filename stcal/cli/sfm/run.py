@@ -24,7 +24,7 @@ from stcal.cli.options import (
     handed_over,
     load_ahead,
 )
-from stcal.cli.terminal import StageProgress, say, verbose, write_if
+from stcal.cli.terminal import StageProgress, print_each, say, verbose, write_if
 from stcal.errors import ChecksFailed, InputError
 from stcal.io.files import keep_apart
 
@@ -237,7 +237,9 @@ def detect(
             "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
         )
     files = chosen_images(images, options.exclude)
-    model = pipeline.assumed_camera(files[0], target_design) if camera is None else read_camera(camera)
+    model = pipeline.assumed_camera(files[0]) if camera is None else read_camera(camera)
+    if camera is None and target_design.with_faces(printed=False).faces:
+        print_each("note", ["no --camera: a lens is assumed, and centres are good for a look, not for measuring"])
     inputs = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with (
         designs_told(target, board),
@@ -265,7 +267,9 @@ def verify(run: Run, out: JsonFile = None) -> None:
 @app.command()
 def report(
     run: Run,
-    pdf: Annotated[bool, typer.Option("--pdf", help="Also write the page as PDF, beside it (stcal[pdf]).")] = False,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Also write the page as PDF, beside it (needs the extra `pdf`).")
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option("--out", writable=True, help="Write the page to this file (HTML), not into the run's folder."),

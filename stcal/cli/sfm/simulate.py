@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, TargetFile, Workers, designs_told
+from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, PlateMargin, TargetFile, Workers, designs_told
 from stcal.cli.terminal import StageProgress, say, write_if
 from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER, json_text, real_place, save
@@ -96,7 +96,10 @@ def simulate(
     board: BoardFile = None,
     groups: Annotated[
         str | None,
-        typer.Option(help="Photograph these pairs of faces together, such as 12,14; all that show together if none."),
+        typer.Option(
+            help="Photograph these pairs of faces together, such as 12,14 or front-right,front-top; all that show "
+            "together if none."
+        ),
     ] = None,
     camera: Annotated[
         Path | None, typer.Option("--camera", help="Render with the camera of this file, in place of --width.")
@@ -107,6 +110,7 @@ def simulate(
     png: Annotated[bool, typer.Option("--png", help="Write PNG in place of JPEG.")] = False,
     sixteen_bit: Annotated[bool, typer.Option("--16-bit", help="Write 16-bit PNG.")] = False,
     seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw everything random with this seed.")] = 0,
+    margin: PlateMargin = 15.0,
     workers: Workers = None,
 ) -> None:
     """Write a simulated data set with known truth, of the reference design or one's own: images, cameras.txt,
@@ -124,6 +128,7 @@ def simulate(
         distance_mm=distance,
         spread_deg=spread,
         images_per_group=images,
+        margin_mm=margin,
     )
     kind = "png" if png or sixteen_bit else "jpg"
     if target is not None and (body := body_of(target)).with_faces(printed=True).faces:

@@ -1,4 +1,4 @@
-"""HEIC and raw photographs, which optional packages decode: ``stcal[heic]``, ``stcal[raw]``."""
+"""HEIC and raw photographs, which optional packages decode: extras ``heic`` and ``raw``."""
 
 import struct
 from importlib.util import find_spec
@@ -33,7 +33,7 @@ def readable() -> tuple[str, ...]:
 def reason_unread(suffix: str) -> str:
     """Return why a photograph of this suffix is not read, and what to do; for suffixes whose package is missing."""
     _, extra, what, remedy = EXTRAS[suffix]
-    return f"{what}, which is read after `pip install 'stcal[{extra}]'`; or {remedy}"
+    return f"{what}, which is read after `pip install 'stereo-target-calibration[{extra}]'`; or {remedy}"
 
 
 def is_heic(data: bytes) -> bool:

@@ -224,7 +224,8 @@ def _require_few(outliers: list[Outlier], observations: int, group: str) -> None
             "E-GROUP-CONTRADICTS",
             f"group {group}: more than {100 * MAX_OUTLIER_SHARE:.0f} % of {observations} observations contradict the "
             f"others, first {outliers[0].image} {outliers[0].label} by {outliers[0].residual_px:.1f} px; "
-            "check that the camera file belongs to the images, and that nothing but the camera moved",
+            "check that nothing but the camera moved, and that the camera file belongs to the images (without --camera "
+            "the camera is found from the board's dots)",
         )
 
 

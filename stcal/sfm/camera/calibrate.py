@@ -134,18 +134,43 @@ def calibrate_camera(
             detection = _detect(
                 files, camera, colmap_model, target, board, ellipses, Path(cache), workers, progress, rounds
             )
-            views = board_views(detection.images, board, camera)
-            skipped = (*not_images, *detection.skipped, *_without_board(detection, views))
-            require_views(views, files, skipped)
-            start = camera if before else closed_form(views, board, camera)
-            result = adjust_intrinsics(views, board, start, colmap_model)
-            require_determined(result, views)
+            views, skipped, result = _of_one_round(
+                files, not_images, detection, board, camera, colmap_model, before is None
+            )
             camera = result.camera
             settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS
             if settled:
                 break
             before = result
     return judged(result, views, skipped, rounds, settled, board)
+
+
+def camera_of_dots(
+    files: Sequence[ImageFile], detection: DetectionResult, board: BoardDesign, start: Camera, colmap_model: str
+) -> Intrinsics:
+    """Returns the intrinsics by the boards of one detection, which was made with the rough camera ``start``; errors as
+    :func:`calibrate_camera`."""
+    return _of_one_round(files, (), detection, board, start, colmap_model, True)[2]
+
+
+def _of_one_round(
+    files: Sequence[ImageFile],
+    not_images: Sequence[Skipped],
+    detection: DetectionResult,
+    board: BoardDesign,
+    camera: Camera,
+    colmap_model: str,
+    first: bool,
+) -> tuple[list[ImageObservations], tuple[Skipped, ...], Intrinsics]:
+    """Returns the views of the board, what was skipped, and the adjusted intrinsics. ``first`` : the focal length of
+    ``camera`` is not known."""
+    views = board_views(detection.images, board, camera)
+    skipped = (*not_images, *detection.skipped, *_without_board(detection, views))
+    require_views(views, files, skipped)
+    start = closed_form(views, board, camera) if first else camera
+    result = adjust_intrinsics(views, board, start, colmap_model)
+    require_determined(result, views)
+    return views, skipped, result
 
 
 def require_model(colmap_model: str) -> None:

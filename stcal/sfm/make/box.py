@@ -35,9 +35,13 @@ class Side:
         return np.array([[0, 0], [self.width, 0], [self.width, self.height], [0, self.height]])
 
 
-def sides_of(size_mm: tuple[float, float, float]) -> list[Side]:
-    """Returns the sides of a box of this width, height and depth. The origin is in the middle of the box, Z points
-    upwards."""
+NAMES = ("front", "right", "back", "left", "top")
+"""Names of the sides that may have circles."""
+
+
+def sides_of(size_mm: tuple[float, float, float], names: tuple[str, ...] = NAMES) -> list[Side]:
+    """Returns the sides with these names, in this order, of a box of this width, height and depth. The origin is in the
+    middle of the box, Z points upwards."""
     w, h, d = size_mm
     x, y, z = np.eye(3)
     rows = (
@@ -47,10 +51,34 @@ def sides_of(size_mm: tuple[float, float, float]) -> list[Side]:
         ("left", d, h, (-y, z), (-w, d, -h)),
         ("top", w, d, (x, y), (-w, -d, h)),
     )
-    return [
-        Side(name, width, height, Rigid(np.column_stack([across, up, np.cross(across, up)]), np.array(corner) / 2))
-        for name, width, height, (across, up), corner in rows
-    ]
+    side_of = {
+        name: Side(name, width, height, Rigid(np.column_stack([x, y, np.cross(x, y)]), np.array(corner) / 2))
+        for name, width, height, (x, y), corner in rows
+    }
+    return [side_of[name] for name in names]
+
+
+def faces_of(text: str) -> tuple[str, ...]:
+    """Parses ``front,right,top`` into the names of sides; all of them if the text is empty.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown or occurs twice, or if no two of the sides are neighbours.
+    """
+    names = tuple(name.strip() for name in text.split(",")) if text else NAMES
+    for name in names:
+        if name not in NAMES:
+            raise InputError("E-OPTION-VALUE", f"--faces {text}: {name!r} is no side; use some of {', '.join(NAMES)}")
+        if names.count(name) > 1:
+            raise InputError("E-OPTION-REPEATED", f"--faces {text}: {name} occurs twice; name each side once")
+    if len(names) < 2 or set(names) in ({"front", "back"}, {"left", "right"}):
+        raise InputError(
+            "E-OPTION-VALUE",
+            f"--faces {text}: two sides with a common edge needed, so that one photograph shows both; "
+            "use such as front,right,top",
+        )
+    return names
 
 
 def size_of(text: str) -> tuple[float, float, float]:

@@ -12,7 +12,7 @@ from stcal.geometry.camera import COEFFICIENTS, Camera
 from stcal.io.cameras.model import CameraModel
 from stcal.sfm.data.patterns import MAX_TILT_RAD
 from stcal.sfm.detect.circles.candidates import EllipseOptions, diameter_limits_px
-from stcal.sfm.make.box import sides_of
+from stcal.sfm.make.box import NAMES, sides_of
 from stcal.sfm.make.pattern import HIDDEN, LARGE, MadeTarget, make_pattern, unnamed_cases
 from stcal.synthetic.scene import FOCAL_PER_WIDTH
 
@@ -40,7 +40,8 @@ class MakeOptions:
 
     ``size_mm`` : width, height, depth of the box; ``circles`` : number of circles per face; ``radius_mm`` : radius of
     the smaller circles, None to choose a suitable one; ``distance_mm`` : distance from the cameras; ``width`` : image
-    width in px, for 3:2 images of a 24 mm lens; used only without ``camera``.
+    width in px, for 3:2 images of a 24 mm lens; used only without ``camera``; ``faces`` : names of the sides with
+    circles, the reference face first.
     """
 
     size_mm: tuple[float, float, float]
@@ -51,6 +52,7 @@ class MakeOptions:
     camera: CameraModel | None = None
     polarity: Polarity = "dark"
     seed: int = 0
+    faces: tuple[str, ...] = NAMES
 
     def ideal_camera(self) -> Camera:
         """Returns the camera without its distortion, or a default camera if none is given.
@@ -97,7 +99,7 @@ class Made:
 
 
 def make_target(options: MakeOptions, progress: Callable[[int, int], None] | None = None) -> Made:
-    """Returns a board, and a pattern for each side of the box except the one it stands on.
+    """Returns a board, and a pattern for each side of the box that is to have one.
 
     Parameters
     ----------
@@ -140,7 +142,7 @@ def _named(
 ) -> tuple[MadeTarget, int]:
     """Returns the first pattern whose faces are all identified in every case of hidden circles, and the number of
     cases."""
-    name, sides = "box {:g} x {:g} x {:g} mm".format(*options.size_mm), sides_of(options.size_mm)
+    name, sides = "box {:g} x {:g} x {:g} mm".format(*options.size_mm), sides_of(options.size_mm, options.faces)
     failed, cases = [], 0
     for attempt in range(ATTEMPTS):
         seed = [options.seed, attempt] if attempt else options.seed

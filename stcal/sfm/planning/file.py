@@ -266,6 +266,11 @@ def plan_text(plan: Plan, noise: str) -> str:
         f"{plan.aperture_mm:.2g} mm across ({lens}), and up to "
         "one 2.8 times as wide from twice as far; what it moves is corrected to about 15 %"
     )
+    if assumed := [face.id for face in plan.setup.target.faces if face.outline_mm is None]:
+        lines.append(
+            f"plates of {', '.join(assumed)} are assumed to end {options.margin_mm:g} mm beyond their circles "
+            "(--margin-mm, or outline_mm in target.toml)"
+        )
     if plan.setup.board.rows:
         lines.append("where board and cameras happen to stand (--seed) makes about ±3 %")
     else:

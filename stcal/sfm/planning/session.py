@@ -27,7 +27,7 @@ from stcal.sfm.planning.forecast import (
 )
 from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
-from stcal.synthetic.scene import Scene, SceneOptions, group_name, make_scene, seen_by
+from stcal.synthetic.scene import FACE_MARGIN_MM, Scene, SceneOptions, group_name, make_scene, seen_by
 
 SPREADS_DEG = (80.0, 70.0, 60.0, 50.0, 40.0)
 """Spreads that are tried, from the largest down. The largest tilts that a view may have often forbid wide ones."""
@@ -66,6 +66,8 @@ class PlanOptions:
         Flatness, frame, refined intrinsics and reference face.
     seed : int
         Seed of the random places of board and cameras.
+    margin_mm : float
+        How far plates without ``outline_mm`` reach beyond the rims of their circles.
 
     Raises
     ------
@@ -83,6 +85,7 @@ class PlanOptions:
     one_board: bool = True
     run: RunOptions = field(default_factory=RunOptions)
     seed: int = 0
+    margin_mm: float = FACE_MARGIN_MM
 
     def __post_init__(self):
         if self.images < MIN_IMAGES:
@@ -140,7 +143,8 @@ def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ..
         if name not in pair_of_name:
             raise InputError(
                 "E-OPTION-VALUE",
-                f"--groups: {name!r} is no pair of faces; use such as {', '.join(list(pair_of_name)[:3])}",
+                f"--groups: {name!r} is no pair of faces; use such as {', '.join(list(pair_of_name)[:3])}: ids of one "
+                "character beside each other, longer ones with a hyphen",
             )
     return tuple(pair_of_name[name] for name in names)
 
@@ -252,6 +256,7 @@ def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nomin
         face_turn_deg=0.0,
         width=options.width,
         height=height,
+        margin_mm=options.margin_mm,
     )
     if file is not None:
         shape = seen_by(shape, file)

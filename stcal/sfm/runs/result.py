@@ -242,7 +242,7 @@ class RunResult:
         return tuple(image for model in calibration.models for image in _images(model, calibration.camera, scale))
 
     def to_dataframe(self, rows: Rows = "faces") -> "DataFrame":
-        """Returns a table of the result as a DataFrame of pandas (``pip install stcal[pandas]``).
+        """Returns a table of the result as a DataFrame of pandas (``pip install stereo-target-calibration[pandas]``).
 
         Parameters
         ----------
@@ -261,7 +261,9 @@ class RunResult:
         try:
             from pandas import DataFrame
         except ImportError as error:
-            raise InputError("E-EXTRA-MISSING", "DataFrame: needs pandas; install stcal[pandas]") from error
+            raise InputError(
+                "E-EXTRA-MISSING", "DataFrame: needs pandas; install stereo-target-calibration[pandas]"
+            ) from error
         return DataFrame(tables[rows]())
 
     def _faces(self) -> list[Cells]:

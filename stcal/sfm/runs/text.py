@@ -103,8 +103,8 @@ def _found_camera(result: RunResult) -> Iterator[str]:
     sigma = np.sqrt(np.diag(refined.covariance))
     focal, centre = refined.focal, refined.centre
     yield (
-        f"camera: found from the photographs, no file: f {focal[0]:.1f} ± {sigma[0]:.1f}, {focal[1]:.1f} ± "
-        f"{sigma[1]:.1f} px, principal point {centre[0]:.1f} ± {sigma[2]:.1f}, {centre[1]:.1f} ± {sigma[3]:.1f} px"
+        f"camera: found from the photographs: f {focal[0]:.2f} ± {sigma[0]:.2f}, {focal[1]:.2f} ± {sigma[1]:.2f} px, "
+        f"principal point {centre[0]:.2f} ± {sigma[2]:.2f}, {centre[1]:.2f} ± {sigma[3]:.2f} px"
     )
     if sigma[0] > WEAK_FOCAL * focal[0]:
         yield (

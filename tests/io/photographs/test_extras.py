@@ -82,7 +82,7 @@ def test_the_camera_of_a_heic_photograph(tmp_path):
 def test_a_missing_package_is_named(monkeypatch, suffix):
     monkeypatch.setattr(extras, "find_spec", lambda _: None)
     data = b"\0\0\0\x18ftypheic" + bytes(40) if suffix == ".heic" else dng(SCENE)
-    with fails_with("E-IMAGE-EXTRA … pip install 'stcal["):
+    with fails_with("E-IMAGE-EXTRA … pip install 'stereo-target-calibration["):
         decode(data, f"a{suffix}")
 
 

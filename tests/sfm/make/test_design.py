@@ -12,7 +12,7 @@ from stcal.io.design import load_board, load_target, target_toml
 from stcal.lookalikes import MIN_COMMON
 from stcal.sfm.detect.sightings import confusable, in_common, is_named, mirror_images
 from stcal.sfm.make import design
-from stcal.sfm.make.box import sides_of, size_of
+from stcal.sfm.make.box import NAMES, faces_of, sides_of, size_of
 from stcal.sfm.make.design import MakeOptions, make_target
 from stcal.sfm.make.pattern import HIDDEN, LARGE, LEAST_CIRCLES, make_pattern, unnamed_cases
 from stcal.synthetic.designs import face_of_drawing, second_design
@@ -153,6 +153,29 @@ def test_another_seed_makes_another_pattern():
 def test_what_cannot_be_made_is_refused(options, said):
     with fails_with(said):
         make_target(options)
+
+
+def test_some_sides_alone_have_circles():
+    assert faces_of("") == NAMES
+    names = faces_of("top, front")
+    assert [side.name for side in sides_of(SIZE, names)] == ["top", "front"]
+    every = {side.name: side.box_from_plate.matrix() for side in sides_of(SIZE)}
+    for side in sides_of(SIZE, names):
+        np.testing.assert_array_equal(side.box_from_plate.matrix(), every[side.name])
+
+
+@pytest.mark.parametrize(
+    ("faces", "said"),
+    [
+        ("front,under", "E-OPTION-VALUE … --faces … under … front, right"),
+        ("front,right,front", "E-OPTION-REPEATED … --faces … front"),
+        ("top", "E-OPTION-VALUE … --faces top … two sides"),
+        ("left,right", "E-OPTION-VALUE … --faces left,right … two sides"),
+    ],
+)
+def test_sides_that_no_photograph_links_are_refused(faces, said):
+    with fails_with(said):
+        faces_of(faces)
 
 
 @pytest.mark.parametrize("size", ["130", "130,110", "a,b,c", "0,1,1", "nan,1,1", "1e6,1,1"])

@@ -1,11 +1,15 @@
 """``refined_cameras.txt``: the camera as a run adjusted it, a camera file for other commands."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from stcal.io.cameras.model import model_of
 from stcal.io.cameras.read import read_camera
 from stcal.io.files import CAMERA, REFINED_CAMERA
 from stcal.sfm.camera.intrinsics import model_parameters
+from stcal.sfm.mapping.placed import unknown_lens
 from stcal.sfm.pipeline import RunOptions, run
 
 CHI2_8_999 = 26.1
@@ -39,3 +43,26 @@ def test_refined_intrinsics_are_a_camera_file_with_sigma(small_dataset, small_sc
     assert np.abs(off[:4]).max() < 0.2 * np.abs(before[:4]).max()
     made(False)
     assert not (tmp_path / "run" / REFINED_CAMERA).exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", ["nothing", "as of EXIF, 4 % off"])
+def test_an_unknown_or_rough_camera_is_found_from_the_dots(small_dataset, small_scene, tmp_path, given):
+    """The photographs have a lens with distortion. f is right within 4 of its σ, and far nearer than what was given."""
+    true = small_scene.camera
+    rough = replace(true, focal=np.full(2, 1.04 * true.focal.mean()), distortion=np.zeros(12))
+    camera = None if given == "nothing" else model_of(unknown_lens(rough))
+    files = [small_dataset / name for name in ("target.toml", "board.toml")]
+    result = run(small_dataset / "images", camera, tmp_path / "run", *files, RunOptions(refine_camera=True, workers=1))
+    assert not result.camera_given
+    assert not result.notes
+    found = read_camera(tmp_path / "run" / REFINED_CAMERA)
+    assert found.covariance is not None
+    off = model_parameters(found.sized(0, 0), "OPENCV") - model_parameters(true, "OPENCV")
+    assert np.abs(off[:2]).max() < 4 * np.sqrt(found.covariance[0, 0])
+    assert np.abs(off[:2]).max() < 0.02 * 0.04 * true.focal.mean()
+    for face, pose in result.target.target_from_face.items():
+        error = pose.translation - small_scene.target_from_face[face].translation
+        if face != result.target.reference_face:
+            sigma = np.sqrt(np.diag(result.target.face_covariance[face])[3:])
+            assert 0.05 < np.abs(error / sigma).max() < 4

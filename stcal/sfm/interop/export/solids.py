@@ -84,7 +84,7 @@ def dxf(content: Content) -> str:
     Raises
     ------
     InputError
-        If ``stcal[cad]`` is not installed.
+        If ``stereo-target-calibration[cad]`` is not installed.
     """
     drawing = new_drawing()
     from ezdxf.colors import rgb2int

@@ -216,12 +216,12 @@ def write_rrd(content: Content, path: Path) -> list[str]:
     Raises
     ------
     InputError
-        If ``stcal[rerun]`` is not installed.
+        If ``stereo-target-calibration[rerun]`` is not installed.
     """
     try:
         import rerun as rr
     except ImportError as error:
-        raise InputError("E-EXTRA-MISSING", "Rerun: needs rerun-sdk; install stcal[rerun]") from error
+        raise InputError("E-EXTRA-MISSING", "Rerun: needs rerun-sdk; pip install rerun-sdk") from error
     recording = rr.RecordingStream(APPLICATION, recording_id=f"{APPLICATION}-{content.run.folder.name}")
     recording.save(path)
     factor = exaggeration(content)
