@@ -21,7 +21,7 @@ def test_another_distribution_beside_it_is_refused_at_import(tmp_path):
         shutil.copy(Path(stcal.__file__).with_name(name), package)
     (tmp_path / "stcal-1.20.0.dist-info").mkdir()
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import stcal"
-    ended = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=False)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     last = ended.stderr.splitlines()[-1]
     assert last.startswith(f"ImportError: {package}: the distribution stcal 1.20.0")

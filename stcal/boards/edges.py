@@ -48,6 +48,8 @@ the border's band that is used, px."""
 CLEAR_BLURS = 1.5
 """Distance from what is beside a crossing, in σ of blur and pixel, up to which pixels are used: less takes in what the
 blur brings from there, more leaves a small window, in which single flaws of a print weigh more."""
+SHADED_HALF_PX, LEAST_REDUNDANCY = 4, 5
+"""Half the side of a window from which on grey values may change along it, and the fewest pixels beyond the unknowns."""
 CROSSING_STEPS = 4
 """Number of Gauss–Newton steps to a crossing, which may end :data:`MOST_MOVED_PX` from its start."""
 MOST_LEFT = 0.15
@@ -422,14 +424,15 @@ def crossings(
 
 def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the crossings, their covariances and a mask of those seen, for windows of one size."""
-    n, q = len(start), 11
+    n, shaded = len(start), half >= SHADED_HALF_PX
+    q, parameters = 11, 11 if shaded else 7
     offsets = np.stack(np.meshgrid(*[np.arange(-half, half + 1)] * 2), axis=-1).reshape(-1, 2)
     pixels = np.rint(start).astype(int)[:, None] + offsets
     last = np.array(grey.shape[::-1]) - 1
     inside = ((pixels >= 0) & (pixels <= last)).all((1, 2))
     x, y = np.moveaxis(pixels.clip(0, last), 2, 0)
     level, weight = grey[y, x].astype(float), np.ones(x.shape)
-    relative = offsets / half
+    relative = offsets / half * shaded
     shade = np.broadcast_to(np.column_stack([np.ones(len(offsets)), relative]), (n, len(offsets), 3))
     angle = np.arctan2(along[..., 1], along[..., 0])
     value = np.zeros((n, q))  # shift, turns of both edges, variance of the blur, dark and rise with their gradients
@@ -439,6 +442,7 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
     for k in range(CROSSING_STEPS + 1):
         if k == CROSSING_STEPS - 1:  # the blur is known
             reach = clear_px - CLEAR_BLURS * np.sqrt(value[:, 4] + PIXEL_VARIANCE)
+            reach = np.maximum(reach, half if shaded else 2 * half)  # a small window is needed whole
             weight = weight * (np.linalg.norm(pixels - (start + value[:, :2])[:, None], axis=2) <= reach[:, None])
         direction = np.stack([np.cos(angle + value[:, 2:4]), np.sin(angle + value[:, 2:4])], axis=-1)
         normal = np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
@@ -470,8 +474,9 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
         if k < CROSSING_STEPS:
             value += np.where(np.isfinite(change), change, 0.0)
             value[:, 4] = value[:, 4].clip(MIN_VARIANCE, half**2)
-    redundancy = weight.sum(1) - q
+    redundancy = weight.sum(1) - parameters
     noise = np.maximum((weight * residual**2).sum(1) / np.maximum(redundancy, 1), ROUNDING)
+    noise = np.maximum(noise, np.median(noise))  # a few pixels alone do not tell it
     pull = weight[..., None] * (design @ inverse)[..., :2]
     near = np.where(np.abs(distance[0]) <= np.abs(distance[1]), place[0], place[1] + 4 * half)
     growth = _growth(pull, residual, near, noise, 2 * half + 1)

@@ -64,7 +64,9 @@ def _connected(address: str) -> Iterator["_Workers"]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise InputError("E-EXTRA-MISSING", "--scheduler: needs Dask; pip install distributed") from error
+        raise InputError(
+            "E-EXTRA-MISSING", "--scheduler: needs Dask; install stereo-target-calibration[dask]"
+        ) from error
     _require_address(address)
     with _silent("distributed"), Client(address, timeout=ANSWER_S, set_as_default=False) as client:
         try:

@@ -100,8 +100,8 @@ def nees_of(detection, scene: Scene, camera_from_board: Rigid) -> np.ndarray:
     return min(errors, key=np.mean)
 
 
-@pytest.mark.parametrize(("kind", "high"), [("aprilgrid", 1.6), ("chessboard", 1.6), ("charuco", 3.0)])
-def test_corners_of_one_image_are_as_good_as_they_say(kind, high):
+@pytest.mark.parametrize(("kind", "low"), [("aprilgrid", 0.4), ("chessboard", 0.4), ("charuco", 0.05)])
+def test_corners_of_one_image_are_as_good_as_they_say(kind, low):
     board = BOARDS[kind]
     scene = scene_with(board, seed=5, width=864, height=576, images_per_group=2, groups=(("top", "left"),))
     where = scene.groups["top-left"]
@@ -110,8 +110,9 @@ def test_corners_of_one_image_are_as_good_as_they_say(kind, high):
     detection = detect_image(picture, scene.camera, scene.target, scene.board, EllipseOptions())
     assert 44 <= len(detection.boards[0].rows) <= len(scene.board.labels()) == 48
     assert len(detection.boards[0].numberings) == (2 if kind == "chessboard" else 1)
-    # The mean of 96 squares has a σ of 0.14. The σ of ChArUco corners is up to 1.6 times too small here.
-    assert 0.4 < nees_of(detection, scene, camera_from_board).mean() < high
+    # The mean of 96 squares has a σ of 0.14. The ChArUco board has 1.8 px of white beside its corners: edges alone do
+    # not tell some of them, and the σ of a saddle covers what its shape leaves.
+    assert low < nees_of(detection, scene, camera_from_board).mean() < 1.6
     assert not detection.faces
     assert detection.candidates - len(detection.boards[0].rows) < 6, (
         "outlines of the board's own squares are not tried as circles"

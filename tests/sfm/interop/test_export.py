@@ -272,7 +272,7 @@ def test_photographs_that_are_gone_are_said(small_run, tmp_path):
 def test_a_library_that_is_missing_is_named(small_run, tmp_path, monkeypatch, form, library, extra):
     monkeypatch.setitem(sys.modules, library, None)
     path = tmp_path / f"box{FORMS[form].suffix}"
-    with pytest.raises(InputError, match=rf"install stcal\[{extra}\]$"):
+    with pytest.raises(InputError, match=rf"install stereo-target-calibration\[{extra}\]$"):
         export_run(small_run, path)
     assert not any(tmp_path.iterdir())
 

@@ -486,7 +486,7 @@ def test_a_wrong_folder_of_images_costs_no_earlier_result(small_set, small_run, 
 
 
 USAGE = {
-    "no camera": (["run", "x", "--out", "y"], ("'--camera'", "`stcal-sfm run --help`")),
+    "no folder": (["run", "x"], ("'--out'", "`stcal-sfm run --help`")),
     "no such option": (["run", "x", "--camra", "y"], ("--camra", "`stcal-sfm run --help`")),
     "no such command": (["calibrate"], ("'calibrate'", "`stcal-sfm --help`")),
     "no such choice": (["run", "x", "--camera", "y", "--out", "z", "--frame", "best"], ("'--frame'", "'three-point'")),

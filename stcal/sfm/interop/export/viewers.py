@@ -221,7 +221,9 @@ def write_rrd(content: Content, path: Path) -> list[str]:
     try:
         import rerun as rr
     except ImportError as error:
-        raise InputError("E-EXTRA-MISSING", "Rerun: needs rerun-sdk; pip install rerun-sdk") from error
+        raise InputError(
+            "E-EXTRA-MISSING", "Rerun: needs rerun-sdk; install stereo-target-calibration[rerun]"
+        ) from error
     recording = rr.RecordingStream(APPLICATION, recording_id=f"{APPLICATION}-{content.run.folder.name}")
     recording.save(path)
     factor = exaggeration(content)
