@@ -49,7 +49,7 @@ CLEAR_BLURS = 1.5
 """Distance from what is beside a crossing, in σ of blur and pixel, up to which pixels are used: less takes in what the
 blur brings from there, more leaves a small window, in which single flaws of a print weigh more."""
 SHADED_HALF_PX, LEAST_REDUNDANCY = 4, 5
-"""Half the side of a window from which on grey values may change along it, and the fewest pixels beyond the unknowns."""
+"""Half the side of a window from which on grey values may change along it; the fewest pixels beyond the unknowns."""
 CROSSING_STEPS = 4
 """Number of Gauss–Newton steps to a crossing, which may end :data:`MOST_MOVED_PX` from its start."""
 MOST_LEFT = 0.15
