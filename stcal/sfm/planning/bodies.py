@@ -10,7 +10,7 @@ from stcal.design import FaceDesign, KnownDistance, ScaleReference, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import camera_prior, refinable
-from stcal.labels import CircleLabel
+from stcal.labels import CircleLabel, Label
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.scale import with_edge_sigma
@@ -107,7 +107,8 @@ def _planned(options: PlanOptions, target: TargetDesign) -> tuple[BodyScene, Met
     scene = make_body_scene(target, camera, shape)
     run = options.run.adjustment(target)
     images, place = corners_seen(scene, options.noise.corner_px)
-    model = assemble(MetricModel, GROUP, images, list(scene.camera_from_target), place)
+    xyz: dict[Label, np.ndarray] = {**place}
+    model = assemble(MetricModel, GROUP, images, list(scene.camera_from_target), xyz)
     faces = {label.face for label in model.labels if isinstance(label, CircleLabel)}
     if unseen := [face.id for face in target.faces if face.id not in faces]:
         raise InputError(
@@ -176,7 +177,9 @@ def body_views(model: MetricModel, setup: Setup, noise: CentreNoise) -> list[Pla
             position = centre + distance * direction
             tilts = {face.id: _tilt(position, target_from_face[face.id], normals[face.id], face) for face in faces}
             shown = {face for face, tilt in tilts.items() if tilt < MAX_TILT_RAD}
-            labels = [label for label in model.labels if isinstance(label, CircleLabel) and label.face in shown]
+            labels: list[Label] = [
+                label for label in model.labels if isinstance(label, CircleLabel) and label.face in shown
+            ]
             name = f"{model.group}/view {one.id} {two.id} {share} {roll}"
             views.append(
                 PlannedView(
