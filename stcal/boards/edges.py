@@ -412,7 +412,8 @@ def crossings(
     """Measure the crossings near ``start`` (n, 2) of edges in the directions ``along`` (n, 2, 2), one edge in a row.
 
     ``half`` : (n,) half the sides of the square windows, whole px; ``clear_px`` : (n,) distance to the nearest thing
-    that is none of the two edges. What the blur carries into the window from there is not used.
+    that is none of the two edges. What the blur carries into the window from there is not used, but in windows of which
+    half a side is below :data:`SHADED_HALF_PX`: they are needed whole.
     """
     n = len(start)
     xy, covariance, seen = start.astype(float), np.full((n, 2, 2), np.nan), np.zeros(n, bool)
