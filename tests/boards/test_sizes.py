@@ -39,6 +39,9 @@ def test_one_turned_photograph_in_front_drops_itself_alone(tmp_path, size, orien
     assert len(found.views()) == 5 + turned_back
     assert [each.name for each in found.skipped] == ([] if turned_back else ["0.png"])
     if turned_back:
-        np.testing.assert_allclose(found.views()["0.png"].xy_px, found.views()["1.png"].xy_px, atol=1e-9)
+        turned, upright = (found.views()[name].xy_px for name in ("0.png", "1.png"))
+        # The board looks the same after half a turn, and OpenCV's detector begins at either end.
+        same_end = np.linalg.norm(turned[0] - upright[0]) < np.linalg.norm(turned[0] - upright[-1])
+        np.testing.assert_allclose(turned, upright if same_end else upright[::-1], atol=1e-9)
     else:
         assert "sides swapped" in found.skipped[0].reason
