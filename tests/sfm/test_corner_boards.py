@@ -183,7 +183,9 @@ def test_the_published_method_needs_dots(option):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", BOARDS)
+@pytest.mark.parametrize(
+    "kind", ["charuco", *(pytest.param(kind, marks=pytest.mark.full) for kind in BOARDS if kind != "charuco")]
+)
 def test_faces_beside_a_board_of_corners_are_right(tmp_path, kind):
     board = BOARDS[kind]
     scene = scene_with(board, seed=5, width=1728, height=1152, images_per_group=4)
