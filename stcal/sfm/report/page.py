@@ -86,7 +86,8 @@ def report_html(
         Section("Overlays", _overlays(report, overlays, residuals or {}, gone), name="overlays"),
     ]
     counts = (
-        f"{summary['images']} images in {summary['groups']} group{'' if summary['groups'] == 1 else 's'}, {summary['images_mapped']} mapped, "
+        f"{summary['images']} images in {summary['groups']} group{'' if summary['groups'] == 1 else 's'}, "
+        f"{summary['images_mapped']} mapped, "
         f"{summary['faces']} faces"
     )
     banner = [_warning(report), macro("answers", judgement.answers()[:1], tone_of(judgement.verdict))]

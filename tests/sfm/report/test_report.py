@@ -250,7 +250,7 @@ def test_banner_only_where_eccentricity_is_off(joint, chained):
 
 def test_numbers_have_their_digits(joint):
     text = Page(joint).text
-    assert "2 images in 1 groups, 2 mapped, 2 faces" in text
+    assert "2 images in 1 group, 2 mapped, 2 faces" in text
     assert "residuals are 1.5 times the centres' own σ" in text
     faces = rows_of(joint, "faces")
     assert ["1 (datum)", "0.0000", "0.0000", "0.0000", *["0"] * 6, "4", "10", "0.4", "2", "a"] in faces
