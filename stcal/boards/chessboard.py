@@ -7,6 +7,7 @@ Corners are measured in the original image.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -50,11 +51,13 @@ def find_chessboard(
     """
     grey = grey_8bit(image)
     for detected in _found(grey, board):
-        grid = _refined(grey, detected)
+        measured = _refined(grey, detected)
+        grid = measured.xy_px.reshape(detected.shape)
         if _is_a_grid(detected, grid):
-            corners = _numbered(grey, grid, board)
-            covariance = _covariances(grey, corners.reshape(grid.shape)) if with_sigma else None
-            return view_of(name, board, np.arange(board.rows * board.columns), corners, covariance)
+            order = _numbered(grey, grid, board)
+            covariance = np.where(measured.seen[:, None, None], measured.covariance_px2, UNSEEN_PX**2 * np.eye(2))
+            stated = covariance[order] if with_sigma else None
+            return view_of(name, board, np.arange(len(order)), measured.xy_px[order], stated)
     return None
 
 
@@ -87,18 +90,20 @@ def _is_a_grid(found: np.ndarray, refined: np.ndarray) -> bool:
 
 
 def _numbered(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> np.ndarray:
-    """Return the corners (k, 2) in the order of the design."""
+    """Return the rows (k,) of the corners in the order of the design."""
+    order = np.arange(grid.shape[0] * grid.shape[1]).reshape(grid.shape[:2])
     across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if across[0] * down[1] - across[1] * down[0] < 0:  # seen from the front, X to Y turns clockwise on the screen
-        grid = grid[:, ::-1]
-    if not _first_is_black(grey, grid, board):
-        grid = grid[::-1, ::-1]
-    if not _first_is_black(grey, grid, board) and board.rows == board.columns:
-        grid = np.rot90(grid)
-    return grid.reshape(-1, 2)
+        order = order[:, ::-1]
+    xy = grid.reshape(-1, 2)
+    if not _first_is_black(grey, xy[order], board):
+        order = order[::-1, ::-1]
+    if not _first_is_black(grey, xy[order], board) and board.rows == board.columns:
+        order = np.rot90(order)
+    return order.ravel()
 
 
-def _refined(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _refined(grey: np.ndarray, grid: np.ndarray) -> Crossings:
     """Return the corners to a few hundredths of a pixel; the detectors are off by up to half a pixel in slanted views.
 
     The first windows are large enough for blurred edges; the second are so small that lens distortion bends no edge.
@@ -115,7 +120,8 @@ def _refined(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
         grid = cv2.cornerSubPix(smooth, places, (half, half), (-1, -1), REFINE_STEPS).reshape(grid.shape).astype(float)
         if window <= MOST_WINDOW:
             break
-    return _by_area(grey, grid).xy_px.reshape(grid.shape) + first
+    measured = _by_area(grey, grid)
+    return replace(measured, xy_px=measured.xy_px + first)
 
 
 def _by_area(grey: np.ndarray, grid: np.ndarray) -> Crossings:
@@ -133,12 +139,6 @@ def _window(grid: np.ndarray) -> float:
     """Return half the side of a window that holds no neighbour of a corner, px."""
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
     return max(WINDOW_SHARE * min(steps), LEAST_WINDOW)
-
-
-def _covariances(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return the covariances (n, 2, 2) of refined corners, px²; :data:`UNSEEN_PX` where areas do not fit."""
-    measured = _by_area(grey, grid)
-    return np.where(measured.seen[:, None, None], measured.covariance_px2, UNSEEN_PX**2 * np.eye(2))
 
 
 def _first_is_black(grey: np.ndarray, grid: np.ndarray, board: ChessboardDesign) -> bool:

@@ -480,7 +480,7 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
     noise = np.maximum(noise, np.median(noise))  # a few pixels alone do not tell it
     pull = weight[..., None] * (design @ inverse)[..., :2]
     near = np.where(np.abs(distance[0]) <= np.abs(distance[1]), place[0], place[1] + 4 * half)
-    growth = _growth(pull, residual, near, noise, 2 * half + 1)
+    growth = _growth(pull, residual, near, noise, 2 * half + 1, float(np.median(value[:, 4])))
     covariance = growth * noise[:, None, None] * inverse[:, :2, :2]
     for displaced, apart in ((first, distance[0]), (second, distance[1])):
         covariance += PRIOR_PX**2 * _common(pull * displaced[..., None], apart, half)
@@ -504,11 +504,15 @@ def _common(pull: np.ndarray, distance: np.ndarray, half: int) -> np.ndarray:
     return np.swapaxes(summed, 1, 2) @ summed
 
 
-def _growth(pull: np.ndarray, residual: np.ndarray, place: np.ndarray, noise: np.ndarray, profiles: int) -> float:
+def _growth(
+    pull: np.ndarray, residual: np.ndarray, place: np.ndarray, noise: np.ndarray, profiles: int, blur: float
+) -> float:
     """Return the factor of the variances that is due to edges that are not straight, as by print, for all windows.
 
     All pixels of a profile share the displacement of the edge there. The squares of their common pulls are compared
-    with what the noise of single pixels makes of them.
+    with what the noise of single pixels makes of them. The blur smooths displacements along the edge, by which they
+    seem smaller from profile to profile, but not in their sum: neighbours at a distance k then correlate by
+    exp(−k²/4σ²), and the variance of the sum is 2σ√π times what the single ones add up to.
 
     Parameters
     ----------
@@ -522,6 +526,8 @@ def _growth(pull: np.ndarray, residual: np.ndarray, place: np.ndarray, noise: np
         Variances of the pixels.
     profiles : int
         Number of profiles on each edge.
+    blur : float
+        Variance of the blur, px².
 
     Returns
     -------
@@ -537,4 +543,7 @@ def _growth(pull: np.ndarray, residual: np.ndarray, place: np.ndarray, noise: np
     squares = (np.square(pulls[0]) + np.square(pulls[1])).sum(1)
     expected = noise * (pull**2).sum((1, 2)) * (1 - 2 / profiles)
     told = expected > 0
-    return max(float(np.median(squares[told] / expected[told])), 1.0) if told.any() else 1.0
+    if not told.any():
+        return 1.0
+    together = max(2 * np.sqrt(np.pi * (blur + PIXEL_VARIANCE)), 1.0)
+    return 1 + together * max(float(np.median(squares[told] / expected[told])) - 1, 0.0)

@@ -162,10 +162,10 @@ def _printed_face(entry: PrintedFaceFile, unusual_size: bool, where: str) -> Fac
 
 def _printed_lines(face: FaceDesign) -> list[str]:
     board = face.printed
+    assert isinstance(board, CharucoDesign | AprilGridDesign | TagLayout)
     lines = [f"sigma_mm = {face.sigma_mm!r}  # of a corner about the design, per axis"]
     if face.size_sigma:
-        lines.append(f"size_sigma_mm = {face.size_sigma * _size_mm(board)!r}  # of the side of a square or tag")  # type: ignore
+        lines.append(f"size_sigma_mm = {face.size_sigma * _size_mm(board)!r}  # of the side of a square or tag")
     if isinstance(board, TagLayout):
         return [*lines, "tags = [", *tag_rows(board), "]"]
-    assert isinstance(board, CharucoDesign | AprilGridDesign)
     return [*lines, f"board = {{ type = {toml_string(TYPES[type(board)])}, {', '.join(keys_of(board))} }}"]

@@ -7,7 +7,6 @@ import tempfile
 import threading
 import unicodedata
 import warnings
-import zlib
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
@@ -22,6 +21,7 @@ from PIL import ExifTags, Image
 from stcal.errors import InputError, InputNote
 from stcal.io.files import IMAGE_BYTES, RUN_MARKER, read_bytes
 from stcal.io.photographs import extras
+from stcal.io.photographs.intact import ends_properly, is_png, png_intact
 from stcal.io.photographs.mosaic import PATTERNS, demosaiced, patterns_seen
 
 USUAL = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
@@ -55,8 +55,6 @@ THUMBNAIL_QUALITY = 80
 MOST_JPEG_SIDE = 65_000
 """Largest height of a thumbnail, px; the JPEG format is limited to 65 535."""
 
-_JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
-"""A JPEG marker other than a restart marker, which occurs inside a scan."""
 _DAMAGE = re.compile(
     rb"(Corrupt JPEG data(?!: \d+ extraneous bytes before marker 0xd9)|Premature end|TIFF_Error)[^\n]*"
 )
@@ -307,9 +305,9 @@ def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.nd
     """
     if not data:
         raise InputError("E-IMAGE-EMPTY", f"{name}: empty file (0 bytes); copy it again")
-    if not _ends_properly(data):
+    if not ends_properly(data):
         raise InputError("E-IMAGE-TRUNCATED", f"{name}: truncated ({len(data)} bytes); copy it again")
-    if _is_png(data) and not _png_intact(data):
+    if is_png(data) and not png_intact(data):
         raise InputError("E-IMAGE-DAMAGED", f"{name}: damaged (a checksum is wrong); copy it again")
     if extras.is_heic(data):
         image = extras.heic_grey(data, name)
@@ -588,43 +586,3 @@ def _decoder_messages() -> Iterator[bytearray]:
             os.close(standard_error)
             caught.seek(0)
             messages += caught.read()
-
-
-def _is_png(data: bytes) -> bool:
-    return data[:8] == b"\x89PNG\r\n\x1a\n"
-
-
-def _png_intact(data: bytes) -> bool:
-    """Return True if the checksums of all chunks are right."""
-    at = 8
-    while at + 12 <= len(data):
-        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
-        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            return False
-        if data[at + 4 : at + 8] == b"IEND":
-            return True
-        at = end + 4
-    return False
-
-
-def _ends_properly(data: bytes) -> bool:
-    """Return True if a JPEG, PNG or BMP is complete: decoders silently fill in missing data."""
-    if data[:2] == b"\xff\xd8":
-        return _jpeg_ends(data)
-    if _is_png(data):
-        return data.rfind(b"IEND") > 0
-    if data[:2] == b"BM" and len(data) >= 6:
-        return len(data) >= int.from_bytes(data[2:6], "little")
-    return True
-
-
-def _jpeg_ends(data: bytes) -> bool:
-    """Return True if the end marker of the main image exists; an embedded thumbnail or appended video has its own."""
-    at = 2
-    while marker := _JPEG_MARKER.search(data, at):
-        kind, at = data[marker.end() - 1], marker.end()
-        if kind == 0xD9:
-            return True
-        if kind not in (0x01, 0xD8):
-            at += max(int.from_bytes(data[at : at + 2], "big"), 2)
-    return False

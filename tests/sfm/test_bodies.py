@@ -237,10 +237,10 @@ def test_a_run_of_photographs_without_board_and_camera(tmp_path):
     errors = compare(tmp_path / "r", tmp_path / "set/truth.json")
     normalised = [face.normalised_error for face in errors.faces.values() if face.normalised_error is not None]
     assert 0.3 < np.sqrt(np.mean(np.square(normalised))) < 2  # about 1 of five faces that share their camera
-    summary = load_run(tmp_path / "r", printed=True).report["summary"]
+    summary = load_run(tmp_path / "r").report["summary"]
     assert (summary["scale_from"], summary["camera_given"]) == (["faces"], False)
     assert not (tmp_path / "r/board.toml").exists()
-    again = adjusted_run(load_run(tmp_path / "r", printed=True)).state.result()
+    again = adjusted_run(load_run(tmp_path / "r")).state.result()
     assert again.sigma0 == pytest.approx(result.calibration.joint.sigma0, rel=1e-3)
 
 

@@ -91,7 +91,7 @@ def plan(
     if noise is not None:
         centre_noise, source = stated_noise(noise)
     else:
-        centre_noise, source = noise_of_run(load_run(run, printed)) if run else expected_noise(of_corners=printed)
+        centre_noise, source = noise_of_run(load_run(run)) if run else expected_noise(of_corners=printed)
     options = PlanOptions(
         images,
         spread,

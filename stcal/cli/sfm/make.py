@@ -25,6 +25,10 @@ class TagBody(StrEnum):
     dodecahedron = "dodecahedron"
 
 
+CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"
+"""What `design` takes if nothing is said."""
+
+
 @app.command()
 def draw(
     design: Annotated[
@@ -75,7 +79,7 @@ def design(
     tags: Annotated[
         TagBody | None, typer.Option("--tags", help="Make a cube or dodecahedron with a tag on each face, no board.")
     ] = None,
-    dictionary: Annotated[str, typer.Option(help="Take the tags of --tags from this dictionary.")] = "APRILTAG_36h11",
+    dictionary: Annotated[str, typer.Option(help="Take the tags of --tags from this dictionary.")] = DICTIONARY,
     first_id: Annotated[int, typer.Option(min=0, max=100_000, help="Count the tags of --tags up from this id.")] = 0,
     faces: Annotated[
         str,
@@ -84,7 +88,7 @@ def design(
             "first is the reference face."
         ),
     ] = "",
-    circles: Annotated[int, typer.Option(min=9, max=40, help="Place this many circles on each face.")] = 10,
+    circles: Annotated[int, typer.Option(min=9, max=40, help="Place this many circles on each face.")] = CIRCLES,
     radius: Annotated[
         float | None,
         typer.Option(
@@ -126,16 +130,23 @@ def design(
     if tags is not None:
         if unfit := [
             name
-            for name, given in {"--circles": circles != 10, "--radius-mm": radius, "--bright": bright}.items()
+            for name, given in {
+                "--faces": faces,
+                "--circles": circles != CIRCLES,
+                "--radius-mm": radius,
+                "--bright": bright,
+            }.items()
             if given
         ]:
             raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of circles, not of --tags; leave it out")
-        planned = PlanOptions(
-            images=max(images, 2), distance_mm=distance, width=width, camera=read_camera(camera) if camera else None,
-            seed=seed,
-        )  # fmt: skip
+        model = read_camera(camera) if camera else None
+        planned = PlanOptions(images=images, distance_mm=distance, width=width, camera=model, seed=seed)
         say(_tag_body(target_file, tags, size, (dictionary, first_id), planned))
         return
+    if unfit := [
+        name for name, given in {"--dictionary": dictionary != DICTIONARY, "--first-id": first_id}.items() if given
+    ]:
+        raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of tags, and there are none without --tags; add it")
     board = load_board(board_file) if os.path.lexists(board_file) else None
     model = read_camera(camera) if camera else None
     polarity = "bright" if bright else "dark"

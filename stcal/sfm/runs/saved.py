@@ -103,15 +103,13 @@ class SavedRun:
         return Camera.of(camera, self.camera.colmap_model)
 
 
-def load_run(folder: str | Path, printed: bool = False) -> SavedRun:
+def load_run(folder: str | Path) -> SavedRun:
     """Reads a finished run.
 
     Parameters
     ----------
     folder : path
         Folder that was given to the run as ``out``.
-    printed : bool
-        Whether the caller takes a target with boards or tags on its faces.
 
     Returns
     -------
