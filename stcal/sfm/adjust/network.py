@@ -83,6 +83,24 @@ class Network:
         weighted = to_points @ self.covariance_mm2
         return normal - weighted @ np.swapaxes(to_points, 1, 2), right - weighted @ self.point_right
 
+    def score_of_image(self, image: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns :meth:`score` of one parameter for each coordinate that was observed in an image: (2k, 2k), (2k,).
+
+        They explain the image's residuals whatever they are, as if the image were taken out. The order is all of the
+        first coordinate, then all of the second.
+        """
+        rows = self.model.rows_by_image()[image]
+        k, p = len(rows), len(self.model.labels)
+        by_pose = np.concatenate([self.by_pose[rows, 0], self.by_pose[rows, 1]])
+        to_points = np.zeros((2 * k, p, 3))
+        for axis in range(2):
+            to_points[axis * k + np.arange(k), self.model.point_index[rows]] = self.by_point[rows, axis]
+        eliminated = by_pose @ self.inverse[image]
+        coupled = to_points.reshape(2 * k, 3 * p) - eliminated @ self.coupling[image]
+        weighted = coupled @ self.covariance_mm2
+        right = self.residual[rows].T.ravel() - eliminated @ self.pose_right[image]
+        return np.eye(2 * k) - eliminated @ by_pose.T - weighted @ coupled.T, right - weighted @ self.point_right
+
     def _by_image(self, e: np.ndarray):
         """Returns the equations of each image with its pose eliminated.
 
@@ -90,13 +108,13 @@ class Network:
         """
         model = self.model
         m, q, p = len(model.images), e.shape[2], len(model.labels)
-        et = np.swapaxes(e, 1, 2)
-        normal, by_pose, right = np.zeros((m, q, q)), np.zeros((m, q, 6)), np.zeros((m, q))
-        np.add.at(normal, model.image_index, et @ e)
-        np.add.at(by_pose, model.image_index, et @ self.by_pose)
-        np.add.at(right, model.image_index, np.einsum("nki,nk->ni", e, self.residual))
+        normal, by_pose, right = np.empty((m, q, q)), np.empty((m, q, 6)), np.empty((m, q))
+        for i, rows in enumerate(model.rows_by_image()):
+            own = e[rows].reshape(-1, q).T
+            normal[i], by_pose[i] = own @ own.T, own @ self.by_pose[rows].reshape(-1, 6)
+            right[i] = own @ self.residual[rows].ravel()
         to_points = np.zeros((m, q, p, 3))
-        to_points[model.image_index, :, model.point_index] = et @ self.by_point
+        to_points[model.image_index, :, model.point_index] = np.swapaxes(e, 1, 2) @ self.by_point
         eliminated = by_pose @ self.inverse
         return (
             normal - eliminated @ np.swapaxes(by_pose, 1, 2),

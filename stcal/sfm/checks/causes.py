@@ -189,10 +189,8 @@ def _explained_by_one(networks: Sequence[Network], left: float) -> float:
     """
     most = 0.0
     for network in networks:
-        for rows in network.model.rows_by_image():
-            columns = np.zeros((len(network.residual), 2, 2 * len(rows)))
-            columns[rows, 0, np.arange(len(rows))] = columns[rows, 1, len(rows) + np.arange(len(rows))] = 1
-            test = solve_score(*network.score(columns))
+        for image in range(len(network.model.images)):
+            test = solve_score(*network.score_of_image(image))
             most = max(most, test.statistic - test.freedom * left)
     return most
 

@@ -84,6 +84,19 @@ def test_score_of_a_parameter_is_its_estimate_beside_all_others(network, full, g
     assert test.statistic == pytest.approx(test.estimate[0] ** 2 / test.covariance[0, 0])
 
 
+def test_what_an_image_explains_is_what_leaving_it_out_changes(network):
+    """One parameter for each of its coordinates, by the general equations and by those of one image."""
+    image = 3
+    rows = np.flatnonzero(network.model.image_index == image)
+    k = np.arange(len(rows))
+    columns = np.zeros((len(network.residual), 2, 2 * len(rows)))
+    columns[rows, 0, k] = columns[rows, 1, len(rows) + k] = 1
+    normal, right = network.score_of_image(image)
+    general = network.score(columns)
+    np.testing.assert_allclose(normal, general[0], atol=1e-9)
+    np.testing.assert_allclose(right, general[1], atol=1e-9)
+
+
 def test_a_fault_of_one_image_is_found_there_and_nowhere_else(group):
     """One image's focal length 1e-4 longer: 100 times its σ there."""
     model, camera = group
