@@ -57,7 +57,13 @@ LIBRARIES = {
     "sqlite3": ("sfm/mapping", "sfm/interop", "io/cameras/foreign.py"),
     "cv2": (
         *("io/images.py", "io/photographs", "boards", "sfm/detect", "sfm/diagnose", "synthetic"),
-        *("io/device.py", "io/cameras/foreign.py", "handeye/methods/closed_form.py", "sfm/mapping/pairs.py"),
+        *(
+            "io/device.py",
+            "io/cameras/foreign.py",
+            "handeye/methods/closed_form.py",
+            "sfm/measurement/live.py",
+            "sfm/mapping/pairs.py",
+        ),
     ),
 }
 """Library: folders or files that may use it. ``cv2`` where pixels are, and in two places for a method of its own."""

@@ -16,7 +16,7 @@ from stcal import robot, sfm, synthetic
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.model import mh80
 from stcal.synthetic.dataset import write_dataset
-from tests.levels import SLOW
+from tests.levels import FULL, SLOW
 from tests.locate.test_arrays import CAMERA, LAYOUT, TRUTH
 from tests.support.areas import homography, rendered
 
@@ -178,7 +178,7 @@ def typed(tmp_path_factory):
     return folder
 
 
-@SLOW
+@FULL  # basedpyright, which holds the same in `.ci/run`, takes a fifth of its time
 def test_mypy_is_strict_about_the_scripts(typed):
     pytest.importorskip("mypy")
     words = [

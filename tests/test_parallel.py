@@ -144,6 +144,7 @@ def test_the_limit_ends_with_the_outermost_call(said):
     assert said[OUTERMOST] == [CORES, "1", "1", "1", CORES]
 
 
+@pytest.mark.slow
 def test_calls_of_several_threads_leave_no_limit_behind(said):
     """The first to begin is the first to end; the second found one thread, and must not restore that."""
     assert said[SEVERAL_THREADS] == ["1", CORES]

@@ -102,6 +102,7 @@ def test_points_of_a_tracker_are_registered(call, shared_case, tmp_path, case, f
     assert mm < 0.1, mm
 
 
+@pytest.mark.slow
 def test_a_trackers_export_is_joined_by_two_names(call, tmp_path):
     words = "robot identify --a joints.csv --b tracker.txt --robot robot.toml --out {tmp}/o.toml --key "
     line = assert_error(call("rob_tracker_nomap", words + '"Point Name"'), 2, "no column Point Name", "--key")
@@ -156,6 +157,7 @@ def test_tags_half_a_turn_off_are_told(call):
     assert "reject" not in out
 
 
+@pytest.mark.slow
 def test_mosaics_of_a_bayer_sensor(call, shared_case, tmp_path):
     """The same photographs through a filter without white balance: rejected and said, and right with the pattern."""
     folder = shared_case("loc_bundle/images")

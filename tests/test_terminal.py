@@ -111,6 +111,7 @@ def test_text_that_nothing_takes_is_one_line(words):
     assert found.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no such shell there")
 def test_closed_streams_end_no_command(tmp_path):
     """The first files that are opened would take their numbers."""

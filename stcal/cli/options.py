@@ -109,7 +109,7 @@ Verbose = Annotated[
 ]
 ALWAYS_NEW = ("export_database", "export_run")
 """Commands that never replace a file, as other programs work on their outputs."""
-WRITE_NOTHING = ("serve", "dry_run")
+WRITE_NOTHING = ("serve", "live", "dry_run")
 """Options with which no output is written."""
 _replacing: ContextVar[bool] = ContextVar("_replacing", default=True)
 """Whether a command may replace existing outputs."""

@@ -161,11 +161,8 @@ def said_apart() -> Iterator[None]:
 
 def write(path: Path, content, said: str = "written") -> None:
     """Saves text, bytes, or a dict or result file as JSON, and prints the path; ``-`` is standard output."""
-    if path == STANDARD_OUTPUT and (taker := _taker.get()) is not None:
-        if getattr(taker, "name", "") == os.devnull:  # see ``entry.py``
-            raise InputError("E-OUTPUT-UNWRITABLE", "--json -: standard output is closed; give the name of a file")
-        taker.write(_escaped(files.json_text(content), taker.encoding or "ascii"))
-        taker.flush()
+    if path == STANDARD_OUTPUT and _taker.get() is not None:
+        write_out(files.json_text(content))
         return
     files.save(path, content if isinstance(content, str | bytes) else files.json_text(content))
     if not isinstance(content, str | bytes | dict):
@@ -173,6 +170,15 @@ def write(path: Path, content, said: str = "written") -> None:
 
         require_result_written(path, content)
     say(f"{said}: {path}")
+
+
+def write_out(text: str) -> None:
+    """Writes JSON to standard output, which is reserved for it."""
+    taker = _taker.get() or sys.stdout
+    if getattr(taker, "name", "") == os.devnull:  # see ``entry.py``
+        raise InputError("E-OUTPUT-UNWRITABLE", "--json -: standard output is closed; give the name of a file")
+    taker.write(_escaped(text, taker.encoding or "ascii"))
+    taker.flush()
 
 
 def write_if(path: Path | None, content: Callable[[], object], said: str = "written") -> None:

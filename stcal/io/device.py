@@ -1,8 +1,12 @@
-"""Image sources: cameras of this machine, over V4L2 or UVC through OpenCV, and simulated cameras."""
+"""Image sources: cameras of this machine (V4L2, UVC), streams and videos through OpenCV; simulated cameras."""
 
+import os
 import re
+import threading
 import time
-from itertools import repeat
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Protocol
 
@@ -20,6 +24,10 @@ DARK = 5
 FULL_SCALE = 255
 SIMULATED_NOISE = 1.0
 """Noise σ of a pixel of the simulated camera, grey values."""
+PATIENCE_S = 5.0
+"""Time without a picture after which a camera or a stream counts as lost, s."""
+FFMPEG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
+"""Variable of the environment by which OpenCV sets how much FFmpeg says."""
 READINGS = 3
 """Number of frames that a driver may still have in its queue after the exposure was changed."""
 
@@ -62,10 +70,7 @@ class OpenCVSource:
     def __init__(self, device: str, gain: float | None = None, by_hand: bool = True):
         self.name = f"camera {device}"
         place = int(device) if device.isdigit() else device
-        before = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(0)  # a missing camera is reported below
-        self._capture = cv2.VideoCapture(place)
-        cv2.utils.logging.setLogLevel(before)
+        self._capture = _device(place)
         if not self._capture.isOpened():
             raise InputError(
                 "E-DEVICE-OPEN",
@@ -101,8 +106,7 @@ class OpenCVSource:
                 )
         if frame is None:
             raise InputError("E-DEVICE-NO-IMAGE", f"{self.name}: gives no image; check it")
-        grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-        return grey, float(self._capture.get(cv2.CAP_PROP_EXPOSURE))
+        return _grey(frame), float(self._capture.get(cv2.CAP_PROP_EXPOSURE))
 
     def close(self) -> None:
         """Give the camera back."""
@@ -174,3 +178,100 @@ def checked_name(name: str, what: str) -> str:
             "E-DEVICE-NAME", f"{what} {name!r}: letters, digits, spaces, '.', '-' and '_' needed, up to 100"
         )
     return name
+
+
+@contextmanager
+def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
+    """Open a camera, a stream or a video file, and return its pictures, grey.
+
+    Pictures of a camera or a stream that come while one is measured are left out; of a video file none is.
+
+    Parameters
+    ----------
+    source : int or str
+        Number of a camera of this machine, URL of a stream (``rtsp://…``, ``http://…``), or a video file.
+
+    Raises
+    ------
+    InputError
+        If it cannot be opened or gives no picture; in between, if no picture comes for ``PATIENCE_S``.
+    """
+    what = f"--camera-index {source}" if isinstance(source, int) else f"--live {source}"
+    device = _device(source)
+    is_file = isinstance(source, str) and Path(source).is_file()
+    pictures = _every(device) if is_file else _newest(device, what)
+    try:
+        if not device.isOpened():
+            raise InputError(
+                "E-LIVE-SOURCE", f"{what}: cannot be opened; give a camera's number, a stream's URL or a video file"
+            )
+        first = next(pictures, None)
+        if first is None:
+            raise InputError("E-LIVE-SOURCE", f"{what}: opened, but gives no picture; is another program using it?")
+        yield chain([first], pictures)
+    finally:
+        pictures.close()  # which waits until nothing reads from the device any more
+        device.release()
+
+
+def _device(source: int | str) -> cv2.VideoCapture:
+    """Return the source, opened if it can be. The libraries' own words about it are kept back."""
+    level, before = cv2.utils.logging.getLogLevel(), os.environ.get(FFMPEG_LEVEL)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    os.environ[FFMPEG_LEVEL] = "-8"
+    try:
+        return cv2.VideoCapture(source)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+        os.environ.pop(FFMPEG_LEVEL)
+        if before is not None:
+            os.environ[FFMPEG_LEVEL] = before
+
+
+def _grey(frame: np.ndarray) -> np.ndarray:
+    return frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+
+
+def _every(device: cv2.VideoCapture) -> Generator[np.ndarray, None, None]:
+    """Yield each picture of a video file."""
+    while (read := device.read())[0]:
+        yield _grey(read[1])
+
+
+def _newest(device: cv2.VideoCapture, what: str) -> Generator[np.ndarray, None, None]:
+    """Yield the newest picture of a camera or a stream, and leave out those that come meanwhile.
+
+    Raises
+    ------
+    InputError
+        If no picture comes for ``PATIENCE_S``.
+    """
+    ready, ended = threading.Condition(), threading.Event()
+    newest: list[np.ndarray] = []
+
+    def read() -> None:
+        while not ended.is_set():
+            came, frame = device.read()
+            if not came:
+                break
+            with ready:
+                newest[:] = [frame]
+                ready.notify()
+        with ready:
+            ended.set()
+            ready.notify()
+
+    thread = threading.Thread(target=read, daemon=True)
+    thread.start()
+    try:
+        while True:
+            with ready:
+                if not ready.wait_for(lambda: newest or ended.is_set(), PATIENCE_S):
+                    raise InputError("E-LIVE-LOST", f"{what}: no picture for {PATIENCE_S:g} s; is it still connected?")
+                if not newest:
+                    return
+                frame = newest.pop()
+            yield _grey(frame)
+    finally:
+        ended.set()
+        thread.join()

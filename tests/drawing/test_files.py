@@ -232,6 +232,7 @@ def test_dxf_names_the_library_that_is_missing(files, monkeypatch):
         draw(files / "board.toml", files / "board.dxf")
 
 
+@pytest.mark.slow
 def test_boards_of_a_set_are_drawn_one_by_one(files):
     (files / "boards.toml").write_text(
         'type = "boards"\n[[board]]\ntype = "chessboard"\nrows = 4\ncolumns = 5\nsquare_mm = 10\n'

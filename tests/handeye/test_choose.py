@@ -118,6 +118,7 @@ def test_answers_that_contradict_widen_sigma(monkeypatch):
     assert 0.5 * 5 / np.sqrt(6) < np.sqrt(found.result.covariance[3, 3]) < 1.5 * 5 / np.sqrt(6)
 
 
+@pytest.mark.slow
 def test_a_closed_form_is_taken_where_it_predicts_better():
     """The robot's reach errs by 1 %, which is no noise of single poses, and the images are poor."""
     truth = simulated(np.random.default_rng(0), 14, "eye-in-hand", (2e-3, 1.0), (3e-3, 2.0))
@@ -147,6 +148,7 @@ def test_steps_from_the_solution_of_all_are_solutions_of_the_others():
         assert (np.abs(moved) < 0.1 * np.array(size)).all(), method
 
 
+@pytest.mark.slow
 def test_a_board_of_another_unit_is_told_by_a_factor():
     truth = simulated(np.random.default_rng(7), 12, "eye-in-hand", ROBOT, (5e-4, 0.2))
     eye = truth.pairs.camera_from_board

@@ -167,6 +167,7 @@ def test_mrcals_splines_project_as_mrcal_does(tmp_path, order):
         read_lens(tmp_path / "c.cameramodel")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "most_px"),
     [("FOV", 1e-4), ("RAD_TAN_THIN_PRISM_FISHEYE", 0.1), ("DIVISION", 1e-4), ("EUCM", 1e-3)],
@@ -269,6 +270,7 @@ def inside(polygon: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     return np.array([cv2.pointPolygonTest(contour, (x * 1024, y * 1024), False) > 0 for x, y in pixels.tolist()])
 
 
+@pytest.mark.slow
 def test_a_fit_turns_the_camera_where_that_helps():
     lens, camera, turn = turned_lens([2.0, -3.0, 1.0])
     found = fit_lens(lens, WIDTH, HEIGHT)
@@ -291,6 +293,7 @@ def test_a_lens_is_fitted_where_it_was_determined():
     np.testing.assert_allclose(found.camera_from_lens.rotation, turn.rotation, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_lenses_are_compared_by_their_own_projections():
     """Not by the models that are fitted to them, which are a pixel off."""
     lens, camera, turn = turned_lens([1.0, 2.0, 0.0], REGION)

@@ -103,6 +103,7 @@ def test_a_file_that_is_not_there(tmp_path):
         read_json(tmp_path / "some.json", "file", "make one")
 
 
+@pytest.mark.slow
 @given(st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
 def test_any_bytes_are_a_value_or_one_line(tmp_path_factory, content):
     path = tmp_path_factory.getbasetemp() / "any.json"

@@ -177,6 +177,7 @@ def test_the_page_is_never_wider_than_its_window(chrome, page, width):
     assert faults(chrome) == []
 
 
+@pytest.mark.slow
 def test_without_script_and_on_paper_the_pictures_stand(chrome, page):
     canvas, still = ".turn canvas", ".still img"
     chrome.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})

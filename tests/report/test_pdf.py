@@ -41,6 +41,7 @@ def test_a_page_is_printed_on_a4_with_numbers_and_its_title():
     assert all("Name" in each for each in text[1:3])  # heads of a table again on each sheet
 
 
+@pytest.mark.slow
 def test_what_paper_cannot_do_is_not_printed():
     text = words(pdf_of(page(3)))
     assert "Hidden (folded: see the page on screen)" in text

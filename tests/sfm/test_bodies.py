@@ -152,6 +152,7 @@ def calibrated(target, images, size):
     return body, calibrate([model], camera, target, board, options, camera_prior(camera))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [tag_cube(60), tag_dodecahedron(30)], ids=["cube", "dodecahedron"])
 def test_a_body_of_tags_gives_faces_and_camera(target):
     scene, images = observed(target, 10, 8)
@@ -175,6 +176,7 @@ def test_a_body_of_tags_gives_faces_and_camera(target):
         assert normalised < 30  # χ² of 6: by chance in 4 of 100 000
 
 
+@pytest.mark.slow
 def test_contributions_of_a_body_add_up_to_its_covariance():
     target = tag_cube(60, size_sigma_mm=0.1)
     scene, images = observed(target, 12, 8)

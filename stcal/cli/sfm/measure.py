@@ -1,10 +1,13 @@
 """Command ``stcal-sfm measure``: poses of the calibrated target in images."""
 
+import json
 import os
+import re
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,10 +27,15 @@ from stcal.cli.options import (
     load_ahead,
     require_passed,
 )
-from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
+from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, write, write_if, write_out
 from stcal.errors import InputError
 
+if TYPE_CHECKING:
+    from stcal.sfm.measurement.serve import MeasureServer, Setting
+
 app = typer.Typer()
+SAY_EVERY_S = 1.0
+"""Shortest time between two lines of --live, s."""
 
 
 @app.command()
@@ -35,7 +43,12 @@ def measure(
     camera: CameraFile,
     faces: Annotated[Path, typer.Option("--faces", help="Read the calibrated target from this faces.json.")],
     images: Annotated[
-        Path | None, typer.Argument(help="Read the images of this folder and of its subfolders; none with --serve.")
+        Path | None,
+        typer.Argument(
+            help="Read the images of this folder and of its subfolders; none with --serve, and with --live none, a "
+            "stream's URL or a video file.",
+            show_default=False,
+        ),
     ] = None,
     target: TargetFile = None,
     out: Annotated[
@@ -98,11 +111,25 @@ def measure(
             "--serve", help="Answer images that programs send over HTTP, POST /measure, with a JSON each, until Ctrl-C."
         ),
     ] = False,
+    live: Annotated[
+        bool,
+        typer.Option(
+            "--live",
+            help="Show a page with the pictures of a camera, or of the stream or video IMAGES, and the target's pose "
+            "in each, until Ctrl-C. A line is printed each second, each pose with `--json -`.",
+        ),
+    ] = False,
+    camera_index: Annotated[
+        int,
+        typer.Option(
+            "--camera-index", min=0, max=99, help="Take the pictures of --live from the camera of this number."
+        ),
+    ] = 0,
     host: Annotated[
-        str, typer.Option(help="Listen at this address with --serve; other machines reach 0.0.0.0.")
+        str, typer.Option(help="Listen at this address with --serve or --live; other machines reach 0.0.0.0.")
     ] = "127.0.0.1",
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Listen at this port with --serve; at a free one with 0.")
+        int, typer.Option(min=0, max=65535, help="Listen at this port with --serve or --live; at a free one with 0.")
     ] = 8765,
     max_megabytes: Annotated[
         float,
@@ -116,9 +143,13 @@ def measure(
     ] = "",
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
-    if serve:
-        alone = {"IMAGES": images, "--json": json_file, "--report": report, "--joints": joints, "--columns": columns}
+    ellipses = ellipse_options(min_diameter, max_diameter)
+    if serve or live:
+        mode = "--live" if live else "--serve"
+        alone = {"--serve": serve and live, "--report": report, "--joints": joints, "--columns": columns}
         alone |= {
+            "IMAGES": images if serve else None,
+            "--json": json_file if serve or json_file != STANDARD_OUTPUT else None,
             "--previous": previous,
             "--sequence": sequence,
             "--scheduler": scheduler,
@@ -126,15 +157,21 @@ def measure(
             "--strict": strict,
         }
         if conflicting := [name for name, value in alone.items() if value]:
+            source = "from a camera, as it takes them" if live else "over HTTP, one answer each"
             raise InputError(
                 "E-OPTION-CONFLICT",
-                f"--serve and {conflicting[0]}: images come over HTTP, one answer each; leave {conflicting[0]} out",
+                f"{mode} and {conflicting[0]}: images come {source}; leave {conflicting[0]} out"
+                + (", or give --json -, a line each" if live and conflicting[0] == "--json" else ""),
             )
-        ellipses = ellipse_options(min_diameter, max_diameter)
-        _serve(camera, faces, target, board, sigma_factor, ellipses, (host, port, max_megabytes, token), workers)
+        setting = _setting(camera, faces, target, board, sigma_factor, ellipses)
+        listen = host, port, max_megabytes, token
+        if live:
+            _live(setting, camera_index if images is None else _source(images), listen, json_file is not None)
+        else:
+            _serve(setting, listen, workers)
         return
     if images is None:
-        raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, or --serve")
+        raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, --serve or --live")
     if columns is not None and joints is None:
         raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of joint values; give it with --joints")
     load_ahead(workers)
@@ -153,9 +190,7 @@ def measure(
     design = body_of(target)
     circles = read_target(faces, design)
     table = table_of(joints, columns, "joints") if joints else None
-    options = work.MeasureOptions(
-        PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipse_options(min_diameter, max_diameter), workers
-    )
+    options = work.MeasureOptions(PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipses, workers)
     told = designs_told(target, board, with_board=False)
     with told, handed_over(scheduler, send_images), StageProgress() as progress:
         result = work.measure(
@@ -173,37 +208,77 @@ def measure(
     require_passed(strict, [f"χ² of {name}" for name in failed], report)
 
 
-def _serve(camera, faces, target, board, sigma_factor, ellipses, listen, workers) -> None:
+def _setting(camera, faces, target, board, sigma_factor, ellipses) -> "Setting":
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
     from stcal.sfm.measurement.pose import PoseOptions
-    from stcal.sfm.measurement.serve import MeasureServer, MeasureService, ServeOptions, Setting, counts_text, serve
+    from stcal.sfm.measurement.service import Setting
     from stcal.sfm.measurement.target import read_target
 
-    options = ServeOptions(*listen)
-    workers = workers or os.cpu_count() or 1
-    circles = replace(read_target(faces, design := body_of(target)), design=design)
-    setting = Setting(
-        circles,
+    return Setting(
+        replace(read_target(faces, design := body_of(target)), design=design),
         read_camera(camera),
         load_board(board) if board else None,
         PoseOptions(sigma_factor=sigma_factor),
         ellipses,
     )
+
+
+def _say_place(server: "MeasureServer", what: str) -> None:
+    """Prints where the server is reached, with a warning if not from this machine alone."""
+    if not server.local:
+        token = server.options.token
+        who = "that knows the token" if token else f"that reaches {server.options.host}"
+        remedy = "" if token else "; give a --token"
+        print_each("warning", [f"every machine {who} can send images; nothing is encrypted{remedy}"])
+    say(what)
+    sys.stdout.flush()
+
+
+def _serve(setting: "Setting", listen, workers) -> None:
+    from stcal.sfm.measurement.serve import MeasureServer, MeasureService, ServeOptions, counts_text, serve
+
+    options = ServeOptions(*listen)
+    workers = workers or os.cpu_count() or 1
     servers: list[MeasureServer] = []
 
     def ready(server: MeasureServer) -> None:
         servers.append(server)
-        if not server.local:
-            who = "that knows the token" if options.token else f"that reaches {options.host}"
-            remedy = "" if options.token else "; give a --token"
-            print_each("warning", [f"every machine {who} can send images; nothing is encrypted{remedy}"])
-        say(f"answering POST {server.url}/measure, {workers} processes, files up to {options.max_megabytes:g} MB")
-        sys.stdout.flush()
+        limit = f"{workers} processes, files up to {options.max_megabytes:g} MB"
+        _say_place(server, f"answering POST {server.url}/measure, {limit}")
 
     try:
         serve(MeasureService(setting, workers), options, ready)
     finally:
         for server in servers:
             say(counts_text(server.counts))
+
+
+def _source(path: Path) -> str:
+    """Returns the stream's URL or the file that was given; a path has one slash where a URL has two."""
+    return re.sub(r"^([a-z]+):/(?!/)", r"\1://", str(path))
+
+
+def _live(setting: "Setting", source: int | str, listen, as_json: bool) -> None:
+    from stcal.io.device import pictures_of
+    from stcal.sfm.measurement.live import LivePicture, LiveView, follow, line_of
+    from stcal.sfm.measurement.serve import MeasureService, ServeOptions, show_live
+    from stcal.sfm.measurement.tracker import Tracker
+
+    tracker = Tracker(setting.target, setting.camera, setting.board, setting.pose, setting.ellipses)
+    said_s = -SAY_EVERY_S
+
+    def tell(picture: LivePicture) -> None:
+        nonlocal said_s
+        if as_json:
+            write_out(f"{json.dumps(picture.content, ensure_ascii=False, allow_nan=False)}\n")
+        if time.monotonic() - said_s >= SAY_EVERY_S:
+            said_s = time.monotonic()
+            say(line_of(picture))
+            sys.stdout.flush()
+
+    view = LiveView()
+    with pictures_of(source) as frames, show_live(MeasureService(setting, 1), ServeOptions(*listen), view) as server:
+        _say_place(server, f"showing {server.url}/ until Ctrl-C")
+        say(f"ended after {follow(frames, tracker, view, tell)} pictures")

@@ -6,9 +6,9 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from email.utils import formatdate
 from hmac import compare_digest
@@ -21,6 +21,7 @@ import h11
 import stcal
 from stcal.errors import InputError
 from stcal.parallel import LOOK_S
+from stcal.sfm.measurement.live import LiveView
 from stcal.sfm.measurement.service import BUSY, DONE, FAILED, NO_POSE, REFUSED, Answer, MeasureService, refusal
 from stcal.sfm.measurement.service import WAITING as WAITING
 from stcal.sfm.measurement.service import Setting as Setting
@@ -42,6 +43,12 @@ CROWDED_S = 1.0
 LINGER_S = 1.0
 """Time for which the rest of a refused request is read, s. Else the client could lose the answer."""
 MEASURE, STATUS = "/measure", "/"
+LIVE_PAGE, LIVE_JSON, LIVE_PICTURES = "/", "/live.json", "/live.mjpg"
+"""Places of a live view. Its page takes the place of the status."""
+BOUNDARY = "picture"
+JSON, HTML = "application/json; charset=utf-8", "text/html; charset=utf-8"
+LIVE_LOOK_S = 0.01
+"""Interval at which a stream looks for a newer picture, s."""
 NO_TOKEN, NOT_FOUND, NOT_ALLOWED, NO_LENGTH, TOO_LARGE, LONG_TARGET, MANY_FIELDS, OTHER_HTTP = (
     *(401, 404, 405, 411, 413, 414, 431, 505),
 )
@@ -80,6 +87,8 @@ class _Refused(Exception):
 class MeasureServer:
     """HTTP server that passes images to the service. One thread holds all connections; h11 reads and writes HTTP.
 
+    With a ``view`` it also shows the pictures of that, as a page.
+
     Attributes
     ----------
     counts : Counter
@@ -93,8 +102,8 @@ class MeasureServer:
         If it cannot listen on the address.
     """
 
-    def __init__(self, service: MeasureService, options: ServeOptions):
-        self.service, self.options = service, options
+    def __init__(self, service: MeasureService, options: ServeOptions, view: LiveView | None = None):
+        self.service, self.options, self.view = service, options, view
         self.most_bytes = int(options.max_megabytes * 1e6)
         self.most_held = max(HELD_BYTES, 2 * self.most_bytes)
         self.counts: Counter[int] = Counter()
@@ -254,9 +263,11 @@ class _Connection:
         place, asked, length = _checked(request, self.server)
         async with asyncio.timeout(PATIENCE_S + length / SLOWEST):
             data = await self._body()
+        if place == LIVE_PICTURES:
+            return await self._stream()
         self.complete = True
         until = time.monotonic() + CROWDED_S
-        answer = self._status() if place == STATUS else await self._measured(data, asked)
+        answer = await self._measured(data, asked) if place == MEASURE else self._shown(place)
         while answer is not None and answer.code == BUSY and time.monotonic() < until:
             await asyncio.sleep(LOOK_S)
             answer = await self._measured(data, asked)
@@ -264,9 +275,9 @@ class _Connection:
         if answer is None:
             self.server.left += 1
             return False
-        if place != STATUS:
+        if place == MEASURE:
             self.server.counts[answer.code] += 1
-        self._write(answer)
+        self._write(answer, kind=HTML if self.server.view and place == LIVE_PAGE else JSON)
         async with asyncio.timeout(PATIENCE_S):
             await self.writer.drain()
         self.complete, self._answers = False, self._answers + 1
@@ -317,6 +328,34 @@ class _Connection:
         except Exception as error:  # a fault of the program must not end the connection without an answer
             return refusal(FAILED, "E-SERVICE-FAILED", f"{type(error).__name__}: not answered")
 
+    async def _stream(self) -> bool:
+        """Sends the pictures of the view as they come, until the client goes away or the view ends."""
+        view, number = self.server.view, 0
+        assert view is not None
+        self._send(DONE, f"multipart/x-mixed-replace; boundary={BOUNDARY}", None, closing=True)
+        while not (self.ended or self.writer.transport.is_closing()):
+            picture = view.newest
+            if picture is None or picture.number == number:
+                if view.ended:
+                    self.writer.write(self.http.send(h11.EndOfMessage()) or b"")
+                    break
+                await asyncio.sleep(LIVE_LOOK_S)
+                continue
+            number, size = picture.number, len(picture.jpeg)
+            head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {size}\r\n\r\n".encode()
+            self.writer.write(self.http.send(h11.Data(data=head + picture.jpeg + b"\r\n")) or b"")
+            async with asyncio.timeout(PATIENCE_S):
+                await self.writer.drain()
+            self._last = time.monotonic()
+        return False
+
+    def _shown(self, place: str) -> Answer:
+        """Returns the answer to a GET."""
+        view = self.server.view
+        if view is None:
+            return self._status()
+        return Answer(DONE, view.page() if place == LIVE_PAGE else view.json())
+
     def _status(self) -> Answer:
         description = {
             "format": "stcal service 1",
@@ -340,20 +379,27 @@ class _Connection:
                 while await self.reader.read(CHUNK_BYTES):
                     pass
 
-    def _write(self, answer: Answer, closing: bool = False) -> None:
-        body = answer.text.encode() + b"\n"
+    def _write(self, answer: Answer, closing: bool = False, kind: str = JSON) -> None:
+        self._send(answer.code, kind, answer.text.encode() + b"\n", closing)
+
+    def _send(self, code: int, kind: str, body: bytes | None, closing: bool) -> None:
+        """Sends the head of an answer, and its body; with None for the body, that follows in parts."""
         headers = [
             ("Server", f"stcal/{stcal.__version__}"),
             ("Date", formatdate(usegmt=True)),
-            ("Content-Type", "application/json; charset=utf-8"),
-            ("Content-Length", str(len(body))),
+            ("Content-Type", kind),
+            *([] if body is None else [("Content-Length", str(len(body)))]),
+            *([("Cache-Control", "no-store")] if self.server.view else []),
             *([("Connection", "close")] if closing else []),
-            *([("WWW-Authenticate", "Bearer")] if answer.code == NO_TOKEN else []),
+            *([("WWW-Authenticate", "Bearer")] if code == NO_TOKEN else []),
         ]
-        response = h11.Response(status_code=answer.code, headers=headers, reason=responses.get(answer.code, ""))
-        content = [] if self._method == b"HEAD" else [h11.Data(data=body)]
-        for event in (response, *content, h11.EndOfMessage()):
-            self.writer.write(self.http.send(event) or b"")
+        self.writer.write(
+            self.http.send(h11.Response(status_code=code, headers=headers, reason=responses.get(code, ""))) or b""
+        )
+        if body is not None:
+            content = [] if self._method == b"HEAD" else [h11.Data(data=body)]
+            for event in (*content, h11.EndOfMessage()):
+                self.writer.write(self.http.send(event) or b"")
 
 
 def _checked(request: h11.Request, server: MeasureServer) -> tuple[str, dict[str, str], int]:
@@ -361,28 +407,35 @@ def _checked(request: h11.Request, server: MeasureServer) -> tuple[str, dict[str
     fields = {name.decode(): value.decode("latin-1") for name, value in request.headers}
     if request.http_version not in (b"1.0", b"1.1"):
         raise _Refused(OTHER_HTTP, "version 1.1 of HTTP needed")
-    given, wanted = fields.get("authorization", ""), f"Bearer {server.options.token}"
-    if server.options.token and not compare_digest(given.encode("latin-1"), wanted.encode()):
-        raise _Refused(NO_TOKEN, "Authorization: Bearer with the token of the service needed")
     try:
         parts = urlsplit(request.target.decode())
-    except ValueError as error:
-        raise _Refused(REFUSED, "the request's target is no URL") from error
-    place = {b"POST": MEASURE, b"GET": STATUS}.get(request.method)
-    if place is None:
+    except ValueError:
+        parts = None
+    asked = {key: values[0] for key, values in parse_qs(parts.query).items()} if parts else {}
+    given, wanted = fields.get("authorization", "").encode("latin-1"), f"Bearer {server.options.token}".encode()
+    if server.view and request.method == b"GET" and "token" in asked:  # a browser sends no such header
+        given = f"Bearer {asked['token']}".encode()
+    if server.options.token and not compare_digest(given, wanted):
+        raise _Refused(NO_TOKEN, "Authorization: Bearer with the token of the service needed")
+    if parts is None:
+        raise _Refused(REFUSED, "the request's target is no URL")
+    seen = (LIVE_PAGE, LIVE_JSON, LIVE_PICTURES) if server.view else (STATUS,)
+    places = {b"POST": (MEASURE,), b"GET": seen}.get(request.method)
+    if places is None:
         raise _Refused(NOT_ALLOWED, f"POST an image to {MEASURE}; GET {STATUS} tells what this is")
-    if parts.path != place:
+    if parts.path not in places:
         raise _Refused(NOT_FOUND, f"POST an image to {MEASURE}; GET {STATUS} tells what this is")
+    place = parts.path
     stated = fields.get("content-length", "" if place == MEASURE else "0")
     if "transfer-encoding" in fields or not stated:
         raise _Refused(NO_LENGTH, "Content-Length needed, in bytes")
     length = int(stated)  # digits alone: h11 has looked
-    if place == STATUS and length:
+    if place != MEASURE and length:
         raise _Refused(REFUSED, "a GET with a body; leave the body out")
     if length > server.most_bytes:
         limit = server.options.max_megabytes
         raise _Refused(TOO_LARGE, f"{length / 1e6:.1f} MB; {limit:g} MB at most, see --max-megabytes")
-    return place, {key: values[0] for key, values in parse_qs(parts.query).items()}, length
+    return place, asked, length
 
 
 def _fault(error: h11.RemoteProtocolError, http: h11.Connection) -> _Refused:
@@ -409,6 +462,20 @@ def serve(service: MeasureService, options: ServeOptions, ready: Callable[[Measu
                 thread.join(0.5)
         finally:
             server.shutdown()
+            service.close()
+
+
+@contextmanager
+def show_live(service: MeasureService, options: ServeOptions, view: LiveView) -> Iterator[MeasureServer]:
+    """Shows a live view, and answers images, within the context."""
+    with MeasureServer(service, options, view) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
             service.close()
 
 

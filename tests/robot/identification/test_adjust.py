@@ -40,6 +40,7 @@ def test_zeros_alone_are_found_and_nothing_else_moves():
     assert (found.dh_sigma[:, LENGTHS] == 0).all()
 
 
+@pytest.mark.slow
 def test_fewer_poses_do_for_zeros():
     """4 poses are 24 numbers: too few for 30 parameters, enough for 16."""
     data = zeros_off()[1][:4]

@@ -56,6 +56,7 @@ def test_stations_taken_for_one_are_refused():
         identify(mh80(), replace(drawn("position"), stations=()))
 
 
+@pytest.mark.slow
 def test_distances_of_positions_go_within_stations():
     data = drawn("position")
     found = identify(mh80(), data, IdentifyOptions(observe="distance", folds=0))

@@ -16,6 +16,7 @@ from stcal.sfm.planning.nominal import true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.levels import sampled
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +34,7 @@ def rims_of(scene, rim_mm):
     return find_rims(true_models(scene, images), images, radius, scene.camera)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("rim_mm", [0.3, 0.15])
+@pytest.mark.parametrize("rim_mm", sampled([0.3, 0.15]))
 def test_the_height_of_a_rim_is_found(scene, rim_mm):
     """Within 10 %, as the area of the lens-shaped image is that of an ellipse to second order alone, and within 3 σ."""
     rim = rims_of(scene, rim_mm)["circles"]

@@ -155,6 +155,7 @@ def test_closed_form_finds_the_focal_length():
         assert (found != start.focal).all()
 
 
+@pytest.mark.slow
 def test_boards_of_one_direction_are_refused():
     views = views_of(np.random.default_rng(1), count=6, tilt_deg=0.02)
     with fails_with("E-CALIBRATE-UNDETERMINED … 6 … 1"):

@@ -66,6 +66,7 @@ def test_urdf(files, faces):
     np.testing.assert_allclose(radii, sorted(1e-3 * r for r in faces["radius_mm"].values()))
 
 
+@pytest.mark.slow
 def test_xacro(files, faces, tmp_path):
     """Twice on one robot, by the program itself."""
     xacro = importlib.import_module("xacro")
@@ -137,6 +138,7 @@ def test_table(files, faces):
     assert [row["kind"] for row in rows].count("circle") == len(faces["circles"])
 
 
+@pytest.mark.slow
 def test_ply(files, faces, small_run):
     trimesh = importlib.import_module("trimesh")
     mesh = trimesh.load(files["ply"], process=False)

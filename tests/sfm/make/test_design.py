@@ -38,6 +38,7 @@ def test_each_face_is_named_with_any_three_circles_hidden(made):
             assert is_named(face, found, target)
 
 
+@pytest.mark.slow
 def test_no_four_circles_are_alike_in_two_readings(made):
     """Not with another face, not turned, not in a mirror: by the package's own search for likeness."""
     target = made.pattern.target

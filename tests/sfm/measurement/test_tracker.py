@@ -78,6 +78,7 @@ def test_a_followed_pose_is_that_of_a_search(film, frames, target, model):
         assert error @ np.linalg.solve(own.covariance, error) < 28  # χ² of 6, one in 10 000
 
 
+@pytest.mark.slow
 def test_what_jumps_is_searched_and_found(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     truth = film.groups["12"].camera_from_target
