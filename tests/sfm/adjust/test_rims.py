@@ -40,27 +40,27 @@ def test_the_height_of_a_rim_is_found(scene, rim_mm):
     rim = rims_of(scene, rim_mm)["circles"]
     assert rim.height_mm == pytest.approx(rim_mm, abs=0.1 * rim_mm + 3 * rim.sigma_mm)
     assert rim.height_mm > 4 * rim.sigma_mm
-    check = rim_check({"circles": rim}, 0.002)
+    check = rim_check({"circles": rim}, 0.002, {})
     assert check.verdict == "suspicious"
     assert "in front of the luminous surface" in check.reason
-    assert rim_check({"circles": rim}, 0.002, rim_mm).verdict == "passed"
+    assert rim_check({"circles": rim}, 0.002, {"circles": rim_mm}).verdict == "passed"
 
 
 @pytest.mark.slow
 def test_no_rim_is_found_where_there_is_none(scene):
     rims = rims_of(scene, 0.0)
     assert abs(rims["circles"].height_mm) < 3 * rims["circles"].sigma_mm
-    assert rim_check(rims, 0.002).verdict == "passed"
+    assert rim_check(rims, 0.002, {}).verdict == "passed"
 
 
 def test_without_tilts_nothing_is_said():
-    assert rim_check({}, 0.002).verdict == "not possible"
+    assert rim_check({}, 0.002, {}).verdict == "not possible"
 
 
 def test_a_rim_that_harms_nothing_is_no_fault():
     """It is seen with certainty, and moves faces by less than their σ."""
-    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.02).verdict == "passed"
-    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.002).verdict == "suspicious"
+    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.02, {}).verdict == "passed"
+    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.002, {}).verdict == "suspicious"
 
 
 @pytest.mark.parametrize("solve", ["chain", "paper"])
