@@ -89,7 +89,7 @@ def boards(tmp_path_factory):
 
 
 LEFT_PX = 0.0035
-"""RMS that the correction of dots may leave: 0.0014 to 0.0026 px on these three images, of 0.004 to 0.012 without it."""
+"""RMS that the correction of dots may leave: on these three images 0.0014 to 0.0026 px of 0.004 to 0.012."""
 
 
 @pytest.mark.slow
