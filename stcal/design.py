@@ -165,11 +165,6 @@ class TargetDesign:
         """Returns the design with only the printed faces, or only the faces of circles."""
         return replace(self, faces=tuple(face for face in self.faces if (face.printed is not None) == printed))
 
-    @property
-    def has_printed(self) -> bool:
-        """True if a face is a board or has tags."""
-        return any(face.printed is not None for face in self.faces)
-
     def face(self, face_id: str) -> FaceDesign:
         """Returns the face with this id; raises InputError if there is none."""
         for face in self.faces:

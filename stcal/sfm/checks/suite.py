@@ -87,7 +87,7 @@ class Evidence:
         models = self.models
         if not camera.same_as(self.camera):
             models = tuple(adjust(model, camera) for model in models)
-        factors = image_sigma_factors(models, camera, self.target.has_printed)
+        factors = image_sigma_factors(models, camera)
         scales = self.calibration.scales
         return [free_network(with_sigma(m.metric(scales[m.group].group_from_world()), factors), camera) for m in models]
 
