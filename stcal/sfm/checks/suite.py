@@ -92,7 +92,7 @@ class Evidence:
         return [free_network(with_sigma(m.metric(scales[m.group].group_from_world()), factors), camera) for m in models]
 
 
-def _rims(evidence: Evidence) -> tuple[dict[str, Rim], float | None, dict[str, float | None]]:
+def _rims(evidence: Evidence) -> tuple[dict[str, Rim], float | None, Mapping[str, float | None]]:
     """Returns the rims by kind of circle; the largest σ of a face's position, mm, None if it is not known; and by kind
     the height that the result allows for, None if it is to be estimated."""
     rims = find_rims(evidence.calibration.models, evidence.images, evidence.radius_mm(), evidence.calibration.camera)
