@@ -108,6 +108,7 @@ def test_the_dots_of_a_single_view_are_corrected(boards):
     for i in range(3):
         pictures = (decode((folder / name / f"{i}.png").read_bytes(), name) for name in ("blurred", "sharp"))
         view, twin = (find_board(picture, "", scene.camera, scene.board)[0] for picture in pictures)
-        assert view and twin
+        assert view
+        assert twin
         np.testing.assert_array_equal(view.ids, twin.ids)
         assert np.sqrt(((view.xy_px - twin.xy_px) ** 2).mean()) < LEFT_PX
