@@ -25,7 +25,8 @@ corrected as here (``scripts/studies/defocus_study.py``). Half of it is a shift 
 grows by up to a third faster than the variance of the pupil's image."""
 RESPONSE_SIGMA = 0.15
 """σ of this multiple for one circle, as a share of it: the study's scatter of single circles, and what the circles of a
-face have in common in one image (0.04), as ten of them take together; and pupils that are not round."""
+face have in common in one image (0.04 where shifts are large), as ten of them take together; and pupils that are not
+round."""
 FAR_BLUR, FAR_SIGMA = 0.45, 0.5
 """Where the blur is wider than this share of the smaller radius, the share is :data:`FAR_SIGMA`."""
 MAX_UNEXPLAINED = 0.5
