@@ -165,11 +165,6 @@ class TargetDesign:
         """Returns the design with only the printed faces, or only the faces of circles."""
         return replace(self, faces=tuple(face for face in self.faces if (face.printed is not None) == printed))
 
-    @property
-    def has_printed(self) -> bool:
-        """True if a face is a board or has tags."""
-        return any(face.printed is not None for face in self.faces)
-
     def face(self, face_id: str) -> FaceDesign:
         """Returns the face with this id; raises InputError if there is none."""
         for face in self.faces:
@@ -246,6 +241,8 @@ class BoardDesign:
         What is stated of its size beside the drawing.
     unusual_size : bool
         Whether a pitch or radius that no hardware has in mm is meant as it stands.
+    rim_mm : float
+        Height of the rims in front of the dots, negative for dots that stand out; mm.
 
     Raises
     ------
@@ -263,6 +260,7 @@ class BoardDesign:
     corner_radius_mm: float | None = None
     stated: StatedSize = StatedSize()
     unusual_size: bool = False
+    rim_mm: float = 0.0
 
     def __post_init__(self):
         require_choices(self, "board")
@@ -292,9 +290,9 @@ class BoardDesign:
         return list(_dot_labels(self.rows, self.columns))
 
     def places_mm(self, labels: Iterable[Label]) -> np.ndarray:
-        """Returns the grid positions of these dots, (n, 3), board frame."""
+        """Returns the places at which these dots are seen, (n, 3), board frame: half of a rim before the surface."""
         cells = dot_cells(labels)
-        return np.column_stack([self.pitch_mm * cells[:, ::-1], np.zeros(len(cells))])
+        return np.column_stack([self.pitch_mm * cells[:, ::-1], np.full(len(cells), -0.5 * self.rim_mm)])
 
     def radius_of(self) -> dict[DotLabel, float]:
         """Returns the radius in mm by label."""

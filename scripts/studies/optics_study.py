@@ -3,9 +3,10 @@
     .venv/bin/python scripts/studies/optics_study.py [SET …] [--data FOLDER] [--runs FOLDER] [--rim]
 
 For each set of `../shared/data/stereo_target`, JPEG and PNG where both exist, `stcal-sfm run` with its default options.
-Columns: largest error of a face's place (µm) and rotation (mdeg); largest normalised error √(eᵀC⁻¹e/6) of a face; χ² of
-all circles of the faces with their joint covariance, after the best rigid motion, per degree of freedom; largest
-correction for defocus, px; wrong labels; verdict, and the checks that did not pass.
+Columns: largest error of a face's place (µm), what it is on average by the stated covariances of the faces, and the
+share of draws from these in which it is as large as here; largest error of a rotation (mdeg); largest normalised error
+√(eᵀC⁻¹e/6) of a face; χ² of all circles of the faces with their joint covariance, after the best rigid motion, per
+degree of freedom; largest correction for defocus, px; wrong labels; verdict, and the checks that did not pass.
 `--rim` : runs that estimate rims, and their height.
 """
 
@@ -23,6 +24,7 @@ from stcal.report.text import text_table
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "stereo_target"
 COMMAND = [sys.executable, "-m", "stcal", "sfm"]
+DRAWS = 20_000
 FREE = 1e6
 """Variance of the rigid motion, in mm² about each axis: the truth's frame is another one."""
 
@@ -46,6 +48,14 @@ def joint_chi2(faces: dict, truth: dict) -> tuple[float, int]:
     return float(error @ np.linalg.solve(whole, error)), n - 6
 
 
+def worst_of_draws(faces: dict) -> np.ndarray:
+    """Largest error of a face's place, µm, in random draws from the stated covariances of the faces."""
+    rng = np.random.default_rng(0)
+    covariances = [np.array(c)[3:, 3:] for c in faces["target_from_face_covariance"].values()]
+    errors = [rng.multivariate_normal(np.zeros(3), c, DRAWS, check_valid="ignore") for c in covariances]
+    return 1e3 * np.linalg.norm(errors, axis=2).max(0)
+
+
 def row_of(name: str, images: Path, folder: Path, run: Path, options: list[str]) -> list[str]:
     """One row of the table."""
     words = ["run", str(images), "--camera", str(folder / "cameras.txt"), "--out", str(run), "--quiet", *options]
@@ -64,10 +74,13 @@ def row_of(name: str, images: Path, folder: Path, run: Path, options: list[str])
     chi2, freedom = joint_chi2(faces, truth)
     errors = [face["normalised_error"] for face in compared["faces"].values() if face.get("normalised_error")]
     wrong = compared["labels"]["wrong"] if compared.get("labels") else "–"
+    by_chance = worst_of_draws(faces)
     bad = [check["key"] for check in report["checks"] if check["verdict"] != "passed"]
     return [
         name,
         f"{compared['worst']['translation_um']:.1f}",
+        f"{by_chance.mean():.1f}",
+        f"{100 * (by_chance >= compared['worst']['translation_um']).mean():.0f}",
         f"{compared['worst']['rotation_mdeg']:.1f}",
         f"{max(errors):.2f}",
         f"{chi2 / freedom:.2f}",
@@ -104,6 +117,8 @@ def main() -> None:
     heads = [
         "<set",
         "faces µm",
+        "expected",
+        "chance %",
         "mdeg",
         "worst σ",
         "χ²/dof",

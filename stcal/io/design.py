@@ -178,6 +178,7 @@ class BoardEntry(BoardSizeEntry):
     polarity: Polarity
     sigma_mm: Positive = 0.005
     corner: _CornerFile | None = None
+    rim_mm: RimHeight = 0.0
     unusual_size: bool = False
 
 
@@ -277,6 +278,7 @@ def board_design(data: BoardEntry, where: str) -> BoardDesign:
         corner_mm,
         data.stated(),
         data.unusual_size,
+        data.rim_mm,
     )
 
 
@@ -453,6 +455,7 @@ def board_toml(board: BoardDesign) -> str:
                 f"radius_mm = {_number(board.radius_mm)}",
                 f'polarity = "{board.polarity}"  # dots are "bright" or "dark" against the board',
                 f"sigma_mm = {_number(board.sigma_mm)}  # standard deviation of the dots' positions, per axis",
+                *([f"rim_mm = {_number(board.rim_mm)}  # height of rims before the dots"] if board.rim_mm else []),
                 *(f"{key} = {_number(value)}" for key, value in sizes if value is not None),
                 *stated_unusual(board_lengths(board.pitch_mm, board.radius_mm)),
                 "",

@@ -54,7 +54,7 @@ class TrueOptics(Part):
     rim_mm: float | None = Field(
         None,
         description="depth of the faces' circles behind a rim, negative where they are raised; `circles` are those of "
-        "the face's surface all the same. The board's dots have none",
+        "the face's surface all the same. The board's dots have those of its design",
     )
 
 

@@ -286,7 +286,7 @@ class RenderOptions:
         Depth of the luminous discs of the faces behind rims of the same radius, cylindrical holes: what is seen is the
         part of a disc that a camera sees through the hole's upper edge. A negative value raises the disc by that
         height: its top shines, its wall is dark, and the circle simply lies higher. The stated true circles stay where
-        the face is. Dots of the board are printed and have no rim.
+        the face is. Dots of the board have the rims that its design states.
     """
 
     noise: float = 0.01
@@ -354,7 +354,9 @@ def render(scene: Scene, group: str, image: int, options: RenderOptions | None =
     dot = np.array([isinstance(label, DotLabel) for label in circles.labels], bool)
     base = np.where(dot, board, face)
     levels = base * (1 + options.spread * rng.standard_normal(len(base)))
-    picture = _add_circles(picture, scene.camera, circles, levels, np.where(dot, 0.0, options.rim_mm), options)
+    picture = _add_circles(
+        picture, scene.camera, circles, levels, np.where(dot, scene.board.rim_mm, options.rim_mm), options
+    )
     return _expose(picture, options, rng)
 
 

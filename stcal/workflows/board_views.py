@@ -33,6 +33,7 @@ from stcal.io.cameras.model import CameraModel
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import (
     MAJORITY,
+    TOP_GROUP,
     ImageFile,
     Skipped,
     common_size,
@@ -41,8 +42,12 @@ from stcal.io.images import (
     grey_8bit,
     size_fault,
 )
+from stcal.labels import DotLabel
 from stcal.locate.calibration.solve import CalibrationImages
+from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.patterns import pattern_of_board
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, find_ellipses
+from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.image import detect_image
 
 CENTRING_ROUNDS = 3
@@ -242,9 +247,21 @@ def _find_circles(
     if not _turned_only(ids, board):
         return None, "a strip of the board is hidden, so that its dots cannot be numbered; show more of it"
     centres, xy = detected.centres.select(detected.board.rows), board.xy_mm()[ids[0]]
+    labels = tuple(DotLabel(*cell) for cell in detected.board.numberings[0].tolist())
+    seen = ImageObservations(
+        name,
+        TOP_GROUP,
+        labels,
+        centres.centre_px,
+        centres.centre,
+        centres.shape,
+        centres.covariance_px2,
+        blur_px=centres.blur_px,
+    )
+    (sharp,), _ = correct_defocus([seen], camera, pattern_of_board(grid))
     xyz = np.column_stack([xy, np.zeros(len(xy))])
-    centre_px = images_of_centres(centres.centre_px, xyz, board.radii_mm()[ids[0]], camera)
-    return BoardView(name, ids[0], xyz, centre_px, centres.covariance_px2), ""
+    centre_px = images_of_centres(sharp.centre_px, xyz, board.radii_mm()[ids[0]], camera)
+    return BoardView(name, ids[0], xyz, centre_px, sharp.covariance_px2), ""
 
 
 def _turned_only(ids: np.ndarray, board: BoardDesign | AsymmetricCirclesDesign) -> bool:

@@ -92,6 +92,12 @@ def radius_views(
     )
 
 
+def lost_radius_mm(height_mm: float, tan_tilt: np.ndarray, radius_mm: float | np.ndarray) -> np.ndarray:
+    """Returns the radius that a rim of this height hides of a circle at these tilts, mm: that of the area in common of
+    two discs that are h tan τ apart, to second order."""
+    return height_mm * tan_tilt / np.pi + SECOND_ORDER * height_mm * abs(height_mm) * tan_tilt**2 / radius_mm
+
+
 def find_rims(
     models: Sequence[GroupModel], images: Sequence[ImageObservations], design_mm: Mapping[Label, float], camera: Camera
 ) -> dict[str, Rim]:
@@ -126,7 +132,7 @@ def _rim(short: np.ndarray, tangent: np.ndarray, radius: np.ndarray, blur: np.nd
     rows = np.column_stack([np.eye(kind.max() + 1)[kind], -tangent / np.pi])
     height, weight, sigma, inverse = 0.0, np.ones(len(short)), 1.0, np.eye(1)
     for _ in range(STEPS):
-        right = short + SECOND_ORDER * height * abs(height) * tangent**2 / radius
+        right = short + lost_radius_mm(height, tangent, radius) - height * tangent / np.pi
         inverse = np.linalg.pinv((rows.T * weight) @ rows, hermitian=True)
         solution = inverse @ ((rows.T * weight) @ right)
         height = float(solution[-1])

@@ -150,14 +150,12 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
 
 def _rims(run: SavedRun, found: Contributions, own: Derivatives) -> tuple[Source, ...]:
     """Returns the row of the rims in front of the circles, none if the faces are as seen."""
-    if not run.faces.rim_mm:
+    heights, sigma_mm = run.rims_mm()
+    if not heights:
         return ()
-    sigma_mm = run.report["summary"].get("rim_sigma_mm")
-    heights = {label: run.faces.rim_mm[label] for label in found.joint.labels if label in run.faces.rim_mm}
-    covariance = rim_covariance_mm2(found.joint, own.target_from_face, heights, sigma_mm or 0.0)
+    covariance = rim_covariance_mm2(found.joint, own.target_from_face, heights, sigma_mm)
     origin, words = ("estimated", "from radii by tilt, --rim") if sigma_mm else ("not stated", "rim_mm of target.toml")
-    sigma_um = 1e3 * sigma_mm if sigma_mm else None
-    return (Source("rims", "rims before the circles", "A", origin, words, sigma_um, "µm", covariance),)
+    return (Source("rims", "rims before the circles", "A", origin, words, 1e3 * sigma_mm or None, "µm", covariance),)
 
 
 def budget(

@@ -37,7 +37,9 @@ from stcal.sfm.camera.intrinsics import (
     start_camera,
 )
 from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.patterns import pattern_of_board
 from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.defocus import correct_defocus
 from stcal.sfm.detect.files import DetectionResult, detect_files
 
 MIN_VIEWS = 3
@@ -163,8 +165,10 @@ def _of_one_round(
     first: bool,
 ) -> tuple[list[ImageObservations], tuple[Skipped, ...], Intrinsics]:
     """Returns the views of the board, what was skipped, and the adjusted intrinsics. ``first`` : the focal length of
-    ``camera`` is not known."""
+    ``camera`` is not known, and with it the depths of the dots, by which they are corrected for defocus."""
     views = board_views(detection.images, board, camera)
+    if not first:
+        views, _ = correct_defocus(views, camera, pattern_of_board(board))
     skipped = (*not_images, *detection.skipped, *_without_board(detection, views))
     require_views(views, files, skipped)
     start = closed_form(views, board, camera) if first else camera

@@ -117,6 +117,7 @@ def board_views(images: Sequence[DetectedImage], board: BoardDesign, camera: Cam
                     centre=dots.centre,
                     shape=dots.shape,
                     covariance_px2=dots.covariance_px2,
+                    blur_px=dots.blur_px,
                 )
             )
     numberings = {i.file.name: i.detection.board.numberings for i in images if i.detection.board is not None}

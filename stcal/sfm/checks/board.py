@@ -14,7 +14,7 @@ from stcal.geometry.robust import robust_sigma
 from stcal.labels import CircleLabel, DotLabel, Label, dot_cells
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import Network
-from stcal.sfm.adjust.rims import Rim, radius_views
+from stcal.sfm.adjust.rims import Rim, lost_radius_mm, radius_views
 from stcal.sfm.checks.verdict import Check, Measured, Trial, impossible, judge
 from stcal.sfm.data.model import ImageObservations
 
@@ -67,9 +67,16 @@ class Size:
 
 
 def measure_radii(
-    networks: Sequence[Network], images: Sequence[ImageObservations], design_mm: dict[Label, float], camera: Camera
+    networks: Sequence[Network],
+    images: Sequence[ImageObservations],
+    design_mm: dict[Label, float],
+    camera: Camera,
+    rim_mm: Mapping[Label, float],
 ) -> Radii:
-    """Computes radii from the areas of the ellipses and the positions and planes of the circles."""
+    """Computes radii from the areas of the ellipses and the positions and planes of the circles.
+
+    ``rim_mm`` : heights of the rims that the result allows for, which hide a part of the circles.
+    """
     by_name = {image.name: image for image in images}
     ratio: dict[Label, list[np.ndarray]] = {}
     size: dict[Label, list[np.ndarray]] = {}
@@ -78,8 +85,10 @@ def measure_radii(
         for k, label in enumerate(network.model.labels):
             if label not in design_mm:  # a corner
                 continue
-            ratio.setdefault(label, []).append(views.ratio[views.point_index == k])
-            size.setdefault(label, []).append(views.size_px[views.point_index == k])
+            own = views.point_index == k
+            hidden = lost_radius_mm(rim_mm.get(label, 0.0), views.tan_tilt[own], design_mm[label]) / design_mm[label]
+            ratio.setdefault(label, []).append(views.ratio[own] + hidden)
+            size.setdefault(label, []).append(views.size_px[own])
     return Radii(
         tuple(ratio),
         np.array([design_mm[label] for label in ratio]),
@@ -121,47 +130,42 @@ def radius_checks(radii: Radii) -> list[Check]:
 
 RIM_SIGMAS = 4.0
 """Height of a rim, in its σ, that is taken as seen: by chance in one of 16 000 kinds of circle."""
+KINDS = {"circles": ("circles of the faces", "the faces lie"), "dots": ("dots of the board", "the board lies")}
+"""Name of each kind of circle, and what lies where its circles do."""
 
 
-def rim_check(rims: Mapping[str, Rim], sigma_mm: float | None, allowed_mm: float | None = 0.0) -> Check:
+def rim_check(rims: Mapping[str, Rim], sigma_mm: float | None, allowed_mm: Mapping[str, float | None]) -> Check:
     """Tests whether circles lie behind a rim, from the change of their radii with tilt.
 
     ``rims`` : by kind of circle; ``sigma_mm`` : largest σ of a face's position; a rim that moves the faces by less
-    than this is seen and does no harm; ``allowed_mm`` : height in front of the faces' circles that the result allows
-    for, None if it takes what is estimated here.
+    than this is seen and does no harm; ``allowed_mm`` : by kind of circle, the height that the result allows for, None
+    if it takes what is estimated here; 0 of other kinds.
     """
     key, title = "rim", "Rim in front of the circles"
     if not rims:
         return impossible(key, title, "too few tilts of circles to tell", "photograph faces from several angles")
-    measured, names, reasons = [], [], []
+    measured, names, reasons, settled = [], [], [], []
     for kind, rim in rims.items():
         limit = max(RIM_SIGMAS * rim.sigma_mm, 2 * (sigma_mm or 0.0))
-        allowed = 0.0 if kind == "dots" else rim.height_mm if allowed_mm is None else allowed_mm
-        beyond = rim.height_mm - allowed
-        what = "circles of the faces" if kind == "circles" else "dots of the board"
+        allowed = allowed_mm.get(kind, 0.0)
+        beyond = 0.0 if allowed is None else rim.height_mm - allowed
+        what, surface = KINDS[kind]
+        look = f"{what} look {rim.height_mm:.3f} ± {rim.sigma_mm:.3f} mm deep"
         measured.append(Measured(what, 1e3 * rim.height_mm, 1e3 * limit, "µm", None))
         if abs(beyond) > limit:
             names.append(what)
-            surface = "the faces lie" if kind == "circles" else "the board lies"
             where = "in front of" if beyond > 0 else "behind"
-            reasons.append(
-                f"{what} look {rim.height_mm:.3f} ± {rim.sigma_mm:.3f} mm deep: {surface} "
-                f"{abs(beyond) / 2:.3f} mm {where} the luminous surface"
-            )
+            reasons.append(f"{look}: {surface} {abs(beyond) / 2:.3f} mm {where} the luminous surface")
+        elif allowed != 0:
+            source = "estimated" if allowed is None else f"{allowed:g} mm stated"
+            settled.append(f"{look}, {source}; {surface} on the surface")
     if not names:
-        if allowed_mm != 0 and "circles" in rims:
-            rim = rims["circles"]
-            source = "estimated" if allowed_mm is None else f"{allowed_mm:g} mm stated"
-            reason = (
-                f"circles look {rim.height_mm:.3f} ± {rim.sigma_mm:.3f} mm deep, {source}; faces are of the surface"
-            )
-            return Check(key, title, "passed", reason, tuple(measured), len(rims), (), "")
         deepest = max(rims.values(), key=lambda rim: abs(rim.height_mm) / rim.sigma_mm)
-        reason = f"radii change with tilt as those of flat circles: {deepest.height_mm:.3f} ± {deepest.sigma_mm:.3f} mm"
-        return Check(key, title, "passed", reason, tuple(measured), len(rims), (), "")
+        flat = f"radii change with tilt as those of flat circles: {deepest.height_mm:.3f} ± {deepest.sigma_mm:.3f} mm"
+        return Check(key, title, "passed", "; ".join(settled) or flat, tuple(measured), len(rims), (), "")
     remedy = (
         "faces are where their circles seem to lie; for the luminous surface run with --rim, or state rim_mm in "
-        "target.toml"
+        "target.toml, of dots in board.toml"
     )
     return Check(key, title, "suspicious", "; ".join(reasons), tuple(measured), len(rims), tuple(names), remedy)
 

@@ -1,6 +1,6 @@
 """Checks that residuals cannot fake: each asks a question that a wrong result with small residuals answers wrongly."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -10,7 +10,7 @@ from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDes
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraPrior
-from stcal.labels import Label
+from stcal.labels import DotLabel, Label
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.calibration import Calibration, calibrate, image_sigma_factors, with_sigma
 from stcal.sfm.adjust.network import Network, free_network, solve_score
@@ -87,19 +87,29 @@ class Evidence:
         models = self.models
         if not camera.same_as(self.camera):
             models = tuple(adjust(model, camera) for model in models)
-        factors = image_sigma_factors(models, camera, self.target.has_printed)
+        factors = image_sigma_factors(models, camera)
         scales = self.calibration.scales
         return [free_network(with_sigma(m.metric(scales[m.group].group_from_world()), factors), camera) for m in models]
 
 
-def _rims(evidence: Evidence) -> tuple[dict[str, Rim], float | None, float | None]:
-    """Returns the rims by kind of circle; the largest σ of a face's position, mm, None if it is not known; and the
-    height that the result allows for, None if it is to be estimated."""
+def _rims(evidence: Evidence) -> tuple[dict[str, Rim], float | None, Mapping[str, float | None]]:
+    """Returns the rims by kind of circle; the largest σ of a face's position, mm, None if it is not known; and by kind
+    the height that the result allows for, None if it is to be estimated."""
     rims = find_rims(evidence.calibration.models, evidence.images, evidence.radius_mm(), evidence.calibration.camera)
     known = [np.sqrt(np.diag(c)[3:].max()) for c in evidence.calibration.target.face_covariance.values()]
-    stated = list(evidence.target.rim_of().values())
-    allowed = None if evidence.rim else float(np.mean(stated)) if stated else 0.0
-    return rims, float(max(known)) if known else None, allowed
+    if evidence.rim:
+        return rims, float(max(known)) if known else None, dict.fromkeys(rims)
+    faces = list(evidence.target.rim_of().values())
+    stated = {"circles": float(np.mean(faces)) if faces else 0.0, "dots": evidence.board.rim_mm}
+    return rims, float(max(known)) if known else None, stated
+
+
+def _allowed_mm(evidence: Evidence, rims: Mapping[str, Rim]) -> dict[Label, float]:
+    """Returns the heights of the rims that the result allows for, by label: as estimated, or as stated."""
+    if not evidence.rim:
+        return {**evidence.target.rim_of(), **dict.fromkeys(evidence.board.labels(), evidence.board.rim_mm)}
+    kinds = {label: "dots" if isinstance(label, DotLabel) else "circles" for label in evidence.radius_mm()}
+    return {label: rims[kind].height_mm for label, kind in kinds.items() if kind in rims}
 
 
 def _bend(evidence: Evidence) -> tuple[set[str], float]:
@@ -115,7 +125,8 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
     """
     networks, calibration = evidence.networks(), evidence.calibration
     camera, board, target = calibration.camera, evidence.board, evidence.target
-    radii = measure_radii(networks, evidence.images, evidence.radius_mm(), camera)
+    rims, sigma_mm, allowed = _rims(evidence)
+    radii = measure_radii(networks, evidence.images, evidence.radius_mm(), camera, _allowed_mm(evidence, rims))
     makers: tuple[Callable[[], Check | Iterable[Check]], ...] = (
         lambda: camera_check(networks, evidence.camera, calibration, evidence.prior),
         lambda: field_check(networks, camera),
@@ -129,7 +140,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: board_checks(networks, board),
         lambda: pitch_check(calibration.target, target, radii),
         lambda: radius_checks(radii),
-        lambda: rim_check(*_rims(evidence)),
+        lambda: rim_check(rims, sigma_mm, allowed),
         lambda: flatness_check(networks, evidence.options.flatness_mm, *_bend(evidence)),
         lambda: control_check(evidence, networks),
     )

@@ -46,9 +46,12 @@ class Pattern:
 def patterns_of(target: TargetDesign, board: BoardDesign | None) -> dict[str, Pattern]:
     """Returns the patterns of the faces and the board by name."""
     patterns = {f.id: Pattern(f.id, f.labels(), f.xy_mm, f.radius_mm, target.polarity, 1) for f in target.faces}
-    if board is not None:  # its Z points into it
-        patterns[BOARD] = Pattern(BOARD, board.labels(), board.xy_mm(), board.radii_mm(), board.polarity, -1)
-    return patterns
+    return patterns if board is None else patterns | pattern_of_board(board)
+
+
+def pattern_of_board(board: BoardDesign) -> dict[str, Pattern]:
+    """Returns the pattern of the board by its name. Its Z points into it."""
+    return {BOARD: Pattern(BOARD, board.labels(), board.xy_mm(), board.radii_mm(), board.polarity, -1)}
 
 
 def in_view(

@@ -18,12 +18,15 @@ MIN_CIRCLES = 12
 """Smallest number of circles of an image for its law of blur, which has three parameters."""
 BY_CHANCE = 1e-6
 """Share of images with even blur of which a law is found by chance."""
-RESPONSE, RESPONSE_OF_BLUR2 = 0.57, 13.0
-"""Shift of a centre as a multiple of the gradient of the squared blur, and its growth with the square of the blur over
-the smaller radius. From circles rendered through 400 points of a pupil (``scripts/studies/defocus_study.py``): radii of
-5 to 28 px, tilts of 15° to 72°, blur of up to half of the smaller radius."""
+RESPONSE, RESPONSE_OF_BLUR2 = 0.54, 9.9
+"""Shift of a centre as a multiple of the gradient of the squared blur by the law of its image, and its growth with the
+square of the blur over the smaller radius. From circles of scenes that were rendered through points of a pupil and
+corrected as here (``scripts/studies/defocus_study.py``). Half of it is a shift of the edges; the blur that fits show
+grows by up to a third faster than the variance of the pupil's image."""
 RESPONSE_SIGMA = 0.15
-"""σ of this multiple, as a share of it: the scatter of the study, and pupils that are not round."""
+"""σ of this multiple for one circle, as a share of it: the study's scatter of single circles, and what the circles of a
+face have in common in one image (0.04 where shifts are large), as ten of them take together; and pupils that are not
+round."""
 FAR_BLUR, FAR_SIGMA = 0.45, 0.5
 """Where the blur is wider than this share of the smaller radius, the share is :data:`FAR_SIGMA`."""
 MAX_UNEXPLAINED = 0.5

@@ -14,7 +14,7 @@ from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.json import Part, ResultFile, read_json
 from stcal.parallel import Progress
 from stcal.report.text import number, text_table
-from stcal.sfm.adjust.calibration import Calibration, calibrate, with_sigma
+from stcal.sfm.adjust.calibration import Calibration, calibrate, on_luminous_surface, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.refine import refine
@@ -125,7 +125,11 @@ def crosscheck(
             pycolmap_models.append(_own(folder, work, names, pair, name, run, ids))
         progress("crosscheck", len(groups), len(groups))
         of_native, of_pycolmap = faces_from_models(native_models, run), faces_from_models(pycolmap_models, run)
-    readjusted = calibrate(adjusted, run.camera, run.target, run.board, run.options.adjustment(run.target))
+    options = run.options.adjustment(run.target)
+    readjusted = calibrate(adjusted, run.camera, run.target, run.board, options)
+    heights, rim_sigma_mm = run.rims_mm()
+    if heights:
+        readjusted = on_luminous_surface(readjusted, heights, rim_sigma_mm, run.target, options.frame)
     return _comparison(run, native, schema, of_native, of_pycolmap, readjusted, tolerances)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from stcal.errors import DegenerateError
 from stcal.parallel import Progress, kept_processes, one_thread, run_briefly
+from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.equations import rows_of_view
 from stcal.sfm.adjust.joint import JointResult, basis_of, photographs_of
 from stcal.sfm.data.model import MetricModel
@@ -114,6 +115,8 @@ def known_of(run: SavedRun) -> Known:
     """
     again = adjusted_run(run)
     joint = again.state.result()
+    heights, rim_sigma_mm = run.rims_mm()
+    rims = rim_covariance_mm2(joint, again.start.target_from_face, heights, rim_sigma_mm) if rim_sigma_mm else None
     setup = Setup(
         target=run.target,
         board=run.board,
@@ -124,6 +127,7 @@ def known_of(run: SavedRun) -> Known:
         prior=again.prior,
         common=joint.board_common,
         sigma0=joint.sigma_scale,
+        rims_mm2=rims,
     )
     noise = CentreNoise.measured(joint.models, joint.camera, setup.radius_mm())
     return Known(joint.models, joint, setup, noise, known_scene(joint.models, joint, setup, run.camera.colmap_model))

@@ -53,8 +53,8 @@ class ForecastPart(Part):
         description="all faces but the reference: `translation_sigma_um` and `rotation_sigma_mdeg` (x, y, z), "
         "`position_sigma_um` (root of the summed variances of x, y, z), `worst_circle` and its "
         "`worst_circle_sigma_um` (likewise), `variance_shares`: by source (`image noise`, `board`, `intrinsics` where "
-        "refined) the share of the position's variance that goes when the source is switched off; they need not add up "
-        "to 1"
+        "refined, `rims` where estimated) the share of the position's variance that goes when the source is switched "
+        "off; they need not add up to 1"
     )
 
     @classmethod

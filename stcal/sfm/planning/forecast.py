@@ -148,7 +148,8 @@ class Setup:
 
     ``start`` : the target as it is, for the reference face and the sides that faces look to; ``prior`` : of the
     intrinsics, None if they are fixed; ``common`` : see :func:`stcal.sfm.adjust.joint.covariance_of`; ``sigma0`` :
-    factor on all σ.
+    factor on all σ; ``rims_mm2`` : (3c, 3c) covariance of the circles by the heights of their rims, which no view
+    changes, None if these are not estimated.
     """
 
     target: TargetDesign
@@ -160,6 +161,11 @@ class Setup:
     prior: CameraPrior | None
     common: float
     sigma0: float = 1.0
+    rims_mm2: np.ndarray | None = None
+
+    def circle_covariance(self, adjusted_mm2: np.ndarray) -> np.ndarray:
+        """Returns the covariance of the circles, (3c, 3c) mm², from that of an adjustment whose σ₀ is 1."""
+        return self.sigma0**2 * adjusted_mm2 + (0.0 if self.rims_mm2 is None else self.rims_mm2)
 
     def radius_mm(self) -> dict[Label, float]:
         """Radius by label, mm."""
@@ -227,7 +233,7 @@ def forecast(
     """
     joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
     used_derivatives = known or derivatives(joint, setup.start, setup.target, setup.frame)
-    covariance = setup.sigma0**2 * joint.covariance_mm2
+    covariance = setup.circle_covariance(joint.covariance_mm2)
     reference = setup.start.reference_face
     circles = np.sqrt(np.trace(used_derivatives.circle_covariance(covariance), axis1=1, axis2=2))
     return Forecast(
@@ -256,7 +262,7 @@ class PositionsWith:
 
     def __call__(self, view: MetricModel) -> dict[str, float]:
         """Returns the σ of each face's position with this view, mm."""
-        faces = self.known.face_covariance(self.setup.sigma0**2 * self.now.with_view(view))
+        faces = self.known.face_covariance(self.setup.circle_covariance(self.now.with_view(view)))
         return {f: position_sigma_mm(c) for f, c in faces.items() if f != self.setup.start.reference_face}
 
 
@@ -268,7 +274,8 @@ def position_sigma_mm(face_covariance: np.ndarray) -> float:
 def without_sources(
     models: Sequence[MetricModel], setup: Setup, known: Derivatives, photographs: Photographs | None = None
 ) -> dict[str, Forecast]:
-    """Returns the forecast with each source of error switched off in turn: images, board, and intrinsics if refined."""
+    """Returns the forecast with each source of error switched off in turn: images, board, intrinsics if refined,
+    and rims if estimated."""
     if photographs is None:
         fixed, quiet = None, None
         quieter = [replace(model, covariance_px2=OFF**2 * model.covariance_px2) for model in models]
@@ -281,6 +288,8 @@ def without_sources(
     }
     if setup.prior is not None:
         forecasts["intrinsics"] = forecast(models, replace(setup, prior=None), known, fixed)
+    if setup.rims_mm2 is not None:
+        forecasts["rims"] = forecast(models, replace(setup, rims_mm2=None), known, photographs)
     return forecasts
 
 

@@ -312,6 +312,7 @@ def _settings(report: dict) -> list[list[str]]:
         ["Face frames", FRAMES.get(frame, frame)],
         ["Eccentricity", "corrected" if options["eccentricity"] else "off (uncorrected control)"],
         *([["Surface", f"luminous, behind rims of {rim:.3f} mm"]] if (rim := summary.get("rim_mm")) else []),
+        *([["Dots of the board", f"behind rims of {rim:.3f} mm"]] if (rim := summary.get("dot_rim_mm")) else []),
         ["Reference face", report["reference_face"]],
         ["Faces not seen", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
         ["Centres observed", f"{summary['observations']}, redundancy {summary['redundancy'] or NONE}"],

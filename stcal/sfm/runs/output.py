@@ -69,6 +69,7 @@ def report_of(result: RunResult) -> ReportFile:
                 "last_move_px": result.calibration.joint.last_move_px if result.calibration.joint else None,
                 "rim_mm": float(np.mean(rims)) if (rims := list(result.calibration.rim_mm.values())) else None,
                 "rim_sigma_mm": result.calibration.rim_sigma_mm if rims else None,
+                "dot_rim_mm": result.board_design.rim_mm or None,
                 "scale_from": result.scale_from(),
                 "print_factor": joint.print_factor if joint and "faces" in result.scale_from() else None,
                 "bend_factor": joint.bend_factor if joint and "faces" in result.scale_from() else None,

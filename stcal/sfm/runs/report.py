@@ -54,6 +54,7 @@ class Summary(Part):
     last_move_px: float | None
     rim_mm: float | None = None
     rim_sigma_mm: float | None = None
+    dot_rim_mm: float | None = None
     scale_from: list[ScaleSource] = Field(default=["board"])
     print_factor: float | None = None
     bend_factor: float | None = None
@@ -257,7 +258,8 @@ class ReportFile(ResultFile):
         "of the size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
         "moved a projection at most (settled: less than 1e-6); these four are null with `chain` and `paper`; "
         "`rim_mm` mean height of the rims behind which the faces lie, `rim_sigma_mm` its σ (0 where stated), null "
-        "where they are as seen; `scale_from` what the size rests on; `print_factor`, `bend_factor` by which corners "
+        "where they are as seen; `dot_rim_mm` stated height of the rims before the board's dots, null without them; "
+        "`scale_from` what the size rests on; `print_factor`, `bend_factor` by which corners "
         "of printed faces are off their design over their σ, in the plane and off it (null without such faces); "
         "`camera_given` false where the camera was found from the photographs"
     )

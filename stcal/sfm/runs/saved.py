@@ -22,7 +22,7 @@ from stcal.io.cameras.read import read_camera
 from stcal.io.covariance import OF_PIXEL, first_fault
 from stcal.io.files import BOARD, CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, read_bytes
 from stcal.io.json import Part, checked, read_json
-from stcal.labels import circle_labels
+from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.calibration import SigmaFactors, with_sigma
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
@@ -78,6 +78,12 @@ class SavedRun:
         summary = self.report["summary"]
         overall = summary["sigma_factor"]
         return SigmaFactors(overall, *(summary.get(f"{kind}_sigma_factor", overall) for kind in ("circle", "dot")))
+
+    def rims_mm(self) -> tuple[dict[CircleLabel, float], float]:
+        """Returns the heights of the rims behind which the faces lie, by circle, and σ of all of them together, mm: 0
+        if they are stated. Without a circle the faces are as seen."""
+        heights = dict(zip(circle_labels(self.faces.rim_mm), self.faces.rim_mm.values(), strict=True))
+        return heights, self.report["summary"].get("rim_sigma_mm") or 0.0
 
     def report_as(self, part: type[ReportPart]) -> ReportPart:
         """Returns the part of ``report.json`` that a command needs.

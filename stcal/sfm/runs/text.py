@@ -35,7 +35,7 @@ def run_text(result: RunResult) -> str:
     lines += result.notes
     lines += _noted(result.labelled)
     lines += [*_scale_of_target(result), *_found_camera(result)]
-    lines += _defocus(result.labelled)
+    lines += [*_defocus(result.labelled), *_rims(result)]
     if result.options.solve == "paper":
         lines.append(
             "as published, for comparison: centres of contours, alike in weight, without the eccentricity; faces are "
@@ -125,6 +125,20 @@ def _defocus(labelled: Sequence[LabelledImage]) -> list[str]:
         f"blur {most.blur_px[0]:.2f} px at {most.depth_mm[0]:.0f} mm, {most.blur_px[1]:.2f} at "
         f"{most.depth_mm[1]:.0f} mm{plane})"
     ]
+
+
+def _rims(result: RunResult) -> Iterator[str]:
+    """Yields what the result allows for of rims before the circles of the faces and the dots of the board."""
+    calibration, of_dots = result.calibration, result.board_design.rim_mm
+    if calibration.rim_mm:
+        height, sigma = float(np.mean(list(calibration.rim_mm.values()))), calibration.rim_sigma_mm
+        source = f" ± {sigma:.3f} mm, as estimated" if sigma else " mm, as stated"
+        yield f"rims: faces are of the luminous surface, behind rims of {height:.3f}{source}"
+    if of_dots:
+        yield (
+            f"rims: dots of the board are seen {of_dots / 2:.3f} mm before its surface, as stated, and no face depends "
+            "on it"
+        )
 
 
 def detection_text(detection: DetectionResult, labelled: Sequence[LabelledImage]) -> str:

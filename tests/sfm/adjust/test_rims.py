@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from stcal.errors import InputError
-from stcal.io.design import load_target, target_toml
-from stcal.sfm.adjust.rims import Rim, find_rims
+from stcal.io.design import board_toml, load_board, load_target, target_toml
+from stcal.sfm.adjust.joint import adjust_jointly
+from stcal.sfm.adjust.rims import Rim, find_rims, lost_radius_mm
 from stcal.sfm.checks.board import rim_check
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.image import detect_image
 from stcal.sfm.detect.labels import label_single
-from stcal.sfm.planning.nominal import true_models
+from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene
@@ -40,27 +41,27 @@ def test_the_height_of_a_rim_is_found(scene, rim_mm):
     rim = rims_of(scene, rim_mm)["circles"]
     assert rim.height_mm == pytest.approx(rim_mm, abs=0.1 * rim_mm + 3 * rim.sigma_mm)
     assert rim.height_mm > 4 * rim.sigma_mm
-    check = rim_check({"circles": rim}, 0.002)
+    check = rim_check({"circles": rim}, 0.002, {})
     assert check.verdict == "suspicious"
     assert "in front of the luminous surface" in check.reason
-    assert rim_check({"circles": rim}, 0.002, rim_mm).verdict == "passed"
+    assert rim_check({"circles": rim}, 0.002, {"circles": rim_mm}).verdict == "passed"
 
 
 @pytest.mark.slow
 def test_no_rim_is_found_where_there_is_none(scene):
     rims = rims_of(scene, 0.0)
     assert abs(rims["circles"].height_mm) < 3 * rims["circles"].sigma_mm
-    assert rim_check(rims, 0.002).verdict == "passed"
+    assert rim_check(rims, 0.002, {}).verdict == "passed"
 
 
 def test_without_tilts_nothing_is_said():
-    assert rim_check({}, 0.002).verdict == "not possible"
+    assert rim_check({}, 0.002, {}).verdict == "not possible"
 
 
 def test_a_rim_that_harms_nothing_is_no_fault():
     """It is seen with certainty, and moves faces by less than their σ."""
-    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.02).verdict == "passed"
-    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.002).verdict == "suspicious"
+    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.02, {}).verdict == "passed"
+    assert rim_check({"circles": Rim(0.02, 0.001, 500)}, 0.002, {}).verdict == "suspicious"
 
 
 @pytest.mark.parametrize("solve", ["chain", "paper"])
@@ -80,3 +81,29 @@ def test_a_design_states_its_rims(scene, tmp_path):
     np.testing.assert_array_equal(read.faces[0].rim_mm, heights)
     assert read.faces[1].rim_mm is None
     assert read.rim_of() == dict(zip(face.labels(), heights.tolist(), strict=True))
+
+
+def test_a_rim_hides_what_is_not_in_common_of_two_discs():
+    """Of the radius by area. That of the fit, which follows the rim, is less by up to 2 %."""
+    apart = np.array([0.05, 0.1, 0.15])
+    area = 2 * np.arccos(apart / 2) - apart / 2 * np.sqrt(4 - apart**2)
+    np.testing.assert_allclose(lost_radius_mm(0.1, 10 * 5.0 * apart, 5.0) / 5.0, 1 - np.sqrt(area / np.pi), rtol=0.02)
+
+
+def test_a_board_states_the_rims_of_its_dots(scene, tmp_path):
+    board = replace(scene.board, rim_mm=0.3)
+    (tmp_path / "board.toml").write_text(board_toml(board), encoding="utf-8")
+    assert load_board(tmp_path / "board.toml").rim_mm == 0.3
+    rims = {"dots": Rim(0.31, 0.01, 500)}
+    assert "the board lies 0.155 mm in front of" in rim_check(rims, 0.002, {}).reason
+    passed = rim_check(rims, 0.002, {"dots": board.rim_mm})
+    assert passed.verdict == "passed"
+    assert "0.3 mm stated" in passed.reason
+
+
+def test_rims_of_dots_move_the_board_and_no_face(scene):
+    models = true_models(scene, observe(scene, 0.01, np.random.default_rng(0)))
+    seen, surface = (adjust_jointly(models, replace(scene.board, rim_mm=h), scene.camera) for h in (0.0, 0.3))
+    np.testing.assert_allclose(surface.xyz_model, seen.xyz_model, atol=1e-6)
+    moved = surface.model_from_board["12"].translation - seen.model_from_board["12"].translation
+    np.testing.assert_allclose(moved, 0.15 * seen.model_from_board["12"].rotation[:, 2], atol=1e-6)

@@ -32,6 +32,7 @@ from stcal.sfm.planning.forecast import (
     Setup,
     _rim_integrals,
     forecast,
+    without_sources,
 )
 from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.planning.session import PlanOptions, widest_aperture_mm
@@ -349,6 +350,30 @@ def test_advise_of_a_run_starts_from_its_own_sigma(small_run):
     for face, covariance in now.face_covariance.items():
         # Huber's weights of the few long residuals make the difference.
         assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(stated[face])), rel=0.03)
+
+
+def test_advice_holds_the_sigma_of_estimated_rims(small_run):
+    """No view lowers it: each face lies half of an error of the height along its own normal."""
+    saved = load_run(small_run)
+    faces = saved.faces.model_copy(update={"rim_mm": dict.fromkeys(saved.faces.circles, 0.2)})
+    summary = saved.report["summary"] | {"rim_sigma_mm": 0.01}
+    known = known_of(replace(saved, faces=faces, report=saved.report | {"summary": summary}))
+    now = forecast(known.models, known.setup)
+    seen = without_sources(known.models, known.setup, now.derivatives)["rims"]
+    normal = {face: np.array(m)[:3, 2] for face, m in saved.faces.target_from_face.items()}
+    model = known.models[0]
+    view = replace(
+        model.observed(model.rows_by_image()[0]), images=model.images[:1], camera_from_model=model.camera_from_model[:1]
+    )
+    further, further_seen = (
+        PositionsWith.of(known.models, setup, now.derivatives)(view)
+        for setup in (known.setup, replace(known.setup, rims_mm2=None))
+    )
+    for face, covariance in now.face_covariance.items():
+        expected = 0.005 * np.linalg.norm(normal[face] - normal[saved.faces.reference_face])
+        added = np.trace((covariance - seen.face_covariance[face])[3:, 3:])
+        assert np.sqrt(added) == pytest.approx(expected, rel=0.02)
+        assert np.sqrt(further[face] ** 2 - further_seen[face] ** 2) == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.slow

@@ -70,3 +70,16 @@ def test_a_run_that_takes_a_camera_with_sigma_as_exact_says_so(small_result):
     assert said in " ".join(run_text(replace(small_result, camera=stated)).split())
     refined = replace(small_result, camera=stated, options=replace(small_result.options, refine_camera=True))
     assert said not in " ".join(run_text(refined).split())
+
+
+def test_a_run_says_behind_which_rims_circles_and_dots_lie(small_result):
+    assert "rims" not in run_text(small_result)
+    heights = dict.fromkeys(small_result.target.circles, 0.2)
+    behind = replace(
+        small_result,
+        calibration=replace(small_result.calibration, rim_mm=heights, rim_sigma_mm=0.004),
+        board_design=replace(small_result.board_design, rim_mm=0.3),
+    )
+    said = " ".join(run_text(behind).split())
+    assert "faces are of the luminous surface, behind rims of 0.200 ± 0.004 mm, as estimated" in said
+    assert "dots of the board are seen 0.150 mm before its surface, as stated" in said
