@@ -22,7 +22,6 @@ from concurrent.futures import (
     wait,
 )
 from contextvars import ContextVar
-from importlib import import_module
 from operator import itemgetter
 from typing import TypeVar
 
@@ -174,12 +173,6 @@ class _Processes:
                 future.cancel()
             raise
 
-    def everywhere(self, function: Callable, arguments: tuple) -> None:
-        """Starts the function once per process, as far as processes are idle."""
-        with _starting():
-            for _ in range(self.workers):
-                self._start().submit(function, *arguments)
-
     def __enter__(self) -> "_Processes":
         return self
 
@@ -193,19 +186,6 @@ class _Processes:
                     process.terminate()
         # also after that: at the end of the interpreter the pool's thread must not be closing what is woken there
         self._pool.shutdown(wait=True, cancel_futures=True)
-
-
-def load_in_processes(*modules: str) -> None:
-    """Loads modules in the processes of :func:`kept_processes`, while this process goes on."""
-    processes = _kept.get()
-    if processes and processes.workers > 1:
-        with contextlib.suppress(BrokenExecutor):
-            processes.everywhere(_load, modules)
-
-
-def _load(*modules: str) -> None:
-    for name in modules:
-        import_module(name)
 
 
 _kept: ContextVar[_Processes | None] = ContextVar("kept processes", default=None)
