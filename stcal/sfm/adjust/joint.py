@@ -45,6 +45,8 @@ from stcal.sfm.data.model import GroupModel, MetricModel
 
 EXACTLY = 1e-15
 """Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
+NEAR = 1e-8
+"""The same of parts of a result that are compared with one another: a hundredth of σ."""
 MAX_STEPS = 100
 MAX_MOVE_PX = 0.02
 """Largest move of a projection, in px, at which a result is returned. Contradictory observations make the last steps
@@ -116,17 +118,21 @@ class Adjusted:
     """State of a joint adjustment at its minimum.
 
     ``blocks`` : the groups; ``shared`` : what the groups share; ``setting`` : constants of the adjustment, weights
-    included; ``move_px`` : largest move of a projection by the next whole step, px.
+    included; ``normal`` : normal matrix over the shared unknowns; ``move_px`` : largest move of a projection by the
+    next whole step, px.
     """
 
     blocks: tuple[Block, ...]
     shared: Shared
     setting: Setting
+    normal: np.ndarray
     move_px: float
 
     def result(self) -> JointResult:
         """Returns the result with its covariances."""
-        return _result(list(self.blocks), self.shared, self.setting, self.move_px)
+        places = self.setting.places(self.shared)
+        equations = self.normal, places.circles, places.intrinsics
+        return _result(list(self.blocks), self.shared, self.setting, self.move_px, equations=equations)
 
 
 def adjust_jointly(
@@ -175,12 +181,33 @@ def adjusted(
         setting = replace(setting, huber=HUBER * _robust_sigma(blocks, shared.camera))
     if common is None and faces_of_known_shape(board):
         blocks, shared, setting = _with_shape_factors(blocks, shared, setting, factors)
-    blocks, shared, move = _minimise(blocks, shared, setting)
-    share = _common_share(blocks, board) if common is None else 0.0
+    state = _minimise(blocks, shared, setting)
+    share = _common_share(list(state.blocks), board) if common is None else 0.0
     if share > 0:
-        blocks, setting = _with_common(blocks, setting, share)
-        blocks, shared, move = _minimise(blocks, shared, setting)
-    return Adjusted(tuple(blocks), shared, setting, move)
+        blocks, setting = _with_common(list(state.blocks), setting, share)
+        state = _minimise(blocks, state.shared, setting)
+    return state
+
+
+def adjust_part(
+    models: Sequence[MetricModel], board: BoardDesign, flatness_mm: float | None, whole: JointResult
+) -> JointResult:
+    """Adjusts a part of the models of a ``whole`` joint result, from which it begins, with the weights of the whole.
+
+    Camera, factors on the σ of faces of known shape, and the share of the board's variance that groups have in common
+    are those of the whole.
+
+    Raises
+    ------
+    ConvergenceError
+        No minimum is reached.
+    """
+    # Of a single group, the variance of its board is the same whatever share of it other groups have.
+    common = whole.board_common if len(models) > 1 else 0.0
+    blocks, shared, setting = _start(models, board, whole.camera, flatness_mm, None, common)
+    huber = HUBER * _robust_sigma(blocks, shared.camera)
+    setting = replace(setting, huber=huber, print_factor=whole.print_factor, bend_factor=whole.bend_factor)
+    return _minimise(blocks, shared, setting, NEAR).result()
 
 
 SHAPE_ROUNDS, SETTLED_FACTOR, NEARLY = 6, 0.03, 1e-6
@@ -361,9 +388,9 @@ def _with_common(blocks: list[Block], setting: Setting, common: float) -> tuple[
     return [replace(b, sigma_mm=own_sigma, dot_place=_dot_place(b.model, b.dots, board)) for b in blocks], setting
 
 
-def _minimise(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[list[Block], Shared, float]:
-    """Returns the state of least cost, and the largest move of a projection by the next whole step, px."""
-    minimum = _descent(blocks, shared, setting, EXACTLY)
+def _minimise(blocks: list[Block], shared: Shared, setting: Setting, settled: float = EXACTLY) -> Adjusted:
+    """Returns the state of least cost; ``settled`` : see :func:`~stcal.geometry.least_squares.minimise`."""
+    minimum = _descent(blocks, shared, setting, settled)
     last, beyond = minimum.state, minimum.state.moved(minimum.linear.step(DAMPING)[0], setting)
     move = max(_largest_move(a, last.shared, b, beyond.shared) for a, b in zip(last.blocks, beyond.blocks, strict=True))
     if not move <= MAX_MOVE_PX:  # true of NaN, too
@@ -372,7 +399,7 @@ def _minimise(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[li
             f"joint adjustment: projections still move by {move:.1g} px in the last of at most {MAX_STEPS} steps; "
             "compare with --solve chain and look at the outliers",
         )
-    return list(last.blocks), last.shared, float(move)
+    return Adjusted(last.blocks, last.shared, setting, minimum.linear.normal, float(move))
 
 
 def _descent(
