@@ -46,7 +46,9 @@ from stcal.sfm.data.model import GroupModel, MetricModel
 EXACTLY = 1e-15
 """Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
 NEAR = 1e-8
-"""The same of parts of a result that are compared with one another: a hundredth of σ."""
+"""The same where a result is the start of another one: a hundredth of σ."""
+NEARLY = 1e-6
+"""The same where parts of the images are compared, or the σ of faces of known shape are estimated: a tenth of σ."""
 MAX_STEPS = 100
 MAX_MOVE_PX = 0.02
 """Largest move of a projection, in px, at which a result is returned. Contradictory observations make the last steps
@@ -136,16 +138,10 @@ class Adjusted:
 
 
 def adjust_jointly(
-    models: Sequence[MetricModel],
-    board: BoardDesign,
-    camera: Camera,
-    flatness_mm: float | None = None,
-    prior: CameraPrior | None = None,
-    start: Camera | None = None,
-    factors: tuple[float, float] = (1.0, 1.0),
+    models: Sequence[MetricModel], board: BoardDesign, camera: Camera, flatness_mm: float | None = None
 ) -> JointResult:
     """Returns the result of :func:`adjusted` with the covariances at its minimum."""
-    return adjusted(models, board, camera, flatness_mm, prior, start, None, factors).result()
+    return adjusted(models, board, camera, flatness_mm).result()
 
 
 def adjusted(
@@ -157,6 +153,7 @@ def adjusted(
     start: Camera | None = None,
     common: float | None = None,
     factors: tuple[float, float] = (1.0, 1.0),
+    settled: float = EXACTLY,
 ) -> Adjusted:
     """Adjusts metric models that share one frame, with all observations weighted by their σ.
 
@@ -164,7 +161,8 @@ def adjusted(
     intrinsics of ``camera`` are observations with this covariance and are adjusted, beginning at ``start``; they are
     fixed if None; ``common`` : share of the board's variance that all groups have in common. If it is given, no
     residual is down-weighted, so that the result is linear in the observations; ``factors`` : on the σ of faces of
-    known shape, ``print_factor`` and ``bend_factor`` of an earlier result, from which their estimation starts.
+    known shape, ``print_factor`` and ``bend_factor`` of an earlier result, from which their estimation starts;
+    ``settled`` : largest predicted decrease of the last step, as a share of χ².
 
     If ``common`` is None, the dots tell whether the board kept its shape between the groups (one plate) or not
     (a film, a screen). First every group has its own deviations from the design. If these deviations agree, a common
@@ -181,12 +179,13 @@ def adjusted(
         setting = replace(setting, huber=HUBER * _robust_sigma(blocks, shared.camera))
     if common is None and faces_of_known_shape(board):
         blocks, shared, setting = _with_shape_factors(blocks, shared, setting, factors)
-    state = _minimise(blocks, shared, setting)
-    share = _common_share(list(state.blocks), board) if common is None else 0.0
-    if share > 0:
-        blocks, setting = _with_common(list(state.blocks), setting, share)
-        state = _minimise(blocks, state.shared, setting)
-    return state
+    if common is None:
+        near = _minimise(blocks, shared, setting, NEAR)
+        blocks, shared = list(near.blocks), near.shared
+        share = _common_share(blocks, board)
+        if share > 0:
+            blocks, setting = _with_common(blocks, setting, share)
+    return _minimise(blocks, shared, setting, settled)
 
 
 def adjust_part(
@@ -207,12 +206,11 @@ def adjust_part(
     blocks, shared, setting = _start(models, board, whole.camera, flatness_mm, None, common)
     huber = HUBER * _robust_sigma(blocks, shared.camera)
     setting = replace(setting, huber=huber, print_factor=whole.print_factor, bend_factor=whole.bend_factor)
-    return _minimise(blocks, shared, setting, NEAR).result()
+    return _minimise(blocks, shared, setting, NEARLY).result()
 
 
-SHAPE_ROUNDS, SETTLED_FACTOR, NEARLY = 6, 0.03, 1e-6
-"""Most rounds of the factors on the σ of faces of known shape, the change at which they end, and the share of χ² by
-which a round may still fall."""
+SHAPE_ROUNDS, SETTLED_FACTOR = 6, 0.03
+"""Most rounds of the factors on the σ of faces of known shape, and the change at which they end."""
 PRIOR_FREEDOM = 4.0
 """Degrees of freedom that the stated σ of such faces stand for beside their deviations."""
 LEAST_FACTOR = 0.1
@@ -388,7 +386,7 @@ def _with_common(blocks: list[Block], setting: Setting, common: float) -> tuple[
     return [replace(b, sigma_mm=own_sigma, dot_place=_dot_place(b.model, b.dots, board)) for b in blocks], setting
 
 
-def _minimise(blocks: list[Block], shared: Shared, setting: Setting, settled: float = EXACTLY) -> Adjusted:
+def _minimise(blocks: list[Block], shared: Shared, setting: Setting, settled: float) -> Adjusted:
     """Returns the state of least cost; ``settled`` : see :func:`~stcal.geometry.least_squares.minimise`."""
     minimum = _descent(blocks, shared, setting, settled)
     last, beyond = minimum.state, minimum.state.moved(minimum.linear.step(DAMPING)[0], setting)
