@@ -22,7 +22,6 @@ from concurrent.futures import (
     wait,
 )
 from contextvars import ContextVar
-from operator import itemgetter
 from typing import TypeVar
 
 from stcal.errors import InputNote
@@ -105,18 +104,28 @@ def run_parallel(
         yield from processes.run(function, jobs)
 
 
-def run_briefly(function: Callable[..., R], jobs: Sequence[tuple]) -> list[R]:
+def run_briefly(
+    function: Callable[..., R], jobs: Sequence[tuple], step: Callable[[object], None] | None = None
+) -> list[R]:
     """Returns the results of ``function(*job)`` in the order of the jobs, for jobs of about a tenth of a second each.
 
-    The jobs run in the processes of :func:`kept_processes` if there are any, else in this process.
+    The jobs run in the processes of :func:`kept_processes` if there are any, else in this process; one job alone runs
+    in this process. ``step`` : called with each result as it arrives, in any order
     """
-    processes = _kept.get()
-    if processes and processes.workers > 1:
-        try:
-            return [result for _, result in sorted(processes.run(function, jobs), key=itemgetter(0))]
-        except BrokenExecutor:  # a process was ended from outside: the jobs run in this process, more slowly
-            pass
-    return [function(*job) for job in jobs]
+    processes, results = _kept.get(), dict[int, R]()
+    if processes and processes.workers > 1 and len(jobs) > 1:
+        # If a process is ended from outside, the other jobs run in this process, more slowly.
+        with contextlib.suppress(BrokenExecutor):
+            for i, result in processes.run(function, jobs):
+                results[i] = result
+                if step:
+                    step(result)
+    for i, job in enumerate(jobs):
+        if i not in results:
+            results[i] = function(*job)
+            if step:
+                step(results[i])
+    return [results[i] for i in range(len(jobs))]
 
 
 @contextlib.contextmanager

@@ -200,7 +200,7 @@ def _calibrated(
         if model is None or (board.rows and is_rough(model, options)):
             model = _camera_of_dots(files, model, folder, target, board, options, progress)
         detection, labelled = labelled_images(files, model, folder, target, board, options, progress)
-    with overlays_beside(detection, labelled, target, folder.stage, progress):
+    with overlays_beside(detection, labelled, target, folder, progress):
         return _solved(detection, labelled, model, folder, target, board, options, progress)
 
 
@@ -452,7 +452,7 @@ def detect(
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detects and labels the images, and writes ``detections.csv`` and overlays into a claimed folder."""
     detection, labelled = labelled_images(files, camera, folder, target, board, options, progress)
-    with overlays_beside(detection, labelled, target, folder.stage, progress):
+    with overlays_beside(detection, labelled, target, folder, progress):
         return detection, labelled
 
 
