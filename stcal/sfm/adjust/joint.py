@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from stcal.design import BoardDesign, faces_of_known_shape, known_distances
 from stcal.errors import ConvergenceError, ScaleError
@@ -306,16 +307,17 @@ class Extensible:
     points: dict[str, np.ndarray]
     to_circles: dict[str, np.ndarray]
 
-    def with_view(self, view: MetricModel) -> np.ndarray:
-        """Returns the covariance of the circles, (3c, 3c) mm², with one more view.
+    def lowered(self, view: MetricModel, to_functions: np.ndarray) -> np.ndarray:
+        """Returns by how much one more view lowers the variances of f functions of the circles, (f,).
 
-        ``view`` : a model of one image and all points of its group. The inverse is that of a matrix with a change of
-        small rank (Woodbury 1950).
+        ``view`` : a model of one image and all points of its group; ``to_functions`` : (3p + q, f) covariance between
+        these points and intrinsics, and the functions. The inverse is that of a matrix with a change of small rank
+        (Woodbury 1950).
         """
         rows = rows_of_view(view, self.camera, self.basis)
-        away = rows @ self.to_circles[view.group]
         inner = np.eye(len(rows)) + rows @ self.points[view.group] @ rows.T
-        return self.covariance_mm2 - away.T @ np.linalg.solve(inner, away)
+        half = solve_triangular(np.linalg.cholesky(inner), rows @ to_functions, lower=True)
+        return (half**2).sum(0)
 
 
 def extensible(
