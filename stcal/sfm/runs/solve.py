@@ -345,9 +345,9 @@ def solve_groups(
         shutil.rmtree(scratch, ignore_errors=True)
     solutions: list[GroupSolution] = []
     errors: list[StcalError] = []
-    for group, solution in zip(groups, found, strict=True):
+    for group, solution in zip(groups, (each for each in found if each is not None), strict=True):
         try:
-            if not isinstance(solution, GroupSolution):
+            if isinstance(solution, StcalError):
                 raise solution
             find_scale(solution.model, board)
         except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
