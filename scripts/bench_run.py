@@ -31,10 +31,11 @@ from stcal.parallel import run_parallel
 FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION  # as stcal.io.images.decode
 GROUPS = 4
 RIGHT_PX = 3.0  # a board is right when every centre is this close to the image of a true dot
+BY_HAND = "OpenCV, 1 threshold, set by hand"
 THRESHOLDS = {
     "OpenCV, its own 17 thresholds": (50, 220, 10, 2),
     "OpenCV, 3 thresholds": (60, 180, 40, 2),
-    "OpenCV, 1 threshold, set by hand": (100, 101, 10, 1),
+    BY_HAND: (100, 101, 10, 1),
 }
 """minThreshold, maxThreshold, thresholdStep, minRepeatability. The last one is the least with which it can work."""
 
@@ -43,6 +44,12 @@ ADVISED = 2000
 """Images of the larger set for ``advise``."""
 STREAM = 40, 1728
 """Photographs for ``measure``, and their width, px: 2 megapixels."""
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+REAL_BOARDS = {
+    "calibrate-camera, 25 chessboards, 8 Mpx": ("multidic_chessboard", "201"),
+    "calibrate-camera, 22 ChArUco, 1.3 Mpx": ("pycamset_charuco", "1"),
+}
+"""Sets of real photographs of boards in ``shared/data/real``; a set that is not there is left out."""
 MEMORY_EVERY_S = 0.05
 TARGET_SIGMA_MM = 0.002
 """Of the circles of the target that is followed, about that of a run."""
@@ -280,6 +287,29 @@ def timed_advice() -> float:
     return time.perf_counter() - begin
 
 
+def timed_boards(stream: Path, scratch: Path, log: Path) -> dict[str, dict]:
+    """Seconds of ``calibrate-camera`` and of ``handeye`` on each set, the latter by its function."""
+    sys.path.append(str(Path(__file__).parent / "studies"))
+    import handeye_shared
+
+    places = {"calibrate-camera, 40 dot boards, 2 Mpx": (stream / "images", stream / "board.toml")}
+    places |= {
+        title: (SHARED / "real" / name / folder, SHARED / "real" / name / "board.toml")
+        for title, (name, folder) in REAL_BOARDS.items()
+    }
+    rows = {}
+    for title, (images, board) in places.items():
+        if images.is_dir():
+            words = ["calibrate-camera", images, "--board", board, "--out", scratch / "camera.txt", "--overwrite"]
+            rows[title] = {"seconds": timed_program(words, log)[0]}
+    for title, name in (("ChArUco, 16 of 1.9 Mpx", "charuco"), ("dot boards, 15 of 0.3 Mpx", "dots")):
+        if (SHARED / f"{name.replace('dots', 'dotgrid')}_handeye").is_dir():
+            start = time.perf_counter()
+            getattr(handeye_shared, name)(SHARED, scratch / name, splits=handeye_shared.DEFAULT)
+            rows[f"handeye, {title}"] = {"seconds": time.perf_counter() - start}
+    return rows
+
+
 def boards(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> dict[str, int]:
     """How many boards were found, how many with every dot, and how many with no centre where no dot is."""
     off = [np.linalg.norm(xy[:, None] - true[name], axis=2).min(1).max() for name, xy in found.items()]
@@ -327,6 +357,7 @@ def measure(data: Path, stream: Path, film: Path, scratch: Path) -> dict:
     following = timed_following(film, filmed_scene())
     for title, seconds in zip(("measure --sequence, one core", "Tracker.locate, one core"), following, strict=True):
         rows[title] = {"seconds": seconds, "images": STREAM[0]}
+    rows |= timed_boards(stream, scratch, log)
     shutil.rmtree(scratch)
     about = {"images": len(paths), "size_px": [camera.width, camera.height], "megabytes": megabytes}
     about["workers"] = os.cpu_count()
@@ -396,6 +427,50 @@ def detection_profile(paths: list[Path], data: Path) -> dict[str, float]:
     return found
 
 
+def processor_time(paths: list[Path], data: Path) -> dict[str, float]:
+    """CPU ms an image of one process with one thread, decoded before: ours, and what others find in them."""
+    from stcal.io.images import decode
+    from stcal.parallel import one_thread
+    from stcal.sfm.detect.circles.candidates import EllipseOptions
+    from stcal.sfm.detect.image import detect_image
+
+    target, board = load_target(data / "target.toml"), load_board(data / "board.toml")
+    camera = read_camera(data / "cameras.txt")
+    camera = camera.sized(camera.width, camera.height)
+    pictures = [decode(path.read_bytes(), path.name) for path in paths]
+    area = np.pi * (board.radius_mm * 24 / 22.3 * camera.width / 1000) ** 2
+    blobs = cv2.SimpleBlobDetector_Params()
+    blobs.minThreshold, blobs.maxThreshold, blobs.thresholdStep, blobs.minRepeatability = THRESHOLDS[BY_HAND]
+    blobs.blobColor, blobs.minArea, blobs.maxArea = 255, 0.34 * area / 2, 2 * area
+    refined = cv2.aruco.DetectorParameters()
+    refined.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
+    tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    ways = {
+        "stcal: faces, board, centres with σ": lambda grey: detect_image(grey, camera, target, board, EllipseOptions()),
+        "OpenCV, blobs at 1 threshold": cv2.SimpleBlobDetector_create(blobs).detect,
+        "OpenCV, ArUco": cv2.aruco.ArucoDetector(tags).detectMarkers,
+        "OpenCV, ArUco, AprilTag's corners": cv2.aruco.ArucoDetector(tags, refined).detectMarkers,
+    }
+    try:
+        from pupil_apriltags import Detector
+    except ImportError:
+        print("pupil_apriltags is not there: its rows are left out", file=sys.stderr)
+    else:
+        Detector.__del__ = lambda _: None  # it frees the family a second time, which ends the process
+        ways["AprilTag 3, half resolution"] = Detector(quad_decimate=2.0).detect
+        ways["AprilTag 3"] = Detector(quad_decimate=1.0).detect
+    found, threads = {}, cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    with one_thread():
+        for title, way in ways.items():
+            start = time.process_time()
+            for picture in pictures:
+                way(picture)
+            found[title] = 1e3 * (time.process_time() - start) / len(pictures)
+    cv2.setNumThreads(threads)
+    return found
+
+
 def best_of(rounds: list[dict]) -> dict:
     """Of each row the smallest and the median time (what else the machine did only adds)."""
     best = rounds[-1] | {"rounds": len(rounds)}
@@ -418,7 +493,9 @@ def main() -> None:
     given = parser.parse_args()
     if given.images % GROUPS or given.images < 4 * GROUPS:
         parser.error(f"--images {given.images}: a multiple of {GROUPS}, at least {4 * GROUPS}, needed")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # a user's modules are compiled from the second start on
     with tempfile.TemporaryDirectory() as scratch:
+        os.environ.setdefault("PYTHONPYCACHEPREFIX", str(Path(scratch) / "compiled"))
         keep = given.keep or Path(scratch)
         data, stream = keep / "photographs", keep / "stream"
         render(data, given.images, given.width)
@@ -437,13 +514,15 @@ def main() -> None:
         result["run_profile_s"] = run_profile(data, Path(scratch) / "profiled")
         some = sorted((data / "images").glob("*/*"))[:: max(1, given.images // 10)]
         result["detection_profile_ms"] = detection_profile(some, data)
+        times = [processor_time(some[::3], data) for _ in range(max(given.rounds, 1))]
+        result["cpu_ms"] = {title: min(each[title] for each in times) for title in times[0]}
     print("{images} images of {size_px} px, {megabytes:.0f} MB, {workers} workers, {rounds} rounds".format(**result))
-    print(f"{'':34} {'seconds':>8} {'median':>7} {'ratio':>6}   boards found, complete, right")
+    print(f"{'':40} {'seconds':>8} {'median':>7} {'ratio':>6}   boards found, complete, right")
     for name, row in result["rows"].items():
         counts = f"{row['found']:8} {row['complete']:9} {row['right']:6}" if "found" in row else ""
         counts = f"{row['images'] / row['seconds']:8.1f} images a second" if "images" in row else counts
         counts = f"{row['mib']:8.0f} MiB" if "mib" in row else counts
-        print(f"{name:34} {row['seconds']:8.2f} {row['median']:7.2f} {row['ratio']:6.2f} {counts}".rstrip())
+        print(f"{name:40} {row['seconds']:8.2f} {row['median']:7.2f} {row['ratio']:6.2f} {counts}".rstrip())
     row = result["rows"]["stcal detection"]
     cost = row["seconds"] * result["workers"] / result["images"]
     a_day = f"{cost * 1e6 / 86400:.1f} cores, {result['megabytes'] / result['images'] * 1e6 / 86400:.0f} MB a second"
@@ -462,6 +541,9 @@ def main() -> None:
     print("where that of detection goes, ms an image (one process alone):")
     for part, ms in result["detection_profile_ms"].items():
         print(f"  {part:52} {ms:6.1f}")
+    print("detection, CPU ms an image (one thread, decoded before, the least of the rounds):")
+    for title, ms in result["cpu_ms"].items():
+        print(f"  {title:52} {ms:6.1f}")
     if given.json:
         given.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 

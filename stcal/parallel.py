@@ -22,8 +22,6 @@ from concurrent.futures import (
     wait,
 )
 from contextvars import ContextVar
-from importlib import import_module
-from operator import itemgetter
 from typing import TypeVar
 
 from stcal.errors import InputNote
@@ -106,18 +104,28 @@ def run_parallel(
         yield from processes.run(function, jobs)
 
 
-def run_briefly(function: Callable[..., R], jobs: Sequence[tuple]) -> list[R]:
+def run_briefly(
+    function: Callable[..., R], jobs: Sequence[tuple], step: Callable[[object], None] | None = None
+) -> list[R]:
     """Returns the results of ``function(*job)`` in the order of the jobs, for jobs of about a tenth of a second each.
 
-    The jobs run in the processes of :func:`kept_processes` if there are any, else in this process.
+    The jobs run in the processes of :func:`kept_processes` if there are any, else in this process; one job alone runs
+    in this process. ``step`` : called with each result as it arrives, in any order
     """
-    processes = _kept.get()
-    if processes and processes.workers > 1:
-        try:
-            return [result for _, result in sorted(processes.run(function, jobs), key=itemgetter(0))]
-        except BrokenExecutor:  # a process was ended from outside: the jobs run in this process, more slowly
-            pass
-    return [function(*job) for job in jobs]
+    processes, results = _kept.get(), dict[int, R]()
+    if processes and processes.workers > 1 and len(jobs) > 1:
+        # If a process is ended from outside, the other jobs run in this process, more slowly.
+        with contextlib.suppress(BrokenExecutor):
+            for i, result in processes.run(function, jobs):
+                results[i] = result
+                if step:
+                    step(result)
+    for i, job in enumerate(jobs):
+        if i not in results:
+            results[i] = function(*job)
+            if step:
+                step(results[i])
+    return [results[i] for i in range(len(jobs))]
 
 
 @contextlib.contextmanager
@@ -174,12 +182,6 @@ class _Processes:
                 future.cancel()
             raise
 
-    def everywhere(self, function: Callable, arguments: tuple) -> None:
-        """Starts the function once per process, as far as processes are idle."""
-        with _starting():
-            for _ in range(self.workers):
-                self._start().submit(function, *arguments)
-
     def __enter__(self) -> "_Processes":
         return self
 
@@ -193,19 +195,6 @@ class _Processes:
                     process.terminate()
         # also after that: at the end of the interpreter the pool's thread must not be closing what is woken there
         self._pool.shutdown(wait=True, cancel_futures=True)
-
-
-def load_in_processes(*modules: str) -> None:
-    """Loads modules in the processes of :func:`kept_processes`, while this process goes on."""
-    processes = _kept.get()
-    if processes and processes.workers > 1:
-        with contextlib.suppress(BrokenExecutor):
-            processes.everywhere(_load, modules)
-
-
-def _load(*modules: str) -> None:
-    for name in modules:
-        import_module(name)
 
 
 _kept: ContextVar[_Processes | None] = ContextVar("kept processes", default=None)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from stcal.parallel import ONE_THREAD, counted, kept_processes, load_in_processes, run_briefly, run_parallel
+from stcal.parallel import ONE_THREAD, counted, kept_processes, run_briefly, run_parallel
 
 UNLIMITED = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
 
@@ -237,7 +237,6 @@ def test_brief_work_goes_on_here_when_a_process_is_ended():
     with kept_processes(2):
         assert run_briefly(end_elsewhere, [(os.getpid(),)] * 4) == [os.getpid()] * 4
         assert run_briefly(pow, [(2, 3)] * 2) == [8, 8]
-        load_in_processes("json")
 
 
 @pytest.mark.slow

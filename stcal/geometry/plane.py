@@ -196,7 +196,7 @@ def refine_planar_pose(camera_from_plane: Rigid, xy_plane: np.ndarray, xy_normal
         by_pose = np.concatenate([-by_point @ skew(rotated), by_point], axis=2)
         return NormalEquations.of((p[:, :2] / p[:, 2:] - xy_normalised).ravel(), by_pose.reshape(-1, 6))
 
-    if not np.isfinite(linearise(camera_from_plane).cost):
+    if ((camera_from_plane @ xyz)[:, 2] <= 0).any():
         raise DegenerateError("E-POINTS-BEHIND", "planar pose: points behind the camera")
     minimum = minimise(camera_from_plane, linearise, perturbed, least_gain=EXACT, max_steps=MAX_STEPS)
     return minimum.required("planar pose", "check that the points are numbered rightly").state

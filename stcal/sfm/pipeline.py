@@ -20,7 +20,7 @@ from stcal.io.cameras.read import camera_model
 from stcal.io.files import save
 from stcal.io.images import TOP_GROUP, ImageFile, ImageFiles, chosen_images, mosaic_of, require_common_size
 from stcal.io.photographs.memory import files_of_arrays
-from stcal.parallel import Progress, counted, kept_processes, load_in_processes, one_thread
+from stcal.parallel import Progress, counted, kept_processes, one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
@@ -52,8 +52,6 @@ Images = str | Path | Mapping[str, Sequence[np.ndarray]]
 """A folder of images, or grey or RGB arrays by the name of their group."""
 OwnCheck = Callable[[RunResult], Check]
 """A check of a caller's own."""
-DRAWN_WITH = "matplotlib.backends.backend_svg", "mpl_toolkits.mplot3d.axes3d"
-"""Modules that draw the figures of the report. They take half a second to load."""
 
 
 @one_thread()
@@ -202,7 +200,7 @@ def _calibrated(
         if model is None or (board.rows and is_rough(model, options)):
             model = _camera_of_dots(files, model, folder, target, board, options, progress)
         detection, labelled = labelled_images(files, model, folder, target, board, options, progress)
-    with overlays_beside(detection, labelled, target, folder.stage, progress):
+    with overlays_beside(detection, labelled, target, folder, progress):
         return _solved(detection, labelled, model, folder, target, board, options, progress)
 
 
@@ -372,7 +370,6 @@ def _solved(
     options: RunOptions,
     progress: Progress,
 ) -> RunResult:
-    load_in_processes(*DRAWN_WITH)
     calibrated_camera = model.calibrated(detection.camera.width, detection.camera.height)
     calibrated_camera = refinable(calibrated_camera) if options.refine_camera else calibrated_camera
     if not board.rows:
@@ -455,7 +452,7 @@ def detect(
 ) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detects and labels the images, and writes ``detections.csv`` and overlays into a claimed folder."""
     detection, labelled = labelled_images(files, camera, folder, target, board, options, progress)
-    with overlays_beside(detection, labelled, target, folder.stage, progress):
+    with overlays_beside(detection, labelled, target, folder, progress):
         return detection, labelled
 
 

@@ -15,7 +15,7 @@ from stcal.labels import CircleLabel, DotLabel
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
 from stcal.sfm.adjust.faces import FaceInGroup, FrameKind, faces_of_group, missing_frame_circles
-from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
+from stcal.sfm.adjust.joint import EXACTLY, NEAR, SETTLED_PX, JointResult, adjusted
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
@@ -274,18 +274,19 @@ def _adjust_all(
     rounds = _joint_rounds(options, prior)
     prior = prior if options.refine_camera else None
     current, shape_factors = camera, (1.0, 1.0)
-    for _ in range(rounds):
+    for last in [False] * (rounds - 1) + [True]:
         if options.eccentricity:
             models = [replace(m, shift_px=eccentricity_px(m, current, radius, 1.0)) for m in models]
         models = [with_sigma(replace(m, covariance_px2=c), factors) for m, c in zip(models, covariances, strict=True)]
-        result = adjust_jointly(models, board, camera, options.flatness_mm, prior, current, shape_factors)
-        shape_factors = result.print_factor, result.bend_factor
-        models, current = list(result.models), result.camera
+        settled = EXACTLY if last else NEAR
+        state = adjusted(models, board, camera, options.flatness_mm, prior, current, None, shape_factors, settled)
+        shape_factors = state.setting.print_factor, state.setting.bend_factor
+        models, current = [block.model for block in state.blocks], state.shared.camera
         step(None)
         if prior is not None:
             unscaled = [replace(m, covariance_px2=c) for m, c in zip(models, covariances, strict=True)]
             factors = image_sigma_factors([adjust(m, current) for m in unscaled], current)
-    return result, factors
+    return state.result(), factors
 
 
 def image_sigma_factors(models: Sequence[GroupModel], camera: Camera) -> SigmaFactors:

@@ -165,13 +165,14 @@ def without_cameras(
 ) -> tuple[np.ndarray, np.ndarray, Reduction]:
     """Returns normal equations over points (3p) and intrinsics (q), and the reduction that gives the cameras."""
     by_pose, by_point = projection_jacobians(model, camera)
-    root = np.sqrt(robust_weights(model, camera, huber))[:, None]
+    residual = normalised(model, camera)
+    root = np.sqrt(huber_weights(np.linalg.norm(residual, axis=1), huber))[:, None]
     by_intrinsics = np.zeros((*by_pose.shape[:2], 0))
     if basis.shape[1]:
         xyz = model.xyz_camera()
         by_intrinsics = camera.parameter_jacobian(xyz[:, :2] / xyz[:, 2:]) @ basis
     a, c, e = (model.whiten(d) * root[..., None] for d in (by_pose, by_point, by_intrinsics))
-    equations = equations_of_poses(model, a, c, e, normalised(model, camera) * root)
+    equations = equations_of_poses(model, a, c, e, residual * root)
     cameras = reduce(equations.block, equations.block_right, equations.cross)
     return equations.normal - cameras.normal, equations.right - cameras.right, cameras
 

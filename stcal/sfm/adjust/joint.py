@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from stcal.design import BoardDesign, faces_of_known_shape, known_distances
 from stcal.errors import ConvergenceError, ScaleError
@@ -45,6 +46,10 @@ from stcal.sfm.data.model import GroupModel, MetricModel
 
 EXACTLY = 1e-15
 """Largest predicted decrease of the last step, as a share of χ²: corrections of nanometres must be seen."""
+NEAR = 1e-8
+"""The same where a result is the start of another one: a hundredth of σ."""
+NEARLY = 1e-6
+"""The same where parts of the images are compared, or the σ of faces of known shape are estimated: a tenth of σ."""
 MAX_STEPS = 100
 MAX_MOVE_PX = 0.02
 """Largest move of a projection, in px, at which a result is returned. Contradictory observations make the last steps
@@ -116,30 +121,28 @@ class Adjusted:
     """State of a joint adjustment at its minimum.
 
     ``blocks`` : the groups; ``shared`` : what the groups share; ``setting`` : constants of the adjustment, weights
-    included; ``move_px`` : largest move of a projection by the next whole step, px.
+    included; ``normal`` : normal matrix over the shared unknowns; ``move_px`` : largest move of a projection by the
+    next whole step, px.
     """
 
     blocks: tuple[Block, ...]
     shared: Shared
     setting: Setting
+    normal: np.ndarray
     move_px: float
 
     def result(self) -> JointResult:
         """Returns the result with its covariances."""
-        return _result(list(self.blocks), self.shared, self.setting, self.move_px)
+        places = self.setting.places(self.shared)
+        equations = self.normal, places.circles, places.intrinsics
+        return _result(list(self.blocks), self.shared, self.setting, self.move_px, equations=equations)
 
 
 def adjust_jointly(
-    models: Sequence[MetricModel],
-    board: BoardDesign,
-    camera: Camera,
-    flatness_mm: float | None = None,
-    prior: CameraPrior | None = None,
-    start: Camera | None = None,
-    factors: tuple[float, float] = (1.0, 1.0),
+    models: Sequence[MetricModel], board: BoardDesign, camera: Camera, flatness_mm: float | None = None
 ) -> JointResult:
     """Returns the result of :func:`adjusted` with the covariances at its minimum."""
-    return adjusted(models, board, camera, flatness_mm, prior, start, None, factors).result()
+    return adjusted(models, board, camera, flatness_mm).result()
 
 
 def adjusted(
@@ -151,6 +154,7 @@ def adjusted(
     start: Camera | None = None,
     common: float | None = None,
     factors: tuple[float, float] = (1.0, 1.0),
+    settled: float = EXACTLY,
 ) -> Adjusted:
     """Adjusts metric models that share one frame, with all observations weighted by their σ.
 
@@ -158,7 +162,8 @@ def adjusted(
     intrinsics of ``camera`` are observations with this covariance and are adjusted, beginning at ``start``; they are
     fixed if None; ``common`` : share of the board's variance that all groups have in common. If it is given, no
     residual is down-weighted, so that the result is linear in the observations; ``factors`` : on the σ of faces of
-    known shape, ``print_factor`` and ``bend_factor`` of an earlier result, from which their estimation starts.
+    known shape, ``print_factor`` and ``bend_factor`` of an earlier result, from which their estimation starts;
+    ``settled`` : largest predicted decrease of the last step, as a share of χ².
 
     If ``common`` is None, the dots tell whether the board kept its shape between the groups (one plate) or not
     (a film, a screen). First every group has its own deviations from the design. If these deviations agree, a common
@@ -175,17 +180,38 @@ def adjusted(
         setting = replace(setting, huber=HUBER * _robust_sigma(blocks, shared.camera))
     if common is None and faces_of_known_shape(board):
         blocks, shared, setting = _with_shape_factors(blocks, shared, setting, factors)
-    blocks, shared, move = _minimise(blocks, shared, setting)
-    share = _common_share(blocks, board) if common is None else 0.0
-    if share > 0:
-        blocks, setting = _with_common(blocks, setting, share)
-        blocks, shared, move = _minimise(blocks, shared, setting)
-    return Adjusted(tuple(blocks), shared, setting, move)
+    if common is None:
+        near = _minimise(blocks, shared, setting, NEAR)
+        blocks, shared = list(near.blocks), near.shared
+        share = _common_share(blocks, board)
+        if share > 0:
+            blocks, setting = _with_common(blocks, setting, share)
+    return _minimise(blocks, shared, setting, settled)
 
 
-SHAPE_ROUNDS, SETTLED_FACTOR, NEARLY = 6, 0.03, 1e-6
-"""Most rounds of the factors on the σ of faces of known shape, the change at which they end, and the share of χ² by
-which a round may still fall."""
+def adjust_part(
+    models: Sequence[MetricModel], board: BoardDesign, flatness_mm: float | None, whole: JointResult
+) -> JointResult:
+    """Adjusts a part of the models of a ``whole`` joint result, from which it begins, with the weights of the whole.
+
+    Camera, factors on the σ of faces of known shape, and the share of the board's variance that groups have in common
+    are those of the whole.
+
+    Raises
+    ------
+    ConvergenceError
+        No minimum is reached.
+    """
+    # Of a single group, the variance of its board is the same whatever share of it other groups have.
+    common = whole.board_common if len(models) > 1 else 0.0
+    blocks, shared, setting = _start(models, board, whole.camera, flatness_mm, None, common)
+    huber = HUBER * _robust_sigma(blocks, shared.camera)
+    setting = replace(setting, huber=huber, print_factor=whole.print_factor, bend_factor=whole.bend_factor)
+    return _minimise(blocks, shared, setting, NEARLY).result()
+
+
+SHAPE_ROUNDS, SETTLED_FACTOR = 6, 0.03
+"""Most rounds of the factors on the σ of faces of known shape, and the change at which they end."""
 PRIOR_FREEDOM = 4.0
 """Degrees of freedom that the stated σ of such faces stand for beside their deviations."""
 LEAST_FACTOR = 0.1
@@ -281,16 +307,17 @@ class Extensible:
     points: dict[str, np.ndarray]
     to_circles: dict[str, np.ndarray]
 
-    def with_view(self, view: MetricModel) -> np.ndarray:
-        """Returns the covariance of the circles, (3c, 3c) mm², with one more view.
+    def lowered(self, view: MetricModel, to_functions: np.ndarray) -> np.ndarray:
+        """Returns by how much one more view lowers the variances of f functions of the circles, (f,).
 
-        ``view`` : a model of one image and all points of its group. The inverse is that of a matrix with a change of
-        small rank (Woodbury 1950).
+        ``view`` : a model of one image and all points of its group; ``to_functions`` : (3p + q, f) covariance between
+        these points and intrinsics, and the functions. The inverse is that of a matrix with a change of small rank
+        (Woodbury 1950).
         """
         rows = rows_of_view(view, self.camera, self.basis)
-        away = rows @ self.to_circles[view.group]
         inner = np.eye(len(rows)) + rows @ self.points[view.group] @ rows.T
-        return self.covariance_mm2 - away.T @ np.linalg.solve(inner, away)
+        half = solve_triangular(np.linalg.cholesky(inner), rows @ to_functions, lower=True)
+        return (half**2).sum(0)
 
 
 def extensible(
@@ -361,9 +388,9 @@ def _with_common(blocks: list[Block], setting: Setting, common: float) -> tuple[
     return [replace(b, sigma_mm=own_sigma, dot_place=_dot_place(b.model, b.dots, board)) for b in blocks], setting
 
 
-def _minimise(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[list[Block], Shared, float]:
-    """Returns the state of least cost, and the largest move of a projection by the next whole step, px."""
-    minimum = _descent(blocks, shared, setting, EXACTLY)
+def _minimise(blocks: list[Block], shared: Shared, setting: Setting, settled: float) -> Adjusted:
+    """Returns the state of least cost; ``settled`` : see :func:`~stcal.geometry.least_squares.minimise`."""
+    minimum = _descent(blocks, shared, setting, settled)
     last, beyond = minimum.state, minimum.state.moved(minimum.linear.step(DAMPING)[0], setting)
     move = max(_largest_move(a, last.shared, b, beyond.shared) for a, b in zip(last.blocks, beyond.blocks, strict=True))
     if not move <= MAX_MOVE_PX:  # true of NaN, too
@@ -372,7 +399,7 @@ def _minimise(blocks: list[Block], shared: Shared, setting: Setting) -> tuple[li
             f"joint adjustment: projections still move by {move:.1g} px in the last of at most {MAX_STEPS} steps; "
             "compare with --solve chain and look at the outliers",
         )
-    return list(last.blocks), last.shared, float(move)
+    return Adjusted(last.blocks, last.shared, setting, minimum.linear.normal, float(move))
 
 
 def _descent(

@@ -16,7 +16,7 @@ from stcal.geometry.rigid import Rigid, skew
 from stcal.parallel import run_briefly
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.chain import CalibratedTarget, FaceChain, measure_chains
-from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_jointly
+from stcal.sfm.adjust.joint import SETTLED_PX, JointResult, adjust_part
 from stcal.sfm.adjust.network import Network
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.uncertainty import calibrated_target
@@ -43,9 +43,8 @@ class Again:
 
     def adjust(self, parts: Sequence[Sequence[MetricModel]]) -> list[JointResult | StcalError]:
         """Adjusts parts of the models as the run did; returns the error of a part that has no result."""
-        camera, flatness_mm = self.calibration.camera, self.options.flatness_mm
-        factors = self.joint.print_factor, self.joint.bend_factor
-        return run_briefly(_adjusted, [(models, self.board, camera, flatness_mm, factors) for models in parts])
+        jobs = [(models, self.board, self.options.flatness_mm, self.joint) for models in parts]
+        return run_briefly(_adjusted, jobs)
 
     def posed(self, joint: JointResult | StcalError, faces: Sequence[str]) -> tuple[CalibratedTarget, JointResult]:
         """Returns the poses of ``faces`` by the adjustment of a part of the models, and that adjustment.
@@ -67,9 +66,9 @@ class Again:
             raise _unfixed(joint.models) from error
 
 
-def _adjusted(models: Sequence[MetricModel], board, camera, flatness_mm, factors) -> JointResult | StcalError:
+def _adjusted(models: Sequence[MetricModel], board, flatness_mm, whole: JointResult) -> JointResult | StcalError:
     try:
-        return adjust_jointly(models, board, camera, flatness_mm, factors=factors)
+        return adjust_part(models, board, flatness_mm, whole)
     except StcalError as error:
         return error
     except np.linalg.LinAlgError:

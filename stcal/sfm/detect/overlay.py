@@ -1,19 +1,51 @@
 """Overlay pictures: images with the measured circles drawn on them."""
 
+import hashlib
+from pathlib import Path
+
 import cv2
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.io.cache import keep, kept, made_by
 from stcal.labels import BOARD, CircleLabel, DotLabel
 from stcal.sfm.data.model import ImageObservations
 
 # OpenCV's order: blue, green, red. The palette of Okabe & Ito (2008), for all kinds of colour vision.
 PALETTE = [(0, 159, 230), (115, 158, 0), (66, 228, 240), (167, 121, 204), (0, 94, 213), (178, 114, 0)]
 BOARD_COLOUR = (233, 180, 86)
+CACHE_VERSION = 1
+"""Version of the drawing, which increases with every change of it, so that older kept overlays are not used."""
 QUALITY = 82
 MIN_WIDTH_PX = 1000
 MIN_LABEL_GAP = 70.0
 """Smallest distance between numbered dots, px at text size 1."""
+
+
+def kept_overlay(
+    cache: Path,
+    digest: str,
+    thumbnail: bytes,
+    scale: float,
+    observations: ImageObservations,
+    faces: list[str],
+    focal_px: np.ndarray,
+    notes: int,
+) -> bytes:
+    """Returns the JPEG of :func:`draw_overlay`, that of an earlier run with the same content if the ``cache`` has it.
+
+    ``digest`` : of the image that the thumbnail shows
+    """
+    stated = CACHE_VERSION, made_by(), cv2.__version__, digest, scale, observations.name, observations.labels
+    hasher = hashlib.sha256("\0".join(map(repr, (*stated, faces, notes))).encode("utf-8", "backslashreplace"))
+    for values in (observations.centre_px, observations.shape, focal_px):
+        hasher.update(values.tobytes())
+    path = cache / f"overlay-{hasher.hexdigest()[:40]}.npz"
+    picture = kept(path, lambda arrays, _: arrays["jpeg"].tobytes())
+    if picture is None:
+        picture = draw_overlay(thumbnail, scale, observations, faces, focal_px, notes)
+        keep(path, {"jpeg": np.frombuffer(picture, np.uint8)}, {})
+    return picture
 
 
 def draw_overlay(

@@ -246,11 +246,16 @@ def forecast(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PositionsWith:
-    """Computes :meth:`Forecast.position_sigma_mm` with one further view, as :func:`forecast` would."""
+    """Computes :meth:`Forecast.position_sigma_mm` with one further view, as :func:`forecast` would.
+
+    ``variance_mm2`` : of the position of each face without it; ``to_positions`` : by group, (3p + q, 3f) covariance
+    between its points and the intrinsics, and the positions, without the factor ``scale``.
+    """
 
     now: Extensible
-    setup: Setup
-    known: Derivatives
+    variance_mm2: dict[str, float]
+    to_positions: dict[str, np.ndarray]
+    scale: float
 
     @classmethod
     def of(
@@ -258,12 +263,19 @@ class PositionsWith:
     ) -> "PositionsWith":
         """Prepares views in addition to these models. ``known`` and ``photographs`` are as in :func:`forecast`."""
         now = extensible(models, setup.board, setup.camera, setup.flatness_mm, setup.prior, setup.common, photographs)
-        return cls(now, setup, known)
+        faces = known.face_covariance(setup.circle_covariance(now.covariance_mm2))
+        variance = {f: position_sigma_mm(c) ** 2 for f, c in faces.items() if f != setup.start.reference_face}
+        jacobian = np.concatenate([known.faces[face][3:] for face in variance])
+        to_positions = {group: covariance @ jacobian.T for group, covariance in now.to_circles.items()}
+        return cls(now, variance, to_positions, setup.sigma0**2)
 
     def __call__(self, view: MetricModel) -> dict[str, float]:
         """Returns the σ of each face's position with this view, mm."""
-        faces = self.known.face_covariance(self.setup.circle_covariance(self.now.with_view(view)))
-        return {f: position_sigma_mm(c) for f, c in faces.items() if f != self.setup.start.reference_face}
+        lowered = self.scale * self.now.lowered(view, self.to_positions[view.group]).reshape(-1, 3).sum(1)
+        return {
+            face: float(np.sqrt(max(now - less, 0.0)))
+            for (face, now), less in zip(self.variance_mm2.items(), lowered, strict=True)
+        }
 
 
 def position_sigma_mm(face_covariance: np.ndarray) -> float:

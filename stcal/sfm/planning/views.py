@@ -191,21 +191,20 @@ def shown(scene: Scene, group: str, image: int, max_tilt_rad: float) -> set[str]
     circles = image_circles(scene, group, image)
     camera_from_target = scene.groups[group].camera_from_target[image]
     plates = [scene.face_outline(face.id) for face in scene.target.faces] + [scene.board_outline(group)]
-    hidden = np.zeros(len(circles.labels), bool)
-    for corners in plates:
-        hidden |= _behind(circles.xyz_camera, camera_from_target @ corners)
+    hidden = _behind(circles.xyz_camera, camera_from_target @ np.stack(plates)).any(0)
     visible = circles.must_find & (circles.tilt_rad <= max_tilt_rad) & ~hidden
     return {label for label, is_visible in zip(circles.labels, visible, strict=True) if is_visible}
 
 
 def _behind(xyz_camera: np.ndarray, corners_camera: np.ndarray) -> np.ndarray:
-    """Returns whether a rectangle, (4, 3) corners in turn, is between the camera and each of the points (n, 3)."""
-    origin, a, b = corners_camera[0], corners_camera[1] - corners_camera[0], corners_camera[3] - corners_camera[0]
+    """Returns whether rectangles, (m, 4, 3) corners in turn, are between the camera and points (n, 3); (m, n)."""
+    origin, a, b = corners_camera[:, 0], corners_camera[:, 1], corners_camera[:, 3]
+    a, b = a - origin, b - origin
     normal = np.cross(a, b)
     with np.errstate(divide="ignore", invalid="ignore"):  # lines of sight parallel to the plane never meet it
-        depth_ratio = (origin @ normal) / (xyz_camera @ normal)
-        from_corner = depth_ratio[:, None] * xyz_camera - origin
-        u, v = from_corner @ a / (a @ a), from_corner @ b / (b @ b)
+        depth_ratio = (origin * normal).sum(1)[:, None] / (normal @ xyz_camera.T)
+        from_corner = depth_ratio[..., None] * xyz_camera - origin[:, None]
+        u, v = ((from_corner @ side[..., None])[..., 0] / (side * side).sum(1)[:, None] for side in (a, b))
         return (depth_ratio > 0) & (depth_ratio < 1 - 1e-3) & (u > 0) & (u < 1) & (v > 0) & (v < 1)
 
 

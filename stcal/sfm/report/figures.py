@@ -4,12 +4,12 @@ import base64
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
 from stcal.labels import dot_cells, parse_label, parse_labels
-from stcal.report.figure import AXIS_COLOURS, COLOURS, INK, SMALL, calm, locator, new_figure, round_below, uri
+from stcal.report.figure import AXIS_COLOURS, COLOURS, INK, SMALL, round_below
+from stcal.report.svg import Axes, Drawing, Space, arrows, red_blue, ticks
 from stcal.report.text import number
 
 
@@ -27,33 +27,27 @@ def board_residuals(residuals_um: dict[str, list[float]], reach_um: float, heigh
     reach_um : residual that is drawn as long as the grid's pitch
     height_um : end of the colour scale for the out-of-plane part; both are the same for all groups, to compare them
     """
-    cells = dot_cells(parse_labels(residuals_um)).astype(float)
+    cells = dot_cells(parse_labels(residuals_um)).astype(float).reshape(-1, 2)
     vectors = np.array(list(residuals_um.values()), float).reshape(-1, 3)
     per_cell = reach_um if reach_um > 0 else 1.0
     height_um = height_um if height_um > 0 else 1.0
     bar_um = round_below(per_cell)
-    figure = new_figure(4.3, 3.5)
-    axes = figure.add_axes((0.08, 0.16, 0.76, 0.80))
-    dots = axes.scatter(
-        *cells[:, ::-1].T, c=vectors[:, 2], s=30, cmap="RdBu_r", vmin=-height_um, vmax=height_um, zorder=2
-    )
-    dots.set(edgecolor="#777777", linewidth=0.5)
-    axes.quiver(
-        *cells[:, ::-1].T, *(vectors[:, :2] / per_cell).T, angles="xy", scale_units="xy", scale=1, width=0.006, zorder=3
-    )
+    drawing = Drawing(4.3, 3.5)
     last = cells.max(0) if len(cells) else np.zeros(2)
-    axes.set(xlim=(-1.2, last[1] + 1.2), ylim=(last[0] + 2.0, -1.2), aspect="equal")
-    axes.plot([0, bar_um / per_cell], [last[0] + 1.45] * 2, color=INK, linewidth=2.5, solid_capstyle="butt")
-    axes.text(bar_um / per_cell + 0.25, last[0] + 1.45, f"{bar_um:g} µm", va="center", fontsize=SMALL + 1)
-    axes.set_xlabel("column", fontsize=SMALL)
-    axes.set_ylabel("row", fontsize=SMALL)
-    axes.set(xticks=np.arange(0, last[1] + 1, 2), yticks=np.arange(0, last[0] + 1, 2))
-    calm(axes)
-    bar = figure.colorbar(dots, cax=figure.add_axes((0.88, 0.30, 0.022, 0.52)))
-    bar.ax.tick_params(labelsize=SMALL - 1, length=2)
-    bar.outline.set_visible(False)
-    bar.ax.set_title("z, µm", fontsize=SMALL)
-    return uri(figure)
+    pitch = min(236 / (last[1] + 2.4), 202 / (last[0] + 3.2))  # pt
+    box = (26.0, 10.0, 26 + pitch * (last[1] + 2.4), 10 + pitch * (last[0] + 3.2))
+    axes = Axes(box, (-1.2, last[1] + 1.2), (last[0] + 2.0, -1.2))
+    marks = [[float(i) for i in range(0, int(end) + 1, max(2, int(np.ceil((end + 1) / 12))))] for end in last]
+    rows, columns = ((values, [f"{value:g}" for value in values]) for values in marks)
+    axes.draw(drawing, columns, rows, "column", "row", size=SMALL)
+    places = axes.at(cells[:, 1], cells[:, 0])
+    drawing.discs(places, min(2.75, 0.25 * pitch), red_blue(vectors[:, 2] / height_um), "#777777")
+    drawing.lines(arrows(places, vectors[:, :2] * pitch / per_cell, 1.4), fill="#000000")
+    bar = axes.at([0, bar_um / per_cell], last[0] + 1.45)
+    drawing.lines([bar], INK, 2.5)
+    drawing.words(bar[1] + [4, 0], f"{bar_um:g} µm", SMALL + 1, "start")
+    drawing.scale((box[2] + 14, 50, box[2] + 21, 176), height_um, "z, µm")
+    return drawing.uri()
 
 
 def image_bars(rows: list[dict], colours: dict[str, str]) -> str:
@@ -61,70 +55,64 @@ def image_bars(rows: list[dict], colours: dict[str, str]) -> str:
 
     The horizontal axis is the number of the image in the table.
     """
-    figure = new_figure(10.5, 2.9)
-    axes = figure.add_axes((0.055, 0.16, 0.935, 0.75))
-    place = np.arange(1, len(rows) + 1)
-    axes.bar(place, [row["rms_px"] for row in rows], 0.72, color=[colours.get(row["group"], INK) for row in rows])
-    axes.plot(place, [row["max_px"] for row in rows], "_", color=INK, markersize=9, markeredgewidth=1.4)
-    axes.set(xlim=(0.2, len(rows) + 0.8), ylim=(0, None))
+    drawing, count = Drawing(10.5, 2.9), max(len(rows), 1)
+    top = max((row["max_px"] for row in rows), default=0.0)
+    axes = Axes((43.0, 19.0, 749.0, 176.0), (0.2, count + 0.8), (0.0, 1.05 * top if top > 0 else 1.0))
+    numbers = list(range(1, len(rows) + 1, max(1, int(np.ceil(len(rows) / 40)))))
+    axes.draw(
+        drawing, (numbers, list(map(str, numbers))), ticks(*axes.y, 8), "number of the image in the table below",
+        "residual, px", grid=True,
+    )  # fmt: skip
     groups = [row["group"] for row in rows]
-    for i, group in enumerate(
-        groups
-    ):  # the name of each group stands over its first image, so that colour is not needed
-        if group not in groups[:i]:
-            axes.annotate(group, (i + 0.6, 1.0), xycoords=("data", "axes fraction"), va="bottom", fontsize=SMALL,
-                          color=colours.get(group, INK), parse_math=False)  # fmt: skip
-    step = max(1, int(np.ceil(len(rows) / 40)))
-    axes.set_xticks(place[::step])
-    calm(axes, "number of the image in the table below", "residual, px", "y")
-    return uri(figure)
+    for group in dict.fromkeys(groups):
+        colour = colours.get(group, INK)
+        own = [(i, row["rms_px"]) for i, row in enumerate(rows, 1) if row["group"] == group]
+        bars = [axes.at([i - 0.36, i + 0.36, i + 0.36, i - 0.36], [0, 0, rms, rms]) for i, rms in own]
+        drawing.lines(bars, fill=colour)
+        # The name of each group stands over its first image, so that colour is not needed.
+        drawing.words((axes.at(groups.index(group) + 0.6, 0)[0, 0], axes.box[1] - 6), group, SMALL, "start", colour)
+    largest = axes.at(np.arange(1, len(rows) + 1), [row["max_px"] for row in rows])
+    half = np.array([min(4.5, 0.4 * (axes.box[2] - axes.box[0]) / (count + 0.6)), 0.0])
+    drawing.lines([np.array([at - half, at + half]) for at in largest], INK, 1.4)
+    return drawing.uri()
 
 
 def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: float) -> str:
     """Draws cameras, boards and the target's circles in the target frame."""
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection
-
     target = np.array(list(scene["circles"].values()), float).reshape(-1, 3)
     positions = np.array([view["position_mm"] for view in scene["cameras"]], float).reshape(-1, 3)
     boards = {name: np.array(xyz, float).reshape(-1, 3) for name, xyz in scene["boards"].items()}
     everything = np.vstack([target, positions, *boards.values()])
-    depth = 0.07 * float(np.ptp(everything, axis=0).max()) if len(everything) else 1.0
-    figure, axes = _space(everything, 5.4, 4.9, elevation=22, azimuth=azimuth)
-    lines, ink = [], []
-    for view in scene["cameras"]:
-        pyramid = frustum(view, camera, depth)
-        lines += pyramid
-        ink += [colours.get(view["group"], INK)] * len(pyramid)
-    axes.add_collection3d(Line3DCollection(lines, colors=ink, linewidths=0.9), autolim=False)
+    depth = CAMERA * float(np.ptp(everything, axis=0).max()) if len(everything) else 1.0
+    drawing = Drawing(5.4, 4.9)
+    space = Space(drawing, everything, 22, azimuth)
     for name, xyz in boards.items():
-        axes.scatter(*xyz.T, s=2, color=colours.get(name, INK), depthshade=False)
-    axes.scatter(*target.T, s=4, color="black", depthshade=False)
-    return uri(figure)
+        drawing.dots(space.at(xyz), 1.8, colours.get(name, INK))
+    drawing.dots(space.at(target), 2.0, "#000000")
+    for name in dict.fromkeys(view["group"] for view in scene["cameras"]):
+        views = [view for view in scene["cameras"] if view["group"] == name]
+        pyramids = [space.at(line) for view in views for line in frustum(view, camera, depth)]
+        drawing.lines(pyramids, colours.get(name, INK), 0.9)
+    return drawing.uri()
 
 
 def target_view(circles: dict[str, list[float]], faces: dict[str, dict], azimuth: float) -> str:
     """Draws the target's circles, and the frame of each face with its name at the end of the normal."""
-    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
-
+    parts = _faces(circles, faces)
     xyz = np.array(list(circles.values()), float).reshape(-1, 3)
-    reach = 0.2 * float(np.ptp(xyz, axis=0).max()) if len(xyz) else 1.0
-    lines, ink, names, sheets = [], [], [], []
-    for name, face in faces.items():
-        centres = np.array([p for label, p in circles.items() if parse_label(label).plane == name], float).reshape(
-            -1, 3
-        )
-        pose = np.array(face["target_from_face"], float)
-        lines += [np.array([pose[:3, 3], pose[:3, 3] + reach * pose[:3, i]]) for i in range(3)]
-        ink += AXIS_COLOURS
-        sheets += outline(centres, pose)
-        names.append((name, (centres.mean(0) if len(centres) else pose[:3, 3]) + 0.9 * reach * pose[:3, 2]))
-    figure, axes = _space(np.vstack([xyz, *lines, *[at for _, at in names]]), 5.4, 4.9, elevation=24, azimuth=azimuth)
-    axes.add_collection3d(Poly3DCollection(sheets, facecolors="#7f93a8", alpha=0.16), autolim=False)
-    axes.scatter(*xyz.T, s=9, color=INK, depthshade=False)
-    axes.add_collection3d(Line3DCollection(lines, colors=ink, linewidths=1.6), autolim=False)
-    for name, at in names:
-        axes.text(*at, name, fontsize=11, weight="bold", ha="center", va="center", parse_math=False)
-    return uri(figure)
+    shown = [np.array(part["xyz"], float).reshape(-1, 3) for part in parts]
+    drawing = Drawing(5.4, 4.9)
+    space = Space(drawing, np.vstack([xyz, *shown]), 24, azimuth)
+    for part, own in zip(parts, shown, strict=True):
+        if part["kind"] == "sheet":
+            drawing.lines([space.at(own)], fill=SHEET, opacity=0.16)
+    drawing.dots(space.at(xyz), 3.0, INK)
+    for part, own in zip(parts, shown, strict=True):
+        if part["kind"] == "line":
+            drawing.lines([space.at(own)], part["colour"], 1.6)
+        elif part["kind"] == "text":
+            drawing.words(space.at(own)[0], part["name"], 11, colour="#000000", weight="bold")
+    return drawing.uri()
 
 
 def outline(xyz: np.ndarray, target_from_face: np.ndarray) -> list[np.ndarray]:
@@ -145,29 +133,6 @@ def frustum(pose: dict, camera: dict, depth: float) -> list[np.ndarray]:
     corners = [at + depth * axes[2] + sx * half[0] * axes[0] + sy * half[1] * axes[1] for sx, sy in around]
     sides = [np.array([at, corner]) for corner in corners]
     return [*sides, np.array([*corners, corners[0]]), np.array([at, at + 2.2 * depth * axes[2]])]
-
-
-def _space(xyz: np.ndarray, width: float, height: float, elevation: float, azimuth: float):
-    """Returns figure and axes in space, with one scale for X, Y and Z, just large enough for the points."""
-    from mpl_toolkits.mplot3d import Axes3D
-
-    low, high = (xyz.min(0), xyz.max(0)) if len(xyz) else (-np.ones(3), np.ones(3))
-    margin = 0.03 * max(float((high - low).max()), 1e-6)
-    low, high = low - margin, high + margin
-    figure = new_figure(width, height)
-    axes: Any = figure.add_axes(Axes3D(figure, rect=(0.0, 0.03, 0.95, 0.94)))  # has no types of its own
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.08)
-    axes.set_proj_type("ortho")
-    axes.view_init(elevation, azimuth)
-    for axis, name in ((axes.xaxis, "X"), (axes.yaxis, "Y"), (axes.zaxis, "Z")):
-        axis.set_pane_color((0.955, 0.965, 0.975, 1))
-        axis.set_label_text(f"{name}, mm", fontsize=SMALL + 0.5)
-        axis.line.set_color("#9aa0a8")
-        axis.set_major_locator(locator())
-    axes.tick_params(labelsize=SMALL - 0.5, pad=0)
-    axes.grid(False)
-    return figure, axes
 
 
 DIGITS = 2

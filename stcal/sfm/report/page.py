@@ -1,10 +1,9 @@
 """The page of a run."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from stcal.labels import BOARD, parse_label
-from stcal.parallel import run_briefly
 from stcal.report.document import (
     Block,
     Document,
@@ -240,20 +239,17 @@ def _drawn(report: dict, colours: dict[str, str]) -> tuple[dict[str, str], list[
 
     A view is (cameras, target, words for its side).
     """
-    scene = report["scene"]
-    boards, jobs = _boards(report), []
-    jobs += [(figures.board_residuals, *board) for board in boards.values()]
-    for azimuth in SIDES:
-        jobs.append((figures.scene_view, scene, report["camera"], colours, azimuth))
-        jobs.append((figures.target_view, scene["circles"], report["faces"], azimuth))
-    drawn = run_briefly(_draw, [*jobs, (figures.image_bars, report["residuals_by_image"], colours)])
-    n = len(boards)
-    views = [(drawn[n + 2 * i], drawn[n + 2 * i + 1], side) for i, side in enumerate(SIDES.values())]
-    return dict(zip(boards, drawn, strict=False)), views, drawn[-1]
-
-
-def _draw(figure: Callable[..., str], *arguments) -> str:
-    return figure(*arguments)
+    scene, faces = report["scene"], report["faces"]
+    boards = {name: figures.board_residuals(*board) for name, board in _boards(report).items()}
+    views = [
+        (
+            figures.scene_view(scene, report["camera"], colours, azimuth),
+            figures.target_view(scene["circles"], faces, azimuth),
+            side,
+        )
+        for azimuth, side in SIDES.items()
+    ]
+    return boards, views, figures.image_bars(report["residuals_by_image"], colours)
 
 
 # --- result and trust -------------------------------------------------------------------------------------------------

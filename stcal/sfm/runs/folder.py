@@ -24,9 +24,9 @@ from stcal.parallel import Progress
 from stcal.report.page import pdf_of, require_pdf
 from stcal.sfm.adjust.file import FacesFile, require_faces_written
 from stcal.sfm.data.model import GroupModel, ImageObservations
-from stcal.sfm.detect.files import DetectionResult
+from stcal.sfm.detect.files import DetectedImage, DetectionResult
 from stcal.sfm.detect.labels import LabelledImage
-from stcal.sfm.detect.overlay import draw_overlay
+from stcal.sfm.detect.overlay import kept_overlay
 from stcal.sfm.mapping.database import image_ids, labels_csv, write_database
 from stcal.sfm.mapping.models import write_model
 from stcal.sfm.report.figures import Residuals, shown_overlays
@@ -36,7 +36,7 @@ from stcal.sfm.runs.output import report_of, residuals_px
 from stcal.sfm.runs.report import ReportFile
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.saved import SavedRun
-from stcal.sfm.runs.transaction import added_results, complete_interrupted
+from stcal.sfm.runs.transaction import RunFolder, added_results, complete_interrupted
 
 LONGEST_NAME = 200
 """Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix
@@ -46,23 +46,19 @@ HASH_DIGITS = 12
 
 @contextlib.contextmanager
 def overlays_beside(
-    detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, folder: Path, progress: Progress
+    detection: DetectionResult, labelled: list[LabelledImage], target: TargetDesign, run: RunFolder, progress: Progress
 ) -> Iterator[None]:
-    """Draws the detections into every image while other work goes on; all overlays exist at the end of the block."""
-    face_ids = [face.id for face in target.faces]
+    """Draws the detections into every image while other work goes on; all overlays exist at the end of the block.
 
-    def draw(image, each: LabelledImage) -> None:
-        path = overlay_path(folder, image.file.name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        picture = draw_overlay(
-            image.thumbnail,
-            image.thumbnail_scale,
-            each.observations,
-            face_ids,
-            detection.camera.focal,
-            len(each.notes),
-        )
-        save(path, picture)
+    An overlay of an earlier run with the same content is taken from the cache.
+    """
+    face_ids, focal_px = [face.id for face in target.faces], detection.camera.focal
+
+    def draw(image: DetectedImage, each: LabelledImage) -> None:
+        small = image.thumbnail, image.thumbnail_scale
+        seen, notes = each.observations, len(each.notes)
+        picture = kept_overlay(run.cache, image.digest, *small, seen, face_ids, focal_px, notes)
+        save(overlay_path(run.stage, image.file.name), picture)
 
     with ThreadPoolExecutor() as pool:  # drawing and JPEG release the interpreter
         drawn = pool.map(draw, _in_order(detection, labelled), labelled)

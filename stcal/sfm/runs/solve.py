@@ -16,7 +16,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cache import keep, kept, made_by
 from stcal.io.images import HOLDS_IMAGES, SUFFIXES, TOP_GROUP, Skipped
 from stcal.labels import DotLabel, parse_labels, unseen_lines
-from stcal.parallel import Progress
+from stcal.parallel import Progress, counted, run_briefly
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel, by_group
@@ -29,7 +29,7 @@ from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_o
 from stcal.sfm.report.judgement import LEFT_OUT_WHOLE
 from stcal.sfm.runs.options import RunOptions
 
-CACHE_VERSION = 6
+CACHE_VERSION = 7
 SHOW_MORE = "show two faces of it at once, or one by more corners"
 _ARRAYS = ("xyz_model", "image_index", "point_index", "keypoint", "measured_px", "shift_px", "covariance_px2")
 
@@ -156,66 +156,66 @@ def require_usable(group: list[ImageObservations], board_alone: bool = False, ne
         )
 
 
-def solve_group(
-    group: list[ImageObservations],
-    skeleton: Sequence[str],
-    database: Path,
-    scratch: Path,
-    ids: dict[str, int],
-    camera: Camera,
-    target: TargetDesign,
-    board: BoardDesign,
-    pair_options: PairOptions,
-    eccentricity: bool,
-    cache: Path,
-) -> GroupSolution:
-    """Solves one group, or takes the solution of an earlier run with the same inputs.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Group:
+    """A group and all that its solution depends on.
 
-    The initial pair is chosen among the images of the ``skeleton``, which are mapped first.
-
-    Raises
-    ------
-    MappingError, ScaleError, ConvergenceError
+    ``skeleton`` : names of the images that are mapped first, among which the initial pair is chosen; ``matched`` :
+    (n, 2) indices of images to match, in the group.
     """
-    key = _key(group, skeleton, ids, camera, target, board, pair_options, eccentricity)
-    path = cache / f"group-{key}.npz"
-    cached = kept(path, _stored)
-    if cached is not None:
-        return cached
-    pairs = rank_pairs([image for image in group if image.name in skeleton], camera, pair_options, board)
-    mapping = map_group(database, scratch, group, skeleton, ids, pairs, camera)
-    refined = refine(mapping.model, camera, target, board, eccentricity)
-    solution = GroupSolution(
+
+    images: list[ImageObservations]
+    skeleton: list[str]
+    matched: np.ndarray
+    camera: Camera
+    target: TargetDesign
+    board: BoardDesign
+    pair_options: PairOptions
+    eccentricity: bool
+
+    def key(self) -> str:
+        """Returns a hash of all inputs of the solution. It does not depend on other groups."""
+        hasher = hashlib.sha256()
+        for image in self.images:
+            hasher.update(f"{image.name}\0{image.labels}\0".encode())
+            hasher.update(image.centre_px.tobytes() + image.covariance_px2.tobytes())
+        hasher.update(self.matched.astype("<i8").tobytes())
+        plain = [
+            CACHE_VERSION,
+            made_by(),
+            self.skeleton,
+            [self.camera.width, self.camera.height, self.camera.parameters()],
+            asdict(self.target.patterns_alone()),
+            asdict(self.board),
+            asdict(self.pair_options),
+            self.eccentricity,
+        ]
+        hasher.update(json.dumps(plain, default=lambda v: v.tolist() if isinstance(v, np.ndarray) else str(v)).encode())
+        return hasher.hexdigest()[:40]
+
+
+def _solved(group: _Group, scratch: Path) -> GroupSolution | StcalError:
+    """Solves one group with a database of its own in a folder that is made; returns why it has no solution."""
+    images, camera, board = group.images, group.camera, group.board
+    scratch.mkdir()
+    ids, database = image_ids(images), scratch / "mapping.db"
+    try:
+        pairs = rank_pairs(
+            [image for image in images if image.name in group.skeleton], camera, group.pair_options, board
+        )
+        write_database(database, camera, images, group.matched)
+        mapping = map_group(database, scratch / "models", images, group.skeleton, ids, pairs, camera)
+        refined = refine(mapping.model, camera, group.target, board, group.eccentricity)
+    except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
+        return error
+    return GroupSolution(
         tuple(pairs),
         refined.model,
         mapping.seeded,
         refined.rounds,
-        mapping.left_out | left_out([i for i in group if i.name in mapping.model.images], refined.model),
+        mapping.left_out | left_out([i for i in images if i.name in mapping.model.images], refined.model),
         (*mapping.outliers, *refined.outliers),
     )
-    _save(path, solution)
-    return solution
-
-
-def _key(
-    group, skeleton, ids, camera: Camera, target: TargetDesign, board: BoardDesign, pair_options, eccentricity: bool
-) -> str:
-    hasher = hashlib.sha256()
-    for image in group:
-        hasher.update(f"{image.name}\0{ids[image.name]}\0{image.labels}\0".encode())
-        hasher.update(image.centre_px.tobytes() + image.covariance_px2.tobytes())
-    plain = [
-        CACHE_VERSION,
-        made_by(),
-        list(skeleton),
-        [camera.width, camera.height, camera.parameters()],
-        asdict(target.patterns_alone()),
-        asdict(board),
-        asdict(pair_options),
-        eccentricity,
-    ]
-    hasher.update(json.dumps(plain, default=lambda v: v.tolist() if isinstance(v, np.ndarray) else str(v)).encode())
-    return hasher.hexdigest()[:40]
 
 
 def _save(path: Path, solution: GroupSolution) -> None:
@@ -325,39 +325,69 @@ def solve_groups(
     MappingError, ScaleError, ConvergenceError, DegenerateError
         No group has a solution; the error of the first group is raised.
     """
+    groups = _groups(observations, graph, camera, target, board, options, names)
+    paths = [cache / f"group-{group.key()}.npz" for group in groups]
+    found: list[GroupSolution | StcalError | None] = [kept(path, _stored) for path in paths]
+    pending = [k for k, solution in enumerate(found) if solution is None]
+    step = counted(progress, "map", len(groups))
+    for _ in range(len(groups) - len(pending)):
+        step(None)
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
-    ids = image_ids(observations)
-    database = scratch / "mapping.db"
-    groups = {name: group for name, group in by_group(observations).items() if names is None or name in names}
-    solutions: list[GroupSolution] = []
-    errors: list[StcalError] = []
     try:
-        write_database(database, camera, observations, graph.pairs)
-        for done, (name, group) in enumerate(groups.items(), 1):
-            try:
-                solution = solve_group(
-                    group,
-                    [observations[i].name for i in graph.skeleton[name]],
-                    database,
-                    scratch / "models",
-                    ids,
-                    camera,
-                    target,
-                    board,
-                    options.pairs,
-                    options.eccentricity,
-                    cache,
-                )
-                find_scale(solution.model, board)
-            except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
-                error.append(pitch_hint(group, board))
-                errors.append(error)
-            else:
-                solutions.append(solution)
-            progress("map", done, len(groups))
+        for k, solution in zip(
+            pending, run_briefly(_solved, [(groups[k], scratch / str(k)) for k in pending], step), strict=True
+        ):
+            found[k] = solution
+            if isinstance(solution, GroupSolution):
+                _save(paths[k], solution)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+    solutions: list[GroupSolution] = []
+    errors: list[StcalError] = []
+    for group, solution in zip(groups, (each for each in found if each is not None), strict=True):
+        try:
+            if isinstance(solution, StcalError):
+                raise solution
+            find_scale(solution.model, board)
+        except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
+            error.append(pitch_hint(group.images, board))
+            errors.append(error)
+        else:
+            solutions.append(solution)
     if not solutions:
         raise errors[0]
     return solutions, [_left_out(error) for error in errors]
+
+
+def _groups(
+    observations: Sequence[ImageObservations],
+    graph: ImageGraph,
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign,
+    options: RunOptions,
+    names: Collection[str] | None,
+) -> list[_Group]:
+    """Returns the groups to solve, with the pairs of the graph that lie within them."""
+    groups = []
+    for name, images in by_group(observations).items():
+        if names is not None and name not in names:
+            continue
+        place = np.full(len(observations), -1)
+        members = [i for i, image in enumerate(observations) if image.group == name]
+        place[members] = np.arange(len(members))
+        matched = place[graph.pairs]
+        groups.append(
+            _Group(
+                images,
+                [observations[i].name for i in graph.skeleton[name]],
+                matched[(matched >= 0).all(1)],
+                camera,
+                target,
+                board,
+                options.pairs,
+                options.eccentricity,
+            )
+        )
+    return groups

@@ -1,0 +1,72 @@
+"""Drawings that are written directly as SVG."""
+
+import base64
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from stcal.report.svg import Axes, Drawing, Space, arrows, red_blue, ticks
+
+
+def written(drawing: Drawing) -> ElementTree.Element:
+    """The drawing as a reader of XML takes it."""
+    return ElementTree.fromstring(base64.b64decode(drawing.uri().partition(",")[2]))
+
+
+@pytest.mark.parametrize("name", ["$x^{", "面", "_$\\frac", "<a & 'b'>", "\x07bell", "\udcff.jpg"])
+def test_any_name_can_be_written(name):
+    drawing = Drawing(1, 1)
+    drawing.words((0, 0), name)
+    (text,) = written(drawing).iter("{http://www.w3.org/2000/svg}text")
+    assert text.text == name.replace("\x07", "\ufffd").replace("\udcff", "\\udcff")
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "texts"),
+    [
+        (0, 0.17, ["0.00", "0.05", "0.10", "0.15"]),
+        (-20.7, 20.7, ["\N{MINUS SIGN}20", "\N{MINUS SIGN}10", "0", "10", "20"]),
+        (0, 5, ["0", "1", "2", "3", "4", "5"]),
+        (3, 3, []),
+        (0, np.nan, []),
+    ],
+)
+def test_ticks_are_round(low, high, texts):
+    values, words = ticks(low, high)
+    assert words == texts
+    assert all(low - 1e-9 <= value <= high + 1e-9 for value in values)
+
+
+def test_data_lie_between_the_ends_of_their_axes():
+    axes = Axes((10, 20, 110, 70), (0, 4), (5, -5))  # downwards
+    np.testing.assert_allclose(axes.at([0, 4, 1], [5, -5, 0]), [[10, 70], [110, 20], [35, 45]])
+
+
+def test_red_is_above_and_blue_below():
+    assert red_blue(np.array([-2.0, -1, 0, 1])) == ["#053061", "#053061", "#f7f7f7", "#67001f"]
+
+
+def test_an_arrow_ends_where_its_vector_does():
+    (outline,) = arrows(np.array([[1.0, 2], [3, 3]]), np.array([[3.0, -4], [0, 0]]), 1.0)  # no arrow of no length
+    assert np.abs(outline - [4, -2]).sum(1).min() < 1e-12
+    np.testing.assert_allclose(np.ptp(outline @ [0.8, 0.6]), 3)  # across: the head's width
+
+
+def test_a_view_in_space_holds_all_points_on_one_scale():
+    xyz = np.array([[0.0, 0, 0], [100, 0, 0], [0, 30, 0], [0, 0, 70], [100, 30, 70]])
+    drawing = Drawing(5, 4)
+    space = Space(drawing, xyz, 22, -58)
+    at = space.at(xyz)
+    assert (at > 0).all()
+    assert (at < [drawing.width, drawing.height]).all()
+    along = np.array([at[1] - at[0], (at[2] - at[0]) / 0.3, (at[3] - at[0]) / 0.7]) / 100
+    # Rows are the images of the unit vectors: an orthographic view scales both picture axes alike, without shear.
+    square = along.T @ along
+    np.testing.assert_allclose(square, square[0, 0] * np.eye(2), atol=1e-9)
+    assert along[2, 1] < 0  # Z is upwards
+    assert {text.text for text in written(drawing).iter("{http://www.w3.org/2000/svg}text")} >= {
+        "X, mm",
+        "Y, mm",
+        "Z, mm",
+    }
