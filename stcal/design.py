@@ -170,6 +170,10 @@ class TargetDesign:
         """True if a face is a board or has tags."""
         return any(face.printed is not None for face in self.faces)
 
+    def printed_ids(self) -> frozenset[str]:
+        """Returns the ids of the faces that are boards or have tags."""
+        return frozenset(face.id for face in self.faces if face.printed is not None)
+
     def face(self, face_id: str) -> FaceDesign:
         """Returns the face with this id; raises InputError if there is none."""
         for face in self.faces:

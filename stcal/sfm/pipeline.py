@@ -391,7 +391,8 @@ def _solved(
     graph = image_graph(observations, board, options.graph)
     if known and not board_alone:
         usable = [image for image in observations if image.group in groups]
-        body = place_with_camera(usable, known, calibrated_camera)
+        circles = [face for face in target.with_faces(printed=False).faces if len(face.ids) >= MIN_CORNERS]
+        body = place_with_camera(usable, (*known, *circles), calibrated_camera)
         solutions, unsolved = solve_body(usable, body, calibrated_camera, target, board, options.eccentricity, progress)
         unsolved += unlinked_notes(body)
     else:

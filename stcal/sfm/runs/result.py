@@ -233,7 +233,7 @@ class RunResult:
 
     def circles(self) -> TargetCircles:
         """Returns the calibrated circles with their joint covariance, as :class:`stcal.sfm.Tracker` takes them."""
-        return TargetCircles.of(self.target, self.target_design, self.calibration.sigma_factors.circles)
+        return TargetCircles.of(self.target, self.target_design, self.calibration.sigma_factors.of_target)
 
     def images(self) -> tuple["ImageResult", ...]:
         """Returns the images that the result rests on, each with its pose and residuals, in the order of the groups."""

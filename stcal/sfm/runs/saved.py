@@ -77,7 +77,9 @@ class SavedRun:
         """Returns the factors on the centres' own σ; the factor of all circles for a kind that an older run lacks."""
         summary = self.report["summary"]
         overall = summary["sigma_factor"]
-        return SigmaFactors(overall, *(summary.get(f"{kind}_sigma_factor", overall) for kind in ("circle", "dot")))
+        circles, dots = (summary.get(f"{kind}_sigma_factor", overall) for kind in ("circle", "dot"))
+        printed = summary.get("printed_sigma_factor") or circles
+        return SigmaFactors(overall, circles, dots, printed, self.target.printed_ids())
 
     def report_as(self, part: type[ReportPart]) -> ReportPart:
         """Returns the part of ``report.json`` that a command needs.

@@ -109,10 +109,13 @@ def test_the_redundancy_of_a_free_network(scene, labels_only):
     factors = image_sigma_factors([with_sigma(m, SigmaFactors(0, 2.0, 4.0)) for m in models], scene.camera)
     assert factors.circles == pytest.approx(0.5, abs=0.05)  # a third of the redundancy: ± 3 %
     assert factors.dots == pytest.approx(0.25, abs=0.02)
-    printed = image_sigma_factors([with_sigma(m, SigmaFactors(0, 2.0, 4.0)) for m in models], scene.camera, True)
-    assert (printed.circles, printed.dots) == (1.0, factors.dots)  # residuals do not deny what all views share
-    larger = image_sigma_factors([with_sigma(m, SigmaFactors(0, 0.5, 1.0)) for m in models], scene.camera, True)
-    assert larger.circles == pytest.approx(2.0, abs=0.2)
+    kinds = SigmaFactors(0, 2.0, 4.0, 2.0, frozenset({"1"}))
+    mixed = image_sigma_factors([with_sigma(m, kinds) for m in models], scene.camera, ["1"])
+    assert (mixed.printed, mixed.dots, mixed.of_target) == (1.0, factors.dots, 1.0)  # all views may share an error
+    assert mixed.circles == pytest.approx(0.5, abs=0.06)
+    kinds = SigmaFactors(0, 2.0, 4.0, 0.5, frozenset({"1"}))
+    larger = image_sigma_factors([with_sigma(m, kinds) for m in models], scene.camera, ["1"])
+    assert larger.printed == pytest.approx(2.0, abs=0.25)
 
 
 def test_sigma_follows_the_residuals_and_not_what_the_centres_claim(labels_only):
