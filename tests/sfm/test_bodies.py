@@ -9,7 +9,7 @@ from PIL import Image
 
 from stcal.boards.faces import shift_by_curves
 from stcal.boards.target import body_toml, load_body
-from stcal.design import KnownDistance, reference_target, scale_reference
+from stcal.design import KnownDistance, reference_target, scale_reference, with_drawn_size
 from stcal.drawing.net import net_parts
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import camera_prior
@@ -31,7 +31,7 @@ from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
-from stcal.synthetic.designs import tag_body, tag_cube, tag_dodecahedron
+from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
 from tests.outcome import fails_with
 
 CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
@@ -242,6 +242,43 @@ def test_a_run_of_photographs_without_board_and_camera(tmp_path):
     assert not (tmp_path / "r/board.toml").exists()
     again = adjusted_run(load_run(tmp_path / "r")).state.result()
     assert again.sigma0 == pytest.approx(result.calibration.joint.sigma0, rel=1e-3)
+
+
+def test_the_unit_of_a_body_of_unknown_size_is_kept_in_its_file(tmp_path):
+    target = with_drawn_size(second_design()[0], [[CircleLabel("left", circle) for circle in "pqrstuvw"]])
+    (known,) = load_body(written(tmp_path, body_toml(target))).distances
+    face = target.face("left")
+    apart = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2).max()
+    assert (known.first.face, known.second.face, known.drawn) == ("left", "left", True)  # the face that is seen
+    assert known.mm == pytest.approx(apart, abs=1e-6)
+
+
+@pytest.mark.slow
+def test_circles_without_anything_of_known_size_are_known_up_to_scale(tmp_path):
+    """Faces without a board: a known distance gives the size; without one, the shape is right and the rest is said."""
+    options = BodyOptions(images=9, distance_mm=500, seed=4, noise=0.005)
+    scene = make_body_scene(second_design()[0], body_camera(640), options)
+    write_body(tmp_path / "set", scene)
+    truth = scene.circles_target()
+    ends = CircleLabel("top", "A"), CircleLabel("left", "q")
+    long = float(np.linalg.norm(truth[str(ends[0])] - truth[str(ends[1])]))
+    images, camera = tmp_path / "set/images", tmp_path / "set/cameras.txt"
+    stretch = 1.01  # a bar in another unit: the whole result follows it
+    known = replace(scene.target, distances=(KnownDistance(*ends, stretch * long, 0.01),))
+    free = pipeline.run(images, camera, tmp_path / "free", scene.target)
+    held = pipeline.run(images, camera, tmp_path / "held", known)
+    assert (free.scale_from(), held.scale_from()) == (["drawing"], ["distances"])
+    ratio = {
+        face: np.linalg.norm(held.target.target_from_face[face].translation)
+        / np.linalg.norm(free.target.target_from_face[face].translation)
+        for face in ("left", "right")
+    }
+    assert ratio["left"] == pytest.approx(ratio["right"], abs=1e-6)  # one shape
+    assert ratio["left"] == pytest.approx(stretch, abs=2e-3)
+    report, faces = load_run(tmp_path / "free").report, load_run(tmp_path / "free").faces
+    assert (faces.up_to_scale, faces.scale_sigma_ppm, report["summary"]["scale_sigma_ppm"]) == (True, None, None)
+    assert report["judgement"]["verdict"] != "yes"
+    assert held.target.scale_sigma == pytest.approx(0.01 / long, rel=0.3)
 
 
 @pytest.mark.slow

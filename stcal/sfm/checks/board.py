@@ -272,6 +272,8 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
     weighted mean of both is tested, with 100 ppm as σ of the target's own size beside that of the result. Without a
     board (``has_board``) the result has its size from printed faces or known distances.
     """
+    if target.up_to_scale:
+        return impossible("pitch", PITCH, "the drawing defines the size", "state a known distance with scale")
     measures = [m for m in (_size_by_positions(calibrated, target), size_by_radii(radii)) if m is not None]
     if not measures:
         return impossible(

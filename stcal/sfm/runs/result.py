@@ -197,7 +197,10 @@ class RunResult:
     def scale_from(self) -> list[ScaleSource]:
         """Returns what the size of the result rests on."""
         board = self.board_design
-        known = {"board": board.rows, "faces": faces_of_known_shape(board), "distances": known_distances(board)}
+        drawn = self.target_design.up_to_scale
+        distances = known_distances(board)
+        known = {"board": board.rows, "faces": faces_of_known_shape(board), "distances": distances and not drawn}
+        known["drawing"] = drawn
         return [source for source in get_args(ScaleSource) if known[source]]
 
     @property
