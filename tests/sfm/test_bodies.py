@@ -256,8 +256,8 @@ def test_the_unit_of_a_body_of_unknown_size_is_kept_in_its_file(tmp_path):
 @pytest.mark.slow
 def test_circles_without_anything_of_known_size_are_known_up_to_scale(tmp_path):
     """Faces without a board: a known distance gives the size; without one, the shape is right and the rest is said."""
-    options = BodyOptions(images=9, distance_mm=500, seed=4, noise=0.005)
-    scene = make_body_scene(second_design()[0], body_camera(640), options)
+    options = BodyOptions(images=7, distance_mm=420, seed=4, noise=0.005)
+    scene = make_body_scene(second_design()[0], body_camera(560), options)
     write_body(tmp_path / "set", scene)
     truth = scene.circles_target()
     ends = CircleLabel("top", "A"), CircleLabel("left", "q")
@@ -273,12 +273,12 @@ def test_circles_without_anything_of_known_size_are_known_up_to_scale(tmp_path):
         / np.linalg.norm(free.target.target_from_face[face].translation)
         for face in ("left", "right")
     }
-    assert ratio["left"] == pytest.approx(ratio["right"], abs=1e-6)  # one shape
+    assert ratio["left"] == pytest.approx(ratio["right"], abs=3e-5)  # one shape; flatness is in mm
     assert ratio["left"] == pytest.approx(stretch, abs=2e-3)
     report, faces = load_run(tmp_path / "free").report, load_run(tmp_path / "free").faces
     assert (faces.up_to_scale, faces.scale_sigma_ppm, report["summary"]["scale_sigma_ppm"]) == (True, None, None)
     assert report["judgement"]["verdict"] != "yes"
-    assert held.target.scale_sigma == pytest.approx(0.01 / long, rel=0.3)
+    assert 0.01 / long < held.target.scale_sigma < 1e-3  # the bar's, and what few small photographs add
 
 
 @pytest.mark.slow
