@@ -164,8 +164,8 @@ class Drawing:
 def drawing_of(face: FaceDesign, polarity: Polarity = "bright") -> Drawing:
     """Returns the drawing of a face with the plate about it; ``polarity`` : of circles."""
     if face.printed is None:
-        around = np.exp(2j * np.pi * np.arange(CIRCLE_CORNERS) / CIRCLE_CORNERS)
-        unit = np.column_stack([around.real, around.imag])
+        around = 2 * np.pi * np.arange(CIRCLE_CORNERS) / CIRCLE_CORNERS
+        unit = np.column_stack([np.cos(around), np.sin(around)])
         areas = [[xy + radius * unit] for xy, radius in zip(face.xy_mm, face.radius_mm, strict=True)]
         margin, dark = float(face.radius_mm.max()), polarity == "dark"
     else:
