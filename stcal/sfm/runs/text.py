@@ -98,7 +98,8 @@ def _scale_of_target(result: RunResult) -> Iterator[str]:
             f"are {known.mm:g} mm apart, as drawn"
         )
     if "distances" in sources:
-        yield f"scale: from {len(known_distances(result.board_design))} known distances"
+        count = len(known_distances(result.board_design))
+        yield f"scale: from {count} known distance{'' if count == 1 else 's'}"
 
 
 def _found_camera(result: RunResult) -> Iterator[str]:
