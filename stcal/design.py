@@ -109,12 +109,16 @@ class FaceDesign:
 
 @dataclass(frozen=True, slots=True)
 class KnownDistance:
-    """A measured distance between two points of the target, mm, with its σ: a scale bar."""
+    """A measured distance between two points of the target, mm, with its σ: a scale bar.
+
+    ``drawn`` : True if it is that of the drawing, and defines the unit of a target of which no size is known.
+    """
 
     first: CircleLabel
     second: CircleLabel
     mm: float
     sigma_mm: float
+    drawn: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,9 +165,23 @@ class TargetDesign:
         """True if the target itself tells its size: by printed faces, or by known distances."""
         return bool(self.distances) or any(face.printed is not None for face in self.faces)
 
+    @property
+    def up_to_scale(self) -> bool:
+        """True if no size is known, and lengths are in the unit of the drawing."""
+        return any(known.drawn for known in self.distances)
+
     def with_faces(self, printed: bool) -> "TargetDesign":
         """Returns the design with only the printed faces, or only the faces of circles."""
         return replace(self, faces=tuple(face for face in self.faces if (face.printed is not None) == printed))
+
+    @property
+    def has_printed(self) -> bool:
+        """True if a face is a board or has tags."""
+        return any(face.printed is not None for face in self.faces)
+
+    def printed_ids(self) -> frozenset[str]:
+        """Returns the ids of the faces that are boards or have tags."""
+        return frozenset(face.id for face in self.faces if face.printed is not None)
 
     def face(self, face_id: str) -> FaceDesign:
         """Returns the face with this id; raises InputError if there is none."""
@@ -483,6 +501,29 @@ def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDes
     known = {} if board is None else {entry.name: getattr(board, entry.name) for entry in fields(BoardDesign)}
     none = {"rows": 0, "columns": 0, "pitch_mm": 1.0, "radius_mm": 0.25, "polarity": "bright", "sigma_mm": 1.0}
     return ScaleReference(**(known or none), faces=faces, distances=target.distances)
+
+
+DRAWN_SIGMA = 1e-7
+"""Relative σ of the drawn distance that defines the unit where no size is known."""
+
+
+def with_drawn_size(target: TargetDesign, images: Iterable[Sequence[Label]]) -> TargetDesign:
+    """Returns the design with one drawn distance as the unit: the longest on a face that most images see whole.
+
+    ``images`` : labels seen in each image.
+    """
+    views = [set(labels) for labels in images]
+    best: tuple[int, float, KnownDistance] | None = None
+    for face in target.faces:
+        labels = face.labels()
+        apart = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
+        i, j = np.unravel_index(int(apart.argmax()), apart.shape)
+        mm = float(apart[i, j])
+        seen = sum(labels[i] in view and labels[j] in view for view in views)
+        if best is None or (seen, mm) > best[:2]:
+            best = seen, mm, KnownDistance(labels[i], labels[j], mm, DRAWN_SIGMA * mm, drawn=True)
+    assert best is not None, "a target has a face"
+    return replace(target, distances=(best[2],))
 
 
 def faces_of_known_shape(board: BoardDesign) -> tuple[FaceDesign, ...]:

@@ -1,5 +1,7 @@
 #!/usr/bin/env python
-"""Calibrate simulated bodies of tags from pixels, without a board and without a camera file, against their truth.
+"""Calibrate simulated bodies of tags, and of tags beside circles, against their truth: from pixels alone.
+
+No dot board and no camera file are used.
 
 Each draw has its own faces (0.3 mm and 0.5° about the nominal ones), poses and noise. NEES: squared errors of each
 face's pose against the reference face over its covariance, of 6, mean over faces and draws; 1 where σ are true.
@@ -7,19 +9,44 @@ face's pose against the reference face over its covariance, of 6, mean over face
 
 import argparse
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.design import CharucoDesign
+from stcal.boards.target import printed_face
+from stcal.design import TargetDesign
 from stcal.errors import StcalError
+from stcal.geometry.rigid import Rigid
 from stcal.sfm import pipeline
 from stcal.sfm.report.compare import compare
 from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
-from stcal.synthetic.designs import tag_cube, tag_dodecahedron
+from stcal.synthetic.designs import second_design, tag_cube, tag_dodecahedron
+
+
+def mixed_cube() -> TargetDesign:
+    """A cube of 100 mm with circles on two faces, a ChArUco board on one and tags on three, mm."""
+    faces = list(tag_cube(100.0, size_sigma_mm=0.04).faces)
+    board = CharucoDesign(8, 8, 9.2, 6.8, "DICT_6X6_250", first_id=100)
+    charuco = printed_face("4", board, 0.02, 0.02)
+    outwards = Rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    for k, face, turn in (
+        (1, second_design()[0].faces[0], outwards),
+        (2, second_design()[0].faces[1], outwards),
+        (3, charuco, Rigid()),
+    ):
+        middle = np.append((face.xy_mm.min(0) + face.xy_mm.max(0)) / 2, 0.0)
+        pose = faces[k].rough_target_from_face
+        assert pose is not None
+        faces[k] = replace(face, rough_target_from_face=pose @ turn @ Rigid(np.eye(3), -middle))
+    return TargetDesign("mixed cube", "dark", tuple(faces))
+
 
 BODIES = {
     "cube of 60 mm, tags of about 100 px": (tag_cube(60.0), 300.0, 16),
     "dodecahedron of 30 mm edges, tags of about 35 px": (tag_dodecahedron(30.0), 520.0, 24),
+    "cube of 100 mm, circles, ChArUco and tags": (mixed_cube(), 400.0, 20),
 }
 WIDTH = 900
 
@@ -28,10 +55,15 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=10)
+    parser.add_argument(
+        "--body", default="", help="only bodies whose name has this word, such as mixed or dodecahedron"
+    )
     arguments = parser.parse_args()
     print("| body | draws | faces found | error of a position, µm RMS | of a rotation, mdeg RMS | NEES |")
     print("|---|---|---|---|---|---|")
     for name, (target, distance_mm, images) in BODIES.items():
+        if arguments.body not in f"{name}, {target.name}":
+            continue
         position, rotation, normalised, found, lost = [], [], [], 0, 0
         for seed in range(arguments.draws):
             scene = make_body_scene(

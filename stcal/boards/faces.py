@@ -27,7 +27,10 @@ errors of 0.06 px RMS up to 70°, and of 0.27 to 0.45 px, 1.8 px at most, beyond
 OVERLAP_CELL_PX, NARROW_CELL_PX, NARROW_PX = 3.0, 2.0, 0.5
 """Width of a tag's cell below which the blur of its two edges overlaps (±2 σ of a usual 0.75 px), the width below which
 edges cannot be told from the cells behind them, and the σ of corners then. The σ grows in equal ratios between the two:
-drawn tags had errors of up to 0.6 px in cells of 2.5 to 3 px, and of 2 px below."""
+drawn tags had errors of up to 0.6 px in cells of 2.5 to 3 px, and of 2 px below.
+
+Judged on other tags, 2776 corners of 26 px and of five dictionaries on a simulated dodecahedron in a hand, JPEG: errors
+of 0.14 to 0.24 px RMS in cells of 2.5 to 3 px, 0.30 to 0.37 px in 2 to 2.5, 0.45 to 0.68 px in 1.5 to 2."""
 
 
 def find_on_faces(

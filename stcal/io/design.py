@@ -111,6 +111,7 @@ class _ScaleFile(Strict):
     second: str = Field(alias="to")
     mm: Positive
     sigma_mm: Positive
+    drawn: bool = False
 
 
 class _TargetFile(Sized):
@@ -237,7 +238,7 @@ def _distance(entry: _ScaleFile, faces: Sequence[FaceDesign], where: str) -> Kno
             )
     if entry.first == entry.second:
         raise InputError("E-TARGET-SCALE", f"{where}: scale from {entry.first} to itself; two points needed")
-    return KnownDistance(known[entry.first], known[entry.second], entry.mm, entry.sigma_mm)
+    return KnownDistance(known[entry.first], known[entry.second], entry.mm, entry.sigma_mm, entry.drawn)
 
 
 def load_board(path: str | Path) -> BoardDesign:
@@ -381,7 +382,8 @@ def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]]
     scales: list[str] = []
     for known in target.distances:
         ends = f"from = {toml_string(known.first)}, to = {toml_string(known.second)}"
-        scales.append(f"  {{ {ends}, mm = {_number(known.mm)}, sigma_mm = {_number(known.sigma_mm)} }},")
+        drawn = ", drawn = true" if known.drawn else ""
+        scales.append(f"  {{ {ends}, mm = {_number(known.mm)}, sigma_mm = {_number(known.sigma_mm)}{drawn} }},")
     lines += ["scale = [", *scales, "]"] if scales else []
     for face in target.faces:
         if face.printed is not None:

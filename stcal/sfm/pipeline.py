@@ -11,7 +11,7 @@ import numpy as np
 from stcal.boards.design import CornerBoard
 from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
-from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference
+from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference, with_drawn_size
 from stcal.errors import InputError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, camera_prior, model_of, refinable
@@ -20,6 +20,7 @@ from stcal.io.cameras.read import camera_model
 from stcal.io.files import save
 from stcal.io.images import TOP_GROUP, ImageFile, ImageFiles, chosen_images, mosaic_of, require_common_size
 from stcal.io.photographs.memory import files_of_arrays
+from stcal.labels import DotLabel
 from stcal.parallel import Progress, counted, kept_processes, one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
@@ -150,7 +151,8 @@ def run_on_files(
     if options.compare:
         require_comparable(options.adjustment(designs[0]))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
-        result = _calibrated(files, model, folder, *designs, options, progress)
+        is_assumed = board is None and not target_design.has_scale
+        result = _calibrated(files, model, folder, *designs, options, progress, is_assumed)
         result = replace(result, camera_given=model is not None and not is_rough(model, options))
         if options.compare and result.target.target_from_face and model is not None:
             published = _published(files, model, folder, *designs, options, progress)
@@ -193,6 +195,7 @@ def _calibrated(
     board: BoardDesign,
     options: RunOptions,
     progress: Progress,
+    is_board_assumed: bool,
 ) -> RunResult:
     if model is None and target.with_faces(printed=True).faces:
         detection, labelled, model = _with_found_camera(files, folder, target, board, options, progress)
@@ -201,6 +204,9 @@ def _calibrated(
             model = _camera_of_dots(files, model, folder, target, board, options, progress)
         detection, labelled = labelled_images(files, model, folder, target, board, options, progress)
     with overlays_beside(detection, labelled, target, folder, progress):
+        if is_board_assumed and not options.board_only and not _shows_dots(labelled):
+            target = with_drawn_size(target, [image.observations.labels for image in labelled])
+            board = scale_reference(None, target)
         return _solved(detection, labelled, model, folder, target, board, options, progress)
 
 
@@ -388,7 +394,8 @@ def _solved(
     graph = image_graph(observations, board, options.graph)
     if known and not board_alone:
         usable = [image for image in observations if image.group in groups]
-        body = place_with_camera(usable, known, calibrated_camera)
+        circles = [face for face in target.with_faces(printed=False).faces if len(face.ids) >= MIN_CORNERS]
+        body = place_with_camera(usable, (*known, *circles), calibrated_camera)
         solutions, unsolved = solve_body(usable, body, calibrated_camera, target, board, options.eccentricity, progress)
         unsolved += unlinked_notes(body)
     else:
@@ -425,6 +432,10 @@ def _solved(
             *unseen_board(solutions, board),
         ),
     )
+
+
+def _shows_dots(labelled: Sequence[LabelledImage]) -> bool:
+    return any(isinstance(label, DotLabel) for image in labelled for label in image.observations.labels)
 
 
 def as_one_group(labelled: Sequence[LabelledImage]) -> list[LabelledImage]:

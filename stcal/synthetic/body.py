@@ -1,4 +1,4 @@
-"""Photographs of a body with printed faces, held before a camera in changing poses, with its truth."""
+"""Photographs of a body held before a camera in changing poses, with its truth: printed faces, and faces of circles."""
 
 import json
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.boards.cells import black_areas, clear_mm
 from stcal.boards.target import body_toml
-from stcal.design import FaceDesign, TargetDesign
+from stcal.design import FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
@@ -23,6 +23,8 @@ from stcal.synthetic.render import encode
 BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
 DRAWING_PX = 2000
 """Longer side of the drawing of a face, px."""
+CIRCLE_CORNERS = 360
+"""Corners of the polygon that a circle is drawn as."""
 SAMPLES = 3
 """Samples of a pixel, along each axis."""
 LIGHT = np.array([0.3, -0.5, -0.8])
@@ -87,16 +89,14 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions) 
     Raises
     ------
     InputError
-        A face has circles, or no rough pose.
+        A face has no rough pose.
     """
     rough = target.rough_poses()
     for face in target.faces:
-        if face.printed is None or face.id not in rough:
-            reason = "circles beside printed faces cannot be drawn" if face.printed is None else "no rough_pose"
+        if face.id not in rough:
             raise InputError(
                 "E-SIMULATE-BODY",
-                f"face {face.id}: {reason}; photographs of a body need faces with a board or tags, each with a rough "
-                "pose in target.toml",
+                f"face {face.id}: no rough_pose; photographs of a body need one of each face in target.toml",
             )
     rng = np.random.default_rng(options.seed)
     reference = rough[target.faces[0].id]
@@ -142,7 +142,12 @@ def _looks_here(scene: BodyScene, face: FaceDesign, pose: Rigid) -> bool:
     """Returns whether a face is seen at less than 60° from its normal."""
     camera_from_face = pose @ scene.target_from_face[face.id]
     middle = camera_from_face @ np.append(face.xy_mm.mean(0), 0.0)
-    return float(camera_from_face.rotation[:, 2] @ middle / np.linalg.norm(middle)) > 0.5
+    return float(_inward(face, camera_from_face) @ middle / np.linalg.norm(middle)) > 0.5
+
+
+def _inward(face: FaceDesign, camera_from_face: Rigid) -> np.ndarray:
+    """Returns the normal of a face that points into the body, camera frame."""
+    return -face.outward * camera_from_face.rotation[:, 2]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,22 +161,38 @@ class Drawing:
     origin: np.ndarray
 
 
-def drawing_of(face: FaceDesign) -> Drawing:
-    """Returns the drawing of a printed face with the white about it."""
-    areas = black_areas(face.printed)  # type: ignore[arg-type]
+def drawing_of(face: FaceDesign, polarity: Polarity = "bright") -> Drawing:
+    """Returns the drawing of a face with the plate about it; ``polarity`` : of circles."""
+    if face.printed is None:
+        around = 2 * np.pi * np.arange(CIRCLE_CORNERS) / CIRCLE_CORNERS
+        unit = np.column_stack([np.cos(around), np.sin(around)])
+        areas = [[xy + radius * unit] for xy, radius in zip(face.xy_mm, face.radius_mm, strict=True)]
+        margin, dark = float(face.radius_mm.max()), polarity == "dark"
+    else:
+        areas, margin, dark = black_areas(face.printed), clear_mm(face.printed), True  # type: ignore[arg-type]
     every = np.concatenate([line for area in areas for line in area])
     plate = face.outline_mm
     if plate is None:
-        margin = clear_mm(face.printed)  # type: ignore[arg-type]
         (left, top), (right, bottom) = every.min(0) - margin, every.max(0) + margin
         plate = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
     low, high = plate.min(0), plate.max(0)
     px_mm = DRAWING_PX / float((high - low).max())
     width, height = np.ceil((high - low) * px_mm).astype(int)
-    grey, solid = np.full((height, width), WHITE, np.float32), np.zeros((height, width), np.float32)
-    for picture, lines_mm, value in [(solid, [plate], 1.0), *((grey, area, BLACK) for area in areas)]:
-        lines = [np.round(((line - low) * px_mm - 0.5) * 16).astype(np.int32) for line in lines_mm]
-        cv2.fillPoly(picture, lines, value, lineType=cv2.LINE_8, shift=4)
+    ground, ink = (WHITE, BLACK) if dark else (BLACK, WHITE)
+
+    def filled(value: float, inside: float, parts: list[list[np.ndarray]]) -> np.ndarray:
+        picture = np.full((height, width), value, np.float32)
+        for lines_mm in parts:
+            lines = [np.round(((line - low) * px_mm - 0.5) * 16).astype(np.int32) for line in lines_mm]
+            cv2.fillPoly(picture, lines, inside, lineType=cv2.LINE_8, shift=4)
+        return picture
+
+    # A filled area takes all pixels that its outline touches: ink and ground are filled in turn, and averaged.
+    whole = np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) + (
+        np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    )
+    grey = (filled(ground, ink, areas) + filled(ink, ground, [[whole, *(line for area in areas for line in area)]])) / 2
+    solid = filled(0.0, 1.0, [[plate]])
     return Drawing(grey, solid, px_mm, low)
 
 
@@ -189,7 +210,8 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> n
         corners = drawing.origin + np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * extent
         xyz = camera_from_face @ np.pad(corners, ((0, 0), (0, 1)))
         middle = xyz.mean(0)
-        if camera_from_face.rotation[:, 2] @ middle <= 0 or (xyz[:, 2] <= 0).any():
+        inward = _inward(face, camera_from_face)
+        if inward @ middle <= 0 or (xyz[:, 2] <= 0).any():
             continue
         box = camera.project(xyz)
         low, high = np.floor(box.min(0) - 3).astype(int), np.ceil(box.max(0) + 4).astype(int)
@@ -210,7 +232,7 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> n
             for picture in (drawing.grey, drawing.solid)
         )
         inside &= solid > 0.5
-        light = 0.75 + 0.25 * float(camera_from_face.rotation[:, 2] @ (LIGHT / np.linalg.norm(LIGHT)) * -1)
+        light = 0.75 + 0.25 * float(inward @ (LIGHT / np.linalg.norm(LIGHT)) * -1)
         part = total[rows, columns]
         part[inside] = light * value[inside]
     grey = total.reshape(camera.height, SAMPLES, camera.width, SAMPLES).mean((1, 3))
@@ -260,7 +282,7 @@ def write_body(
         raise InputError(
             "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
         ) from error
-    drawings = {face.id: drawing_of(face) for face in scene.target.faces}
+    drawings = {face.id: drawing_of(face, scene.target.polarity) for face in scene.target.faces}
     count = len(scene.camera_from_target)
     paths = [folder / "images" / f"IMG_{1000 + i}.{image_format}" for i in range(count)]
     jobs = [(path, scene, i, drawings, jpeg_quality) for i, path in enumerate(paths)]

@@ -9,9 +9,10 @@ from PIL import Image
 
 from stcal.boards.faces import shift_by_curves
 from stcal.boards.target import body_toml, load_body
-from stcal.design import KnownDistance, reference_target, scale_reference
+from stcal.design import KnownDistance, reference_target, scale_reference, with_drawn_size
 from stcal.drawing.net import net_parts
 from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import camera_prior
 from stcal.io.design import load_target, target_toml
 from stcal.labels import CircleLabel
@@ -24,14 +25,14 @@ from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, contributions_of
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.data.model import ImageObservations
-from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera
+from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera, place_with_camera
 from stcal.sfm.planning.bodies import plan_body
 from stcal.sfm.planning.session import PlanOptions
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
-from stcal.synthetic.designs import tag_body, tag_cube, tag_dodecahedron
+from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
 from tests.outcome import fails_with
 
 CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
@@ -112,9 +113,9 @@ def test_circles_without_a_board_need_a_camera(tmp_path):
         pipeline.run(tmp_path / "images", None, tmp_path / "r", target)
 
 
-def observed(target, count: int, seed: int):
+def observed(target, count: int, seed: int, distance_mm: float = 300):
     """Corners of a body in images, with noise, as detection would give them; and the scene."""
-    scene = make_body_scene(target, body_camera(1200), BodyOptions(images=count, distance_mm=300, seed=seed))
+    scene = make_body_scene(target, body_camera(1200), BodyOptions(images=count, distance_mm=distance_mm, seed=seed))
     rng = np.random.default_rng(seed)
     images = []
     for i, pose in enumerate(scene.camera_from_target):
@@ -123,7 +124,7 @@ def observed(target, count: int, seed: int):
         for face in target.faces:
             camera_from_face = pose @ scene.target_from_face[face.id]
             middle = camera_from_face @ np.append(face.xy_mm.mean(0), 0.0)
-            if camera_from_face.rotation[:, 2] @ middle > 0.3 * np.linalg.norm(middle):
+            if -face.outward * camera_from_face.rotation[:, 2] @ middle > 0.3 * np.linalg.norm(middle):
                 labels += face.labels()
                 pixels.append(scene.camera.project(camera_from_face @ face.places_mm(face.ids)))
         xy = np.concatenate(pixels)
@@ -174,6 +175,32 @@ def test_a_body_of_tags_gives_faces_and_camera(target):
         )
         normalised = off @ np.linalg.solve(result.target.face_covariance[face], off)
         assert normalised < 30  # χ² of 6: by chance in 4 of 100 000
+
+
+def test_corners_behind_a_finger_are_named_and_no_others():
+    scene, images = observed(tag_cube(60), 10, 8)
+    hidden = images[3].labels[:2]
+    moved = images[3].centre_px.copy()
+    moved[:2] += 10 * SIGMA_PX  # an edge that is another's
+    images[3] = replace(images[3], centre_px=moved)
+    body = place_with_camera(images, scene.target.faces, scene.camera)
+    assert [(each.image, each.label) for each in body.contradictions] == [("3.png", label) for label in hidden]
+    assert all(each.residual_px > each.limit_px for each in body.contradictions)
+
+
+def test_images_of_one_tag_beside_circles_are_placed():
+    cube, circles = tag_cube(100), second_design()[0].face("top")
+    middle = Rigid(np.diag([1.0, -1, -1]), [0.0, 0.0, 0.0]) @ Rigid(np.eye(3), np.append(-circles.xy_mm.mean(0), 0))
+    sides = {"2": replace(circles, id="2", rough_target_from_face=cube.faces[1].rough_target_from_face @ middle)}
+    target = replace(cube, polarity="dark", faces=tuple(sides.get(face.id, face) for face in cube.faces))
+    scene, images = observed(target, 14, 3, 450)
+    printed = target.with_faces(printed=True).faces
+    alone, both = (place_with_camera(images, faces, scene.camera) for faces in (printed, target.faces))
+    assert len(alone.camera_from_body) < len(both.camera_from_body) == len(images)
+    assert {"2"} == both.body_from_face.keys() - alone.body_from_face.keys()
+    found = both.body_from_face["1"].inverse() @ both.body_from_face["2"]
+    off = found @ (scene.target_from_face["1"].inverse() @ scene.target_from_face["2"]).inverse()
+    assert np.degrees(off.angle_rad()) < 0.5
 
 
 @pytest.mark.slow
@@ -244,6 +271,43 @@ def test_a_run_of_photographs_without_board_and_camera(tmp_path):
     assert not (tmp_path / "r/board.toml").exists()
     again = adjusted_run(load_run(tmp_path / "r")).state.result()
     assert again.sigma0 == pytest.approx(result.calibration.joint.sigma0, rel=1e-3)
+
+
+def test_the_unit_of_a_body_of_unknown_size_is_kept_in_its_file(tmp_path):
+    target = with_drawn_size(second_design()[0], [[CircleLabel("left", circle) for circle in "pqrstuvw"]])
+    (known,) = load_body(written(tmp_path, body_toml(target))).distances
+    face = target.face("left")
+    apart = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2).max()
+    assert (known.first.face, known.second.face, known.drawn) == ("left", "left", True)  # the face that is seen
+    assert known.mm == pytest.approx(apart, abs=1e-6)
+
+
+@pytest.mark.slow
+def test_circles_without_anything_of_known_size_are_known_up_to_scale(tmp_path):
+    """Faces without a board: a known distance gives the size; without one, the shape is right and the rest is said."""
+    options = BodyOptions(images=7, distance_mm=420, seed=4, noise=0.005)
+    scene = make_body_scene(second_design()[0], body_camera(560), options)
+    write_body(tmp_path / "set", scene)
+    truth = scene.circles_target()
+    ends = CircleLabel("top", "A"), CircleLabel("left", "q")
+    long = float(np.linalg.norm(truth[str(ends[0])] - truth[str(ends[1])]))
+    images, camera = tmp_path / "set/images", tmp_path / "set/cameras.txt"
+    stretch = 1.01  # a bar in another unit: the whole result follows it
+    known = replace(scene.target, distances=(KnownDistance(*ends, stretch * long, 0.01),))
+    free = pipeline.run(images, camera, tmp_path / "free", scene.target)
+    held = pipeline.run(images, camera, tmp_path / "held", known)
+    assert (free.scale_from(), held.scale_from()) == (["drawing"], ["distances"])
+    ratio = {
+        face: np.linalg.norm(held.target.target_from_face[face].translation)
+        / np.linalg.norm(free.target.target_from_face[face].translation)
+        for face in ("left", "right")
+    }
+    assert ratio["left"] == pytest.approx(ratio["right"], abs=3e-5)  # one shape; flatness is in mm
+    assert ratio["left"] == pytest.approx(stretch, abs=2e-3)
+    report, faces = load_run(tmp_path / "free").report, load_run(tmp_path / "free").faces
+    assert (faces.up_to_scale, faces.scale_sigma_ppm, report["summary"]["scale_sigma_ppm"]) == (True, None, None)
+    assert report["judgement"]["verdict"] != "yes"
+    assert 0.01 / long < held.target.scale_sigma < 1e-3  # the bar's, and what few small photographs add
 
 
 @pytest.mark.slow

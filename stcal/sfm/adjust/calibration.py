@@ -1,6 +1,6 @@
 """Calibration of the target from the models of the groups: scale, faces, chaining, joint adjustment."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
-from stcal.labels import CircleLabel, DotLabel
+from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
 from stcal.sfm.adjust.faces import FaceInGroup, FrameKind, faces_of_group, missing_frame_circles
@@ -35,11 +35,24 @@ known to 13 %."""
 @dataclass(frozen=True, slots=True)
 class SigmaFactors:
     """Ratios of the residuals of the single groups to the centres' own σ: of ``all``, and by kind (``circles`` of the
-    faces, ``dots`` of the board)."""
+    faces, ``dots`` of the board, ``printed`` corners of the faces ``printed_faces``)."""
 
     all: float
     circles: float
     dots: float
+    printed: float = 1.0
+    printed_faces: frozenset[str] = frozenset()
+
+    @property
+    def of_target(self) -> float:
+        """The factor of all points of the target together: the larger one where it has circles and printed corners."""
+        return max(self.circles, self.printed) if self.printed_faces else self.circles
+
+    def kinds(self, labels: Sequence[Label]) -> np.ndarray:
+        """Returns the kinds (n,) of points: 0 of circles, 1 of dots, 2 of printed corners."""
+        return np.array(
+            [1 if isinstance(label, DotLabel) else 2 * (label.face in self.printed_faces) for label in labels], int
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +118,7 @@ def calibrate(
         calibrated = (chain_singly if published else chain_faces)(faces, target, options.reference_face)
     except MappingError as error:  # a face without a frame may be why
         raise MappingError(error.code, "; ".join([str(error), *notes])) from error
-    factors = image_sigma_factors(models, camera)
+    factors = image_sigma_factors(models, camera, target.printed_ids())
     metric = [_placed(m, scales[m.group], calibrated) for m in models if m.group in calibrated.target_from_group]
     joint = None
     step(None)
@@ -285,36 +298,41 @@ def _adjust_all(
         step(None)
         if prior is not None:
             unscaled = [replace(m, covariance_px2=c) for m, c in zip(models, covariances, strict=True)]
-            factors = image_sigma_factors([adjust(m, current) for m in unscaled], current)
+            factors = image_sigma_factors([adjust(m, current) for m in unscaled], current, target.printed_ids())
     return state.result(), factors
 
 
-def image_sigma_factors(models: Sequence[GroupModel], camera: Camera) -> SigmaFactors:
+def image_sigma_factors(models: Sequence[GroupModel], camera: Camera, printed: Iterable[str] = ()) -> SigmaFactors:
     """Returns the ratios of the residuals of adjusted free networks to the centres' own σ: variance components by kind
     (Förstner 1979).
 
-    The factor of ``circles`` is not below 1. σ of some centres hold what is uncertain of their corrections, and σ of
-    printed corners what all photographs share: neither is a residual, so that small residuals do not deny σ. On six
-    simulated sets with depth of field χ² of all circles was 1.18 ± 0.05 per degree of freedom without this limit and is
-    1.01 with it; on six without depth of field 1.06 and 1.03 (``simulate``, ``scripts/studies/optics_study.py``).
+    ``printed`` : ids of printed faces, whose corners have a factor of their own. It and the factor of ``circles`` are
+    not below 1. σ of some centres hold what is uncertain of their corrections, and σ of printed corners what all
+    photographs share: neither is a residual, so that small residuals do not deny σ. On six simulated sets with depth of
+    field χ² of all circles was 1.18 ± 0.05 per degree of freedom without this limit and is 1.01 with it; on six without
+    depth of field 1.06 and 1.03 (``simulate``, ``scripts/studies/optics_study.py``).
     """
-    square, redundancy = np.zeros(2), np.zeros(2)
+    start = SigmaFactors(1.0, 1.0, 1.0, 1.0, frozenset(printed))
+    square, redundancy = np.zeros(3), np.zeros(3)
     for model in models:
         network = free_network(model, camera)
-        is_dot = np.array([isinstance(label, DotLabel) for label in model.labels])[model.point_index].astype(int)
-        square += np.bincount(is_dot, (network.residual**2).sum(1), minlength=2)
-        redundancy += np.bincount(is_dot, network.redundancy, minlength=2)
+        kind = start.kinds(model.labels)[model.point_index]
+        square += np.bincount(kind, (network.residual**2).sum(1), minlength=3)
+        redundancy += np.bincount(kind, network.redundancy, minlength=3)
     if redundancy.sum() <= 0:
-        return SigmaFactors(1.0, 1.0, 1.0)
+        return start
     overall = float(np.sqrt(square.sum() / redundancy.sum()))
-    circles, dots = (
+    circles, dots, corners = (
         float(np.sqrt(s / r)) if r >= MIN_REDUNDANCY else overall for s, r in zip(square, redundancy, strict=True)
     )
-    return SigmaFactors(overall, max(circles, 1.0), dots)
+    circles, corners = max(circles, 1.0), max(corners, 1.0)
+    if start.printed_faces and redundancy[0] < MIN_REDUNDANCY:  # hardly a circle: that of the corners
+        circles = corners
+    return replace(start, all=overall, circles=circles, dots=dots, printed=corners)
 
 
 def with_sigma(model: M, factors: SigmaFactors) -> M:
     """Returns the model with the σ of its observations multiplied by the factor of their kind."""
-    is_dot = np.array([isinstance(label, DotLabel) for label in model.labels])[model.point_index]
-    factor = np.where(is_dot, factors.dots, factors.circles)
+    of_kind = np.array([factors.circles, factors.dots, factors.printed])
+    factor = of_kind[factors.kinds(model.labels)[model.point_index]]
     return replace(model, covariance_px2=factor[:, None, None] ** 2 * model.covariance_px2)

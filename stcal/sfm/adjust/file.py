@@ -109,7 +109,14 @@ class FacesFile(ResultFile):
     distance_sigma_mm: dict[ByName, float] = Field(
         {}, description='only with `joint`: `"a b"` → σ of the distance between the origins of two faces, mm'
     )
-    scale_sigma_ppm: float | None = Field(None, description="only with `joint`: σ of the target's size")
+    up_to_scale: bool = Field(
+        False,
+        description="true if nothing of known size was in view: the shape holds, and lengths are in the unit of the "
+        "drawing instead of mm",
+    )
+    scale_sigma_ppm: float | None = Field(
+        None, description="only with `joint`: σ of the target's size; left out where it is not known"
+    )
     circle_covariance_mm2: dict[ByLabel, PointCovariance] = Field(
         {}, description="only with `joint`: `face:circle` → covariance, target frame, mm²"
     )
@@ -141,6 +148,7 @@ class FacesFile(ResultFile):
             "solve": options.solve,
             **({"surface": "luminous", "rim_mm": rim_mm} if rim_mm else {}),
             "eccentricity": options.eccentricity,
+            **({"up_to_scale": True} if design.up_to_scale else {}),
             "target_from_face": target.target_from_face,
             "circles": target.circles,
             "radius_mm": {label: radius[label] for label in target.circles},
@@ -151,7 +159,7 @@ class FacesFile(ResultFile):
             content |= {
                 "target_from_face_covariance": target.face_covariance,
                 "distance_sigma_mm": {f"{a} {b}": sigma for (a, b), sigma in target.distance_sigma_mm.items()},
-                "scale_sigma_ppm": 1e6 * target.scale_sigma,
+                **({} if design.up_to_scale else {"scale_sigma_ppm": 1e6 * target.scale_sigma}),
                 "circle_covariance_mm2": target.circle_covariance,
                 "circles_joint_covariance_mm2": {
                     "labels": list(target.circles),

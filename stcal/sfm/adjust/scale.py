@@ -19,7 +19,7 @@ EDGE_SIGMA_PX = 0.1
 """σ of the shift that all edges of all tags share."""
 MIN_CORNERS = 3
 """Smallest number of corners of a face of known shape that tell anything of it."""
-ScaleSource = Literal["board", "faces", "distances"]
+ScaleSource = Literal["board", "faces", "distances", "drawing"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +30,8 @@ class Scale:
     (mm per unit); ``rows_mm_per_unit`` : λ as in Zhang & Wei (2017) (first and last row, all pairs); ``rows`` : these
     two rows; ``labels`` : (n,) the dots; ``residuals_mm`` : (n, 3) reconstructed minus design, board frame;
     ``sigma_mm_per_unit`` : σ of λ, from the stated σ of the dots' positions; ``source`` : what λ is from, ``board``,
-    ``faces`` of known shape (then ``labels`` and ``residuals_mm`` are of their corners, face frames) or ``distances``.
+    ``faces`` of known shape (then ``labels`` and ``residuals_mm`` are of their corners, face frames), ``distances``, or
+    the ``drawing`` where no size is known.
     """
 
     board_from_world: Similarity
@@ -146,7 +147,8 @@ def _of_distances(model: WorldModel, board: BoardDesign) -> Scale | None:
     away = np.array([[scale * unit - d.mm, 0.0, 0.0] for d, unit in zip(known, units, strict=True)])
     labels = tuple(d.first for d in known)
     sigma = scale / float(np.sqrt(weights.sum()))
-    return Scale(Similarity(scale, Rigid()), scale, (0, 0), labels, away, sigma, "distances")
+    source: ScaleSource = "drawing" if known[0].drawn else "distances"
+    return Scale(Similarity(scale, Rigid()), scale, (0, 0), labels, away, sigma, source)
 
 
 def with_edge_sigma(board: BoardDesign, observations: Sequence[ImageObservations]) -> BoardDesign:

@@ -194,6 +194,10 @@ def _own_size(found: Contributions, board: BoardDesign) -> Iterator[Source]:
         sigma_um = 1e3 * max(each.sigma_mm for each in known) * factor
         words = f"[[scale]] of target.toml, {len(known)} in all; the largest σ"
         covariance = found.covariance_mm2[DISTANCES]
+        if known[0].drawn:
+            words = "nothing of known size was in view: lengths are those of the drawing, known up to scale"
+            yield Source("distances", "size", "B", "not stated", words, None, "µm", covariance)
+            return
         yield Source("distances", "known distances", "B", "stated", words, sigma_um, "µm", covariance)
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.design import BoardDesign
+from stcal.errors import ConvergenceError
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis
 from stcal.geometry.plane import apply_homography, camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
@@ -276,7 +277,13 @@ def adjust_intrinsics(
         sigma_mm=board.sigma_mm,
         huber=np.inf,
     )
-    adjustment = adjusted(state, setting, board, factors)
+    try:
+        adjustment = adjusted(state, setting, board, factors)
+    except ConvergenceError:
+        if held:
+            raise
+        # A focal length far off makes the rest of the lens wander: it comes first, alone.
+        adjustment = adjusted(_with_focal_length(state, setting), setting, board, factors)
     return _intrinsics(adjustment.last, colmap_model, adjustment.factors, adjustment.settled)
 
 
@@ -298,6 +305,7 @@ def _intrinsics(last: Normal, colmap_model: str, factors: SigmaFactors, settled:
     )
 
 
+FOCAL_ROUNDS = 2
 MOST_STEPS, NO_GAIN = 10, 0.1
 """Most steps from the solution of all views to that of some of them, and the predicted decrease of the cost at which
 they end, in σ²: no parameter is then off by more than a third of its σ."""
@@ -408,6 +416,18 @@ def adjusted(state: State, setting: Setting, board: BoardDesign, known: SigmaFac
             break
     assert last is not None
     return Adjusted(state, setting, last, factors, settled)
+
+
+def _with_focal_length(state: State, setting: Setting) -> State:
+    """Returns the state of least cost over the focal lengths alone, each of all of a camera, with robust weights."""
+    basis = intrinsic_basis("SIMPLE_PINHOLE")[:, :1]
+    weights = tuple(np.full((1, 1), camera.focal[0] ** -2.0) for camera in setting.start)
+    setting = replace(setting, basis=(basis,) * len(weights), weight=weights)
+    for _ in range(FOCAL_ROUNDS):
+        state = minimum(state, setting)
+        robust = max(robust_sigma(np.linalg.norm(state.normalised(), axis=1), 2), LEAST_ROBUST)
+        setting = replace(setting, huber=HUBER * robust)
+    return state
 
 
 def _start_state(views, camera_of_view, board: BoardDesign, start: Camera) -> State:

@@ -266,15 +266,18 @@ def _lines(name, gap, weight, cells, board: BoardDesign, inflation: float, redun
     return trials
 
 
-def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii) -> Check:
+def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii, has_board: bool = True) -> Check:
     """Tests the measured size of the target against its design.
 
     If the pitch of the board is wrong as a whole, everything else is too large or too small, and no residual shows it.
 
     Positions: a similarity maps the design to the circles of each face, and its residuals give the σ of their
     placement. Radii: the slope of measured over designed radii, which a constant bias of the edges does not change. The
-    weighted mean of both is tested, with 100 ppm as σ of the target's own size.
+    weighted mean of both is tested, with 100 ppm as σ of the target's own size beside that of the result. Without a
+    board (``has_board``) the result has its size from printed faces or known distances.
     """
+    if target.up_to_scale:
+        return impossible("pitch", PITCH, "the drawing defines the size", "state a known distance with scale")
     measures = [m for m in (_size_by_positions(calibrated, target), size_by_radii(radii)) if m is not None]
     if not measures:
         return impossible(
@@ -282,13 +285,18 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
         )
     weight = np.array([1 / m.sigma**2 for m in measures])
     size = float(weight @ [m.size for m in measures] / weight.sum())
-    variance = 1 / weight.sum() + DESIGN_SCALE**2
+    variance = 1 / weight.sum() + DESIGN_SCALE**2 + (calibrated.scale_sigma or 0.0) ** 2
     freedom = sum(m.freedom for m in measures)
     remedy = (
         "the pitch in board.toml, or the size of the target in target.toml, is wrong as a whole, and all distances of "
         "the result with it: measure the board over its full length with a calliper"
+        if has_board
+        else "printed sizes or known distances in target.toml do not fit the circles there, and all distances of the "
+        "result may be wrong with them: measure a side of each print with a calliper"
     )
-    trial = Trial("board pitch", 1e6 * size, "ppm", size**2 / variance, 1, freedom)
+    trial = Trial(
+        "board pitch" if has_board else "size of the circles' faces", 1e6 * size, "ppm", size**2 / variance, 1, freedom
+    )
     check = judge("pitch", PITCH, [trial], "boards", remedy)
     single = tuple(Measured(m.name, 1e6 * m.size, None, "ppm", None) for m in measures)
     return replace(check, measured=check.measured + single)

@@ -87,7 +87,7 @@ class Evidence:
         models = self.models
         if not camera.same_as(self.camera):
             models = tuple(adjust(model, camera) for model in models)
-        factors = image_sigma_factors(models, camera)
+        factors = image_sigma_factors(models, camera, self.target.printed_ids())
         scales = self.calibration.scales
         return [free_network(with_sigma(m.metric(scales[m.group].group_from_world()), factors), camera) for m in models]
 
@@ -138,7 +138,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: evenness_check(networks, evidence.images, camera),
         lambda: labels_check(networks, evidence.outliers, evidence.images, camera),
         lambda: board_checks(networks, board),
-        lambda: pitch_check(calibration.target, target, radii),
+        lambda: pitch_check(calibration.target, target, radii, bool(board.rows)),
         lambda: radius_checks(radii),
         lambda: rim_check(rims, sigma_mm, allowed),
         lambda: flatness_check(networks, evidence.options.flatness_mm, *_bend(evidence)),
@@ -191,6 +191,8 @@ def control_check(evidence: Evidence, networks: list[Network]) -> Check:
         return impossible(key, CONTROL, "corners alone, which have no eccentricity", "")
     if not evidence.options.eccentricity:
         return impossible(key, CONTROL, "this run is the control", "run with eccentricity")
+    if not any(n.model.shift_px.any() for n in networks):
+        return impossible(key, CONTROL, "no circle is in the result", "add views of the faces with circles")
     test = solve_score(*summed(networks, lambda n: n.model.whiten(n.model.shift_px[:, :, None])))
     redundancy = sum(n.redundancy.sum() for n in networks)
     remedy = (

@@ -95,7 +95,7 @@ def calibrate_models(model: Path, run: SavedRun, solve: Chained = "chain") -> Ca
 def write_faces(path: Path, calibration: Calibration, run: SavedRun, solve: Chained = "chain") -> None:
     """Writes ``faces.json`` of chained models."""
     options = _options(run, solve)
-    faces = FacesFile.of(calibration.target, run.target, options, calibration.sigma_factors.circles)
+    faces = FacesFile.of(calibration.target, run.target, options, calibration.sigma_factors.of_target)
     save(path, json_text(faces.content()))
     require_faces_written(path, calibration.target)
 

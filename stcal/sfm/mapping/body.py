@@ -17,9 +17,9 @@ from stcal.geometry.least_squares import Normal, PoseStack, descend, minimise
 from stcal.geometry.normal_equations import blocks_of, reduce
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
 from stcal.geometry.rigid import Rigid, skew
-from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma
+from stcal.geometry.robust import HUBER, huber_cost, huber_weights, length_limit, robust_sigma
 from stcal.labels import Label
-from stcal.sfm.data.model import MIN_POINTS, ImageObservations
+from stcal.sfm.data.model import MIN_POINTS, ImageObservations, Outlier
 
 MIN_CORNERS = 4
 """Smallest number of corners of a view of a face: they determine its homography."""
@@ -32,6 +32,8 @@ LEAST_SIGMA_PX = 0.05
 """σ that print, lens and detector leave to any corner."""
 BETTER = 0.2
 """Share by which another pose of a face must fit its corners better."""
+BY_CHANCE = 0.01
+"""Number of sound corners in a run that may be taken for gross errors."""
 PASSES, ROBUST_ROUNDS = 3, 3
 MAX_STEPS = 100
 FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)
@@ -41,12 +43,14 @@ FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)
 @dataclass(frozen=True, slots=True, eq=False)
 class Corners:
     """n corners of known faces in the images: ``image``, ``face`` : (n,) indices into ``images`` and ``faces``;
-    ``xy_face`` : (n, 2) mm; ``xy_px`` : (n, 2); ``root`` : (n, 2, 2) whitens residuals in px."""
+    ``corner`` : (n,) index among those of the face; ``xy_face`` : (n, 2) mm; ``xy_px`` : (n, 2); ``root`` : (n, 2, 2)
+    whitens residuals in px."""
 
     images: tuple[str, ...]
     faces: tuple[FaceDesign, ...]
     image: np.ndarray
     face: np.ndarray
+    corner: np.ndarray
     xy_face: np.ndarray
     xy_px: np.ndarray
     root: np.ndarray
@@ -71,11 +75,11 @@ class Corners:
         covariance = np.concatenate(covariances) + LEAST_SIGMA_PX**2 * np.eye(2)
         root = np.linalg.inv(np.linalg.cholesky(covariance))
         names = tuple(each.name for each in observations)
-        return cls(names, tuple(faces), image, face, xy, np.concatenate(pixels), root)
+        return cls(names, tuple(faces), image, face, corner, xy, np.concatenate(pixels), root)
 
     def select(self, keep: np.ndarray) -> "Corners":
         """Returns the corners of a mask."""
-        arrays = {name: getattr(self, name)[keep] for name in ("image", "face", "xy_face", "xy_px", "root")}
+        arrays = {name: getattr(self, name)[keep] for name in ("image", "face", "corner", "xy_face", "xy_px", "root")}
         return replace(self, **arrays)
 
     def xyz_face(self) -> np.ndarray:
@@ -447,6 +451,39 @@ def settled_body(body: Body, corners: Corners, basis: np.ndarray, prior: np.ndar
             break
         body = again
     return body
+
+
+def contradictions(body: Body, corners: Corners) -> list[Outlier]:
+    """Returns the corners of placed printed faces in placed images that lie elsewhere than all others have them.
+
+    A finger over an edge moves two corners of a tag by a few tenths of a pixel, which free points follow: the four
+    corners of a tag hardly control one another, the rigid body does. Lengths are compared with those of all corners,
+    and with those of the same corner in other images, as a print that is off its design is no gross error.
+    """
+    printed = np.array([face.sigma_mm is not None for face in corners.faces])
+    used = corners.select(body.used(corners) & printed[corners.face])
+    length = np.minimum(body.lengths(used), 1e6)
+    if not len(length):
+        return []
+    usual = np.full(len(length), max(robust_sigma(length, 2), 1e-3))
+    for own in _members(np.column_stack([used.face, used.corner])):
+        usual[own] = np.maximum(usual[own], robust_sigma(length[own], 2))
+    limit = length_limit(2, BY_CHANCE / len(length)) * usual
+    return [
+        Outlier(
+            used.images[used.image[k]],
+            used.faces[used.face[k]].labels()[used.corner[k]],
+            *(float(value / np.linalg.norm(used.root[k], 2)) for value in (length[k], limit[k])),
+        )
+        for k in np.flatnonzero(length > limit)
+    ]
+
+
+def _members(key: np.ndarray) -> list[np.ndarray]:
+    """Returns the indices of the rows of each different key (n, k)."""
+    _, of_row = np.unique(key, axis=0, return_inverse=True)
+    order = np.argsort(of_row, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(of_row[order])) + 1)
 
 
 def _robust(length: np.ndarray) -> float:

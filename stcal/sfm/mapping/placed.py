@@ -11,8 +11,8 @@ from stcal.errors import ConvergenceError, DegenerateError, MappingError
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid
 from stcal.labels import Label
-from stcal.sfm.data.model import ImageObservations, WorldModel
-from stcal.sfm.mapping.body import FOCAL_STEPS, Body, Corners, adjust_body, place_body, settled_body
+from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
+from stcal.sfm.mapping.body import FOCAL_STEPS, Body, Corners, adjust_body, contradictions, place_body, settled_body
 from stcal.sfm.mapping.incremental import MAX_REPROJECTION_PX, MIN_RAY_ANGLE_RAD, assemble, complete
 from stcal.sfm.mapping.pairs import PairScore
 
@@ -32,7 +32,8 @@ class PlacedBody:
     """A body with the faces and images that are placed.
 
     ``body_from_face`` : by face id; ``camera_from_body`` : by image; ``faces`` : designs of the placed faces;
-    ``camera`` : with the covariance of what was assumed of an unknown one.
+    ``camera`` : with the covariance of what was assumed of an unknown one; ``unlinked`` : faces that are seen, and
+    never with a placed one; ``contradictions`` : corners that lie elsewhere than the body has them.
     """
 
     body_from_face: dict[str, Rigid]
@@ -40,6 +41,7 @@ class PlacedBody:
     faces: tuple[FaceDesign, ...]
     camera: Camera
     unlinked: tuple[str, ...]
+    contradictions: tuple[Outlier, ...]
 
 
 def unknown_lens(camera: Camera) -> Camera:
@@ -56,7 +58,9 @@ def unknown_lens(camera: Camera) -> Camera:
 def place_with_camera(
     observations: Sequence[ImageObservations], faces: Sequence[FaceDesign], camera: Camera
 ) -> PlacedBody:
-    """Returns the body by its faces of known shape, with a known camera.
+    """Returns the body by its faces, with a known camera.
+
+    Faces of circles may be among them: their design is near enough to begin with, and moves afterwards.
 
     Raises
     ------
@@ -130,6 +134,7 @@ def _named(body: Body, corners: Corners, camera: Camera) -> PlacedBody:
         tuple(corners.faces[f] for f in placed),
         camera,
         tuple(corners.faces[f].id for f in np.flatnonzero(~body.placed_faces) if (corners.face == f).any()),
+        tuple(contradictions(body, corners)),
     )
 
 

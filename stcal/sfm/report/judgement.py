@@ -39,6 +39,7 @@ LEFT_OUT_WHOLE = "left out whole: "
 """How the note begins on a group that could not be solved."""
 EVERY_SIGMA = "every σ"
 DISTANCES = "all distances and the size"
+UNKNOWN_SIZE = "nothing of known size is in view, and its size is that of the drawing"
 PLACES = "the places of all faces"
 CENTRES = "all centres of circles"
 INVALIDATES: dict[str, tuple[str, ...]] = {
@@ -108,7 +109,7 @@ def judgement_of(report: dict) -> Judgement:
     report : content of ``report.json``
     """
     verdict, use = _use(report)
-    cause = _control(report) or _by_checks(report) or _by_gaps(report) or _by_sigma(report)
+    cause = _control(report) or _by_checks(report) or _by_gaps(report) or _by_size(report) or _by_sigma(report)
     position, rotation = (
         None if verdict == "no" else _largest(report, key) for key in ("translation_sigma_um", "rotation_sigma_mdeg")
     )
@@ -153,6 +154,8 @@ def without_sigma(report: dict) -> dict:
 
 def _use(report: dict) -> tuple[Use, str]:
     verdict, answer = _by_result(report)
+    if verdict != "no" and "drawing" in report["summary"].get("scale_from", []):
+        verdict, answer = "with care", f"With care, for its shape alone: {UNKNOWN_SIZE}; {answer.partition(': ')[2]}"
     gaps = _gaps(report)
     if not gaps or not report["faces"]:
         return verdict, answer
@@ -301,6 +304,8 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
         )
     size = report["summary"]["scale_sigma_ppm"]
     scale = "" if size is None else f", the size to {number(size, 1)} ppm"
+    if "drawing" in report["summary"].get("scale_from", []):
+        scale = ", in the unit of the drawing, and the size is not known"
     return (
         f"Faces are known against face {report['reference_face']} to {number(position[0], 1)} µm (face {position[1]}) "
         f"and {number(rotation[0], 2)} mdeg (face {rotation[1]}) at worst, one σ along and about an axis{scale}; that "
@@ -311,6 +316,7 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
 def _premise(report: dict) -> str:
     refined = report["options"].get("refine_camera")
     sizes = {"board": "the board's pitch", "faces": "the printed size of the faces", "distances": "the known distances"}
+    sizes["drawing"] = "a length of the drawing"
     premises = [sizes[source] for source in report["summary"].get("scale_from", ["board"])]
     premises = premises if refined else ["the intrinsics", *premises]
     single = len(premises) == 1 and not premises[0].endswith("distances")
@@ -363,6 +369,17 @@ def _by_gaps(report: dict) -> _Cause | None:
             "Look at the overlays and at what was left out, in the photographs that show it.",
         )
     return None
+
+
+def _by_size(report: dict) -> _Cause | None:
+    """Returns the cause where no size is known; None where one is."""
+    if "drawing" not in report["summary"].get("scale_from", []):
+        return None
+    return _Cause(
+        "Its size: nothing of known size is in view.",
+        "Measure the distance of two points and state it with scale in target.toml, or photograph the board of dots "
+        "with it.",
+    )
 
 
 def _by_sigma(report: dict) -> _Cause:

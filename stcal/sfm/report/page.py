@@ -39,6 +39,7 @@ SOLVES = {
     "paper": "paper: as published by Zhang & Wei (2017), for comparison",
 }
 SCALES = {"board": "the board", "faces": "printed size of the faces", "distances": "known distances"}
+SCALES |= {"drawing": "unknown: the drawing defines the unit"}
 FRAMES = {"plane": "plane: Z from the plane of all circles", "three-point": "three-point: from three circles"}
 
 

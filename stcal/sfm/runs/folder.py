@@ -122,7 +122,7 @@ def write_run(result: RunResult, out: Path, progress: Progress, reload_s: int | 
         save_run_board(out / BOARD, result.board_design)
     report = judged(report_of(result).content())
     if result.target.target_from_face:  # a run of the board alone has no faces
-        options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.circles
+        options, factor = result.options.adjustment(result.target_design), result.calibration.sigma_factors.of_target
         faces = FacesFile.of(result.target, result.target_design, options, factor, result.calibration.rim_mm)
         save(out / "faces.json", json_text(faces.content()))
         require_faces_written(out / "faces.json", result.target)

@@ -63,7 +63,12 @@ def report_of(result: RunResult) -> ReportFile:
                 "sigma_factor": result.calibration.sigma_factors.all,
                 "circle_sigma_factor": result.calibration.sigma_factors.circles,
                 "dot_sigma_factor": result.calibration.sigma_factors.dots,
-                "scale_sigma_ppm": None if result.target.scale_sigma is None else 1e6 * result.target.scale_sigma,
+                "printed_sigma_factor": result.calibration.sigma_factors.printed
+                if result.target_design.has_printed
+                else None,
+                "scale_sigma_ppm": None
+                if result.target.scale_sigma is None or result.target_design.up_to_scale
+                else 1e6 * result.target.scale_sigma,
                 "sigma0": result.calibration.joint.sigma0 if result.calibration.joint else None,
                 "redundancy": result.calibration.joint.redundancy if result.calibration.joint else None,
                 "last_move_px": result.calibration.joint.last_move_px if result.calibration.joint else None,

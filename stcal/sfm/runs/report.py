@@ -48,6 +48,7 @@ class Summary(Part):
     sigma_factor: float
     circle_sigma_factor: float
     dot_sigma_factor: float
+    printed_sigma_factor: float | None = None
     scale_sigma_ppm: float | None
     sigma0: float | None
     redundancy: int | None
@@ -254,8 +255,9 @@ class ReportFile(ResultFile):
         "`faces_not_seen`, `faces_expected` (by `--expect-faces`, or by the names of groups, where all are made of "
         "ids of faces), `observations`; `residual_rms_px` per coordinate; `centre_sigma_rms_px` of the σ used; "
         "`sigma_factor` by which the residuals of the single groups exceed the centres' own σ, `circle_sigma_factor` "
-        "of the circles of the faces and `dot_sigma_factor` of the dots, which multiply these σ; `scale_sigma_ppm`: σ "
-        "of the size; `sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
+        "of the circles of the faces, `dot_sigma_factor` of the dots and `printed_sigma_factor` of printed corners "
+        "(not below 1; null without printed faces), which multiply these σ; `scale_sigma_ppm`: σ of the size; "
+        "`sigma0` and `redundancy` of the joint adjustment, `last_move_px` by which its last step "
         "moved a projection at most (settled: less than 1e-6); these four are null with `chain` and `paper`; "
         "`rim_mm` mean height of the rims behind which the faces lie, `rim_sigma_mm` its σ (0 where stated), null "
         "where they are as seen; `dot_rim_mm` stated height of the rims before the board's dots, null without them; "

@@ -197,7 +197,10 @@ class RunResult:
     def scale_from(self) -> list[ScaleSource]:
         """Returns what the size of the result rests on."""
         board = self.board_design
-        known = {"board": board.rows, "faces": faces_of_known_shape(board), "distances": known_distances(board)}
+        drawn = self.target_design.up_to_scale
+        distances = known_distances(board)
+        known = {"board": board.rows, "faces": faces_of_known_shape(board), "distances": distances and not drawn}
+        known["drawing"] = drawn
         return [source for source in get_args(ScaleSource) if known[source]]
 
     @property
@@ -233,7 +236,7 @@ class RunResult:
 
     def circles(self) -> TargetCircles:
         """Returns the calibrated circles with their joint covariance, as :class:`stcal.sfm.Tracker` takes them."""
-        return TargetCircles.of(self.target, self.target_design, self.calibration.sigma_factors.circles)
+        return TargetCircles.of(self.target, self.target_design, self.calibration.sigma_factors.of_target)
 
     def images(self) -> tuple["ImageResult", ...]:
         """Returns the images that the result rests on, each with its pose and residuals, in the order of the groups."""

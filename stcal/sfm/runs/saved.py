@@ -77,7 +77,9 @@ class SavedRun:
         """Returns the factors on the centres' own σ; the factor of all circles for a kind that an older run lacks."""
         summary = self.report["summary"]
         overall = summary["sigma_factor"]
-        return SigmaFactors(overall, *(summary.get(f"{kind}_sigma_factor", overall) for kind in ("circle", "dot")))
+        circles, dots = (summary.get(f"{kind}_sigma_factor", overall) for kind in ("circle", "dot"))
+        printed = summary.get("printed_sigma_factor") or circles
+        return SigmaFactors(overall, circles, dots, printed, self.target.printed_ids())
 
     def rims_mm(self) -> tuple[dict[CircleLabel, float], float]:
         """Returns the heights of the rims behind which the faces lie, by circle, and σ of all of them together, mm: 0

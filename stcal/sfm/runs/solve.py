@@ -282,7 +282,10 @@ def solve_body(
     for done, group in enumerate(groups.values(), 1):
         try:
             model = model_of_body(body, group, camera)
-            refined = refine(model, camera, target, board, eccentricity)
+            gross = {(o.image, o.label): o for o in body.contradictions if o.image in model.images}
+            seen = zip(model.image_index.tolist(), model.point_index.tolist(), strict=True)
+            is_gross = np.array([(model.images[i], model.labels[p]) in gross for i, p in seen], bool)
+            refined = refine(model.without(is_gross), camera, target, board, eccentricity)
             find_scale(refined.model, board)
         except (MappingError, ScaleError, ConvergenceError, DegenerateError) as error:
             errors.append(error)
@@ -290,7 +293,8 @@ def solve_body(
             members = [image for image in group if image.name in refined.model.images]
             missing = left_out(group, model, SHOW_MORE) | left_out(members, refined.model, SHOW_MORE)
             pair = pair_of_model(refined.model)
-            solutions.append(GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, refined.outliers))
+            outliers = (*gross.values(), *refined.outliers)
+            solutions.append(GroupSolution((pair,), refined.model, BY_FACES, refined.rounds, missing, outliers))
         progress("map", done, len(groups))
     if not solutions:
         raise errors[0]

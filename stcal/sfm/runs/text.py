@@ -91,8 +91,15 @@ def _scale_of_target(result: RunResult) -> Iterator[str]:
             flat = result.options.flatness_mm
             off = "" if flat is None else f", {1e3 * joint.bend_factor * flat:.0f} µm off it"
             yield f"print: corners lie {within:.0f} µm about the design in the plane{off} (σ, from the photographs)"
+    if "drawing" in sources:
+        (known,) = known_distances(result.board_design)
+        yield (
+            f"scale: unknown, nothing of known size is in view; the unit is such that {known.first} and {known.second} "
+            f"are {known.mm:g} mm apart, as drawn"
+        )
     if "distances" in sources:
-        yield f"scale: from {len(known_distances(result.board_design))} known distances"
+        count = len(known_distances(result.board_design))
+        yield f"scale: from {count} known distance{'' if count == 1 else 's'}"
 
 
 def _found_camera(result: RunResult) -> Iterator[str]:
@@ -190,7 +197,9 @@ def _noted(labelled: Sequence[LabelledImage]) -> Iterator[str]:
 
 def _group(solution: GroupSolution, scale: Scale) -> Iterator[str]:
     pair = solution.pairs[0]
-    of_scale = {"board": "board", "faces": "printed faces", "distances": "known distances"}[scale.source]
+    of_scale = {"board": "board", "faces": "printed faces", "distances": "known distances", "drawing": "drawing"}[
+        scale.source
+    ]
     yield (
         f"group {solution.model.group}: {len(solution.model.images)} images, {len(solution.model.labels)} circles, "
         f"initial pair {Path(pair.first).name} – {Path(pair.second).name} at "
