@@ -5,8 +5,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.options import (
     MOST_SEED,
     ColumnsFile,
@@ -40,68 +39,42 @@ class Method(StrEnum):
 
 def register(
     pairs_file: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="PAIRS", help="Read ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm of the same points from this file (CSV)."
-        ),
+        Path | None, "Read ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm of the same points from this file (CSV).", Arg("PAIRS")
     ] = None,
-    model: Annotated[ModelName, typer.Option(help="Fit a transform of this kind.")] = ModelName.rigid,
-    method: Annotated[
-        Method, typer.Option(help="Fit it with this method; liu2017 is a published one, always affine.")
-    ] = Method.robust,
+    model: Annotated[ModelName, "Fit a transform of this kind."] = ModelName.rigid,
+    method: Annotated[Method, "Fit it with this method; liu2017 is a published one, always affine."] = Method.robust,
     threshold: Annotated[
         float | None,
-        typer.Option(
-            "--threshold",
-            "--threshold-mm",
-            help="Count points nearer than this as inliers, mm; if not given estimated from the data, liu2017 0.2.",
-        ),
+        "Count points nearer than this as inliers, mm; if not given estimated from the data, liu2017 0.2.",
+        Opt("--threshold --threshold-mm"),
     ] = None,
     sample: Annotated[
-        int | None, typer.Option(min=4, max=100_000, help="Draw samples of so many points, liu2017; 30 if not given.")
+        int | None, "Draw samples of so many points, liu2017; 30 if not given.", Opt(min=4, max=100_000)
     ] = None,
     share: Annotated[
         float | None,
-        typer.Option(
-            min=1e-9, max=1, help="Accept a sample when more than this share of the others are inliers, liu2017; 0.85."
-        ),
+        "Accept a sample when more than this share of the others are inliers, liu2017; 0.85.",
+        Opt(min=1e-9, max=1),
     ] = None,
-    tries: Annotated[
-        int | None, typer.Option(min=1, max=1_000_000, help="Draw so many samples, liu2017; 1000 if not given.")
-    ] = None,
+    tries: Annotated[int | None, "Draw so many samples, liu2017; 1000 if not given.", Opt(min=1, max=1_000_000)] = None,
     orthogonality: Annotated[
         float | None,
-        typer.Option(
-            min=1e-12,
-            max=1e6,
-            help="Reject a sample whose 3×3 part R has an entry of RᵀR − 1 beyond this, liu2017; 0.01.",
-        ),
+        "Reject a sample whose 3×3 part R has an entry of RᵀR − 1 beyond this, liu2017; 0.01.",
+        Opt(min=1e-12, max=1e6),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw random samples and folds with this seed.")] = 0,
-    folds: Annotated[
-        int, typer.Option(min=0, max=100_000, help="Cross-validate with this many folds; 0 for none.")
-    ] = 6,
-    allow_ambiguous: Annotated[
-        bool, typer.Option("--allow-ambiguous", help="Answer even where another transform is about as good.")
-    ] = False,
+    seed: Annotated[int, "Draw random samples and folds with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    folds: Annotated[int, "Cross-validate with this many folds; 0 for none.", Opt(min=0, max=100_000)] = 6,
+    allow_ambiguous: Annotated[bool, "Answer even where another transform is about as good."] = False,
     robot_file: Annotated[
-        Path | None,
-        typer.Option("--robot", help="Solve base and kinematics of this robot (TOML) together; PAIRS needs q1_deg …."),
+        Path | None, "Solve base and kinematics of this robot (TOML) together; PAIRS needs q1_deg ….", Opt("--robot")
     ] = None,
-    identified: Annotated[
-        Path | None,
-        typer.Option(
-            "--identified", writable=True, help="Write the robot identified with --robot to this file (TOML)."
-        ),
-    ] = None,
+    identified: Annotated[Path | None, "Write the robot identified with --robot to this file (TOML).", WRITES] = None,
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "name",
     columns: ColumnsFile = None,
     columns_a: FirstColumns = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write everything to this file (JSON).")
-    ] = None,
+    out: Annotated[Path | None, "Write everything to this file (JSON).", WRITES] = None,
     report: ReportFile = None,
 ) -> None:
     """Find b_from_a from points measured in two frames, some of them wrong; with σ, outliers and where it holds."""

@@ -6,8 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
+from stcal.cli.declare import WRITES, Opt
 from stcal.cli.handeye.inputs import (
     LengthUnit,
     OwnBoard,
@@ -71,186 +70,102 @@ def handeye(
     rotation: RotationOption = None,
     length_unit: LengthUnit = None,
     poses_are: PosesAre = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print what was understood of the files, and solve and write nothing.")
-    ] = False,
+    dry_run: Annotated[bool, "Print what was understood of the files, and solve and write nothing."] = False,
     method: Annotated[
         str | None,
-        typer.Option(
-            help="Use this method, or compare all. If not given, by poses and by corners, with camera and board as "
-            "filed and solved for: what predicts poses held out best."
-        ),
+        "Use this method, or compare all. If not given, by poses and by corners, with camera and board as filed "
+        "and solved for: what predicts poses held out best.",
     ] = None,
     sigma_robot_mm: Annotated[
-        float | None,
-        typer.Option("--sigma-robot-mm", min=0, help="Set σ of the flange's position, mm; needs --sigma-robot-deg."),
+        float | None, "Set σ of the flange's position, mm; needs --sigma-robot-deg.", Opt(min=0)
     ] = None,
     sigma_robot_deg: Annotated[
-        float | None,
-        typer.Option("--sigma-robot-deg", min=0, help="Set σ of the flange's rotation; estimated if not given."),
+        float | None, "Set σ of the flange's rotation; estimated if not given.", Opt(min=0)
     ] = None,
     sigma_camera_mm: Annotated[
-        float | None,
-        typer.Option("--sigma-camera-mm", min=0, help="Set σ of the board's position, mm; needs --sigma-camera-deg."),
+        float | None, "Set σ of the board's position, mm; needs --sigma-camera-deg.", Opt(min=0)
     ] = None,
-    sigma_camera_deg: Annotated[
-        float | None, typer.Option("--sigma-camera-deg", min=0, help="Set σ of the board's rotation.")
-    ] = None,
+    sigma_camera_deg: Annotated[float | None, "Set σ of the board's rotation.", Opt(min=0)] = None,
     sigma_px: Annotated[
-        float | None,
-        typer.Option("--sigma-px", min=1e-9, help="Set σ of a corner, px; of dots and tags, in units of their own σ."),
+        float | None, "Set σ of a corner, px; of dots and tags, in units of their own σ.", Opt(min=1e-9)
     ] = None,
     sigma_board_mm: Annotated[
-        float | None,
-        typer.Option("--sigma-board-mm", min=0, help="Set σ of a corner's place on the board, mm; 0 if exact."),
+        float | None, "Set σ of a corner's place on the board, mm; 0 if exact.", Opt(min=0)
     ] = None,
-    refine_camera: Annotated[
-        bool, typer.Option("--refine-camera", help="Adjust the intrinsics too, from the given ones with their σ.")
-    ] = False,
-    with_scale: Annotated[
-        bool, typer.Option("--with-scale", help="Find the board's true size from the robot's motion.")
-    ] = False,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too, from the given ones with their σ."] = False,
+    with_scale: Annotated[bool, "Find the board's true size from the robot's motion."] = False,
     with_kinematics: Annotated[
         Path | None,
-        typer.Option(
-            "--with-kinematics",
-            help="Adjust the parameters of this robot (TOML) and the intrinsics too, from images and joint values: "
-            "columns q1_deg … of --poses.",
-        ),
+        "Adjust the parameters of this robot (TOML) and the intrinsics too, from images and joint values: "
+        "columns q1_deg … of --poses.",
     ] = None,
     robot_out: Annotated[
-        Path | None,
-        typer.Option(
-            "--robot-out", writable=True, help="Write the robot of --with-kinematics to this file, as adjusted (TOML)."
-        ),
+        Path | None, "Write the robot of --with-kinematics to this file, as adjusted (TOML).", WRITES
     ] = None,
     undo_flips: Annotated[
         bool,
-        typer.Option(
-            "--undo-flips",
-            help="Replace poses of a flat target by the second pose of its plane, tilted the other way, where only "
-            "that agrees with the others; not with images.",
-        ),
+        "Replace poses of a flat target by the second pose of its plane, tilted the other way, where only that "
+        "agrees with the others; not with images.",
     ] = False,
-    four_dof: Annotated[
-        bool,
-        typer.Option("--four-dof", help="Solve for what a flange that turns about one axis only (SCARA) tells."),
-    ] = False,
+    four_dof: Annotated[bool, "Solve for what a flange that turns about one axis only (SCARA) tells."] = False,
     held_out: Annotated[
-        int | None,
-        typer.Option(
-            "--held-out", min=1, max=100_000, help="Hold out so many poses in each split; a quarter if not given."
-        ),
+        int | None, "Hold out so many poses in each split; a quarter if not given.", Opt(min=1, max=100_000)
     ] = None,
-    splits: Annotated[
-        int, typer.Option("--splits", min=0, max=100_000, help="Cross-validate over this many splits; 0 for none.")
-    ] = 15,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the splits with this seed.")] = 0,
+    splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
+    seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
     time_offset: Annotated[
-        bool,
-        typer.Option(
-            "--time-offset",
-            help="Find the offset of the robot's clock from the camera's, of poses by time, and use it.",
-        ),
+        bool, "Find the offset of the robot's clock from the camera's, of poses by time, and use it."
     ] = False,
     image_times: Annotated[
-        Path | None,
-        typer.Option(
-            "--image-times",
-            help="Read the times of the images from this file: image, time_s (CSV); their names if not given.",
-        ),
+        Path | None, "Read the times of the images from this file: image, time_s (CSV); their names if not given."
     ] = None,
     times_columns: Annotated[
-        Path | None,
-        typer.Option("--times-columns", help="Read --image-times with the columns, delimiter … of this file (TOML)."),
+        Path | None, "Read --image-times with the columns, delimiter … of this file (TOML)."
     ] = None,
     time_tolerance: TimeTolerance = 0.02,
     motions_held_out: Annotated[
         int | None,
-        typer.Option(
-            "--motions-held-out",
-            min=1,
-            max=100_000,
-            help="Hold out so many last motions and predict them by the solution of those before, as the paper on "
-            "differential evolution does with 6 of 24.",
-        ),
+        "Hold out so many last motions and predict them by the solution of those before, as the paper on "
+        "differential evolution does with 6 of 24.",
+        Opt(min=1, max=100_000),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the result to this file (JSON).")
-    ] = None,
-    ros: Annotated[
-        Path | None,
-        typer.Option("--ros", writable=True, help="Write a static transform of ROS to this file (YAML, metres)."),
-    ] = None,
-    urdf: Annotated[
-        Path | None,
-        typer.Option("--urdf", writable=True, help="Write a fixed joint with its origin to this file (URDF, metres)."),
-    ] = None,
-    opencv: Annotated[
-        Path | None, typer.Option("--opencv", writable=True, help="Write OpenCV's FileStorage to this file (YAML, mm).")
-    ] = None,
+    out: Annotated[Path | None, "Write the result to this file (JSON).", WRITES] = None,
+    ros: Annotated[Path | None, "Write a static transform of ROS to this file (YAML, metres).", WRITES] = None,
+    urdf: Annotated[Path | None, "Write a fixed joint with its origin to this file (URDF, metres).", WRITES] = None,
+    opencv: Annotated[Path | None, "Write OpenCV's FileStorage to this file (YAML, mm).", WRITES] = None,
     export: Annotated[
         list[str] | None,
-        typer.Option(
-            "--export",
-            metavar="FORM=FILE",
-            help="Write the transform to this file, again for each further one; forms: ros2, moveit, moveit2, "
-            "easy-handeye, easy-handeye2, zivid, kuka, abb, ur, fanuc.",
-        ),
+        "Write the transform to this file, again for each further one; forms: ros2, moveit, moveit2, "
+        "easy-handeye, easy-handeye2, zivid, kuka, abb, ur, fanuc.",
+        Opt(metavar="FORM=FILE"),
     ] = None,
-    parent: Annotated[str, typer.Option(help="Name the flange or base like this in ROS and URDF.")] = "",
-    child: Annotated[str, typer.Option(help="Name the camera like this in ROS and URDF.")] = "",
+    parent: Annotated[str, "Name the flange or base like this in ROS and URDF."] = "",
+    child: Annotated[str, "Name the camera like this in ROS and URDF."] = "",
     camera_frame: Annotated[
         CameraFrameName,
-        typer.Option(
-            "--camera-frame",
-            help="Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with the optical "
-            "frame in it.",
-        ),
+        "Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with the optical "
+        "frame in it.",
     ] = CameraFrameName.optical,
     camera_out: Annotated[
-        Path | None,
-        typer.Option(
-            "--camera-out", writable=True, help="Write the camera of --refine-camera with σ to this file (cameras.txt)."
-        ),
+        Path | None, "Write the camera of --refine-camera with σ to this file (cameras.txt).", WRITES
     ] = None,
     de_bounds_deg: Annotated[
         str | None,
-        typer.Option(
-            "--de-bounds-deg",
-            help="Begin --method de within ± this rotation about zero, about X,Y,Z,± (rotation vector) or "
-            "closed-form,±; 180 if not given.",
-        ),
+        "Begin --method de within ± this rotation about zero, about X,Y,Z,± (rotation vector) or closed-form,±; "
+        "180 if not given.",
     ] = None,
     de_bounds_mm: Annotated[
         str | None,
-        typer.Option(
-            "--de-bounds-mm",
-            help="Begin --method de within ± this translation, X,Y,Z,± or closed-form,±; the farthest pose if not "
-            "given.",
-        ),
+        "Begin --method de within ± this translation, X,Y,Z,± or closed-form,±; the farthest pose if not given.",
     ] = None,
-    de_population: Annotated[
-        int | None, typer.Option("--de-population", min=4, max=100_000, help="Use M candidates; 30, the paper's.")
-    ] = None,
-    de_f: Annotated[
-        float | None, typer.Option("--de-f", min=1e-6, max=2, help="Use this mutation factor F; 0.5, the paper's.")
-    ] = None,
-    de_cr: Annotated[
-        float | None, typer.Option("--de-cr", min=0, max=1, help="Use this crossover factor CR; 0.9, the paper's.")
-    ] = None,
+    de_population: Annotated[int | None, "Use M candidates; 30, the paper's.", Opt(min=4, max=100_000)] = None,
+    de_f: Annotated[float | None, "Use this mutation factor F; 0.5, the paper's.", Opt(min=1e-6, max=2)] = None,
+    de_cr: Annotated[float | None, "Use this crossover factor CR; 0.9, the paper's.", Opt(min=0, max=1)] = None,
     de_lambda: Annotated[
-        float | None,
-        typer.Option(
-            "--de-lambda", min=1e-12, max=1e12, help="Multiply translations, m, squared by λ; 1, the paper's."
-        ),
+        float | None, "Multiply translations, m, squared by λ; 1, the paper's.", Opt(min=1e-12, max=1e12)
     ] = None,
-    de_generations: Annotated[
-        int | None, typer.Option("--de-generations", min=0, max=100_000, help="End after these; 100, the paper's.")
-    ] = None,
-    de_seed: Annotated[
-        int | None, typer.Option("--de-seed", min=0, max=MOST_SEED, help="Draw the population with this seed.")
-    ] = None,
+    de_generations: Annotated[int | None, "End after these; 100, the paper's.", Opt(min=0, max=100_000)] = None,
+    de_seed: Annotated[int | None, "Draw the population with this seed.", Opt(min=0, max=MOST_SEED)] = None,
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",

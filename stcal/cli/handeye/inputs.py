@@ -4,8 +4,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
+from stcal.cli.declare import Arg, Opt
 from stcal.cli.options import one_table
 
 if TYPE_CHECKING:
@@ -24,71 +23,44 @@ class SetupName(StrEnum):
 
 SourceFile = Annotated[
     Path | None,
-    typer.Argument(
-        metavar="POSES|IMAGES",
-        help="Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV, JSON, YAML, npz), "
-        "or samples of easy_handeye or MoveIt; or photographs of a board from this folder.",
-    ),
+    "Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV, JSON, YAML, npz), or "
+    "samples of easy_handeye or MoveIt; or photographs of a board from this folder.",
+    Arg("POSES|IMAGES"),
 ]
 PosesFile = Annotated[
     Path | None,
-    typer.Option(
-        "--poses",
-        help="Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, "
-        "ROS …; or from this folder, a file for each image.",
-    ),
+    "Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, ROS "
+    "…; or from this folder, a file for each image.",
 ]
-OwnCamera = Annotated[
-    Path | None,
-    typer.Option("--camera", help="Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."),
-]
+OwnCamera = Annotated[Path | None, "Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."]
 OwnBoard = Annotated[
     Path | None,
-    typer.Option(
-        "--board",
-        help="Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid, asymmetric "
-        "circles, tags, or several boards.",
-    ),
+    "Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid, asymmetric "
+    "circles, tags, or several boards.",
 ]
 SetupOption = Annotated[
     SetupName | None,
-    typer.Option(
-        help="Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange; as the file says, or "
-        "eye-in-hand, if not given."
-    ),
+    "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange; as the file says, or "
+    "eye-in-hand, if not given.",
 ]
 RotationOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--rotation",
-        help="Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, xyz "
-        "(fixed axes), ZYX (turned axes) …; robot=… or camera=… for one side.",
-    ),
+    "Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, xyz (fixed "
+    "axes), ZYX (turned axes) …; robot=… or camera=… for one side.",
 ]
 LengthUnit = Annotated[
     list[str] | None,
-    typer.Option(
-        "--length-unit",
-        help="Take lengths in files that do not say it in this unit: mm, m, cm, um, in; robot=… or camera=… for "
-        "one side.",
-    ),
+    "Take lengths in files that do not say it in this unit: mm, m, cm, um, in; robot=… or camera=… for one side.",
 ]
 PosesAre = Annotated[
     list[str] | None,
-    typer.Option(
-        "--poses-are",
-        help="Take poses in files that do not say it as base_from_flange or flange_from_base, or as "
-        "camera_from_board or board_from_camera; once for each side.",
-    ),
+    "Take poses in files that do not say it as base_from_flange or flange_from_base, or as "
+    "camera_from_board or board_from_camera; once for each side.",
 ]
 TimeTolerance = Annotated[
     float,
-    typer.Option(
-        "--time-tolerance",
-        min=0,
-        max=3600,
-        help="Take the nearest of the robot's poses within this time, s, where none can be interpolated.",
-    ),
+    "Take the nearest of the robot's poses within this time, s, where none can be interpolated.",
+    Opt(min=0, max=3600),
 ]
 
 

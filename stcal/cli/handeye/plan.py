@@ -4,8 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from stcal.cli.declare import WRITES, Opt
 from stcal.cli.handeye.inputs import (
     LengthUnit,
     OwnBoard,
@@ -43,16 +42,12 @@ def plan(
     poses_are: PosesAre = None,
     robot_file: Annotated[
         Path | None,
-        typer.Option(
-            "--robot",
-            help="Plan only what this robot reaches within its joint limits (TOML), and name its joint values.",
-        ),
+        "Plan only what this robot reaches within its joint limits (TOML), and name its joint values.",
+        Opt("--robot"),
     ] = None,
-    count: Annotated[int, typer.Option(min=1, max=100, help="Name so many poses.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the candidates with this seed.")] = 0,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the poses to this file (CSV).")
-    ] = None,
+    count: Annotated[int, "Name so many poses.", Opt(min=1, max=100)] = 3,
+    seed: Annotated[int, "Draw the candidates with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    out: Annotated[Path | None, "Write the poses to this file (CSV).", WRITES] = None,
     first: FirstTable = None,
     second: SecondTable = None,
     key: Key = "image",

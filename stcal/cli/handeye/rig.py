@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.handeye.inputs import LengthUnit, PosesAre, RotationOption, TimeTolerance
 from stcal.cli.options import (
     MOST_SEED,
@@ -23,18 +22,11 @@ from stcal.io.files import keep_apart
 def rig(
     rig_file: Annotated[
         Path,
-        typer.Argument(
-            metavar="RIG.toml",
-            help="Read setup, board, the robot's poses, and the images and intrinsics of each camera from this file "
-            "(TOML).",
-        ),
+        "Read setup, board, the robot's poses, and the images and intrinsics of each camera from this file (TOML).",
+        Arg("RIG.toml"),
     ],
-    refine_camera: Annotated[
-        bool, typer.Option("--refine-camera", help="Adjust the intrinsics too, of each camera from its own with σ.")
-    ] = False,
-    with_scale: Annotated[
-        bool, typer.Option("--with-scale", help="Find the board's true size from the robot's motion.")
-    ] = False,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too, of each camera from its own with σ."] = False,
+    with_scale: Annotated[bool, "Find the board's true size from the robot's motion."] = False,
     rotation: RotationOption = None,
     length_unit: LengthUnit = None,
     poses_are: PosesAre = None,
@@ -42,20 +34,12 @@ def rig(
     time_tolerance: TimeTolerance = 0.02,
     held_out: Annotated[
         int | None,
-        typer.Option(
-            "--held-out",
-            min=1,
-            max=100_000,
-            help="Hold out so many poses of the robot in each split; a quarter if not given.",
-        ),
+        "Hold out so many poses of the robot in each split; a quarter if not given.",
+        Opt(min=1, max=100_000),
     ] = None,
-    splits: Annotated[
-        int, typer.Option("--splits", min=0, max=100_000, help="Cross-validate over this many splits; 0 for none.")
-    ] = 15,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the splits with this seed.")] = 0,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the result to this file (JSON).")
-    ] = None,
+    splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
+    seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    out: Annotated[Path | None, "Write the result to this file (JSON).", WRITES] = None,
     workers: Workers = None,
     json_file: JsonFile = None,
     report: ReportFile = None,

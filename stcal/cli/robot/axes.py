@@ -4,8 +4,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.options import (
     ColumnsFile,
     FirstColumns,
@@ -29,23 +28,16 @@ if TYPE_CHECKING:
 def axes(
     robot_file: RobotFile,
     sweeps: Annotated[
-        Path | None,
-        typer.Argument(help="Read joint values and positions of reflectors in sweeps from this file (CSV)."),
+        Path | None, "Read joint values and positions of reflectors in sweeps from this file (CSV).", Arg()
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", writable=True, help="Write the robot that the axes make to this file (TOML)."),
-    ] = None,
+    out: Annotated[Path | None, "Write the robot that the axes make to this file (TOML).", WRITES] = None,
     still_deg: Annotated[
-        float,
-        typer.Option(min=1e-9, max=1.0, help="Take joints that change by less than this as standing still, degrees."),
+        float, "Take joints that change by less than this as standing still, degrees.", Opt(min=1e-9, max=1.0)
     ] = 0.0015,
     orientations: Annotated[
         str,
-        typer.Option(
-            help="Use measured orientations too, as reflectors so far from the target, mm, where an error of rotation "
-            "is worth one of position; auto, by their stated σ and not without, or off."
-        ),
+        "Use measured orientations too, as reflectors so far from the target, mm, where an error of rotation is "
+        "worth one of position; auto, by their stated σ and not without, or off.",
     ] = "auto",
     rotation: Rotation = None,
     first: FirstTable = None,

@@ -4,8 +4,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.options import (
     ColumnsFile,
     FirstColumns,
@@ -35,42 +34,25 @@ class ExportAs(StrEnum):
 
 
 def compensate(
-    robot_file: Annotated[Path, typer.Option("--robot", help="Read the identified robot from this file (TOML).")],
-    targets: Annotated[
-        Path | None, typer.Argument(help="Read commanded poses or joint values from this file (CSV).")
-    ] = None,
-    nominal: Annotated[
-        Path | None, typer.Option("--nominal", help="Read the robot as its controller has it from this file (TOML).")
-    ] = None,
+    robot_file: Annotated[Path, "Read the identified robot from this file (TOML).", Opt("--robot")],
+    targets: Annotated[Path | None, "Read commanded poses or joint values from this file (CSV).", Arg()] = None,
+    nominal: Annotated[Path | None, "Read the robot as its controller has it from this file (TOML)."] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", writable=True, help="Write joint values to send, with status and errors, to this file (CSV)."
-        ),
+        Path | None, "Write joint values to send, with status and errors, to this file (CSV).", WRITES
     ] = None,
     export: Annotated[
         list[str] | None,
-        typer.Option(
-            "--export",
-            metavar="FORM=FILE",
-            help="Write the points that are reached to this file, again for each further one; forms: yaskawa (JBI), "
-            "fanuc (LS), kuka (dat), abb (mod), ur (script).",
-        ),
+        "Write the points that are reached to this file, again for each further one; forms: yaskawa (JBI), "
+        "fanuc (LS), kuka (dat), abb (mod), ur (script).",
+        Opt(metavar="FORM=FILE"),
     ] = None,
     export_as: Annotated[
-        ExportAs,
-        typer.Option(
-            "--export-as",
-            help="Write joint values, or the poses of the nominal robot there, which the controller is told for them.",
-        ),
+        ExportAs, "Write joint values, or the poses of the nominal robot there, which the controller is told for them."
     ] = ExportAs.joints,
     pulses_per_deg: Annotated[
         str | None,
-        typer.Option(
-            "--pulses-per-deg",
-            help="Write joint values for yaskawa by these pulses per degree of each joint, with commas between; poses "
-            "if not given.",
-        ),
+        "Write joint values for yaskawa by these pulses per degree of each joint, with commas between; poses if "
+        "not given.",
     ] = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
     rotation: Rotation = None,

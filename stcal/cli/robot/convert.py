@@ -4,8 +4,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
+from stcal.cli.declare import Arg
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import InputError
 
@@ -27,34 +26,22 @@ class ConventionName(StrEnum):
 def convert(
     source: Annotated[
         Path,
-        typer.Argument(
-            metavar="A",
-            help="Read the robot from this file: a robot file (TOML), URDF, or the calibration of an arm of Universal "
-            "Robots: YAML of ur_calibration, or calibration.conf.",
-        ),
+        "Read the robot from this file: a robot file (TOML), URDF, or the calibration of an arm of Universal "
+        "Robots: YAML of ur_calibration, or calibration.conf.",
+        Arg("A"),
     ],
-    out: Annotated[
-        Path, typer.Argument(metavar="B", writable=True, help="Write the other form to this file: .toml or .urdf.")
-    ],
-    from_link: Annotated[
-        str, typer.Option("--from-link", help="Begin at this link of a URDF; at its root if not given.")
-    ] = "",
+    out: Annotated[Path, "Write the other form to this file: .toml or .urdf.", Arg("B", writes=True)],
+    from_link: Annotated[str, "Begin at this link of a URDF; at its root if not given."] = "",
     to_link: Annotated[
         list[str] | None,
-        typer.Option(
-            "--to-link",
-            help="End at this link of a URDF; at the only one that can be if not given. Repeat it for the hands of "
-            "several arms on a trunk.",
-        ),
+        "End at this link of a URDF; at the only one that can be if not given. Repeat it for the hands of "
+        "several arms on a trunk.",
     ] = None,
     convention: Annotated[
-        ConventionName, typer.Option(help="Write rows of Denavit and Hartenberg in this convention.")
+        ConventionName, "Write rows of Denavit and Hartenberg in this convention."
     ] = ConventionName.standard,
     nominal: Annotated[
-        Path | None,
-        typer.Option(
-            "--nominal", help="Add the deviations of a calibration.conf to the rows of this robot file (TOML)."
-        ),
+        Path | None, "Add the deviations of a calibration.conf to the rows of this robot file (TOML)."
     ] = None,
 ) -> None:
     """Write a robot file as URDF, or the joints of a URDF or an arm of Universal Robots as a robot file."""
@@ -146,7 +133,7 @@ def _is_xml(path: Path) -> bool:
 
 
 def init(
-    file: Annotated[Path, typer.Argument(writable=True, help="Write the robot file here.")] = Path("robot.toml"),
+    file: Annotated[Path, "Write the robot file here.", Arg(writes=True)] = Path("robot.toml"),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
     from stcal.robot.kinematics.file import require_robot_written, robot_toml

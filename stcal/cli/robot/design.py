@@ -4,8 +4,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from stcal.cli.declare import WRITES, Opt
 from stcal.cli.options import MOST_SEED, JsonFile, ReportFile, RobotFile
 from stcal.cli.terminal import say, write_if
 from stcal.errors import InputError
@@ -20,25 +19,15 @@ class ObservedKind(StrEnum):
 
 def design(
     robot_file: RobotFile,
-    count: Annotated[int, typer.Option(min=1, max=2000, help="Choose this many poses.")] = 40,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the candidates with this seed.")] = 0,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the poses to this file (CSV).")
-    ] = None,
-    observe: Annotated[
-        ObservedKind, typer.Option(help="Plan for an instrument that measures this.")
-    ] = ObservedKind.position,
-    candidates: Annotated[int, typer.Option(min=2, max=100_000, help="Choose from this many random poses.")] = 1000,
-    sigma_mm: Annotated[
-        float, typer.Option("--sigma-mm", help="Assume this σ of measured positions, mm per axis.")
-    ] = 0.05,
-    sigma_rad: Annotated[
-        float, typer.Option("--sigma-rad", help="Assume this σ of measured orientations, rad per axis.")
-    ] = 2e-4,
-    box: Annotated[
-        str | None, typer.Option(help="Keep the tool inside this box, mm in the base: xmin,ymin,zmin,xmax,ymax,zmax.")
-    ] = None,
-    target: Annotated[str, typer.Option(help="Measure the target (tool) of this name.")] = "",
+    count: Annotated[int, "Choose this many poses.", Opt(min=1, max=2000)] = 40,
+    seed: Annotated[int, "Draw the candidates with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    out: Annotated[Path | None, "Write the poses to this file (CSV).", WRITES] = None,
+    observe: Annotated[ObservedKind, "Plan for an instrument that measures this."] = ObservedKind.position,
+    candidates: Annotated[int, "Choose from this many random poses.", Opt(min=2, max=100_000)] = 1000,
+    sigma_mm: Annotated[float, "Assume this σ of measured positions, mm per axis."] = 0.05,
+    sigma_rad: Annotated[float, "Assume this σ of measured orientations, rad per axis."] = 2e-4,
+    box: Annotated[str | None, "Keep the tool inside this box, mm in the base: xmin,ymin,zmin,xmax,ymax,zmax."] = None,
+    target: Annotated[str, "Measure the target (tool) of this name."] = "",
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:

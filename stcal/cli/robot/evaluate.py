@@ -4,8 +4,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.options import (
     ColumnsFile,
     FirstColumns,
@@ -34,20 +33,14 @@ class RefitParts(StrEnum):
 
 
 def evaluate(
-    robot_files: Annotated[
-        list[Path], typer.Option("--robot", help="Read a robot from this file (TOML); give it again for others.")
-    ],
+    robot_files: Annotated[list[Path], "Read a robot from this file (TOML); give it again for others.", Opt("--robot")],
     data_file: Annotated[
-        Path | None,
-        typer.Argument(metavar="DATA", help="Read joint values with what was measured there from this file (CSV)."),
+        Path | None, "Read joint values with what was measured there from this file (CSV).", Arg("DATA")
     ] = None,
     refit: Annotated[
-        RefitParts,
-        typer.Option(help="Fit this to the data with each robot's own axes; the rest is taken from its file."),
+        RefitParts, "Fit this to the data with each robot's own axes; the rest is taken from its file."
     ] = RefitParts.both,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the residuals of each row to this file (CSV).")
-    ] = None,
+    out: Annotated[Path | None, "Write the residuals of each row to this file (CSV).", WRITES] = None,
     quaternions: Quaternions = QuaternionOrder.wxyz,
     payload_kg: PayloadKg = None,
     first: FirstTable = None,
@@ -84,21 +77,14 @@ def evaluate(
 
 def verify(
     measured: Annotated[
-        Path | None,
-        typer.Argument(help="Read commanded_x_mm … beside measured x_mm … from this file; set: before, after (CSV)."),
+        Path | None, "Read commanded_x_mm … beside measured x_mm … from this file; set: before, after (CSV).", Arg()
     ] = None,
-    plot: Annotated[
-        Path | None,
-        typer.Option("--plot", writable=True, help="Draw the error of each pose and set to this file (.png or .svg)."),
-    ] = None,
+    plot: Annotated[Path | None, "Draw the error of each pose and set to this file (.png or .svg).", WRITES] = None,
     first: FirstTable = None,
     seconds: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--b",
-            metavar="<path>",
-            help="Read what was measured from this file (CSV); several are sets, called like them.",
-        ),
+        "Read what was measured from this file (CSV); several are sets, called like them.",
+        Opt("--b", metavar="<path>"),
     ] = None,
     key: Key = "pose",
     columns_a: FirstColumns = None,

@@ -4,8 +4,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.options import (
     MOST_SEED,
     ColumnsFile,
@@ -45,62 +44,32 @@ class Model(StrEnum):
 def identify(
     robot_file: RobotFile,
     data_file: Annotated[
-        Path | None,
-        typer.Argument(metavar="DATA", help="Read joint values with what was measured there from this file (CSV)."),
+        Path | None, "Read joint values with what was measured there from this file (CSV).", Arg("DATA")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the identified robot to this file (TOML).")
-    ] = None,
+    out: Annotated[Path | None, "Write the identified robot to this file (TOML).", WRITES] = None,
     offsets: Annotated[
-        Path | None,
-        typer.Option(
-            "--offsets", writable=True, help="Write mastering offsets and differences of D-H values to this file (CSV)."
-        ),
+        Path | None, "Write mastering offsets and differences of D-H values to this file (CSV).", WRITES
     ] = None,
-    observe: Annotated[
-        Kind | None, typer.Option(help="Use this of the measurements; the most that was measured if not given.")
-    ] = None,
+    observe: Annotated[Kind | None, "Use this of the measurements; the most that was measured if not given."] = None,
     sigma_mm: Annotated[
-        float | None,
-        typer.Option(
-            "--sigma-mm", min=1e-9, max=1e4, help="Set σ of a measured position, mm per axis; estimated if not given."
-        ),
+        float | None, "Set σ of a measured position, mm per axis; estimated if not given.", Opt(min=1e-9, max=1e4)
     ] = None,
     sigma_rad: Annotated[
-        float | None,
-        typer.Option(
-            "--sigma-rad",
-            min=1e-12,
-            max=4,
-            help="Set σ of a measured orientation, rad per axis; estimated if not given.",
-        ),
+        float | None, "Set σ of a measured orientation, rad per axis; estimated if not given.", Opt(min=1e-12, max=4)
     ] = None,
-    folds: Annotated[
-        int, typer.Option(min=0, max=100_000, help="Cross-validate with this many folds; 0 for none.")
-    ] = 6,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Divide the rows into folds with this seed.")] = 0,
-    robust: Annotated[
-        bool, typer.Option("--robust/--least-squares", help="Give outliers less weight, or all rows the same.")
-    ] = True,
-    partial: Annotated[
-        bool,
-        typer.Option(
-            "--partial", help="Keep parameters nominal that the data leave open, rather than refuse the data."
-        ),
-    ] = False,
+    folds: Annotated[int, "Cross-validate with this many folds; 0 for none.", Opt(min=0, max=100_000)] = 6,
+    seed: Annotated[int, "Divide the rows into folds with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    robust: Annotated[bool, "Give outliers less weight, or all rows the same.", Opt("--robust/--least-squares")] = True,
+    partial: Annotated[bool, "Keep parameters nominal that the data leave open, rather than refuse the data."] = False,
     adjust: Annotated[
         str,
-        typer.Option(
-            metavar="WHAT",
-            help="Adjust base and tools (base,tool), also zero positions of joints (zeros), or their geometry, or all.",
-        ),
+        "Adjust base and tools (base,tool), also zero positions of joints (zeros), or their geometry, or all.",
+        Opt(metavar="WHAT"),
     ] = "all",
     model: Annotated[
         Model,
-        typer.Option(
-            help="Take the arm as rigid, or as elastic: links give way to gravity, gears turn unevenly; auto chooses "
-            "by rows held out."
-        ),
+        "Take the arm as rigid, or as elastic: links give way to gravity, gears turn unevenly; auto chooses by "
+        "rows held out.",
     ] = Model.rigid,
     quaternions: Quaternions = QuaternionOrder.wxyz,
     rotation: Rotation = None,

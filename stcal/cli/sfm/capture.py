@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stcal.cli.declare import Arg, Opt
 from stcal.cli.options import (
     MOST_SEED,
     BoardFile,
@@ -32,36 +33,26 @@ app = typer.Typer()
 
 @app.command()
 def plan(
-    images: Annotated[int, typer.Option("--images", min=2, max=500, help="Plan this many images in each group.")] = 10,
-    spread: Annotated[float, typer.Option(min=2, max=80, help="Spread the views by ± this, degrees.")] = 40.0,
-    distance: Annotated[float, typer.Option(min=50, max=1e5, help="Place the camera at this distance, mm.")] = 1000.0,
+    images: Annotated[int, "Plan this many images in each group.", Opt(min=2, max=500)] = 10,
+    spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
+    distance: Annotated[float, "Place the camera at this distance, mm.", Opt(min=50, max=1e5)] = 1000.0,
     width: Annotated[
-        int, typer.Option(min=320, max=100_000, help="Take images of this width, px; 3:2 images of a 24 mm lens.")
+        int, "Take images of this width, px; 3:2 images of a 24 mm lens.", Opt(min=320, max=100_000)
     ] = 5184,
-    camera: Annotated[
-        Path | None, typer.Option("--camera", help="Read the camera from this file, in place of --width.")
-    ] = None,
-    noise: Annotated[float | None, typer.Option(min=1e-5, max=10, help="Assume this σ of every centre, px.")] = None,
-    run: Annotated[
-        Path | None, typer.Option("--run", help="Take the σ of centres from the finished run in this folder.")
-    ] = None,
+    camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
+    noise: Annotated[float | None, "Assume this σ of every centre, px.", Opt(min=1e-5, max=10)] = None,
+    run: Annotated[Path | None, "Take the σ of centres from the finished run in this folder."] = None,
     target: TargetFile = None,
-    faces: Annotated[
-        Path | None,
-        typer.Option("--faces", help="Place the faces of --target as in this faces.json of an earlier run."),
-    ] = None,
+    faces: Annotated[Path | None, "Place the faces of --target as in this faces.json of an earlier run."] = None,
     board: BoardFile = None,
     groups: Annotated[
-        str | None,
-        typer.Option(help="Photograph these pairs of faces together, such as 12,14,15,23 or front-right,front-top."),
+        str | None, "Photograph these pairs of faces together, such as 12,14,15,23 or front-right,front-top."
     ] = None,
-    refine_camera: Annotated[bool, typer.Option("--refine-camera", help="Adjust the intrinsics too.")] = False,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
     one_board: Annotated[
-        bool, typer.Option("--one-board/--own-boards", help="Use one plate in all groups, or a new print for each.")
+        bool, "Use one plate in all groups, or a new print for each.", Opt("--one-board/--own-boards")
     ] = True,
-    seed: Annotated[
-        int, typer.Option(min=0, max=MOST_SEED, help="Place board and cameras at random with this seed.")
-    ] = 0,
+    seed: Annotated[int, "Place board and cameras at random with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
     margin: PlateMargin = 15.0,
     out: JsonFile = None,
 ) -> None:
@@ -115,7 +106,7 @@ def plan(
 @app.command()
 def advise(
     run: Run,
-    count: Annotated[int, typer.Option("--count", min=1, max=50, help="Advise this many views.")] = 5,
+    count: Annotated[int, "Advise this many views.", Opt(min=1, max=50)] = 5,
     out: JsonFile = None,
 ) -> None:
     """Compute from a run's own geometry which further photographs would lower the σ of its worst face most."""
@@ -138,21 +129,20 @@ def advise(
 @app.command()
 def watch(
     images: Annotated[
-        Path, typer.Argument(help="Follow this folder, IMAGES/<group>/*.jpg, png, tif, bmp; it may be empty at first.")
+        Path, "Follow this folder, IMAGES/<group>/*.jpg, png, tif, bmp; it may be empty at first.", Arg()
     ],
     camera: CameraFile,
-    out: Annotated[Path, typer.Option("--out", help="Write the run to this folder: new, empty, or of an earlier run.")],
+    out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
     target: TargetFile = None,
     board: BoardFile = None,
     interval: Annotated[
-        float, typer.Option(min=0.1, max=3600, help="Look at the folder so often, s; files must stand still for it.")
+        float, "Look at the folder so often, s; files must stand still for it.", Opt(min=0.1, max=3600)
     ] = 1.0,
     idle: Annotated[
-        float | None,
-        typer.Option(min=0.1, max=1e6, help="End when nothing has come for so long, s; by Ctrl-C if not given."),
+        float | None, "End when nothing has come for so long, s; by Ctrl-C if not given.", Opt(min=0.1, max=1e6)
     ] = None,
-    views: Annotated[int, typer.Option(min=0, max=50, help="Compute so many views that would help; 0 for none.")] = 1,
-    refine_camera: Annotated[bool, typer.Option("--refine-camera", help="Adjust the intrinsics too.")] = False,
+    views: Annotated[int, "Compute so many views that would help; 0 for none.", Opt(min=0, max=50)] = 1,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,
@@ -195,46 +185,35 @@ def _say_update(update: "Update") -> None:
 
 @app.command()
 def capture(
-    images: Annotated[
-        Path, typer.Argument(help="Write photographs to this folder, IMAGES/<group>/IMG_0001.png; earlier ones stay.")
-    ],
+    images: Annotated[Path, "Write photographs to this folder, IMAGES/<group>/IMG_0001.png; earlier ones stay.", Arg()],
     camera: CameraFile,
-    out: Annotated[Path, typer.Option("--out", help="Write the run to this folder: new, empty, or of an earlier run.")],
-    group: Annotated[
-        str, typer.Option(help="Name the group like this; between its photographs only the camera may move.")
-    ],
+    out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
+    group: Annotated[str, "Name the group like this; between its photographs only the camera may move."],
     target: TargetFile = None,
     board: BoardFile = None,
-    device: Annotated[
-        str, typer.Option(help="Use this camera: a number, or a place such as /dev/video0 (V4L2, UVC).")
-    ] = "0",
+    device: Annotated[str, "Use this camera: a number, or a place such as /dev/video0 (V4L2, UVC)."] = "0",
     exposure: Annotated[
         float | None,
-        typer.Option(
-            min=1e-9, max=1e9, help="Set this exposure, in the driver's unit; left to the camera if not given."
-        ),
+        "Set this exposure, in the driver's unit; left to the camera if not given.",
+        Opt(min=1e-9, max=1e9),
     ] = None,
     gain: Annotated[
-        float | None, typer.Option(min=0, max=1e6, help="Set this gain, in the driver's unit; as it is if not given.")
+        float | None, "Set this gain, in the driver's unit; as it is if not given.", Opt(min=0, max=1e6)
     ] = None,
     settle: Annotated[
-        float, typer.Option("--settle-s", min=0, max=60, help="Give the camera this time before each photograph, s.")
+        float, "Give the camera this time before each photograph, s.", Opt("--settle-s", min=0, max=60)
     ] = 0.3,
     count: Annotated[
-        int | None, typer.Option(min=1, max=100_000, help="End after so many; by Ctrl-C or Ctrl-D if not given.")
+        int | None, "End after so many; by Ctrl-C or Ctrl-D if not given.", Opt(min=1, max=100_000)
     ] = None,
     every: Annotated[
-        float | None,
-        typer.Option("--every", min=0, max=86_400, help="Take one each so many seconds; at each Enter if not given."),
+        float | None, "Take one each so many seconds; at each Enter if not given.", Opt(min=0, max=86_400)
     ] = None,
     simulate: Annotated[
-        Path | None,
-        typer.Option(
-            help="Use a simulated camera that sees this image, or those of this folder, in place of --device."
-        ),
+        Path | None, "Use a simulated camera that sees this image, or those of this folder, in place of --device."
     ] = None,
-    views: Annotated[int, typer.Option(min=0, max=50, help="Compute so many views that would help; 0 for none.")] = 1,
-    refine_camera: Annotated[bool, typer.Option("--refine-camera", help="Adjust the intrinsics too.")] = False,
+    views: Annotated[int, "Compute so many views that would help; 0 for none.", Opt(min=0, max=50)] = 1,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
     workers: Workers = None,

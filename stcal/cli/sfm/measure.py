@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.options import (
     CameraFile,
     MaxDiameter,
@@ -33,58 +34,34 @@ app = typer.Typer()
 @app.command()
 def measure(
     camera: CameraFile,
-    faces: Annotated[Path, typer.Option("--faces", help="Read the calibrated target from this faces.json.")],
+    faces: Annotated[Path, "Read the calibrated target from this faces.json."],
     images: Annotated[
-        Path | None, typer.Argument(help="Read the images of this folder and of its subfolders; none with --serve.")
+        Path | None, "Read the images of this folder and of its subfolders; none with --serve.", Arg()
     ] = None,
     target: TargetFile = None,
-    out: Annotated[
-        Path, typer.Option("--out", writable=True, help="Write the table of poses to this file (CSV).")
-    ] = Path("poses.csv"),
+    out: Annotated[Path, "Write the table of poses to this file (CSV).", WRITES] = Path("poses.csv"),
     json_file: Annotated[
         Path | None,
-        typer.Option(
-            "--json",
-            writable=True,
-            help="Also write everything to this file, both solutions of an undecided image too (JSON); to standard "
-            "output with `-`.",
-        ),
+        "Also write everything to this file, both solutions of an undecided image too (JSON); to standard "
+        "output with `-`.",
+        Opt("--json", writes=True),
     ] = None,
     report: ReportFile = None,
     joints: Annotated[
-        Path | None,
-        typer.Option(
-            "--joints",
-            help="Add to the table the columns of this file, joint values say; it needs a column image (CSV).",
-        ),
+        Path | None, "Add to the table the columns of this file, joint values say; it needs a column image (CSV)."
     ] = None,
-    columns: Annotated[
-        Path | None,
-        typer.Option("--columns", help="Read --joints with the columns, delimiter … of this file (TOML)."),
-    ] = None,
-    board: Annotated[
-        Path | None,
-        typer.Option("--board", help="Tell the dots of the board of this board.toml apart, if it is in view."),
-    ] = None,
-    previous: Annotated[
-        bool, typer.Option("--previous", help="Decide between two solutions by the image before, as motions are small.")
-    ] = False,
+    columns: Annotated[Path | None, "Read --joints with the columns, delimiter … of this file (TOML)."] = None,
+    board: Annotated[Path | None, "Tell the dots of the board of this board.toml apart, if it is in view."] = None,
+    previous: Annotated[bool, "Decide between two solutions by the image before, as motions are small."] = False,
     sequence: Annotated[
         bool,
-        typer.Option(
-            "--sequence",
-            help="Follow the target from image to image of each folder, in order of name, and search an image as a "
-            "whole only where it is lost. An undecided pose is decided as with --previous.",
-        ),
+        "Follow the target from image to image of each folder, in order of name, and search an image as a whole "
+        "only where it is lost. An undecided pose is decided as with --previous.",
     ] = False,
     sigma_factor: Annotated[
         float | None,
-        typer.Option(
-            "--sigma-factor",
-            min=1e-3,
-            max=1e3,
-            help="Multiply the centres' σ by this; by the factor of faces.json if not given.",
-        ),
+        "Multiply the centres' σ by this; by the factor of faces.json if not given.",
+        Opt(min=1e-3, max=1e3),
     ] = None,
     strict: Strict = False,
     min_diameter: MinDiameter = None,
@@ -93,26 +70,13 @@ def measure(
     scheduler: Scheduler = None,
     send_images: SendImages = False,
     serve: Annotated[
-        bool,
-        typer.Option(
-            "--serve", help="Answer images that programs send over HTTP, POST /measure, with a JSON each, until Ctrl-C."
-        ),
+        bool, "Answer images that programs send over HTTP, POST /measure, with a JSON each, until Ctrl-C."
     ] = False,
-    host: Annotated[
-        str, typer.Option(help="Listen at this address with --serve; other machines reach 0.0.0.0.")
-    ] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Listen at this port with --serve; at a free one with 0.")
-    ] = 8765,
-    max_megabytes: Annotated[
-        float,
-        typer.Option("--max-megabytes", min=0.01, max=2000, help="Accept image files up to this size with --serve."),
-    ] = 64.0,
+    host: Annotated[str, "Listen at this address with --serve; other machines reach 0.0.0.0."] = "127.0.0.1",
+    port: Annotated[int, "Listen at this port with --serve; at a free one with 0.", Opt(min=0, max=65535)] = 8765,
+    max_megabytes: Annotated[float, "Accept image files up to this size with --serve.", Opt(min=0.01, max=2000)] = 64.0,
     token: Annotated[
-        str,
-        typer.Option(
-            envvar="STCAL_TOKEN", help="Answer with --serve only requests with `Authorization: Bearer` and this word."
-        ),
+        str, "Answer with --serve only requests with `Authorization: Bearer` and this word.", Opt(envvar="STCAL_TOKEN")
     ] = "",
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from stcal.cli.declare import WRITES, Opt
 from stcal.cli.options import (
     BoardFile,
     Exclude,
@@ -62,91 +63,57 @@ class Solve(StrEnum):
 @app.command()
 def run(
     images: Images,
-    out: Annotated[Path, typer.Option("--out", help="Write the run to this folder: new, empty, or of an earlier run.")],
+    out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
     camera: OptionalCamera = None,
     target: TargetFile = None,
     board: BoardFile = None,
     solve: Annotated[
         Solve | None,
-        typer.Option(
-            help="Use joint, one adjustment over all groups, the default; chain, group by group; or paper, all of "
-            "Zhang & Wei (2017) as published, from detection on, for comparison."
-        ),
+        "Use joint, one adjustment over all groups, the default; chain, group by group; or paper, all of Zhang "
+        "& Wei (2017) as published, from detection on, for comparison.",
     ] = None,
     frame: Annotated[
         Frame | None,
-        typer.Option(
-            help="Lay a face's frame by plane, Z from the plane of all its circles, the default; or by three-point, "
-            "as in the paper."
-        ),
+        "Lay a face's frame by plane, Z from the plane of all its circles, the default; or by three-point, as "
+        "in the paper.",
     ] = None,
     reference_face: Annotated[
-        str | None,
-        typer.Option(
-            "--reference-face", help="Take the frame of this face as the target frame; the first if not given."
-        ),
+        str | None, "Take the frame of this face as the target frame; the first if not given."
     ] = None,
     eccentricity: Annotated[
         bool,
-        typer.Option(
-            "--eccentricity/--no-eccentricity",
-            help="Correct the eccentricity of circles, or not: the uncorrected control, chained as in the paper.",
-        ),
+        "Correct the eccentricity of circles, or not: the uncorrected control, chained as in the paper.",
+        Opt("--eccentricity/--no-eccentricity"),
     ] = True,
     max_angle: Annotated[
         float | None,
-        typer.Option(
-            "--max-angle",
-            min=2,
-            max=170,
-            help="Reject an initial pair with a larger median ray angle, degrees; 60, and the smallest beyond it, if "
-            "not given.",
-        ),
+        "Reject an initial pair with a larger median ray angle, degrees; 60, and the smallest beyond it, if not given.",
+        Opt(min=2, max=170),
     ] = None,
-    flatness: Annotated[
-        str, typer.Option(help="Set σ of a circle about the plane of its face, mm, for --solve joint; or off.")
-    ] = "0.02",
-    refine_camera: Annotated[
-        bool,
-        typer.Option("--refine-camera", help="Adjust the intrinsics too, from the given ones with their σ."),
-    ] = False,
-    rim: Annotated[
-        bool,
-        typer.Option("--rim", help="Compute the rim in front of circles, and give faces of the surface behind it."),
-    ] = False,
-    board_only: Annotated[
-        bool,
-        typer.Option("--board-only", help="Take the board alone, though other circles are in view: λ and residuals."),
-    ] = False,
+    flatness: Annotated[str, "Set σ of a circle about the plane of its face, mm, for --solve joint; or off."] = "0.02",
+    refine_camera: Annotated[bool, "Adjust the intrinsics too, from the given ones with their σ."] = False,
+    rim: Annotated[bool, "Compute the rim in front of circles, and give faces of the surface behind it."] = False,
+    board_only: Annotated[bool, "Take the board alone, though other circles are in view: λ and residuals."] = False,
     compare: Annotated[
         ComparedWith | None,
-        typer.Option(
-            help="Solve the same photographs as published too, and show what each step from there is worth: paper."
-        ),
+        "Solve the same photographs as published too, and show what each step from there is worth: paper.",
     ] = None,
     pairs: Annotated[
         PairsChoice | None,
-        typer.Option(
-            help="Match all pairs of images, or sparse, as many as hold every circle together; "
-            "sparse above 80 images if not given."
-        ),
+        "Match all pairs of images, or sparse, as many as hold every circle together; sparse above 80 images if "
+        "not given.",
     ] = None,
     exclude: Exclude = None,
     expect_faces: Annotated[
         str | None,
-        typer.Option(
-            "--expect-faces",
-            metavar="FACES",
-            help="Answer no where one of these faces, such as 1,2, is not in the result; those that the groups are "
-            "named after, such as 12, if not given.",
-        ),
+        "Answer no where one of these faces, such as 1,2, is not in the result; those that the groups are named "
+        "after, such as 12, if not given.",
+        Opt(metavar="FACES"),
     ] = None,
     strict: Annotated[
         bool,
-        typer.Option(
-            "--strict/--no-strict",
-            help="End with exit code 4 where the answer is no, or with 0 all the same; results are written.",
-        ),
+        "End with exit code 4 where the answer is no, or with 0 all the same; results are written.",
+        Opt("--strict/--no-strict"),
     ] = True,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
@@ -198,14 +165,10 @@ def run(
 def detect(
     images: Images,
     camera: OptionalCamera = None,
-    out: Annotated[Path, typer.Option("--out", help="Write detections.csv and overlays/ to this folder.")] = Path(
-        "detect"
-    ),
+    out: Annotated[Path, "Write detections.csv and overlays/ to this folder."] = Path("detect"),
     target: TargetFile = None,
     board: BoardFile = None,
-    solve: Annotated[
-        Solve | None, typer.Option(help="Detect as `run` does with the same option: paper, by the published rules.")
-    ] = None,
+    solve: Annotated[Solve | None, "Detect as `run` does with the same option: paper, by the published rules."] = None,
     exclude: Exclude = None,
     min_diameter: MinDiameter = None,
     max_diameter: MaxDiameter = 450.0,
@@ -267,13 +230,8 @@ def verify(run: Run, out: JsonFile = None) -> None:
 @app.command()
 def report(
     run: Run,
-    pdf: Annotated[
-        bool, typer.Option("--pdf", help="Also write the page as PDF, beside it (needs the extra `pdf`).")
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", writable=True, help="Write the page to this file (HTML), not into the run's folder."),
-    ] = None,
+    pdf: Annotated[bool, "Also write the page as PDF, beside it (needs the extra `pdf`)."] = False,
+    out: Annotated[Path | None, "Write the page to this file (HTML), not into the run's folder.", WRITES] = None,
 ) -> None:
     """Write the report of a finished run again, from the files in its folder: the page, and a PDF of it."""
     from stcal.sfm.runs.folder import report_again
