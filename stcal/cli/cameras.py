@@ -1,8 +1,7 @@
 """Commands ``stcal camera``: camera files of other programs are shown, converted and compared."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -23,19 +22,10 @@ app = typer.Typer(
 )
 
 
-class Form(StrEnum):
-    """Format of a camera file."""
-
-    colmap = "colmap"
-    colmap_bin = "colmap-bin"
-    opencv = "opencv"
-    ros = "ros"
-    kalibr = "kalibr"
-    mrcal = "mrcal"
-    metashape = "metashape"
-    metashape_cameras = "metashape-cameras"
-    matlab = "matlab"
-    zhang = "zhang"
+Form = Literal[
+    "colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab", "zhang"
+]
+"""Format of a camera file."""
 
 
 NameOption = Annotated[str, "Choose this camera of a file of several, such as cam1 or 2; and write this name."]
@@ -58,7 +48,7 @@ def convert(
     """Convert a camera file to the form of another program, and say what that has no place for."""
     from stcal.io.cameras.write import form_of, save_camera
 
-    kind = form_of(out, form.value if form else None)
+    kind = form_of(out, form)
     camera = _camera(source, name, size)
     lost = save_camera(out, camera, kind, name)
     say(f"{source}: {camera.colmap_model}, {camera.width}×{camera.height} px; written as {kind}")

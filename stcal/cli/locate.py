@@ -1,23 +1,13 @@
 """Commands ``stcal locate``: a planar target of several tags is calibrated, located under any light, and judged."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
+from stcal.cli import options as shared
 from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.options import (
-    CameraFile,
-    FlatBoardFile,
-    JsonFile,
-    LayoutFile,
-    QuaternionOrder,
-    Quaternions,
-    ReportFile,
-    Workers,
-)
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 
@@ -30,11 +20,8 @@ app = typer.Typer(
 NOTHING_ACCEPTED = 3
 
 
-class MethodName(StrEnum):
-    """Name of the method that finds and judges the pose."""
-
-    joint = "joint"
-    patent = "patent"
+MethodName = Literal["joint", "patent"]
+"""Name of the method that finds and judges the pose."""
 
 
 @app.command()
@@ -95,12 +82,12 @@ def capture(
 @app.command()
 def calibrate(
     images: Annotated[Path, "Read photographs of the target with a board in the same plane from this folder.", Arg()],
-    camera: CameraFile,
-    board: FlatBoardFile,
-    layout: LayoutFile,
+    camera: shared.CameraFile,
+    board: shared.FlatBoardFile,
+    layout: shared.LayoutFile,
     out: Annotated[Path, "Write the calibrated layout to this file (TOML).", WRITES] = Path("calibrated.toml"),
-    workers: Workers = None,
-    json_file: JsonFile = None,
+    workers: shared.Workers = None,
+    json_file: shared.JsonFile = None,
 ) -> None:
     """Find where the corners of the target's tags lie, with σ, in a frame in the middle of the layout's origin tag."""
     from stcal.boards.file import load_flat_board
@@ -128,12 +115,12 @@ def run(
     exposures: Annotated[
         Path, "Read one image, a folder of exposures of one scene, or a folder of such folders.", Arg()
     ],
-    layout: LayoutFile,
-    camera: CameraFile,
+    layout: shared.LayoutFile,
+    camera: shared.CameraFile,
     out: Annotated[Path | None, "Write the accepted poses to this file (CSV).", WRITES] = None,
     method: Annotated[
         MethodName, "Use joint, all exposures together, or patent, each by itself as published."
-    ] = MethodName.joint,
+    ] = "joint",
     hand_eye: Annotated[Path | None, "Add poses in the robot's base by this result of `stcal handeye` (JSON)."] = None,
     robot_poses: Annotated[Path | None, "Read base_from_flange of each scene from this file (CSV)."] = None,
     key: Annotated[str, "Match scenes and rows of --robot-poses by this column."] = "scene",
@@ -142,7 +129,7 @@ def run(
         Path | None,
         "Add poses in the robot's base by this result of `stcal register` (JSON): a the camera, b the base.",
     ] = None,
-    quaternions: Quaternions = QuaternionOrder.wxyz,
+    quaternions: shared.Quaternions = "wxyz",
     offset: Annotated[
         Path | None, "Add goal poses by obj_from_goal, 4×4 in the target's frame, of this file (JSON)."
     ] = None,
@@ -169,8 +156,8 @@ def run(
     e_lim_px: Annotated[float, "Set the patent's limit of the error, px, for --method patent."] = 1.0,
     e_ratio: Annotated[float, "Set the patent's limit of the errors' ratio, for --method patent."] = 2.0,
     workers: Annotated[int | None, "Use this many threads; one per core if not given.", Opt(min=1, max=1024)] = None,
-    json_file: JsonFile = None,
-    report: ReportFile = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
 ) -> None:
     """Find the pose of the target in each scene, with its 6×6 covariance, and accept, ambiguous or reject.
 
@@ -202,7 +189,7 @@ def run(
             "--offset: only with --hand-eye or --registration, which lead from the camera to the robot",
         )
     if hand_eye:
-        chain = read_chain(hand_eye, robot_poses, offset, quaternions.value, key, columns)
+        chain = read_chain(hand_eye, robot_poses, offset, quaternions, key, columns)
     elif registration:
         chain = read_registered(registration, offset)
     target, model = load_layout(layout), read_camera(camera)
@@ -225,7 +212,7 @@ def run(
             "E-ROBOT-POSES-SCENE",
             f"robot poses {robot_poses}: none of scene {missing[0]}; add a row, or take the scene away",
         )
-    results = list(located(scenes, target, model, LocateOptions(method.value, limits, patent, moved_px, workers)))
+    results = list(located(scenes, target, model, LocateOptions(method, limits, patent, moved_px, workers)))
     doubts = on_chain(chain, {each.name: uncertain(each) for each in accepted(results)}) if chain else ()
     document = run_report(results, scenes, target, model, chain)
     say(document.text())

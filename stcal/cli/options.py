@@ -6,10 +6,9 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
-from enum import StrEnum
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -88,11 +87,8 @@ Scheduler = Annotated[
 SendImages = Annotated[bool, "Send the images' content to the cluster, whose machines do not see their folder."]
 
 
-class QuaternionOrder(StrEnum):
-    """Order of the four columns of a quaternion."""
-
-    wxyz = "wxyz"
-    xyzw = "xyzw"
+QuaternionOrder = Literal["wxyz", "xyzw"]
+"""Order of the four columns of a quaternion."""
 
 
 Quaternions = Annotated[

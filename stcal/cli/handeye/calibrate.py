@@ -2,41 +2,12 @@
 
 import math
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
+from stcal.cli import options as shared
 from stcal.cli.declare import WRITES, Opt
-from stcal.cli.handeye.inputs import (
-    LengthUnit,
-    OwnBoard,
-    OwnCamera,
-    PosesAre,
-    PosesFile,
-    RotationOption,
-    SetupName,
-    SetupOption,
-    SourceFile,
-    TimeTolerance,
-    source_of,
-)
-from stcal.cli.options import (
-    MOST_SEED,
-    ColumnsFile,
-    FirstColumns,
-    FirstTable,
-    JsonFile,
-    Key,
-    QuaternionOrder,
-    Quaternions,
-    ReportFile,
-    SecondTable,
-    Strict,
-    Workers,
-    exports_of,
-    require_new,
-    require_passed,
-)
+from stcal.cli.handeye import inputs as params
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 from stcal.io.files import keep_apart
@@ -54,22 +25,19 @@ SCALED = ("pose", "reprojection")
 """Methods that can find the board's size."""
 
 
-class CameraFrameName(StrEnum):
-    """Name of one of ROS's two frames of a camera."""
-
-    optical = "optical"
-    link = "link"
+CameraFrameName = Literal["optical", "link"]
+"""Name of one of ROS's two frames of a camera."""
 
 
 def handeye(
-    source: SourceFile = None,
-    poses: PosesFile = None,
-    camera: OwnCamera = None,
-    board: OwnBoard = None,
-    setup: SetupOption = None,
-    rotation: RotationOption = None,
-    length_unit: LengthUnit = None,
-    poses_are: PosesAre = None,
+    source: params.SourceFile = None,
+    poses: params.PosesFile = None,
+    camera: params.OwnCamera = None,
+    board: params.OwnBoard = None,
+    setup: params.SetupOption = None,
+    rotation: params.RotationOption = None,
+    length_unit: params.LengthUnit = None,
+    poses_are: params.PosesAre = None,
     dry_run: Annotated[bool, "Print what was understood of the files, and solve and write nothing."] = False,
     method: Annotated[
         str | None,
@@ -112,7 +80,7 @@ def handeye(
         int | None, "Hold out so many poses in each split; a quarter if not given.", Opt(min=1, max=100_000)
     ] = None,
     splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
-    seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
     time_offset: Annotated[
         bool, "Find the offset of the robot's clock from the camera's, of poses by time, and use it."
     ] = False,
@@ -122,7 +90,7 @@ def handeye(
     times_columns: Annotated[
         Path | None, "Read --image-times with the columns, delimiter … of this file (TOML)."
     ] = None,
-    time_tolerance: TimeTolerance = 0.02,
+    time_tolerance: params.TimeTolerance = 0.02,
     motions_held_out: Annotated[
         int | None,
         "Hold out so many last motions and predict them by the solution of those before, as the paper on "
@@ -145,7 +113,7 @@ def handeye(
         CameraFrameName,
         "Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with the optical "
         "frame in it.",
-    ] = CameraFrameName.optical,
+    ] = "optical",
     camera_out: Annotated[
         Path | None, "Write the camera of --refine-camera with σ to this file (cameras.txt).", WRITES
     ] = None,
@@ -165,17 +133,17 @@ def handeye(
         float | None, "Multiply translations, m, squared by λ; 1, the paper's.", Opt(min=1e-12, max=1e12)
     ] = None,
     de_generations: Annotated[int | None, "End after these; 100, the paper's.", Opt(min=0, max=100_000)] = None,
-    de_seed: Annotated[int | None, "Draw the population with this seed.", Opt(min=0, max=MOST_SEED)] = None,
-    first: FirstTable = None,
-    second: SecondTable = None,
-    key: Key = "image",
-    columns: ColumnsFile = None,
-    columns_a: FirstColumns = None,
-    quaternions: Quaternions = QuaternionOrder.wxyz,
-    workers: Workers = None,
-    json_file: JsonFile = None,
-    report: ReportFile = None,
-    strict: Strict = False,
+    de_seed: Annotated[int | None, "Draw the population with this seed.", Opt(min=0, max=shared.MOST_SEED)] = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "image",
+    columns: shared.ColumnsFile = None,
+    columns_a: shared.FirstColumns = None,
+    quaternions: shared.Quaternions = "wxyz",
+    workers: shared.Workers = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
+    strict: shared.Strict = False,
 ) -> None:
     """Find where a camera sits on a robot's flange, or in its base, and how well that is known."""
     from stcal.handeye import HandEyeOptions, Noise
@@ -201,17 +169,17 @@ def handeye(
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
-    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
+    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup)
     if times_columns is not None and image_times is None:
         raise InputError("E-OPTION-NEEDS", f"--times-columns {times_columns}: of times of images; give --image-times")
     timing = Timing(time_tolerance, image_times, time_offset, times_columns)
-    pairs = source_of(source, first, second, key, statements, quaternions.value, timing, columns, columns_a)
+    pairs = params.source_of(source, first, second, key, statements, quaternions, timing, columns, columns_a)
     folder = isinstance(pairs, Path) and pairs.is_dir()
     statements = replace(statements, columns=columns) if folder else statements
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None
-    exports = exports_of(export or [], require_form)
+    exports = shared.exports_of(export or [], require_form)
     written = {"--out": out, "--ros": ros, "--urdf": urdf, "--opencv": opencv, "--camera-out": camera_out}
     written |= {"--robot-out": robot_out}
     written |= {"--json": json_file, "--report": report}
@@ -221,8 +189,8 @@ def handeye(
         [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
         [(name, path) for name, path in read.items() if path],
     )
-    require_new([("--export", path) for _, path in exports])
-    _require_frames(ros or urdf, exports, (setup or SetupName.in_hand).value, parent, child, camera_frame.value)
+    shared.require_new([("--export", path) for _, path in exports])
+    _require_frames(ros or urdf, exports, setup or "eye-in-hand", parent, child, camera_frame)
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
             "E-OPTION-NEEDS",
@@ -244,11 +212,11 @@ def handeye(
         seed=de_seed,
     )
     if dry_run:
-        say("\n".join(understood(pairs, poses, camera, board, quaternions.value, statements, timing, robot_model)))
+        say("\n".join(understood(pairs, poses, camera, board, quaternions, statements, timing, robot_model)))
         return
     with StageProgress() as progress:
         inputs = read_input(
-            pairs, poses, camera, board, workers, progress, quaternions.value, statements, timing, robot_model
+            pairs, poses, camera, board, workers, progress, quaternions, statements, timing, robot_model
         )
         for line in inputs.understood:
             say(line)
@@ -278,15 +246,15 @@ def handeye(
         say(f"left out {name}: {reason}")
     print_each("note", outcome.all_notes())
     write_if(out, lambda: HandEyeFile.of(outcome))
-    write_if(ros, lambda: ros_yaml(result, parent, child, camera_frame.value))
-    write_if(urdf, lambda: urdf_joint(result, parent, child, camera_frame.value))
+    write_if(ros, lambda: ros_yaml(result, parent, child, camera_frame))
+    write_if(urdf, lambda: urdf_joint(result, parent, child, camera_frame))
     write_if(opencv, lambda: opencv_yaml(result))
     for path, kind in ((out, "json"), (ros, "ros"), (urdf, "urdf"), (opencv, "opencv")):
         if path:
-            require_export_written(path, kind, result, parent, child, camera_frame.value)
+            require_export_written(path, kind, result, parent, child, camera_frame)
     write_if(report, document.page)
     for form, path in exports:
-        write(path, text := exported(result, form, path.stem, parent, child, camera_frame.value))
+        write(path, text := exported(result, form, path.stem, parent, child, camera_frame))
         require_same(path, path.read_text, text)  # which gave the transform back
     if camera_out:
         _save_camera(camera_out, outcome)
@@ -294,7 +262,7 @@ def handeye(
         save_robot(robot_out, inputs.arm.identified(result.reprojection.arm))
         say(f"written: {robot_out}")
     write_if(json_file, lambda: HandEyeFile.of(outcome, whole=True))
-    require_passed(strict, judged(outcome).failed(), report)
+    shared.require_passed(strict, judged(outcome).failed(), report)
 
 
 def _require_arm(

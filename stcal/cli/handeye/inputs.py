@@ -1,8 +1,7 @@
 """Inputs of the commands of hand-eye, and their options."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from stcal.cli.declare import Arg, Opt
 from stcal.cli.options import one_table
@@ -14,11 +13,8 @@ if TYPE_CHECKING:
     from stcal.workflows.handeye.times import Timing
 
 
-class SetupName(StrEnum):
-    """Name of the setup, by the carrier of the camera."""
-
-    in_hand = "eye-in-hand"
-    to_hand = "eye-to-hand"
+SetupName = Literal["eye-in-hand", "eye-to-hand"]
+"""Name of the setup, by the carrier of the camera."""
 
 
 SourceFile = Annotated[

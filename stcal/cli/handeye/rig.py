@@ -3,18 +3,9 @@
 from pathlib import Path
 from typing import Annotated
 
+from stcal.cli import options as shared
 from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.handeye.inputs import LengthUnit, PosesAre, RotationOption, TimeTolerance
-from stcal.cli.options import (
-    MOST_SEED,
-    JsonFile,
-    QuaternionOrder,
-    Quaternions,
-    ReportFile,
-    Strict,
-    Workers,
-    require_passed,
-)
 from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.io.files import keep_apart
 
@@ -30,7 +21,7 @@ def rig(
     rotation: RotationOption = None,
     length_unit: LengthUnit = None,
     poses_are: PosesAre = None,
-    quaternions: Quaternions = QuaternionOrder.wxyz,
+    quaternions: shared.Quaternions = "wxyz",
     time_tolerance: TimeTolerance = 0.02,
     held_out: Annotated[
         int | None,
@@ -38,12 +29,12 @@ def rig(
         Opt(min=1, max=100_000),
     ] = None,
     splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
-    seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
     out: Annotated[Path | None, "Write the result to this file (JSON).", WRITES] = None,
-    workers: Workers = None,
-    json_file: JsonFile = None,
-    report: ReportFile = None,
-    strict: Strict = False,
+    workers: shared.Workers = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
+    strict: shared.Strict = False,
 ) -> None:
     """Find where several cameras sit on one flange, or in one base, and in each other, from one adjustment."""
     from stcal.handeye.data.formats.record import Said
@@ -59,7 +50,7 @@ def rig(
     keep_apart([(name, path) for name, path in written.items() if path], files.read())
     statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], None)
     with StageProgress() as progress:
-        inputs = read_rig(files, workers, progress, quaternions.value, statements, time_tolerance)
+        inputs = read_rig(files, workers, progress, quaternions, statements, time_tolerance)
         print_each("understood", inputs.understood)
         validation = Splits(splits, held_out, seed, workers)
         outcome = calibrate_rig(inputs, refine_camera, with_scale, validation, progress)
@@ -71,4 +62,4 @@ def rig(
     write_if(out, lambda: HandEyeRigFile.of(outcome))
     write_if(report, document.page)
     write_if(json_file, lambda: HandEyeRigFile.of(outcome, whole=True))
-    require_passed(strict, rig_judged(outcome).failed(), report)
+    shared.require_passed(strict, rig_judged(outcome).failed(), report)

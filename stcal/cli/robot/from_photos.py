@@ -25,7 +25,7 @@ def from_photos(
     ] = None,
     target: TargetFile = None,
     board: Annotated[Path | None, "Tell the dots of the board of this board.toml apart, if it is in view."] = None,
-    model: Annotated[Model, "Take the arm as rigid, or as elastic; auto chooses by rows held out."] = Model.rigid,
+    model: Annotated[Model, "Take the arm as rigid, or as elastic; auto chooses by rows held out."] = "rigid",
     partial: Annotated[bool, "Keep parameters nominal that the photographs leave open."] = False,
     key: Annotated[str, "Match photographs and joint values by this column."] = "image",
     columns: Annotated[Path | None, "Read --joints with the columns, delimiter … of this file (TOML)."] = None,
@@ -57,7 +57,7 @@ def from_photos(
             load_board(board) if board else None,
             key,
             MeasureOptions(workers=workers),
-            IdentifyOptions(model=model.value, partial=partial),
+            IdentifyOptions(model=model, partial=partial),
             progress,
             columns,
         )

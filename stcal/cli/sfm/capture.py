@@ -6,22 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stcal.cli import options as shared
 from stcal.cli.declare import Arg, Opt
-from stcal.cli.options import (
-    MOST_SEED,
-    BoardFile,
-    CameraFile,
-    JsonFile,
-    MaxDiameter,
-    MinDiameter,
-    PlateMargin,
-    Run,
-    TargetFile,
-    Workers,
-    designs_told,
-    ellipse_options,
-    load_ahead,
-)
 from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.errors import InputError
 
@@ -42,9 +28,9 @@ def plan(
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     noise: Annotated[float | None, "Assume this σ of every centre, px.", Opt(min=1e-5, max=10)] = None,
     run: Annotated[Path | None, "Take the σ of centres from the finished run in this folder."] = None,
-    target: TargetFile = None,
+    target: shared.TargetFile = None,
     faces: Annotated[Path | None, "Place the faces of --target as in this faces.json of an earlier run."] = None,
-    board: BoardFile = None,
+    board: shared.BoardFile = None,
     groups: Annotated[
         str | None, "Photograph these pairs of faces together, such as 12,14,15,23 or front-right,front-top."
     ] = None,
@@ -52,9 +38,9 @@ def plan(
     one_board: Annotated[
         bool, "Use one plate in all groups, or a new print for each.", Opt("--one-board/--own-boards")
     ] = True,
-    seed: Annotated[int, "Place board and cameras at random with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
-    margin: PlateMargin = 15.0,
-    out: JsonFile = None,
+    seed: Annotated[int, "Place board and cameras at random with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    margin: shared.PlateMargin = 15.0,
+    out: shared.JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
     from stcal.boards.target import body_of
@@ -96,7 +82,7 @@ def plan(
         seed,
         margin,
     )
-    with designs_told(target, board):
+    with shared.designs_told(target, board):
         nominal = nominal_poses(design, faces)
         result = plan_body(options, design, nominal) if printed else planned(options, design, board_of(board), nominal)
     say(plan_text(result, source))
@@ -105,12 +91,12 @@ def plan(
 
 @app.command()
 def advise(
-    run: Run,
+    run: shared.Run,
     count: Annotated[int, "Advise this many views.", Opt(min=1, max=50)] = 5,
-    out: JsonFile = None,
+    out: shared.JsonFile = None,
 ) -> None:
     """Compute from a run's own geometry which further photographs would lower the σ of its worst face most."""
-    load_ahead(None)
+    shared.load_ahead(None)
     from stcal.sfm.planning.advise import advise as advice_for
     from stcal.sfm.planning.advise import doubts, known_of
     from stcal.sfm.planning.file import AdviceFile, advice_text
@@ -131,10 +117,10 @@ def watch(
     images: Annotated[
         Path, "Follow this folder, IMAGES/<group>/*.jpg, png, tif, bmp; it may be empty at first.", Arg()
     ],
-    camera: CameraFile,
+    camera: shared.CameraFile,
     out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
-    target: TargetFile = None,
-    board: BoardFile = None,
+    target: shared.TargetFile = None,
+    board: shared.BoardFile = None,
     interval: Annotated[
         float, "Look at the folder so often, s; files must stand still for it.", Opt(min=0.1, max=3600)
     ] = 1.0,
@@ -143,24 +129,24 @@ def watch(
     ] = None,
     views: Annotated[int, "Compute so many views that would help; 0 for none.", Opt(min=0, max=50)] = 1,
     refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
-    min_diameter: MinDiameter = None,
-    max_diameter: MaxDiameter = 450.0,
-    workers: Workers = None,
+    min_diameter: shared.MinDiameter = None,
+    max_diameter: shared.MaxDiameter = 450.0,
+    workers: shared.Workers = None,
 ) -> None:
     """Calibrate while photographs are taken: after each, what was found, the worst σ so far and the view that would
     help most. RUN/report.html is kept up to date and reloads itself."""
-    load_ahead(workers)
+    shared.load_ahead(workers)
     from stcal.sfm.runs.options import RunOptions
     from stcal.workflows.watch import WatchOptions
     from stcal.workflows.watch import watch as updates
 
     run_options = RunOptions(
-        refine_camera=refine_camera, ellipses=ellipse_options(min_diameter, max_diameter), workers=workers
+        refine_camera=refine_camera, ellipses=shared.ellipse_options(min_diameter, max_diameter), workers=workers
     )
     options = WatchOptions(interval, idle, views, run_options)
     say(f"watching {images}; report: {out / 'report.html'}")
     sys.stdout.flush()
-    with designs_told(target, board):
+    with shared.designs_told(target, board):
         for update in updates(images, camera, out, target, board, options):
             _say_update(update)
 
@@ -186,11 +172,11 @@ def _say_update(update: "Update") -> None:
 @app.command()
 def capture(
     images: Annotated[Path, "Write photographs to this folder, IMAGES/<group>/IMG_0001.png; earlier ones stay.", Arg()],
-    camera: CameraFile,
+    camera: shared.CameraFile,
     out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
     group: Annotated[str, "Name the group like this; between its photographs only the camera may move."],
-    target: TargetFile = None,
-    board: BoardFile = None,
+    target: shared.TargetFile = None,
+    board: shared.BoardFile = None,
     device: Annotated[str, "Use this camera: a number, or a place such as /dev/video0 (V4L2, UVC)."] = "0",
     exposure: Annotated[
         float | None,
@@ -214,27 +200,27 @@ def capture(
     ] = None,
     views: Annotated[int, "Compute so many views that would help; 0 for none.", Opt(min=0, max=50)] = 1,
     refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
-    min_diameter: MinDiameter = None,
-    max_diameter: MaxDiameter = 450.0,
-    workers: Workers = None,
+    min_diameter: shared.MinDiameter = None,
+    max_diameter: shared.MaxDiameter = 450.0,
+    workers: shared.Workers = None,
 ) -> None:
     """Take photographs with a camera of this machine and calibrate meanwhile: after each, what was found, blur,
     saturation, the worst σ so far and the view that would help most."""
-    load_ahead(workers)
+    shared.load_ahead(workers)
     from stcal.io.device import OpenCVSource, SimulatedSource
     from stcal.sfm.runs.options import RunOptions
     from stcal.workflows.capture import Trigger, photograph
     from stcal.workflows.watch import Growing, WatchOptions
 
     run_options = RunOptions(
-        refine_camera=refine_camera, ellipses=ellipse_options(min_diameter, max_diameter), workers=workers
+        refine_camera=refine_camera, ellipses=shared.ellipse_options(min_diameter, max_diameter), workers=workers
     )
     growing = Growing.of(images, camera, out, target, board, WatchOptions(views=views, run=run_options))
     source = SimulatedSource(simulate, gain) if simulate else OpenCVSource(device, gain, exposure is not None)
     trigger = Trigger(count, every, sys.stdin, lambda text: (say(text), sys.stdout.flush()))
     try:
         say(f"{source.name}; report: {out / 'report.html'}")
-        with designs_told(target, board):
+        with shared.designs_told(target, board):
             for photo in photograph(source, growing, group, exposure, settle, trigger.ready):
                 say(f"taken {photo.name}: {photo.light()}")
                 _say_update(photo.update)

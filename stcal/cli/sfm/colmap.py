@@ -1,8 +1,7 @@
 """Commands ``stcal-sfm`` for the exchange with COLMAP and other programs, and for images and circles left out."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -14,11 +13,8 @@ from stcal.errors import InputError, MappingError
 app = typer.Typer()
 
 
-class Chained(StrEnum):
-    """Way in which the faces of single groups are combined."""
-
-    chain = "chain"
-    paper = "paper"
+Chained = Literal["chain", "paper"]
+"""Way in which the faces of single groups are combined."""
 
 
 SHOWN_PAIRS = 10
@@ -128,7 +124,7 @@ def faces(
         Chained,
         "Solve by chain, every way to a face weighed, or as in the paper: λ by rows, three-point frames, single "
         "transforms.",
-    ] = Chained.chain,
+    ] = "chain",
 ) -> None:
     """Find scale and faces from a COLMAP model made or edited elsewhere; labels come by (image, keypoint)."""
     from stcal.sfm.interop.crosscheck import faces_text
@@ -138,10 +134,10 @@ def faces(
     if out is not None and not out.parent.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{out}: no folder {out.parent}; make it, or give another place with --out")
     saved = load_run(run)
-    calibration = calibrate_models(model, saved, solve.value)
+    calibration = calibrate_models(model, saved, solve)
     say(faces_text(calibration, saved))
     if out is not None:
-        write_faces(out, calibration, saved, solve.value)
+        write_faces(out, calibration, saved, solve)
         say(f"faces: {out}")
 
 

@@ -2,10 +2,9 @@
 
 import os
 from dataclasses import replace
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -21,9 +20,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-class TagBody(StrEnum):
-    cube = "cube"
-    dodecahedron = "dodecahedron"
+TagBody = Literal["cube", "dodecahedron"]
 
 
 CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"
@@ -147,7 +144,7 @@ def _tag_body(path: Path, kind: TagBody, size: str, tags: "tuple[str, int]", pla
     from stcal.sfm.planning.noise import expected_noise
     from stcal.synthetic.designs import made_text, tag_body
 
-    target = tag_body(kind.value, size, *tags)
+    target = tag_body(kind, size, *tags)
     noise, source = expected_noise(of_corners=True)
     forecast = plan_body(replace(planned, noise=noise), target, target.rough_poses())
     save_body(path, target)

@@ -8,23 +8,8 @@ from typing import Annotated
 
 import typer
 
+from stcal.cli import options as shared
 from stcal.cli.declare import WRITES, Arg, Opt
-from stcal.cli.options import (
-    CameraFile,
-    MaxDiameter,
-    MinDiameter,
-    ReportFile,
-    Scheduler,
-    SendImages,
-    Strict,
-    TargetFile,
-    Workers,
-    designs_told,
-    ellipse_options,
-    handed_over,
-    load_ahead,
-    require_passed,
-)
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 
@@ -33,12 +18,12 @@ app = typer.Typer()
 
 @app.command()
 def measure(
-    camera: CameraFile,
+    camera: shared.CameraFile,
     faces: Annotated[Path, "Read the calibrated target from this faces.json."],
     images: Annotated[
         Path | None, "Read the images of this folder and of its subfolders; none with --serve.", Arg()
     ] = None,
-    target: TargetFile = None,
+    target: shared.TargetFile = None,
     out: Annotated[Path, "Write the table of poses to this file (CSV).", WRITES] = Path("poses.csv"),
     json_file: Annotated[
         Path | None,
@@ -46,7 +31,7 @@ def measure(
         "output with `-`.",
         Opt("--json", writes=True),
     ] = None,
-    report: ReportFile = None,
+    report: shared.ReportFile = None,
     joints: Annotated[
         Path | None, "Add to the table the columns of this file, joint values say; it needs a column image (CSV)."
     ] = None,
@@ -63,12 +48,12 @@ def measure(
         "Multiply the centres' σ by this; by the factor of faces.json if not given.",
         Opt(min=1e-3, max=1e3),
     ] = None,
-    strict: Strict = False,
-    min_diameter: MinDiameter = None,
-    max_diameter: MaxDiameter = 450.0,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    send_images: SendImages = False,
+    strict: shared.Strict = False,
+    min_diameter: shared.MinDiameter = None,
+    max_diameter: shared.MaxDiameter = 450.0,
+    workers: shared.Workers = None,
+    scheduler: shared.Scheduler = None,
+    send_images: shared.SendImages = False,
     serve: Annotated[
         bool, "Answer images that programs send over HTTP, POST /measure, with a JSON each, until Ctrl-C."
     ] = False,
@@ -94,14 +79,14 @@ def measure(
                 "E-OPTION-CONFLICT",
                 f"--serve and {conflicting[0]}: images come over HTTP, one answer each; leave {conflicting[0]} out",
             )
-        ellipses = ellipse_options(min_diameter, max_diameter)
+        ellipses = shared.ellipse_options(min_diameter, max_diameter)
         _serve(camera, faces, target, board, sigma_factor, ellipses, (host, port, max_megabytes, token), workers)
         return
     if images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, or --serve")
     if columns is not None and joints is None:
         raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of joint values; give it with --joints")
-    load_ahead(workers)
+    shared.load_ahead(workers)
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
@@ -118,10 +103,14 @@ def measure(
     circles = read_target(faces, design)
     table = table_of(joints, columns, "joints") if joints else None
     options = work.MeasureOptions(
-        PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipse_options(min_diameter, max_diameter), workers
+        PoseOptions(sigma_factor=sigma_factor),
+        previous,
+        sequence,
+        shared.ellipse_options(min_diameter, max_diameter),
+        workers,
     )
-    told = designs_told(target, board, with_board=False)
-    with told, handed_over(scheduler, send_images), StageProgress() as progress:
+    told = shared.designs_told(target, board, with_board=False)
+    with told, shared.handed_over(scheduler, send_images), StageProgress() as progress:
         result = work.measure(
             images, read_camera(camera), circles, design, load_board(board) if board else None, options, progress
         )
@@ -134,7 +123,7 @@ def measure(
     write_if(json_file, lambda: output.poses_file(result), "as JSON")
     write_if(report, document.page, "report")
     failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
-    require_passed(strict, [f"χ² of {name}" for name in failed], report)
+    shared.require_passed(strict, [f"χ² of {name}" for name in failed], report)
 
 
 def _serve(camera, faces, target, board, sigma_factor, ellipses, listen, workers) -> None:

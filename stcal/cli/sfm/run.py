@@ -1,30 +1,12 @@
 """Commands ``stcal-sfm run``, ``detect``, ``verify`` and ``report``: calibration of the target from images."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
+from stcal.cli import options as shared
 from stcal.cli.declare import WRITES, Opt
-from stcal.cli.options import (
-    BoardFile,
-    Exclude,
-    Images,
-    JsonFile,
-    MaxDiameter,
-    MinDiameter,
-    OptionalCamera,
-    Run,
-    Scheduler,
-    SendImages,
-    TargetFile,
-    Workers,
-    designs_told,
-    ellipse_options,
-    handed_over,
-    load_ahead,
-)
 from stcal.cli.terminal import StageProgress, print_each, say, verbose, write_if
 from stcal.errors import ChecksFailed, InputError
 from stcal.io.files import keep_apart
@@ -32,41 +14,29 @@ from stcal.io.files import keep_apart
 app = typer.Typer()
 
 
-class Frame(StrEnum):
-    """Definition of a face's frame."""
-
-    plane = "plane"
-    three_point = "three-point"
+Frame = Literal["plane", "three-point"]
+"""Definition of a face's frame."""
 
 
-class PairsChoice(StrEnum):
-    """Choice of the pairs of images that are matched."""
-
-    all = "all"
-    sparse = "sparse"
+PairsChoice = Literal["all", "sparse"]
+"""Choice of the pairs of images that are matched."""
 
 
-class ComparedWith(StrEnum):
-    """Method with which a run's result is compared."""
-
-    paper = "paper"
+ComparedWith = Literal["paper"]
+"""Method with which a run's result is compared."""
 
 
-class Solve(StrEnum):
-    """Way in which the groups are solved."""
-
-    joint = "joint"
-    chain = "chain"
-    paper = "paper"
+Solve = Literal["joint", "chain", "paper"]
+"""Way in which the groups are solved."""
 
 
 @app.command()
 def run(
-    images: Images,
+    images: shared.Images,
     out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
-    camera: OptionalCamera = None,
-    target: TargetFile = None,
-    board: BoardFile = None,
+    camera: shared.OptionalCamera = None,
+    target: shared.TargetFile = None,
+    board: shared.BoardFile = None,
     solve: Annotated[
         Solve | None,
         "Use joint, one adjustment over all groups, the default; chain, group by group; or paper, all of Zhang "
@@ -103,7 +73,7 @@ def run(
         "Match all pairs of images, or sparse, as many as hold every circle together; sparse above 80 images if "
         "not given.",
     ] = None,
-    exclude: Exclude = None,
+    exclude: shared.Exclude = None,
     expect_faces: Annotated[
         str | None,
         "Answer no where one of these faces, such as 1,2, is not in the result; those that the groups are named "
@@ -115,14 +85,14 @@ def run(
         "End with exit code 4 where the answer is no, or with 0 all the same; results are written.",
         Opt("--strict/--no-strict"),
     ] = True,
-    min_diameter: MinDiameter = None,
-    max_diameter: MaxDiameter = 450.0,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    send_images: SendImages = False,
+    min_diameter: shared.MinDiameter = None,
+    max_diameter: shared.MaxDiameter = 450.0,
+    workers: shared.Workers = None,
+    scheduler: shared.Scheduler = None,
+    send_images: shared.SendImages = False,
 ) -> None:
     """Calibrate the target: detect, map, scale, chain and adjust; writes faces.json and report.html."""
-    load_ahead(workers)
+    shared.load_ahead(workers)
     import numpy as np
 
     from stcal.sfm import pipeline
@@ -131,23 +101,23 @@ def run(
     from stcal.sfm.runs.text import found_lines, run_text
 
     options = RunOptions(
-        solve=solve.value if solve is not None else None,
-        frame=frame.value if frame is not None else None,
+        solve=solve,
+        frame=frame,
         eccentricity=eccentricity,
         reference_face=reference_face,
         flatness_mm=_flatness(flatness),
         refine_camera=refine_camera,
         rim=rim,
         board_only=board_only,
-        compare=compare.value if compare is not None else None,
-        graph=pairs.value if pairs is not None else None,
+        compare=compare,
+        graph=pairs,
         pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),
-        ellipses=ellipse_options(min_diameter, max_diameter),
+        ellipses=shared.ellipse_options(min_diameter, max_diameter),
         workers=workers,
         exclude=tuple(exclude or ()),
         expect_faces=tuple(face.strip() for face in (expect_faces or "").split(",") if face.strip()),
     )
-    with designs_told(target, board), handed_over(scheduler, send_images), StageProgress() as progress:
+    with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as progress:
         result = pipeline.run(images, camera, out, target, board, options, progress)
     if verbose():
         say("\n".join(found_lines(result.labelled)))
@@ -163,21 +133,21 @@ def run(
 
 @app.command()
 def detect(
-    images: Images,
-    camera: OptionalCamera = None,
+    images: shared.Images,
+    camera: shared.OptionalCamera = None,
     out: Annotated[Path, "Write detections.csv and overlays/ to this folder."] = Path("detect"),
-    target: TargetFile = None,
-    board: BoardFile = None,
+    target: shared.TargetFile = None,
+    board: shared.BoardFile = None,
     solve: Annotated[Solve | None, "Detect as `run` does with the same option: paper, by the published rules."] = None,
-    exclude: Exclude = None,
-    min_diameter: MinDiameter = None,
-    max_diameter: MaxDiameter = 450.0,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    send_images: SendImages = False,
+    exclude: shared.Exclude = None,
+    min_diameter: shared.MinDiameter = None,
+    max_diameter: shared.MaxDiameter = 450.0,
+    workers: shared.Workers = None,
+    scheduler: shared.Scheduler = None,
+    send_images: shared.SendImages = False,
 ) -> None:
     """Detect circles alone: detections.csv and an overlay picture of every image."""
-    load_ahead(workers)
+    shared.load_ahead(workers)
     from stcal.boards.file import run_board_of as board_of
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
@@ -190,8 +160,8 @@ def detect(
     target_design = body_of(target)
     board_design = None if board is None and target_design.has_scale else board_of(board)
     options = RunOptions(
-        solve=solve.value if solve is not None else None,
-        ellipses=ellipse_options(min_diameter, max_diameter),
+        solve=solve,
+        ellipses=shared.ellipse_options(min_diameter, max_diameter),
         workers=workers,
         exclude=tuple(exclude or ()),
     )
@@ -205,8 +175,8 @@ def detect(
         print_each("note", ["no --camera: a lens is assumed, and centres are good for a look, not for measuring"])
     inputs = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with (
-        designs_told(target, board),
-        handed_over(scheduler, send_images),
+        shared.designs_told(target, board),
+        shared.handed_over(scheduler, send_images),
         run_folder(out, MarkerFile.of(images, None), inputs) as folder,
         StageProgress() as progress,
     ):
@@ -216,7 +186,7 @@ def detect(
 
 
 @app.command()
-def verify(run: Run, out: JsonFile = None) -> None:
+def verify(run: shared.Run, out: shared.JsonFile = None) -> None:
     """Compare all files of a run's folder with the hashes that the run kept, and its version with this one."""
     from stcal.sfm.runs.verify import require_whole, verified_text
     from stcal.sfm.runs.verify import verify as verified
@@ -229,7 +199,7 @@ def verify(run: Run, out: JsonFile = None) -> None:
 
 @app.command()
 def report(
-    run: Run,
+    run: shared.Run,
     pdf: Annotated[bool, "Also write the page as PDF, beside it (needs the extra `pdf`)."] = False,
     out: Annotated[Path | None, "Write the page to this file (HTML), not into the run's folder.", WRITES] = None,
 ) -> None:
