@@ -221,10 +221,7 @@ class Solved:
 
         Adjustments move from the solution of all poses by its equations; other methods are solved again.
 
-        Raises
-        ------
-        StcalError
-            The method fails without these poses.
+        Raises StcalError: the method fails without these poses.
         """
         task, solution = self.task, self.solution
         if solution is None:

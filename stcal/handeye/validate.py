@@ -212,10 +212,7 @@ def _without(pairs: HandEyePoses, out: np.ndarray, error: DegenerateError) -> De
 def require_solvable_without(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, out: np.ndarray) -> None:
     """Checks that the poses besides ``out``, (k,), determine the answer.
 
-    Raises
-    ------
-    DegenerateError
-        They do not. The message names the poses that were held out.
+    Raises DegenerateError: they do not. The message names the poses that were held out.
     """
     remaining = np.setdiff1d(np.arange(len(pairs)), out)
     try:

@@ -92,10 +92,7 @@ def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fau
 def require_covariance(matrix: np.ndarray, size: int, rows: Rows, definite: bool = False) -> None:
     """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`.
 
-    Raises
-    ------
-    InputError
-        The message states measured and needed values; the caller adds whose covariance it is.
+    Raises InputError: the message states measured and needed values; the caller adds whose covariance it is.
     """
     if matrix.shape != (size, size):
         raise InputError(

@@ -164,10 +164,7 @@ def png(image: np.ndarray) -> bytes:
 def checked_name(name: str, what: str) -> str:
     """Return ``name`` if it is a valid name of a folder.
 
-    Raises
-    ------
-    InputError
-        The name is not valid.
+    Raises InputError: the name is not valid.
     """
     if not re.fullmatch(r"[\w][\w .-]{0,99}", name):
         raise InputError(

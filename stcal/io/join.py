@@ -106,10 +106,7 @@ def stack(tables: Sequence[Table], names: Sequence[str], called: dict[str, str],
     ``names`` : name of each table, written into the new column ``column``; ``called`` : second names of some columns,
     which are added as copies.
 
-    Raises
-    ------
-    InputError
-        A name occurs twice.
+    Raises InputError: a name occurs twice.
     """
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

@@ -69,9 +69,6 @@ def pdf_of(page: str) -> bytes:
 def require_pdf() -> None:
     """Refuse, before the work, if no PDF can be made.
 
-    Raises
-    ------
-    InputError
-        The message names the missing library, and how to install it.
+    Raises InputError: the message names the missing library, and how to install it.
     """
     pdf_of("<p></p>")

@@ -260,10 +260,7 @@ def images_of_centres(
 ) -> np.ndarray:
     """Returns the images (n, 2) of the centres of a flat board's circles, px, from their ellipses' centres (n, 2).
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than four circles, or all on a line.
+    Raises DegenerateError: fewer than four circles, or all on a line.
     """
     corrected_px = centre_px
     for _ in range(CENTRING_ROUNDS):

@@ -182,10 +182,7 @@ eccentricity shrinks to less than a tenth with each round. Corners of chessboard
 def corner_grid(board: FlatBoard) -> CornerBoard:
     """Returns the points of a board as a board of dots without extent.
 
-    Raises
-    ------
-    InputError
-        A board of another kind, whose points are not on a grid.
+    Raises InputError: a board of another kind, whose points are not on a grid.
     """
     if isinstance(board, TagLayout):
         raise InputError(
@@ -234,10 +231,7 @@ class Models:
     def of(cls, given: Sequence[str], default: str) -> "Models":
         """Returns the models from words NAME=MODEL, and one word MODEL.
 
-        Raises
-        ------
-        InputError
-            Two models for one camera, or two words MODEL.
+        Raises InputError: two models for one camera, or two words MODEL.
         """
         model_of: dict[str, str] = {}
         common = [word for word in given if "=" not in word]
@@ -315,10 +309,7 @@ def calibrate_rig_from_photographs(
 def camera_names(folder: Path) -> list[str]:
     """Returns the names of the folders in a folder.
 
-    Raises
-    ------
-    InputError
-        Not a folder, fewer than two folders in it, or names that no file can have.
+    Raises InputError: not a folder, fewer than two folders in it, or names that no file can have.
     """
     if not folder.is_dir():
         raise InputError(

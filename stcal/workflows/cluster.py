@@ -50,10 +50,7 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
 def executor_of(address: str | None = None) -> Iterator[Executor]:
     """Yield the workers of a Dask cluster, or, without an address, processes of this machine, one per core.
 
-    Raises
-    ------
-    InputError
-        For the reasons given in :func:`dask_cluster`.
+    Raises InputError: for the reasons given in :func:`dask_cluster`.
     """
     with ProcessPoolExecutor() if address is None else _connected(address) as executor:
         yield executor

@@ -80,12 +80,8 @@ def compared(
 
     ``options`` : of :func:`stcal.register.pipeline`, by which ``found`` was computed.
 
-    Raises
-    ------
-    InputError
-        There are no joint values, or the robot does not fit them.
-    DegenerateError
-        Too few points for the robot's parameters.
+    Raises InputError: there are no joint values, or the robot does not fit them. Raises DegenerateError: too few points
+    for the robot's parameters.
     """
     robot = load_robot(robot_file)
     data = _measurements(pairs, file, robot)

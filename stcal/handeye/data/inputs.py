@@ -86,10 +86,7 @@ def mapped_pairs(path: Path, columns: Path, said: Said, key: str = "image", quat
 def mapped_content(path: Path, columns: Path, said: Said, key: str, quaternions: Order) -> Content:
     """Returns the poses of a table with a map of its ``columns``.
 
-    Raises
-    ------
-    InputError
-        The map does not fit the table, or there are no poses in its columns.
+    Raises InputError: the map does not fit the table, or there are no poses in its columns.
     """
     return _of_table(read_mapped(path, columns, "table", quaternions), said, key)
 
@@ -130,10 +127,7 @@ def read_two(
     order where neither file has names. Where times are not equal, and for all rows where ``timed``, the robot's poses
     are those at the camera's times, within ``tolerance_s``. ``columns`` : maps of the columns of both files.
 
-    Raises
-    ------
-    InputError
-        The message says what is wrong with a file, or that no rows belong together.
+    Raises InputError: the message says what is wrong with a file, or that no rows belong together.
     """
     keys = keys_of(key)
     contents = [
@@ -182,10 +176,7 @@ def _stamped(robot: Posed, camera: Posed, rows: Sequence[int]) -> Timed | None:
 def read_robot(path: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
     """Returns the robot's poses of a file or folder; None where it is one of the package's own tables.
 
-    Raises
-    ------
-    InputError
-        The message says what is wrong with the file or folder.
+    Raises InputError: the message says what is wrong with the file or folder.
     """
     if said.columns is not None:
         content = mapped_content(path, said.columns, said.of("robot"), key, quaternions)
@@ -211,10 +202,7 @@ def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
 def require_own(path: Path, quaternions: Order = "wxyz") -> None:
     """Refuse a table without poses in its columns.
 
-    Raises
-    ------
-    InputError
-        The message says which columns are needed.
+    Raises InputError: the message says which columns are needed.
     """
     table = read_table(path, "table", quaternions)
     if not todays(table):
@@ -295,10 +283,7 @@ def _side(content: Content, role: Role, path: Path) -> Side:
 def settled(side: Side, role: Role, content: Content, path: Path, said: Said) -> Posed:
     """Returns poses in the direction that is needed, mm, with a line on how they were read.
 
-    Raises
-    ------
-    InputError
-        The unit cannot be recognised, or an option contradicts the file.
+    Raises InputError: the unit cannot be recognised, or an option contradicts the file.
     """
     said = said.of(role)
     far = np.flatnonzero(np.abs(side.translation).max(axis=1) > FARTHEST)
@@ -390,10 +375,7 @@ def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]
 
     The description of the match is empty where the names are the same.
 
-    Raises
-    ------
-    InputError
-        No rows belong together.
+    Raises InputError: no rows belong together.
     """
     if not robot.names and not camera.names:
         if len(robot) != len(camera):

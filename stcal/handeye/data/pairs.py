@@ -155,10 +155,7 @@ class HandEyePoses:
         Commanded poses may be equal, and images at one of them differ by noise and by wrong numberings or flips of the
         board; so the board must have turned and moved, each by more than :data:`STALE` of what poses usually do.
 
-        Raises
-        ------
-        InputError
-            The poses of the flange were not read anew.
+        Raises InputError: the poses of the flange were not read anew.
         """
         flange, board = self.base_from_flange, self.camera_from_board
         rows: dict[bytes, list[int]] = {}
@@ -407,10 +404,7 @@ class Motions:
     def with_log(self, method: str) -> "Motions":
         """Returns the motions that satisfy :meth:`has_log`.
 
-        Raises
-        ------
-        DegenerateError
-            Fewer than two motions do.
+        Raises DegenerateError: fewer than two motions do.
         """
         good = self.has_log()
         if good.sum() < 2:

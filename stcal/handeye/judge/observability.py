@@ -97,10 +97,8 @@ class Observability:
 def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability:
     """Refuse a loop that cannot be solved, and return its observability.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than three poses, rotations about one axis only (unless ``four_dof``), or no rotations.
+    Raises DegenerateError: fewer than three poses, rotations about one axis only (unless ``four_dof``), or no
+    rotations.
     """
     if len(loop) < LEAST_POSES:
         raise DegenerateError(
@@ -142,10 +140,7 @@ def scale_is_seen(scale: float, sigma: float, poses: int) -> bool:
 def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
     """Refuse a scale that the motions do not determine, or that is implausible.
 
-    Raises
-    ------
-    DegenerateError
-        The message says how far the flange moves, and that it should move farther.
+    Raises DegenerateError: the message says how far the flange moves, and that it should move farther.
     """
     if scale_is_seen(scale, sigma, len(loop)):
         if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:

@@ -193,10 +193,7 @@ def three_others(rng: np.random.Generator, size: int) -> np.ndarray:
 def polish(objective: Objective, x: Rigid) -> Rigid:
     """Returns the minimum of the objective next to X.
 
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
+    Raises ConvergenceError: no minimum is reached.
     """
     minimum = minimise(x, objective.linear, perturbed, least_gain=EXACT)
     return minimum.required("differential evolution", "check the poses that fit worst").state

@@ -119,12 +119,7 @@ def adjust_views(
     replaces ``base_from_flange``, are unknowns too. Corners and poses have Huber's weights; poses that contradict the
     others are then left out.
 
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
-    DegenerateError
-        Fewer than three poses agree.
+    Raises ConvergenceError: no minimum is reached. Raises DegenerateError: fewer than three poses agree.
     """
     rows, refine = np.arange(len(views)), intrinsics is not None
     one = RigCamera("", views, rows, ("",) * len(rows), intrinsics if refine else camera)
@@ -163,12 +158,8 @@ def adjust_rig(
     pose contribute, and σ of the robot is estimated over all images. Poses of the robot that contradict the others are
     left out, and so is an image that contradicts the others of the same pose.
 
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
-    DegenerateError
-        Fewer than three poses of the robot agree, or no view of a camera agrees.
+    Raises ConvergenceError: no minimum is reached. Raises DegenerateError: fewer than three poses of the robot agree,
+    or no view of a camera agrees.
     """
     loops = [Loop.of(given.pairs(i), setup) for i in range(len(given.cameras))]
     return _adjusted(given, loops, first, noise, refine, with_scale)

@@ -211,10 +211,7 @@ class BundleSolution:
 def adjust(corners: RigCorners, start: RigBundle, free: tuple[str, ...]) -> BundleSolution:
     """Solve the problem, and estimate the σ of the ``free`` groups in rounds.
 
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
+    Raises ConvergenceError: no minimum is reached.
     """
     state, settled = start, not free
     for _ in range(ROUNDS if free else 0):

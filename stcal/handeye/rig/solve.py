@@ -225,10 +225,7 @@ def handeye_rig(given: RigPoses, setup: Setup = "eye-in-hand", options: RigOptio
 def same_numbering(given: RigPoses, setup: Setup, symmetries: tuple[Rigid, ...]) -> RigPoses:
     """Renumbers views of a symmetric board that were numbered from another end, as :func:`handeye_rig` does.
 
-    Raises
-    ------
-    StcalError
-        See :func:`handeye_rig`.
+    Raises StcalError as :func:`handeye_rig`.
     """
     if not symmetries:
         return given
@@ -240,10 +237,7 @@ def same_numbering(given: RigPoses, setup: Setup, symmetries: tuple[Rigid, ...])
 def alone(given: RigPoses, i: int, setup: Setup, options: RigOptions) -> HandEye:
     """Solves for one camera of a rig by itself, with :func:`~stcal.handeye.handeye` and method ``reprojection``.
 
-    Raises
-    ------
-    StcalError
-        See :func:`~stcal.handeye.handeye`.
+    Raises StcalError as :func:`~stcal.handeye.handeye`.
     """
     camera = given.cameras[i]
     prior, one = camera.prior, options

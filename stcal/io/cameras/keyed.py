@@ -116,11 +116,8 @@ NEUTRAL = {
 def from_keys(values: dict, choice: str, source: str) -> CameraModel | ForeignLens:
     """Return a camera of keys and values; ``choice`` : its name or number if there are several.
 
-    Raises
-    ------
-    InputError
-        There is no camera, several and no choice, an unsupported lens, a key that may change the projection, or a value
-        is impossible.
+    Raises InputError: there is no camera, several and no choice, an unsupported lens, a key that may change the
+    projection, or a value is impossible.
     """
     cameras = cameras_of(values)
     if not cameras:

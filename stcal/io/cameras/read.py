@@ -107,10 +107,7 @@ def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None =
 def sized_camera(model: CameraModel | ForeignLens, path: str | Path, size: tuple[int, int] | None) -> Camera:
     """Return the camera of a file; ``size`` is taken where the file states none.
 
-    Raises
-    ------
-    InputError
-        No size is known.
+    Raises InputError: no size is known.
     """
     width, height = size or (0, 0)
     if not (model.width or width) or not (model.height or height):

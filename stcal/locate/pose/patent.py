@@ -176,10 +176,7 @@ def locate_as_patent(
 ) -> PatentPose:
     """Finds the exposure whose IPPE pose has the smallest reprojection error, and applies the gate (S5 to S9).
 
-    Raises
-    ------
-    DegenerateError
-        No exposure shows a tag, or no exposure gives a pose.
+    Raises DegenerateError: no exposure shows a tag, or no exposure gives a pose.
     """
     options = options or PatentOptions()
     rows = layout.rows()

@@ -36,10 +36,7 @@ class Exported:
 def require_form(form: str) -> None:
     """Refuses an unknown form.
 
-    Raises
-    ------
-    InputError
-        The form is unknown; the message names the known ones.
+    Raises InputError: the form is unknown; the message names the known ones.
     """
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")

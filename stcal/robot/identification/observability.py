@@ -62,10 +62,7 @@ class ObservabilityIndices:
         """Returns the indices by the singular values (L,) of the Jacobian of ``count`` poses; all are 0 if one value is
         0.
 
-        Raises
-        ------
-        InputError
-            No singular values, negative ones, or no poses.
+        Raises InputError: no singular values, negative ones, or no poses.
         """
         sigma = np.sort(np.asarray(singular_values, float).ravel())[::-1]
         if not len(sigma) or not np.isfinite(sigma).all() or sigma[-1] < 0 or count < 1:

@@ -175,10 +175,7 @@ DIMENSIONS = ("a", "alpha", "d", "theta", "beta")
 def adjusted(text: str) -> Adjusted:
     """Returns the option for ``text``, names with commas between them; base and tool are always included.
 
-    Raises
-    ------
-    InputError
-        An unknown name.
+    Raises InputError: an unknown name.
     """
     words = {word.strip() for word in text.split(",")}
     if not words <= {"base", "tool", "zeros", "geometry", "all"}:

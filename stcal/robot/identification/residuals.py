@@ -78,10 +78,7 @@ def tool_width(kind: Kind) -> int:
 def observed(data: Measurements, kind: Kind | None = None) -> Observed:
     """Returns the measurements as ``kind``, or as the richest kind that they hold.
 
-    Raises
-    ------
-    InputError
-        The measurements do not hold ``kind``.
+    Raises InputError: the measurements do not hold ``kind``.
     """
     richest = "distance" if data.distances is not None else "position" if data.rotations is None else "pose"
     kind = kind or richest

@@ -352,10 +352,7 @@ class Robot:
     def loaded(self, payload_kg: float) -> "Robot":
         """The robot with another mass at its flange, kg, which a rigid one gives no way to.
 
-        Raises
-        ------
-        InputError
-            A mass below 0, or beyond all that arms carry.
+        Raises InputError: a mass below 0, or beyond all that arms carry.
         """
         loaded(payload_kg, 1)
         if self.elasticity is None:
@@ -489,10 +486,7 @@ class Chain:
     def path(self) -> tuple[int, ...]:
         """The joints from the world to the flange.
 
-        Raises
-        ------
-        InputError
-            A tree, which has no one flange.
+        Raises InputError: a tree, which has no one flange.
         """
         if self.grown is None:
             return tuple(range(len(self)))

@@ -247,10 +247,7 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
     Their flanges are compared over the joints' ranges; arms are made to a thousandth of their reach, and files of one
     arm state the same base and flange, whichever tool they have.
 
-    Raises
-    ------
-    InputError
-        They cannot be.
+    Raises InputError: they cannot be.
     """
     ends = [""] if identified.tree is None else list(identified.tree.carriers)
     identified, nominal = (replace(each, tools=dict.fromkeys(ends, Rigid())) for each in (identified, nominal))

@@ -95,11 +95,8 @@ def read_joints(
 ) -> Table:
     """Returns joint values with the name of each row's photograph in the column ``image``, which replaces ``key``.
 
-    Raises
-    ------
-    InputError
-        No such column, no row of the photographs, one twice, poses beside the joint values, or other joints than the
-        robot's.
+    Raises InputError: no such column, no row of the photographs, one twice, poses beside the joint values, or other
+    joints than the robot's.
     """
     values, nowhere = table_of(path, columns, "joints"), np.zeros(len(photographs))
     files = Table(PHOTOGRAPHS, {key: list(photographs)} | dict.fromkeys(POSE, nowhere), range(len(photographs)))

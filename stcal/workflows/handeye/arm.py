@@ -71,10 +71,7 @@ def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[Rob
 
     Where the table has base_from_flange_… too, ``understood`` says how far these poses are off.
 
-    Raises
-    ------
-    InputError
-        Missing columns, values that are not numbers, or an image that has two rows.
+    Raises InputError: missing columns, values that are not numbers, or an image that has two rows.
     """
     table = read_table(path, "robot poses", quaternions)
     arm = Arm(robot, joint_values(table, robot))

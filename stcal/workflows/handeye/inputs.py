@@ -76,10 +76,7 @@ def two_files(
     The result is None for two tables of the package's own, which are joined as tables. ``columns`` : maps of the
     columns of both, where they are tables of other programs.
 
-    Raises
-    ------
-    InputError
-        As in :func:`~stcal.handeye.data.inputs.read_two`; or options were given that tables do not need.
+    Raises InputError: as in :func:`~stcal.handeye.data.inputs.read_two`; or options were given that tables do not need.
     """
     told = read_two(first, second, said, key, quaternions, timing.tolerance_s, timing.offset, columns)
     if told is None:
@@ -108,10 +105,8 @@ def read_input(
     user's statements about what files do not state; ``timing`` : of poses by time; ``robot`` : the robot at whose joint
     values, in ``poses``, the images were taken, if its parameters are to be solved for.
 
-    Raises
-    ------
-    InputError
-        A file is missing or not of the required form, one file too many was given, or no image shows the board.
+    Raises InputError: a file is missing or not of the required form, one file too many was given, or no image shows the
+    board.
     """
     if isinstance(source, Path) and source.is_dir():
         poses, camera, board = _all_three(source, poses, camera, board)
@@ -195,10 +190,7 @@ def _require_unsaid(said: Said, where: str) -> None:
 def setup_of(said: Said, told: str | None, where: str) -> Setup:
     """Returns the setup that the user states, or that a file states, or eye-in-hand.
 
-    Raises
-    ------
-    InputError
-        The user and the file contradict each other.
+    Raises InputError: the user and the file contradict each other.
     """
     if said.setup and told and said.setup != told:
         raise InputError(
@@ -273,10 +265,7 @@ def photographed(
 ) -> Photographed:
     """Returns the corners of the board in all images that have a pose.
 
-    Raises
-    ------
-    InputError
-        No image shows the board, or no image has a pose.
+    Raises InputError: no image shows the board, or no image has a pose.
     """
     model = read_camera(camera)
     files, skipped = find_images(source)
@@ -391,10 +380,7 @@ def dry_run(
 ) -> list[str]:
     """Returns lines on how the inputs are understood, without looking for the board in images.
 
-    Raises
-    ------
-    InputError
-        For the reasons given in :func:`read_input`.
+    Raises InputError: for the reasons given in :func:`read_input`.
     """
     if isinstance(source, Path) and source.is_dir():
         return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, said, timing, robot)
@@ -452,10 +438,7 @@ def without_flips(inputs: HandEyeInput, setup: Setup, options: HandEyeOptions) -
     """Returns the input with the second pose of a flat target, tilted the other way, for poses that agree with the
     others only so; and a sentence that names them.
 
-    Raises
-    ------
-    InputError
-        Images, which tell the poses by themselves.
+    Raises InputError: images, which tell the poses by themselves.
     """
     if inputs.views is not None:
         raise InputError(

@@ -48,10 +48,7 @@ def read_rig(
 ) -> RigInput:
     """Returns the board in all images of all cameras, with the robot's poses.
 
-    Raises
-    ------
-    InputError
-        The message says what is wrong with a file, and names the camera.
+    Raises InputError: the message says what is wrong with a file, and names the camera.
     """
     design, cameras = load_boards(files.board), []
     by_file = {
@@ -147,10 +144,8 @@ def calibrate_rig(
 ) -> RigOutcome:
     """Solve all cameras in one adjustment and each by itself, and compare both on held-out poses of the robot.
 
-    Raises
-    ------
-    StcalError
-        For the reasons given in :func:`stcal.handeye.handeye_rig`; the message also names what was left out before.
+    Raises StcalError: for the reasons given in :func:`stcal.handeye.handeye_rig`; the message also names what was left
+    out before.
     """
     validation = validation or Splits()
     options = RigOptions(refine=refine, with_scale=with_scale, symmetries=given.symmetries)

@@ -57,10 +57,7 @@ class Line:
 def read_numbers(text: str, said: Said, where: str) -> Content | None:
     """Returns the poses in lines of numbers, each with or without a name before them; None for any other text.
 
-    Raises
-    ------
-    InputError
-        Lines of unequal length, 3×4 matrices, no rotations, or a convention that must be stated.
+    Raises InputError: lines of unequal length, 3×4 matrices, no rotations, or a convention that must be stated.
     """
     lines, comments = [], []
     for i, raw in enumerate(_with_points(text.splitlines()), 1):
@@ -132,10 +129,7 @@ def _without_counts(lines: list[Line], where: str) -> list[Line]:
     """Returns the lines without a first one that holds the number of poses alone; a number alone before each matrix is
     its name.
 
-    Raises
-    ------
-    InputError
-        There are not as many poses as the first line says.
+    Raises InputError: there are not as many poses as the first line says.
     """
     single = [i for i, line in enumerate(lines) if len(line.values) == 1 and not line.label]
     matrix_lines = 4
@@ -263,11 +257,8 @@ def todays(table: Table) -> bool:
 def read_columns(table: Table, key: str, said: Said) -> Content | None:
     """Returns the poses in the columns of a table; None where it has none.
 
-    Raises
-    ------
-    InputError
-        Some columns of a pose are missing, rotations are missing, one file holds several topics, or the convention must
-        be stated.
+    Raises InputError: some columns of a pose are missing, rotations are missing, one file holds several topics, or the
+    convention must be stated.
     """
     messages = _messages(table)
     if messages:

@@ -40,10 +40,7 @@ def read_content(path: Path, said: Said, key: str = "image", quaternions: Order 
 
     ``key`` : the column that names rows, where there is one; ``quaternions`` as in :func:`~stcal.io.table.read_table`.
 
-    Raises
-    ------
-    InputError
-        The message says what is wrong with the file.
+    Raises InputError: the message says what is wrong with the file.
     """
     content = _read(path, said, key, quaternions)
     if content is not None and quaternions != "wxyz" and not content.form.startswith(TABLE):

@@ -134,10 +134,7 @@ class Said:
         """Returns the statements in the values of ``--rotation`` and ``--length-unit``, each for all poses or as
         ``robot=`` and ``camera=``, and of ``--poses-are``.
 
-        Raises
-        ------
-        InputError
-            A name is not known, or is given twice.
+        Raises InputError: a name is not known, or is given twice.
         """
         whole: dict[str, str] = {}
         by_role: list[tuple[Role, str, str]] = []
@@ -195,10 +192,7 @@ class Said:
 def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
     """Returns the rotations and translations of homogeneous matrices (m, 4, 4).
 
-    Raises
-    ------
-    InputError
-        A last row that is not 0 0 0 1, or a matrix whose upper left part is not a rotation.
+    Raises InputError: a last row that is not 0 0 0 1, or a matrix whose upper left part is not a rotation.
     """
     require_finite(matrices, places, where)
     bad = np.flatnonzero(np.abs(matrices[:, 3] - [0, 0, 0, 1]).max(axis=1) > 0)
@@ -215,10 +209,7 @@ def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tupl
 def require_each_once(names: Sequence[str], places: Sequence[str], where: str, kind: str = "") -> None:
     """Refuse a name that two poses have. ``kind`` says whether it names an image or a time stamp.
 
-    Raises
-    ------
-    InputError
-        A name occurs twice.
+    Raises InputError: a name occurs twice.
     """
     first: dict[str, str] = {}
     for name, place in zip(names, places, strict=True):

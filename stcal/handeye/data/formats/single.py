@@ -74,10 +74,7 @@ def _all_numbers(value: Any) -> bool:
 def one(value: Any, said: Said, place: str, where: str) -> One | None:
     """Returns the pose in a value; None where the value does not have the shape of one.
 
-    Raises
-    ------
-    InputError
-        The value has the shape of a pose, but is not valid; or its convention must be stated.
+    Raises InputError: the value has the shape of a pose, but is not valid; or its convention must be stated.
     """
     array = numbers(value)
     if array is not None:

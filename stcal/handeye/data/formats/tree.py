@@ -36,10 +36,7 @@ OPENCV = "OpenCV's hand-eye arrays"
 def read_tree(value: Any, form: str, said: Said, where: str) -> Content | None:
     """Returns the poses in plain values; None where there are none.
 
-    Raises
-    ------
-    InputError
-        A pose is not valid, there are more than two sides, or the convention must be stated.
+    Raises InputError: a pose is not valid, there are more than two sides, or the convention must be stated.
     """
     if isinstance(value, Mapping):
         if "parameters" in value and "transform" in value:
@@ -112,10 +109,7 @@ def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
 def camodocal(value: Mapping, where: str) -> Content | None:
     """Returns the pairs that handeye_calib_camodocal records: ``T1_0``, ``T2_0`` …, tip in base and tag in camera.
 
-    Raises
-    ------
-    InputError
-        A matrix is missing, is none, or ``frameCount`` is another number.
+    Raises InputError: a matrix is missing, is none, or ``frameCount`` is another number.
     """
     found = {key: match for key in value if (match := _CAMODOCAL.fullmatch(str(key)))}
     if "frameCount" not in value or not found:

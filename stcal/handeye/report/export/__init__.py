@@ -87,10 +87,7 @@ FORMS = ROS_FORMS | {
 def require_form(form: str) -> None:
     """Checks the name of a format.
 
-    Raises
-    ------
-    InputError
-        The format is unknown; the message lists all formats.
+    Raises InputError: the format is unknown; the message lists all formats.
     """
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")

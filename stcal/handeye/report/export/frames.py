@@ -56,10 +56,7 @@ def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame
 def require_frame_names(*names: str) -> None:
     """Checks that names of frames are printable and all different; empty names stand for the defaults.
 
-    Raises
-    ------
-    InputError
-        A name has a control character, or occurs twice.
+    Raises InputError: a name has a control character, or occurs twice.
     """
     given = [name for name in names if name]
     for name in given:
