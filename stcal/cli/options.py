@@ -181,14 +181,17 @@ def several_tables(
 
 def exports_of(words: Sequence[str], require_form: Callable[[str], None]) -> list[tuple[str, Path]]:
     """Returns form and file of each FORM=FILE of --export."""
-    exports = []
     for word in words:
         form, _, path = word.partition("=")
         require_form(form)
         if not path:
             raise InputError("E-OPTION-VALUE", f"--export {word}: no file; give {form}=FILE")
-        exports.append((form, Path(path)))
-    return exports
+    return _exports(words)
+
+
+def _exports(words: Sequence[str]) -> list[tuple[str, Path]]:
+    parts = [word.partition("=") for word in words]
+    return [(form, Path(path)) for form, _, path in parts if path]
 
 
 def name_of(source: "Path | Table") -> str:
@@ -286,6 +289,7 @@ def _protected(command: Callable) -> Callable:
         written, read = (
             [(words[n], p) for n, p in paths if (n in outputs) == is_output] for is_output in (True, False)
         )
+        written += [("--export", path) for _, path in _exports(given.get("export") or ())]
         to_stdout = [option for option, path in written if path == STANDARD_OUTPUT]
         for option in to_stdout:
             if option != "--json":

@@ -10,7 +10,6 @@ from stcal.cli.declare import WRITES, Opt
 from stcal.cli.handeye import inputs as params
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
-from stcal.io.files import keep_apart
 
 if TYPE_CHECKING:
     from stcal.handeye import EvolutionOptions
@@ -180,16 +179,6 @@ def handeye(
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None
     exports = shared.exports_of(export or [], require_form)
-    written = {"--out": out, "--ros": ros, "--urdf": urdf, "--opencv": opencv, "--camera-out": camera_out}
-    written |= {"--robot-out": robot_out}
-    written |= {"--json": json_file, "--report": report}
-    read = {"source": source, "--poses": poses, "--camera": camera, "--board": board, "--a": first, "--b": second}
-    read |= {"--with-kinematics": with_kinematics, "--image-times": image_times, "--times-columns": times_columns}
-    keep_apart(
-        [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
-        [(name, path) for name, path in read.items() if path],
-    )
-    shared.require_new([("--export", path) for _, path in exports])
     _require_frames(ros or urdf, exports, setup or "eye-in-hand", parent, child, camera_frame)
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(

@@ -41,7 +41,7 @@ def rig(
     from stcal.handeye.data.rig import read_rig_file
     from stcal.handeye.report.file import HandEyeRigFile
     from stcal.handeye.report.outcome import rig_judged
-    from stcal.handeye.report.page import rig_report
+    from stcal.handeye.report.rig_page import rig_report
     from stcal.workflows.handeye.calibrate import Splits
     from stcal.workflows.handeye.rig import calibrate_rig, read_rig
 

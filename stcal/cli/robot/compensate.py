@@ -7,7 +7,6 @@ from stcal.cli import options as shared
 from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.terminal import print_each, say, write, write_if
 from stcal.errors import DegenerateError, InputError
-from stcal.io.files import keep_apart
 
 ExportAs = Literal["joints", "poses"]
 """Content of the files for controllers."""
@@ -54,13 +53,6 @@ def compensate(
     from stcal.robot.use.targets import read_targets
 
     exports, pulses = shared.exports_of(export or [], require_form), _pulses(pulses_per_deg)
-    read = {"TARGETS": targets, "--robot": robot_file, "--nominal": nominal, "--a": first, "--b": second}
-    written = {"--out": out, "--json": json_file, "--report": report}
-    keep_apart(
-        [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
-        [(name, path) for name, path in read.items() if path],
-    )
-    shared.require_new([("--export", path) for _, path in exports])
     identified = load_robot(robot_file)
     source = shared.one_table(
         targets, first, second, key, "TARGETS", quaternions=quaternions, columns=columns, columns_a=columns_a
