@@ -191,7 +191,7 @@ def outcome_report(outcome: Outcome) -> Document:
 
 
 EXPLAINED = (
-    "The rotation vector is axis times angle, no roll, pitch and yaw. σ are of turns about the axes, and of shifts "
+    "The rotation vector is axis times angle, not roll, pitch and yaw. σ are of turns about the axes, and of shifts "
     "along the axes, of the frame named first"
 )
 CHANCE = (
@@ -421,7 +421,11 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
     if result.sigma_scale is not None:
         pitch = "" if outcome.pitch_mm is None else f": pitch {outcome.pitch_mm * result.scale:.3f} mm"
         headline.append(
-            (f"{result.scale:.4f}", "", f"times its stated size is the board, ± {result.sigma_scale:.4f}{pitch}")
+            (
+                f"{result.scale:.4f}",
+                "",
+                f"true size of the board over its stated one, ± {result.sigma_scale:.4f}{pitch}",
+            )
         )
     return headline
 

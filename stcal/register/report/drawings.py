@@ -38,9 +38,8 @@ def space_figure(found: Findings):
     beyond = beyond[np.argsort(-length[beyond], kind="stable")]
     reach = np.abs(np.concatenate([place, place + arrow]) - middle).max(0) * 1.06 + 0.01 * side
     figure = new_figure(10.2, 3.7)
-    width = 0.27
     for k, (i, j) in enumerate(VIEWS):
-        axes = figure.add_axes((0.055 + k * 0.33, 0.14, width, 0.82))
+        axes = figure.add_axes((0.075 + k * 0.325, 0.14, 0.255, 0.82))
         for kind, colour in ((True, COLOURS[0]), (False, COLOURS[1])):
             own = inlier == kind
             if own.any():
@@ -94,7 +93,7 @@ def field_figure(found: Findings, field: Field):
     levels = np.arange(np.ceil(most / step * (1 - 1e-9)) + 1) * step
     figure, shown = new_figure(10.2, 3.5), []
     for k, ((i, j), (u, v, size)) in enumerate(zip(VIEWS, planes, strict=True)):
-        axes = figure.add_axes((0.055 + k * 0.298, 0.15, 0.24, 0.8))
+        axes = figure.add_axes((0.075 + k * 0.29, 0.15, 0.225, 0.8))
         shown.append(axes.contourf(u, v, size, levels=levels, cmap="YlOrRd"))
         axes.contour(u, v, size, levels=levels[1:-1:2], colors=INK, linewidths=0.4, alpha=0.5)
         third = 3 - i - j

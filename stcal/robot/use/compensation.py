@@ -34,6 +34,8 @@ from stcal.robot.use.targets import (
     robots_apart,
 )
 
+LEAST_SHOWN_MM = 1e-6
+"""Error below which its size says nothing."""
 ISOLATED = 6
 """Largest number of joints with isolated solutions, of which another one is another configuration."""
 
@@ -447,6 +449,7 @@ def compensated_summary(result: Compensated) -> list[str]:
         before = result.before_mm[both]
         lines.append(
             f"Position error of the nominal joint values, by the identified robot: mean {before.mean():.4f}, "
-            f"max {before.max():.4f} mm; taken away by compensation, down to {result.found.error_mm[both].max():.1g} mm"
+            f"max {before.max():.4f} mm; after compensation {max(result.found.error_mm[both].max(), LEAST_SHOWN_MM):.1g} mm "
+            "or less"
         )
     return lines

@@ -116,7 +116,7 @@ def compensation_report(result: Compensated, robot: Robot) -> Document:
             Section(
                 "Result", [*compensated_summary(result), before if result.compared().any() else None], terminal=True
             ),
-            Section("Poses to look at", [bullets([*result.targets.notes, *result.notes()][:MOST_NOTES])]),
+            Section("To know", [bullets([*result.targets.notes, *result.notes()][:MOST_NOTES])]),
             Section("Joint values", [Table(heads, _joint_rows(result, robot))], terminal=True),
         ],
     )
