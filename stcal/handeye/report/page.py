@@ -420,13 +420,8 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
         headline.append((f"{1e3 * offset.seconds:.2f} ms", "", said))
     if result.sigma_scale is not None:
         pitch = "" if outcome.pitch_mm is None else f": pitch {outcome.pitch_mm * result.scale:.3f} mm"
-        headline.append(
-            (
-                f"{result.scale:.4f}",
-                "",
-                f"true size of the board over its stated one, ± {result.sigma_scale:.4f}{pitch}",
-            )
-        )
+        what = f"true size of the board over its stated one, ± {result.sigma_scale:.4f}{pitch}"
+        headline.append((f"{result.scale:.4f}", "", what))
     return headline
 
 

@@ -79,6 +79,10 @@ def _heading(found: Findings) -> str:
     return f"{found.where}: {count} point pairs, {way}: {agree} inliers, {count - agree} outliers"
 
 
+def _three(values: np.ndarray) -> str:
+    return ", ".join(f"{v:.3g}" for v in values)
+
+
 def _parts_lines(found: Findings) -> list[str]:
     """Returns lines on σ of the transform, and on its scale or shear."""
     result, lines = found.registration, []
@@ -87,15 +91,11 @@ def _parts_lines(found: Findings) -> list[str]:
         scales = np.linalg.svd(result.b_from_a.linear, compute_uv=False)
         lines.append(f"scales {' '.join(f'{s:.6f}' for s in scales)}: a frame of the same unit has 1 1 1")
     else:
-        lines.append(
-            f"σ of its rotation about x, y, z: {', '.join(f'{v:.3g}' for v in 1e3 * np.degrees(sigma[:3]))} mdeg"
-        )
+        lines.append(f"σ of its rotation about x, y, z: {_three(1e3 * np.degrees(sigma[:3]))} mdeg")
     if isinstance(result.b_from_a, Similarity):
         lines.append(f"scale {result.b_from_a.scale:.8f} ± {sigma[6] * result.b_from_a.scale:.2g}")
     for place, xyz in (("the middle of the inliers", found.middle()), ("a's origin", np.zeros(3))):
-        lines.append(
-            f"σ of a transformed point at {place}, along x, y, z: {', '.join(f'{v:.3g}' for v in found.sigma_mm_at(xyz))} mm"
-        )
+        lines.append(f"σ of a transformed point at {place}, along x, y, z: {_three(found.sigma_mm_at(xyz))} mm")
     redundancy = f", {result.redundancy:.0f} degrees of freedom" if np.isfinite(result.redundancy) else ""
     factor = "" if result.sigma_factor is None else f", {result.sigma_factor:.2f} of the σ given"
     return [*lines, f"σ of a coordinate {result.sigma_mm:.4g} mm{factor}{redundancy}"]

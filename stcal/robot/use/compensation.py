@@ -446,10 +446,9 @@ def compensated_summary(result: Compensated) -> list[str]:
     lines = [f"{good} of {m} poses reached by the identified robot"]
     both = result.compared()
     if both.any():
-        before = result.before_mm[both]
+        before, after = result.before_mm[both], max(result.found.error_mm[both].max(), LEAST_SHOWN_MM)
         lines.append(
             f"Position error of the nominal joint values, by the identified robot: mean {before.mean():.4f}, "
-            f"max {before.max():.4f} mm; after compensation {max(result.found.error_mm[both].max(), LEAST_SHOWN_MM):.1g} mm "
-            "or less"
+            f"max {before.max():.4f} mm; after compensation {after:.1g} mm or less"
         )
     return lines
