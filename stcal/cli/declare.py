@@ -16,12 +16,9 @@ from stcal.cli.help import panel_of
 class Opt:
     """An option, with what its text of help and its parameter do not say.
 
-    Parameters
-    ----------
-    name : its names, such as ``--a``, or ``--robust/--least-squares``; ``--held-out`` for ``held_out`` if not given
-    min, max : range of a number
-    writes : whether a file of this name is written
-    metavar, envvar : word for the value in the help text, and variable of the environment that sets it
+    ``name`` : its names, such as ``--a``, or ``--robust/--least-squares``; ``--held-out`` for ``held_out`` if not
+    given; ``min``, ``max`` : range of a number; ``writes`` : whether a file of this name is written; ``metavar``,
+    ``envvar`` : word for the value in the help text, and variable of the environment that sets it.
     """
 
     name: str = ""

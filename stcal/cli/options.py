@@ -357,12 +357,8 @@ def designs_told(
 
     Errors within the context name the assumed designs.
 
-    Parameters
-    ----------
-    target, board : path, optional
-        Files that were given.
-    with_target, with_board : bool
-        Whether the reference design replaces a file that was not given.
+    ``target``, ``board`` : files that were given; ``with_target``, ``with_board`` : whether the reference design
+    replaces a file that was not given.
     """
     from stcal.boards.target import body_of
     from stcal.sfm.detect.sightings import likeness_notes

@@ -260,14 +260,9 @@ def _key(key) -> str:
 def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, Path]]) -> None:
     """Refuse, before the work, outputs that would replace an input, a file in an input folder, or each other.
 
-    Parameters
-    ----------
-    outputs, inputs : (option, path); an input may be a folder
+    ``outputs``, ``inputs`` : (option, path); an input may be a folder.
 
-    Raises
-    ------
-    InputError
-        The message names the output, and what it would replace.
+    Raises InputError: the message names the output, and what it would replace.
     """
     places: dict[Path, str] = {}
     for option, path in outputs:

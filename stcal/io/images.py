@@ -488,10 +488,7 @@ def same_photograph(image: np.ndarray, other: np.ndarray) -> bool:
     Such files share their noise, except for losses by compression. The noise of two exposures from one place is
     independent: they differ by √2 times the noise.
 
-    Parameters
-    ----------
-    image, other : (height, width) uint8 or uint16
-        Their brightness may differ by a factor and a constant.
+    ``image``, ``other`` : (height, width) their brightness may differ by a factor and a constant.
     """
     if image.shape != other.shape:
         return False

@@ -322,14 +322,9 @@ def detect_boards(
 
     An image that cannot be used is skipped.
 
-    Parameters
-    ----------
-    progress : called with the number of images done, and the number of all images
+    ``progress`` : called with the number of images done, and the number of all images.
 
-    Raises
-    ------
-    InputError
-        No image is readable, or the camera is not that of the images; the message names the first.
+    Raises InputError: no image is readable, or the camera is not that of the images; the message names the first.
     """
     if not files:
         raise InputError("E-IMAGES-NONE", "no image; images of the board needed")

@@ -261,19 +261,11 @@ def calibrate_rig_from_photographs(
 ) -> RigCalibration:
     """Calibrate each camera by itself, then all together.
 
-    Parameters
-    ----------
-    folder
-        Folder with a folder of photographs for each camera; images of one instant have the same name in all.
-    target, board, workers, progress
-        As in :func:`calibrate_camera`; boards of corners are possible too.
-    models
-        COLMAP's models, or ``auto``.
+    ``folder`` : folder with a folder of photographs for each camera; images of one instant have the same name in all;
+    ``target``, ``board``, ``workers``, ``progress`` : as in :func:`calibrate_camera`; boards of corners are possible
+    too; ``models`` : COLMAP's models, or ``auto``.
 
-    Raises
-    ------
-    StcalError
-        One of its subclasses; the message names the camera.
+    Raises StcalError: one of its subclasses; the message names the camera.
     """
     names = camera_names(folder)
     unknown = [name for name in models.own if name not in names]

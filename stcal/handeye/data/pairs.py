@@ -79,21 +79,12 @@ class HandEyePoses:
     ) -> "HandEyePoses":
         """Returns pose pairs from homogeneous matrices (m, 4, 4), or from :class:`stcal.Poses`.
 
-        Parameters
-        ----------
-        base_from_flange, camera_from_board : (m, 4, 4) arrays or Poses
-            Row i of both belongs together.
-        names : sequence of str, optional
-            Names of the pairs in messages.
-        where : str
-            Source of the poses.
-        unit : {"mm", "m", "cm", "um", "in"}
-            Unit of the translations.
+        ``base_from_flange``, ``camera_from_board`` : (m, 4, 4) row i of both belongs together; ``names`` : names of the
+        pairs in messages; ``where`` : source of the poses; ``unit`` : {"mm", "m", "cm", "um", "in"}: unit of the
+        translations.
 
-        Raises
-        ------
-        InputError
-            A matrix that is not finite, left-handed, scaled or transposed; the message names it. Another unit.
+        Raises InputError: a matrix that is not finite, left-handed, scaled or transposed; the message names it. Another
+        unit.
         """
         if unit not in LENGTHS:
             raise InputError("E-OPTION-VALUE", f"{where}: unit {unit!r}: not a choice; use {', '.join(LENGTHS)}")

@@ -36,18 +36,11 @@ then drawn at random."""
 class Observability:
     """Measures of how well a loop of m poses determines X.
 
-    Parameters
-    ----------
-    turns_rad : (3,) array
-        RMS rotations between poses about ``axes``, in descending order: singular values of the stacked log R_A over
-        √(number of motions). The second one is 0 where all axes are parallel: X then slides along the axis.
-    axes : (3, 3) array
-        Rows: the principal axes of all rotations, in the flange's frame.
-    mount_axis : (3,) array
-        The first principal axis in the mount's frame.
-    sigma_rad, sigma_mm : float
-        σ of the worst direction of X from poses of a common camera (:data:`COMMON_RAD`, :data:`COMMON_MM`); infinite
-        where it is not determined.
+    ``turns_rad`` : (3,) RMS rotations between poses about ``axes``, in descending order: singular values of the stacked
+    log R_A over √(number of motions). The second one is 0 where all axes are parallel: X then slides along the axis.
+    ``axes`` : (3, 3) rows: the principal axes of all rotations, in the flange's frame; ``mount_axis`` : (3,) the first
+    principal axis in the mount's frame; ``sigma_rad``, ``sigma_mm`` : σ of the worst direction of X from poses of a
+    common camera (:data:`COMMON_RAD`, :data:`COMMON_MM`); infinite where it is not determined.
     """
 
     turns_rad: np.ndarray

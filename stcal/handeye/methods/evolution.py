@@ -21,17 +21,10 @@ EXACT = 1e-24
 class Bounds:
     """Bounds of three coordinates of the first population.
 
-    Parameters
-    ----------
-    half_width : float
-        mm, or rad of the rotation vector.
-    centre : (3,) tuple, optional
-        Centre of the bounds; where None, that of the closed-form solution (Park & Martin 1994).
+    ``half_width`` : mm, or rad of the rotation vector; ``centre`` : (3,) centre of the bounds; where None, that of the
+    closed-form solution (Park & Martin 1994).
 
-    Raises
-    ------
-    InputError
-        The half width is not positive, or a number is not finite.
+    Raises InputError: the half width is not positive, or a number is not finite.
     """
 
     half_width: float
@@ -153,14 +146,8 @@ def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, clo
 
     The bounds limit the first population only; mutants may leave them.
 
-    Parameters
-    ----------
-    objective : Objective
-    options : EvolutionOptions
-    reach_mm : float
-        Half width of the translation's bounds where the options have none.
-    closed_form : Rigid, optional
-        Centre of bounds that have no centre.
+    ``reach_mm`` : half width of the translation's bounds
+    where the options have none; ``closed_form`` : centre of bounds that have no centre.
     """
     rng, size = np.random.default_rng(options.seed), options.population
     about = np.zeros(6) if closed_form is None else closed_form.log()

@@ -166,12 +166,8 @@ def variance_components(
     They are computed from residuals (m, 6) near a solution. Redundancy that the parameters take up does not count
     (Patterson & Thompson 1971), nor does :data:`CAUTION`.
 
-    Parameters
-    ----------
-    jacobian : (m, 6, k) array
-        Derivative of the residuals by the parameters solved for; dependent columns do no harm.
-    first : (f,) array
-        The first guess, from :meth:`LoopComponents.first`.
+    ``jacobian`` : (m, 6, k) derivative of the residuals by the parameters solved for; dependent columns do no harm;
+    ``first`` : (f,) the first guess, from :meth:`LoopComponents.first`.
     """
     least = np.maximum(parts.least(), LEAST_SHARE * first)
     most = np.maximum(first, least) * np.exp(2 * FARTHEST)

@@ -25,16 +25,9 @@ from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 class ArmFound:
     """The arm's parameters, if they were solved for.
 
-    Parameters
-    ----------
-    robot : str
-        Name of the robot.
-    names : tuple of str
-        Names of the k parameters: small motions of the axes, such as J2 ry in rad, J2 x in mm.
-    parameters, sigma : (k,) arrays
-        Deviation of the axes from the robot's file, and its σ.
-    plain : HeldOutPoses, optional
-        Errors on the same held-out poses, of the solution without these parameters.
+    ``robot`` : name of the robot; ``names`` : names of the k parameters: small motions of the axes, such as J2 ry in
+    rad, J2 x in mm; ``parameters``, ``sigma`` : (k,) deviation of the axes from the robot's file, and its σ; ``plain``
+    : errors on the same held-out poses, of the solution without these parameters.
     """
 
     robot: str

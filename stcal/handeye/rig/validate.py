@@ -21,13 +21,9 @@ ERRORS = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
 class CameraHeldOut:
     """Errors of one camera on n views from held-out poses of the robot.
 
-    Parameters
-    ----------
-    split, view : (n,) int arrays
-        Number of the split, and of the camera's view.
-    joint, alone : dict of str to (n,) array
-        Errors of :class:`~stcal.handeye.HeldOutPoses` by name: from all cameras solved together, and from this camera
-        alone with the same poses of the robot. NaN if the camera cannot be solved alone.
+    ``split``, ``view`` : (n,) number of the split, and of the camera's view; ``joint``, ``alone`` : errors of
+    :class:`~stcal.handeye.HeldOutPoses` by name: from all cameras solved together, and from this camera alone with the
+    same poses of the robot. NaN if the camera cannot be solved alone.
     """
 
     split: np.ndarray

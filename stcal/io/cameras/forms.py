@@ -162,19 +162,10 @@ def name_to_write(name: str) -> str:
 def written(camera: Camera, form: str, name: str) -> Written:
     """Return the file of a camera.
 
-    Parameters
-    ----------
-    camera : Camera
-        Camera to write.
-    form : str
-        One of :data:`WRITERS`.
-    name : str
-        Name of the camera, for forms that have a place for it.
+    ``camera`` : camera to write; ``form`` : one of :data:`WRITERS`; ``name`` : name of the camera, for forms that have
+    a place for it.
 
-    Raises
-    ------
-    InputError
-        The form cannot hold the lens (the message names one that can), or the name is no word.
+    Raises InputError: the form cannot hold the lens (the message names one that can), or the name is no word.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InputError(

@@ -100,14 +100,7 @@ def affine_least_squares(xyz_a: np.ndarray, xyz_b: np.ndarray) -> Affine:
 
     Coplanar points leave it undetermined off their plane, where it may be wrong by metres.
 
-    Parameters
-    ----------
-    xyz_a, xyz_b : (n, 3) arrays
-        mm; row i of both is the same point.
-
-    Returns
-    -------
-    Affine
+    ``xyz_a``, ``xyz_b`` : (n, 3) mm; row i of both is the same point.
     """
     design = np.column_stack([xyz_a, np.ones(len(xyz_a))])
     solution = np.linalg.lstsq(design, np.asarray(xyz_b, float), rcond=None)[0]

@@ -14,10 +14,7 @@ from stcal.register.core.models import Transform
 class ErrorFigures:
     """Summary of the lengths |b − b_from_a a| of points' errors; NaN if there are no points.
 
-    Parameters
-    ----------
-    points : int
-    mean_mm, rms_mm, max_mm : float
+    ``points`` : int; ``mean_mm``, ``rms_mm``, ``max_mm`` : float.
     """
 
     points: int

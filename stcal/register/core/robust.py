@@ -71,24 +71,11 @@ class Fitted:
 def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) -> Fitted:
     """Returns the transform with its inliers and σ.
 
-    Parameters
-    ----------
-    problem : Problem
-    threshold : float, optional
-        Largest distance of inliers, mm of a point of mean σ; estimated if not given.
-    seed : int
-        Seed of the random samples.
+    ``problem`` : problem; ``threshold`` : largest distance of inliers, mm of a point of mean σ; estimated if not given;
+    ``seed`` : seed of the random samples.
 
-    Returns
-    -------
-    Fitted
-
-    Raises
-    ------
-    DegenerateError
-        If too few points agree, or no more than could agree by chance.
-    ConvergenceError
-        If a fit with covariances did not converge.
+    Raises DegenerateError: if too few points agree, or no more than could agree by chance. Raises ConvergenceError: if
+    a fit with covariances did not converge.
     """
     rng = np.random.default_rng(seed)
     count = len(problem)

@@ -54,13 +54,8 @@ Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 class Consensus:
     """A set of points that agree on a transform.
 
-    Parameters
-    ----------
-    inliers : (n,) bool array
-    value : float
-        Score, less is better.
-    samples : int
-        Number of samples; 0 if all possible ones were tried.
+    ``inliers`` : (n,) bool array; ``value`` : score, less is better; ``samples`` : number of samples; 0 if all possible
+    ones were tried.
     """
 
     inliers: np.ndarray

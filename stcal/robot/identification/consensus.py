@@ -78,14 +78,8 @@ def agreeing(state: State, seen: Observed, weighting: Weighting) -> np.ndarray:
 
     All agree if there are too few observations beyond those needed.
 
-    Parameters
-    ----------
-    state : State
-        Start of the search; steps from it are linear.
-    seen : Observed
-        r observations.
-    weighting : Weighting
-        σ of the observations, up to a common factor.
+    ``state`` : start of the search; steps from it are linear; ``seen`` : r observations; ``weighting`` : σ of the
+    observations, up to a common factor.
     """
     good = every = np.ones(len(seen), bool)
     for step in range(ROUNDS):

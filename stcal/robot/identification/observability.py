@@ -103,10 +103,7 @@ def identification_jacobian(
     r is 6 (rotation over σ_rad, translation over σ_mm) or 3 (position over σ_mm), in the world's axes; the k parameters
     are those of :func:`~stcal.robot.identification.residuals.parameter_names`, rad and mm.
 
-    Parameters
-    ----------
-    q : (m, n) array
-        Joint values of the controller, rad or mm.
+    ``q`` : (m, n) joint values of the controller, rad or mm.
     """
     state = State(robot.chain(), {tool: robot.tool(tool)})
     derivative = tip_jacobian(state, q, (tool,) * len(q), observe)[1]

@@ -47,16 +47,8 @@ class Predicted:
 def predicted(state: State, robot: Robot, seen: Observed, covariance: np.ndarray) -> Predicted | None:
     """Returns σ for the target of most rows; None for distances, which do not show where the whole arm is.
 
-    Parameters
-    ----------
-    state : State
-        The identified state.
-    robot : Robot
-        The robot with the joints' ranges.
-    seen : Observed
-        The observations.
-    covariance : (k, k) array
-        Covariance of the parameters, rad and mm.
+    ``state`` : the identified state; ``robot`` : the robot with the joints' ranges; ``seen`` : the observations;
+    ``covariance`` : (k, k) covariance of the parameters, rad and mm.
     """
     if seen.kind == "distance":
         return None
@@ -86,16 +78,9 @@ def predicted_at(found: Predicted, state: State, kind: Kind, q: np.ndarray, targ
 
     It includes the effects that residuals go with, and is nan for tools that were not measured.
 
-    Parameters
-    ----------
-    found : Predicted
-        Prediction of the identification.
-    state, kind
-        The identified state, and the kind of observation that it was identified from.
-    q : (r, n) array
-        Joint values, rad and mm.
-    targets : (r,) sequence of str
-        The tool of each.
+    ``found`` : prediction of the identification; ``state``, ``kind`` : the identified state, and the kind of
+    observation that it was identified from; ``q`` : (r, n) joint values, rad and mm; ``targets`` : (r,) the tool of
+    each.
     """
     sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
     if known.any():

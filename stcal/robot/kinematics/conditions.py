@@ -23,17 +23,10 @@ MOST_KG = 1e4
 class Conditions:
     """Payload and approach directions of m joint vectors.
 
-    Parameters
-    ----------
-    payload_kg : (m,) array, optional
-        Mass at the flange; that of the robot file if not given.
-    approach : (m, n) array, optional
-        Direction in which each joint moved last: 1 upwards, −1 downwards, 0 unknown.
+    ``payload_kg`` : (m,) mass at the flange; that of the robot file if not given; ``approach`` : (m, n) direction in
+    which each joint moved last: 1 upwards, −1 downwards, 0 unknown.
 
-    Raises
-    ------
-    InputError
-        A mass that is not finite, below 0 or above ``MOST_KG``; a direction other than 1, −1 and 0.
+    Raises InputError: a mass that is not finite, below 0 or above ``MOST_KG``; a direction other than 1, −1 and 0.
     """
 
     payload_kg: np.ndarray | None = None

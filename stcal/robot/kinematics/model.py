@@ -171,19 +171,11 @@ class Elasticity:
 class Tree:
     """Which joint carries which, of a robot with several arms on one trunk.
 
-    Parameters
-    ----------
-    mounts : mapping of int to (int, Rigid)
-        By the joint, from 0, that begins a branch: the joint that carries it (−1: the base), and where the branch's
-        first row begins in the frame that the carrier's row ends in, mm. Every other joint is carried by the one
-        before it.
-    carriers : mapping of str to int
-        By tool the joint, from 0, that carries it; the last one where a tool is not named.
+    ``mounts`` : by the joint, from 0, that begins a branch: the joint that carries it (−1: the base), and where the
+    branch's first row begins in the frame that the carrier's row ends in, mm. Every other joint is carried by the one
+    before it. ``carriers`` : by tool the joint, from 0, that carries it; the last one where a tool is not named.
 
-    Raises
-    ------
-    InputError
-        A branch that is carried by a joint that does not come before it.
+    Raises InputError: a branch that is carried by a joint that does not come before it.
     """
 
     mounts: Mapping[int, tuple[int, Rigid]]

@@ -68,21 +68,11 @@ class Targets:
     ) -> "Targets":
         """Returns targets in memory.
 
-        Parameters
-        ----------
-        poses : Poses
-            m poses base_from_tool, mm.
-        q : (m, n) array, optional
-            Joint values near to which the solutions are wanted, rad or mm.
-        tools : sequence of str, optional
-            (m,) names of the robot's tools; the only one if not given.
-        where : str
-            Source of the poses, for messages.
+        ``poses`` : m poses base_from_tool, mm; ``q`` : (m, n) joint values near to which the solutions are wanted, rad
+        or mm; ``tools`` : (m,) names of the robot's tools; the only one if not given; ``where`` : source of the poses,
+        for messages.
 
-        Raises
-        ------
-        InputError
-            Other numbers of joint values or tools.
+        Raises InputError: other numbers of joint values or tools.
         """
         m, values = len(poses), None if q is None else np.asarray(q, float)
         names = tuple(tools) or ("",) * m
@@ -281,17 +271,10 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
 def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
     """Returns whether joint values beside the poses confirm them, and doubts about the poses.
 
-    Parameters
-    ----------
-    robot : Robot
-        That commands them.
-    targets : Targets
-        m poses base_from_tool, with or without joint values.
+    ``robot`` : that commands them; ``targets`` : m poses base_from_tool, with or without joint values.
 
-    Raises
-    ------
-    InputError
-        Joint values lead to the poses in another unit or convention, or order of rows; the message says which.
+    Raises InputError: joint values lead to the poses in another unit or convention, or order of rows; the message says
+    which.
     """
     if targets.poses is None:
         return True, ()
