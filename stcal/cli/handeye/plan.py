@@ -4,9 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
+import stcal.cli.handeye.inputs as params
 from stcal.cli import options as shared
 from stcal.cli.declare import WRITES, Opt
-from stcal.cli.handeye import inputs as params
 from stcal.cli.terminal import StageProgress, print_each, say, write_if
 
 
