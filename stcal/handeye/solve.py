@@ -120,10 +120,12 @@ class _Task:
         return replace(self, pairs=self.pairs[rows], loop=self.loop[rows], views=views)
 
 
-def _guess(options: HandEyeOptions, seen: Observability, loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
+def _guess(
+    options: HandEyeOptions, observability: Observability, loop: Loop, with_scale: bool
+) -> tuple[Rigid, Rigid, float]:
     """Returns the first X, Z and scale."""
     if options.four_dof:
-        return closed_form.about_one_axis(loop, seen.mount_axis, with_scale)
+        return closed_form.about_one_axis(loop, observability.mount_axis, with_scale)
     return closed_form.robust(loop, with_scale)
 
 

@@ -180,7 +180,7 @@ def estimate_offset(
 
 
 def _inside(stream: Stream, seconds: np.ndarray) -> np.ndarray:
-    """Returns for times (m,) whether they lie within the stream."""
+    """Returns a mask (m,) of the times that lie within the stream."""
     return (seconds >= 0) & (seconds <= stream.seconds[-1])
 
 

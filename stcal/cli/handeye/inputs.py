@@ -65,7 +65,7 @@ def source_of(
     first: Path | None,
     second: Path | None,
     key: str,
-    said: "Said",
+    statements: "Said",
     quaternions: "Order",
     timing: "Timing | None" = None,
     columns: Path | None = None,
@@ -77,11 +77,11 @@ def source_of(
     from stcal.workflows.handeye.times import Timing
 
     if source is None and first is not None and second is not None:
-        told = two_files(first, second, key, said, quaternions, timing or Timing(), (columns_a, columns))
+        told = two_files(first, second, key, statements, quaternions, timing or Timing(), (columns_a, columns))
         if told is not None:
             return told
     if source is not None and columns is not None and source.is_file():
-        return mapped_pairs(source, columns, said, key, quaternions)
+        return mapped_pairs(source, columns, statements, key, quaternions)
     if source is not None and source.is_dir():
         columns = None  # of the robot's poses
     prefixes = ("base_from_flange_", "camera_from_board_")

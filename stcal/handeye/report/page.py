@@ -129,8 +129,8 @@ def sigma_rows(outcome: Outcome) -> list[list[str]]:
     return rows
 
 
-def turns_text(seen: Observability) -> str:
-    turns = ", ".join(f"{t:.1f}°" for t in np.degrees(seen.turns_rad))
+def turns_text(observability: Observability) -> str:
+    turns = ", ".join(f"{t:.1f}°" for t in np.degrees(observability.turns_rad))
     return f"the flange turns between poses by {turns} (RMS) about its principal axes"
 
 

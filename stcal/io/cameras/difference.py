@@ -75,7 +75,7 @@ class SizedLens:
         return np.where((met & self.lens.determined(pixels))[:, None], unit, np.nan)
 
     def determined(self, pixels: np.ndarray) -> np.ndarray:
-        """Return which pixels (n, 2) lie in the region in which the lens was determined, (n,) bool."""
+        """Return a mask (n,) of the pixels (n, 2) that lie in the region in which the lens was determined."""
         return self.lens.determined(pixels)
 
 

@@ -132,7 +132,7 @@ def from_keys(values: dict, choice: str, source: str) -> CameraModel | ForeignLe
 
 
 def _role_of(path: tuple[str, ...], table: Table) -> str | None:
-    """Return what a key holds; containers around it add nothing, ORB-SLAM's ``Camera.`` neither."""
+    """Return the role of a key. Containers around the key do not count, nor does ORB-SLAM's prefix ``Camera.``."""
     parts = [part for key in path for part in key.split(".")]
     while len(parts) > 1 and CONTAINERS.match(plain(parts[0])):
         parts = parts[1:]

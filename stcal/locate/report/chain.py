@@ -65,9 +65,9 @@ class GoalChain:
     source: str = "hand-eye file"
 
     def base_from_goal(self, scene: str, camera_from_obj: UncertainRigid) -> UncertainRigid:
-        """Returns the target's pose with the offset in the robot's base; its covariance holds the errors of all links.
+        """Returns the goal's pose in the robot's base. Its covariance holds the errors of all links of the chain.
 
-        Raises InputError: there is no robot pose of this scene.
+        Raises InputError: the robot has no pose for this scene.
         """
         chain = self.mount @ camera_from_obj @ UncertainRigid.exact(self.offset)
         if not self.moving:

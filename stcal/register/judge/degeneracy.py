@@ -31,7 +31,7 @@ def spreads(xyz: np.ndarray) -> np.ndarray:
 def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
     """Refuses points that do not determine the model at their σ.
 
-    Raises DegenerateError: if they lie along a line, or in a plane for the affine model.
+    Raises DegenerateError: the points lie along a line, or in a plane for the affine model.
     """
     n, spread = len(xyz_a), spreads(xyz_a)
     needed = WIDER_THAN * sigma_mm

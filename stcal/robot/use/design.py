@@ -321,7 +321,7 @@ def design_csv(result: PoseDesign, robot: Robot) -> str:
 
 
 def require_design_written(path: str | Path, result: PoseDesign, robot: Robot, tool: str = "") -> None:
-    """Read a written table of poses again, and require them, and that its joint values lead the robot to them."""
+    """Read a written table again, and require the same poses, and joint values that lead the robot to them."""
     require_pose_table_written(path, {"nominal_": result.poses})
 
     def again() -> np.ndarray:

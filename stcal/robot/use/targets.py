@@ -232,12 +232,12 @@ INVERSE = "poses were inverse (base seen from the tool); give the tool in the ba
 
 
 def robots_apart(identified: Robot, nominal: Robot) -> str:
-    """Returns a doubt whether two files are of one robot; empty if they may be.
+    """Returns a note if two files may be of different robots; an empty text otherwise.
 
-    Their flanges are compared over the joints' ranges; arms are made to a thousandth of their reach, and files of one
-    arm state the same base and flange, whichever tool they have.
+    Their flanges are compared over the joints' ranges. Arms are made to a thousandth of their reach, and all files of
+    one arm state the same base and flange, whatever the tool.
 
-    Raises InputError: they cannot be.
+    Raises InputError: the files cannot be of one robot.
     """
     ends = [""] if identified.tree is None else list(identified.tree.carriers)
     identified, nominal = (replace(each, tools=dict.fromkeys(ends, Rigid())) for each in (identified, nominal))
@@ -389,10 +389,10 @@ def _base_mm(robot: Robot) -> float:
     return float(np.linalg.norm(replace(robot, world_from_base=Rigid()).chain().translation[0]))
 
 
-def out_of_reach(robot: Robot, targets: Targets, found: Inverse) -> tuple[str, ...]:
+def out_of_reach(robot: Robot, targets: Targets, inverse: Inverse) -> tuple[str, ...]:
     """Returns a note if many poses are out of reach, and all of them would be within in another convention."""
-    lost = np.flatnonzero(~found.usable)
-    if targets.poses is None or len(lost) < max(LEAST, DOUBTED * len(found)):
+    lost = np.flatnonzero(~inverse.usable)
+    if targets.poses is None or len(lost) < max(LEAST, DOUBTED * len(inverse)):
         return ()
     some = lost[np.unique(np.linspace(0, len(lost) - 1, TRIED).astype(int))]
     poses = targets.poses[some]
@@ -401,10 +401,10 @@ def out_of_reach(robot: Robot, targets: Targets, found: Inverse) -> tuple[str, .
     for reason, meant in guesses.items():
         # Most guesses fail at once: a pose out of reach takes a third of a second.
         if all(
-            joints_of(robot, targets[some[[i]]], meant[[i]], found.q[some[[i]]]).usable[0] for i in range(len(some))
+            joints_of(robot, targets[some[[i]]], meant[[i]], inverse.q[some[[i]]]).usable[0] for i in range(len(some))
         ):
             return (
-                f"{len(lost)} of {len(found)} poses are out of reach; {len(some)} of {len(some)} of these that were "
+                f"{len(lost)} of {len(inverse)} poses are out of reach; {len(some)} of {len(some)} of these that were "
                 f"tried would be within if {reason}",
             )
     return ()

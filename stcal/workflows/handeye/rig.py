@@ -43,7 +43,7 @@ def read_rig(
     workers: int | None = None,
     progress: Progress = lambda *_: None,
     quaternions: Order = "wxyz",
-    said: Said | None = None,
+    statements: Said | None = None,
     tolerance_s: float = TOLERANCE_S,
 ) -> RigInput:
     """Returns the board in all images of all cameras, with the robot's poses.
@@ -52,7 +52,8 @@ def read_rig(
     """
     design, cameras = load_boards(files.board), []
     by_file = {
-        camera_files.poses: read_robot_poses(camera_files.poses, quaternions, said) for camera_files in files.cameras
+        camera_files.poses: read_robot_poses(camera_files.poses, quaternions, statements)
+        for camera_files in files.cameras
     }
     robots = [_of_camera(by_file[camera_files.poses], camera_files.images, files) for camera_files in files.cameras]
     for camera_files, robot in zip(files.cameras, robots, strict=True):
