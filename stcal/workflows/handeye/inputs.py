@@ -101,9 +101,9 @@ def read_input(
 ) -> HandEyeInput:
     """Returns pose pairs from their files, or from a folder of images with ``poses``, ``camera`` and ``board``.
 
-    ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand;
-    ``statements`` : the user's statements about what files do not state; ``timing`` : of poses by time; ``robot`` : the robot at whose joint
-    values, in ``poses``, the images were taken, if its parameters are to be solved for.
+    ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``statements`` :
+    the user's statements about what files do not state; ``timing`` : of poses by time; ``robot`` : the robot at whose
+    joint values, in ``poses``, the images were taken, if its parameters are to be solved for.
 
     Raises InputError: a file is missing or not of the required form, one file too many was given, or no image shows the
     board.
