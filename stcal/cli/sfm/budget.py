@@ -80,7 +80,7 @@ def budget(
 def _require_pdf(page: Path | None, run: Path) -> None:
     """Refuses, before the work, a PDF without a page or a place.
 
-    Raises InputError: if there is no page, the page itself has the suffix of a PDF, or the extra ``pdf`` is not
+    Raises InputError if there is no page, the page itself has the suffix of a PDF, or the extra ``pdf`` is not
     installed.
     """
     from stcal.report.page import require_pdf

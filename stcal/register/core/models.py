@@ -64,7 +64,7 @@ def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarra
     ``model`` : model; ``xyz_a``, ``xyz_b`` : (n, 3) mm; row i of both is the same point; ``precision`` : (n,) weights,
     or inverse covariances in frame b.
 
-    Raises DegenerateError: if there are too few points, collinear ones, or coplanar ones for the affine model. Raises
+    Raises DegenerateError if there are too few points, collinear ones, or coplanar ones for the affine model. Raises
     ConvergenceError: if no minimum is reached.
     """
     weights = precision

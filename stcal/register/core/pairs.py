@@ -222,7 +222,7 @@ def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None)
     ``n`` : number of point pairs; ``weights`` : (n,) weights, proportional to 1/σ²; ``covariances`` : (n, 3, 3)
     covariances, or variances per axis, of b − b_from_a a in frame b, mm².
 
-    Raises InputError: if both are given, a shape is wrong, or weights or covariances are not positive.
+    Raises InputError if both are given, a shape is wrong, or weights or covariances are not positive.
     """
     if weights is not None and covariances is not None:
         raise InputError("E-REGISTER-WEIGHTS", "registration: weights and covariances given; give only one of them")

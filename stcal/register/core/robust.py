@@ -74,7 +74,7 @@ def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) 
     ``problem`` : problem; ``threshold`` : largest distance of inliers, mm of a point of mean σ; estimated if not given;
     ``seed`` : seed of the random samples.
 
-    Raises DegenerateError: if too few points agree, or no more than could agree by chance. Raises ConvergenceError: if
+    Raises DegenerateError if too few points agree, or no more than could agree by chance. Raises ConvergenceError: if
     a fit with covariances did not converge.
     """
     rng = np.random.default_rng(seed)

@@ -70,7 +70,7 @@ def check_supports(model: Model, xyz_a: np.ndarray, inliers: np.ndarray, sigma_m
     """Refuses a set with outliers in which a single point determines a turn, as any wrong point would have fitted
     there.
 
-    Raises DegenerateError: if the others would be refused by :func:`check_extent` without that point.
+    Raises DegenerateError if the others would be refused by :func:`check_extent` without that point.
     """
     rows = np.flatnonzero(inliers)
     alone = single_supports(model, xyz_a[rows], sigma_mm)

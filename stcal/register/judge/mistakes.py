@@ -40,7 +40,7 @@ LOOKED_AT = 10_000
 def check_units(xyz_a: np.ndarray, xyz_b: np.ndarray, seed: int) -> None:
     """Refuses frames whose distances differ by the ratio of two units.
 
-    Raises InputError: if the median ratio of distances between the same two points in b and a is the ratio of two
+    Raises InputError if the median ratio of distances between the same two points in b and a is the ratio of two
     units.
     """
     rng = np.random.default_rng([seed, 3])
@@ -75,7 +75,7 @@ def mirrored_ratio(xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[float, np.ndar
 def check_mirrored(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> None:
     """Refuses points (n, 3) that a reflection explains far better than any rotation.
 
-    Raises InputError: if they are. The message names the axis to change, if one change of sign or exchange makes the
+    Raises InputError if they are. The message names the axis to change, if one change of sign or exchange makes the
     frames nearly parallel.
     """
     if model.name == "affine" or len(xyz_a) <= model.sample:

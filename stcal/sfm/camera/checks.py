@@ -83,10 +83,7 @@ def projection_jacobian(camera: Camera, colmap_model: str) -> np.ndarray:
 
     The part that a rotation of the camera can absorb is removed.
 
-    Raises
-    ------
-    DegenerateError
-        The distortion folds the image over.
+    Raises DegenerateError: the distortion folds the image over.
     """
     try:
         ideal = camera.normalised_from_pixel(image_grid(camera))
@@ -219,10 +216,7 @@ def held_out(
 
     The places of the dots are those estimated from the other views of the folder, or design places if there are none.
 
-    Raises
-    ------
-    StcalError
-        A calibration without some of the views fails.
+    Raises StcalError: a calibration without some of the views fails.
     """
     folds = min(folds, len(views))
     if len(views) - -(-len(views) // folds) < MIN_TRAINING:
@@ -244,20 +238,11 @@ def choose_model(
 ) -> tuple[str, tuple[Candidate, ...]]:
     """Returns the simplest lens model that predicts held-out views as well as the best one, and all candidates.
 
-    Parameters
-    ----------
-    views : sequence of ImageObservations
-        Dots of the board, found with about the right camera.
-    board : BoardDesign
-    known : Intrinsics
-        Intrinsics of any model that fits; start of all models of the same projection.
-    workers : int, optional
-        Number of processes; one per core if None.
+    ``views`` : dots of the board, found with about the right camera; ``board`` : BoardDesign; ``known`` : intrinsics of
+    any model that fits; start of all models of the same projection; ``workers`` : number of processes; one per core if
+    None.
 
-    Raises
-    ------
-    StcalError
-        No model can be calibrated with four fifths of the views.
+    Raises StcalError: no model can be calibrated with four fifths of the views.
     """
     fitted = dict(
         zip(CANDIDATES, _all(_fitted, [(views, board, known.camera, m) for m in CANDIDATES], workers), strict=True)

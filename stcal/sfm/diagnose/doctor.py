@@ -38,11 +38,8 @@ def missing_circles(
 ) -> dict[str, list[Expected]]:
     """Returns, by image of one group, the planes with circles that should be visible but have no label.
 
-    Parameters
-    ----------
-    model : the model of the group, target frame, mm
-    circles : centres of the target's circles, (3,) by label, target frame, mm; centres of the model take precedence
-    observations : observations by image
+    ``model`` : the model of the group, target frame, mm; ``circles`` : centres of the target's circles, (3,) by label,
+    target frame, mm; centres of the model take precedence; ``observations`` : observations by image.
     """
     xyz = circles | dict(zip(model.labels, model.xyz_model, strict=True))
     patterns = patterns_of(target, board).values()
@@ -87,15 +84,10 @@ def diagnose(
 ) -> Diagnosis:
     """Finds what a run left out, and why.
 
-    Parameters
-    ----------
-    images : the folder of photographs, if it has moved since the run
-    progress : called with (stage, done, total)
+    ``images`` : the folder of photographs, if it has moved since the run; ``progress`` : called with (stage, done,
+    total).
 
-    Raises
-    ------
-    InputError
-        If the run is damaged or of another version, or the folder of photographs does not exist.
+    Raises InputError if the run is damaged or of another version, or the folder of photographs does not exist.
     """
     if images is not None and not images.is_dir():
         raise InputError(

@@ -58,10 +58,7 @@ def place_with_camera(
 ) -> PlacedBody:
     """Returns the body by its faces of known shape, with a known camera.
 
-    Raises
-    ------
-    MappingError
-        No two faces are ever seen together.
+    Raises MappingError: no two faces are ever seen together.
     """
     corners = Corners.of(observations, faces)
     none = np.zeros((16, 0))
@@ -76,10 +73,7 @@ def place_and_find_camera(
 
     The search begins at each of ``starts``, and at several focal lengths about the first; the least cost decides.
 
-    Raises
-    ------
-    MappingError
-        No two faces are ever seen together, or no focal length explains the images.
+    Raises MappingError: no two faces are ever seen together, or no focal length explains the images.
     """
     corners = Corners.of(observations, faces)
     side, first = max(starts[0].width, starts[0].height), starts[0]
@@ -138,10 +132,7 @@ def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: 
 
     Other images of the group, and other points, are added as far as these determine them.
 
-    Raises
-    ------
-    MappingError
-        Fewer than two images of the group are placed.
+    Raises MappingError: fewer than two images of the group are placed.
     """
     placed = [image for image in group if image.name in body.camera_from_body]
     if len(placed) < 2:

@@ -104,10 +104,7 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
 
     ``joints`` : further columns by image. Only images of this table are then written.
 
-    Raises
-    ------
-    InputError
-        If the table has no column ``image``, an image twice, or a column of the name of a measured one.
+    Raises InputError if the table has no column ``image``, an image twice, or a column of the name of a measured one.
     """
     header = [IMAGE, FACES, CIRCLES, STATUS, *POSE, *COVARIANCE, *QUALITY]
     common = common_columns(result.common.shape[2])

@@ -60,12 +60,7 @@ class MeasureService:
     Each image goes to the process with the fewest waiting images, together with the previous poses of its sequence.
     Images of a sequence are measured in the order in which they came.
 
-    Parameters
-    ----------
-    setting : Setting
-        Target and camera.
-    workers : int
-        Number of processes.
+    ``setting`` : target and camera; ``workers`` : number of processes.
     """
 
     def __init__(self, setting: Setting, workers: int):
