@@ -249,7 +249,7 @@ class ObjPose(ImageFit):
 
 
 def locate(
-    detected: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None = None, where: str = "scene"
+    seen: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None = None, where: str = "scene"
 ) -> ObjPose:
     """Estimates the target's pose camera_from_obj from the corners of its tags in one scene.
 
@@ -282,11 +282,11 @@ def locate(
     ConvergenceError
         No minimum is reached.
     """
-    if not len(detected):
+    if not len(seen):
         raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
-    problem = problem_of(detected, layout, camera, prior)
+    problem = problem_of(seen, layout, camera, prior)
     start = PoseStack.of(_start(problem, where))
-    keep, outliers, all_corners = np.arange(len(detected)), [], problem
+    keep, outliers, all_corners = np.arange(len(seen)), [], problem
     failure = f"{where}: no pose found; check layout and camera file"
     while True:
         middle = Rigid(np.eye(3), np.append(problem.xy.mean(0), 0.0))
@@ -296,18 +296,18 @@ def locate(
         worst = int(excess.argmax())
         if excess[worst] <= 1:
             break
-        outliers.append(int(detected.rows[keep[worst]]))
+        outliers.append(int(seen.rows[keep[worst]]))
         keep = np.delete(keep, worst)
-        if len(outliers) > MAX_OUTLIER_SHARE * len(detected):
+        if len(outliers) > MAX_OUTLIER_SHARE * len(seen):
             names = ", ".join(str(layout.tags[row][1]) for row in sorted(outliers))
             raise DegenerateError(
                 "E-LOCATE-CONTRADICTS",
-                f"{where}: {len(outliers)} of {len(detected)} tags contradict the others ({names}); check that layout "
+                f"{where}: {len(outliers)} of {len(seen)} tags contradict the others ({names}); check that layout "
                 "and camera file belong to the images",
             )
         problem = all_corners.select((4 * keep[:, None] + np.arange(4)).ravel())
         start = minima.poses[[0]]
-    pose = _answer(problem, minima, detected.rows[keep], tuple(outliers))
+    pose = _answer(problem, minima, seen.rows[keep], tuple(outliers))
     if pose.sigma_rad() > MAX_SIGMA_RAD:
         raise DegenerateError(
             "E-LOCATE-OPEN", f"{where}: its tags leave the rotation open; show more tags, or larger ones"
