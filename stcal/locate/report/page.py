@@ -112,9 +112,10 @@ def run_report(
     blocks: list[Block] = [Table(heads, _overview(results), css="text")]
     if chain and accepted(results):
         blocks += [page_only("Where the robot has to go"), Table(goal_heads, _in_base(results, chain))]
+    count = f"{len(results)} scene{'s' * (len(results) != 1)}, {len(accepted(results))} accepted"
     return Document(
         f"Tags located: {layout.name}",
-        f"target {layout.name}, {len(layout.tags)} tags: {len(results)} scenes, {len(accepted(results))} accepted",
+        f"target {layout.name}, {len(layout.tags)} tags: {count}",
         [
             Section("Scenes", blocks, terminal=True),
             *(
@@ -180,7 +181,7 @@ def _scene(each: Located, files: SceneFiles, layout: TargetLayout, model: Camera
         Table(["<check", "value", "limit", "<kept"], checks),
         *_patent_blocks(each),
         photo(best, each, WIDE_PX) if best else None,
-        columns(*([photo(exposure, None, SMALL_PX)] for exposure in several), css="columns small"),
+        columns(*([photo(exposure, None, SMALL_PX)] for exposure in several), css="columns thumbs"),
     ]
 
 
