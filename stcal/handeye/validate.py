@@ -279,10 +279,8 @@ def better_setup(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, row
 
     Parameters
     ----------
-    pairs, setup, options
-        See :func:`~stcal.handeye.handeye`.
-    rows : (s, k) int array
-        Poses to hold out.
+    pairs, setup, options : see :func:`~stcal.handeye.handeye`
+    rows : (s, k) poses to hold out
 
     Returns
     -------
@@ -411,10 +409,8 @@ def scatter(result: HandEye, held_out: HeldOutPoses) -> float:
 
     Parameters
     ----------
-    result : HandEye
-        Solution from all poses.
-    held_out : HeldOutPoses
-        Cross-validation of the same poses, with ``mount_from_camera``.
+    result : solution from all poses
+    held_out : cross-validation of the same poses, with ``mount_from_camera``
 
     Returns
     -------

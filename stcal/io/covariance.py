@@ -56,10 +56,8 @@ def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fau
     Parameters
     ----------
     matrices : (m, n, n) array
-    rows : Rows
-        Names of the rows, and the variances that count as zero.
-    definite : bool
-        True if eigenvalues must be positive, since the matrix will be inverted.
+    rows : names of the rows, and the variances that count as zero
+    definite : true if eigenvalues must be positive, since the matrix will be inverted
 
     Returns
     -------

@@ -152,16 +152,11 @@ def require_written(
 
     Parameters
     ----------
-    path : str or Path
-        The file, for the message.
-    read : callable
-        Reads the file with the reader of later commands, and returns what it predicts.
-    reported : array
-        The same quantity from the result in memory; nan where there is none.
-    most : float
-        Largest difference of one value: rounding by the decimals of the file.
-    unit : str
-        Unit of the values.
+    path : the file, for the message
+    read : reads the file with the reader of later commands, and returns what it predicts
+    reported : the same quantity from the result in memory; nan where there is none
+    most : largest difference of one value: rounding by the decimals of the file
+    unit : unit of the values
 
     Raises
     ------

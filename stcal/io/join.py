@@ -37,19 +37,13 @@ def join(
 
     Parameters
     ----------
-    a, b
-        Files with a column ``key`` that holds each value once; or tables read from them.
-    key
-        Name of the key column; or ``image=Point Name``, that of ``a`` and that of ``b``.
-    prefixes
-        Prefix for the columns of a pose or a position in each file, ``x_mm`` to ``qz`` and covariances. Other columns
-        keep their names; if both files have a column of that name, the one of ``a`` is used.
-    quaternions
-        See :func:`~stcal.io.table.read_table`.
-    columns
-        Map of the columns of ``b``, see :func:`~stcal.io.poses.columns.read_mapped`.
-    columns_a
-        Map of the columns of ``a``.
+    a, b : files with a column ``key`` that holds each value once; or tables read from them
+    key : name of the key column; or ``image=Point Name``, that of ``a`` and that of ``b``
+    prefixes : prefix for the columns of a pose or a position in each file, ``x_mm`` to ``qz`` and covariances. Other
+        columns keep their names; if both files have a column of that name, the one of ``a`` is used.
+    quaternions : see :func:`~stcal.io.table.read_table`
+    columns : map of the columns of ``b``, see :func:`~stcal.io.poses.columns.read_mapped`
+    columns_a : map of the columns of ``a``
 
     Returns
     -------

@@ -66,16 +66,11 @@ def calibrate_camera_by_corners(
 
     Parameters
     ----------
-    images
-        Folder of photographs, or of folders of them.
-    board
-        The board, mm, with the σ of its corners.
-    colmap_model
-        COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``.
-    workers
-        Number of processes; one per core if None.
-    progress
-        Called with (stage, done, total).
+    images : folder of photographs, or of folders of them
+    board : the board, mm, with the σ of its corners
+    colmap_model : COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``
+    workers : number of processes; one per core if None
+    progress : called with (stage, done, total)
 
     Returns
     -------

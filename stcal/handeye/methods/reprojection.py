@@ -39,20 +39,13 @@ class Reprojection:
 
     Parameters
     ----------
-    camera : Camera
-        Adjusted camera, or the given one where the intrinsics were not solved for.
-    camera_covariance : (q, q) array, optional
-        Covariance of the intrinsics solved for, in the order of their COLMAP model.
-    base_from_flange : Poses
-        m true poses of the flange; as reported for outliers, and where the robot is exact.
-    designed, corners : (K, 3) arrays
-        The board's corners as designed, and as adjusted in the true scale, mm.
-    view, corner : (n,) int arrays
-        Pose and row in ``corners`` of each measured corner. Outliers have no corners.
-    residuals_px : (n, 2) array
-        Projected minus measured.
-    arm, arm_covariance : (k,), (k, k) arrays, optional
-        Parameters of the arm, where they were solved for; rad, mm.
+    camera : adjusted camera, or the given one where the intrinsics were not solved for
+    camera_covariance : (q, q) covariance of the intrinsics solved for, in the order of their COLMAP model
+    base_from_flange : m true poses of the flange; as reported for outliers, and where the robot is exact
+    designed, corners : (K, 3) the board's corners as designed, and as adjusted in the true scale, mm
+    view, corner : (n,) pose and row in ``corners`` of each measured corner. Outliers have no corners.
+    residuals_px : (n, 2) projected minus measured
+    arm, arm_covariance : (k,) parameters of the arm, where they were solved for; rad, mm
     """
 
     camera: Camera

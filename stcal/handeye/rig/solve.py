@@ -87,8 +87,7 @@ class Rig:
 
         Parameters
         ----------
-        first, second : str
-            Names of two cameras.
+        first, second : names of two cameras
 
         Returns
         -------

@@ -89,14 +89,10 @@ def cross_validate_rig(
 
     Parameters
     ----------
-    given, setup, options
-        See :func:`~stcal.handeye.handeye_rig`.
-    rows : (s, k) int array
-        Poses of the robot to hold out, from :func:`~stcal.handeye.splits`.
-    workers : int or None
-        Number of processes; as many as cores if None.
-    progress : callable, optional
-        Called with the number of splits done, and the number of all splits.
+    given, setup, options : see :func:`~stcal.handeye.handeye_rig`
+    rows : (s, k) poses of the robot to hold out, from :func:`~stcal.handeye.splits`
+    workers : number of processes; as many as cores if None
+    progress : called with the number of splits done, and the number of all splits
 
     Returns
     -------

@@ -229,17 +229,12 @@ def of_parts(
 
     Parameters
     ----------
-    lens : sequence of 4 float
-        fx, fy, cx, cy, px.
-    skew : float
-        px, u = fx x + skew y + cx.
-    given : (k,) array
-        Coefficients in OpenCV's order: k1, k2, p1, p2, k3 …; k1 to k4 of an equidistant lens.
-    kind : str
-        perspective, equidistant, or unified: Mei's projection with ``xi``, of OpenCV's omnidir, Kalibr's omni and
-        camodocal's MEI.
-    width, height : float
-        Image size, px; 0 if the file states none.
+    lens : fx, fy, cx, cy, px
+    skew : px, u = fx x + skew y + cx
+    given : (k,) coefficients in OpenCV's order: k1, k2, p1, p2, k3 …; k1 to k4 of an equidistant lens
+    kind : perspective, equidistant, or unified: Mei's projection with ``xi``, of OpenCV's omnidir, Kalibr's omni and
+        camodocal's MEI
+    width, height : image size, px; 0 if the file states none
 
     Raises
     ------

@@ -221,16 +221,11 @@ def camera_from_opencv(
 
     Parameters
     ----------
-    lens : sequence of 4 float
-        fx, fy, cx, cy, px, with OpenCV's pixel origin.
-    given : (k,) array
-        k1, k2, p1, p2, k3 …; for an equidistant camera k1 to k4, or with ``tangential`` k1, k2, p1, p2, k3, k4.
-    fisheye, tangential : bool
-        Equidistant projection; and whether ``given`` has p1, p2.
-    width, height : float
-        Image size, px; 0 if the file states none.
-    path : str or Path
-        Camera file, for messages.
+    lens : fx, fy, cx, cy, px, with OpenCV's pixel origin
+    given : (k,) k1, k2, p1, p2, k3 …; for an equidistant camera k1 to k4, or with ``tangential`` k1, k2, p1, p2, k3, k4
+    fisheye, tangential : equidistant projection; and whether ``given`` has p1, p2
+    width, height : image size, px; 0 if the file states none
+    path : camera file, for messages
 
     Raises
     ------

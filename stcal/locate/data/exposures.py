@@ -209,16 +209,11 @@ def capture(
 
     Parameters
     ----------
-    source
-        The camera.
-    exposures
-        Exposures in the unit of the camera's driver, from :func:`~stcal.locate.data.exposures.exposure_times`.
-    folder
-        Folder of the scene. It is created and written only after all images are taken.
-    settings
-        Gain and settle time.
-    taken
-        Called with the row of each image.
+    source : the camera
+    exposures : exposures in the unit of the camera's driver, from :func:`~stcal.locate.data.exposures.exposure_times`
+    folder : folder of the scene. It is created and written only after all images are taken.
+    settings : gain and settle time
+    taken : called with the row of each image
 
     Returns
     -------

@@ -37,16 +37,11 @@ def likely_mistake(
 
     Parameters
     ----------
-    seen : SeenTags
-        Corners of the layout's tags, px.
-    layout : TargetLayout
-        The layout as it is.
-    camera : Camera
-        The camera at the size of the image.
-    prior : CameraPrior or None
-        Covariance of the intrinsics.
-    pose : ObjPose or None
-        The pose by the layout as it is; None if none was found.
+    seen : corners of the layout's tags, px
+    layout : the layout as it is
+    camera : the camera at the size of the image
+    prior : covariance of the intrinsics
+    pose : the pose by the layout as it is; None if none was found
     """
     if len(detected) < LEAST_TAGS:
         return None

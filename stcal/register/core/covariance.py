@@ -51,13 +51,10 @@ def sigma_within(square_sum: float, model: Model, count: int, threshold: float) 
 
     Parameters
     ----------
-    square_sum : float
-        Square sum of the residuals of the points used, mm².
-    model : Model
-    count : int
-        Number of points used.
-    threshold : float
-        Threshold at which residuals were cut off, mm; infinite if none was.
+    square_sum : square sum of the residuals of the points used, mm²
+    model : model
+    count : number of points used
+    threshold : threshold at which residuals were cut off, mm; infinite if none was
 
     Returns
     -------

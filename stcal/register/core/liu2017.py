@@ -77,15 +77,11 @@ class Liu2017Result:
 
     Parameters
     ----------
-    b_from_a : Affine
-    sample : (N,) int array
-        Rows of the best sample.
-    inliers : (n,) bool array
-        Points within the limit, including those of the sample.
-    acceptable : int
-        Number of acceptable samples.
-    shares : (tries,) array
-        Share of inliers outside each sample, NaN if the sample was screened out.
+    b_from_a : affine
+    sample : (N,) rows of the best sample
+    inliers : (n,) points within the limit, including those of the sample
+    acceptable : number of acceptable samples
+    shares : (tries,) share of inliers outside each sample, NaN if the sample was screened out
     """
 
     b_from_a: Affine

@@ -124,12 +124,9 @@ def leverages(
 
     Parameters
     ----------
-    model, transform, precision :
-        As in :func:`unit_covariance`.
-    xyz_a : (n, 3) array
-        All points, mm.
-    used : (n,) bool array
-        Mask of the points that were fitted.
+    model, transform, precision : : as in :func:`unit_covariance`
+    xyz_a : (n, 3) all points, mm
+    used : (n,) mask of the points that were fitted
 
     Returns
     -------
@@ -162,9 +159,8 @@ def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.n
 
     Parameters
     ----------
-    model : Model
-    xyz_a, xyz_b : (s, m, 3) arrays
-        m points of each of s samples, mm.
+    model : model
+    xyz_a, xyz_b : (s, m, 3) m points of each of s samples, mm
 
     Returns
     -------

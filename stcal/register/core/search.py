@@ -122,9 +122,8 @@ def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensu
 
     Parameters
     ----------
-    problem : Problem
-    score : Score
-        Score as in :func:`by_scale`, :func:`by_share` and :func:`by_threshold`.
+    problem : problem
+    score : score as in :func:`by_scale`, :func:`by_share` and :func:`by_threshold`
     rng : numpy.random.Generator
 
     Returns

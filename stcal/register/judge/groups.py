@@ -187,10 +187,8 @@ def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
 
     Parameters
     ----------
-    problem : Problem
-        Points that agree on one transform.
-    transform : Transform
-        Fit to these points.
+    problem : points that agree on one transform
+    transform : fit to these points
 
     Returns
     -------

@@ -165,10 +165,8 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
 
     Parameters
     ----------
-    problem : Problem
-        Points that agree on one transform.
-    transform : Transform
-        Fit to these points.
+    problem : points that agree on one transform
+    transform : fit to these points
 
     Returns
     -------

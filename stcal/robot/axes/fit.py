@@ -111,16 +111,11 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
 
     Parameters
     ----------
-    points : (m, 3) array
-        Positions of all rows, mm, with the joints before this one unwound.
-    moved : (m,) array
-        Kinematic values of this joint, rad or mm.
-    arcs : list of Arc
-        The arcs of this joint.
-    prismatic : bool
-        Whether the joint slides.
-    where : str
-        The joint, for messages.
+    points : (m, 3) positions of all rows, mm, with the joints before this one unwound
+    moved : (m,) kinematic values of this joint, rad or mm
+    arcs : the arcs of this joint
+    prismatic : whether the joint slides
+    where : the joint, for messages
 
     Raises
     ------

@@ -34,21 +34,14 @@ class Finding:
 
     Parameters
     ----------
-    what : str
-        Name of the effect: "the angle of joint 3, once a turn".
-    effect_mm, effect_rad : float
-        Amplitude in the residuals of position and of orientation (0 if there are none) if the effect is periodic, else
-        RMS.
-    joint, turns : int
-        Number of the joint, and number of periods in one turn of it; 0 where there is none.
-    share : float
-        Share of the squared residuals (weighted as in the fit) that the effect explains.
-    p : float
-        Probability of such an effect by chance, times the number of tests.
-    line : int, optional
-        Line of the first row after a jump along the order of the rows; ``effect_mm`` and ``effect_rad`` are its size.
-    advice : str
-        What to do about it; empty for effects of the robot.
+    what : name of the effect: "the angle of joint 3, once a turn"
+    effect_mm, effect_rad : amplitude in the residuals of position and of orientation (0 if there are none) if the
+        effect is periodic, else RMS
+    joint, turns : number of the joint, and number of periods in one turn of it; 0 where there is none
+    share : share of the squared residuals (weighted as in the fit) that the effect explains
+    p : probability of such an effect by chance, times the number of tests
+    line : line of the first row after a jump along the order of the rows; ``effect_mm`` and ``effect_rad`` are its size
+    advice : what to do about it; empty for effects of the robot
     """
 
     what: str
@@ -89,18 +82,12 @@ def left(
 
     Parameters
     ----------
-    state : State
-        Chain and tools, as fitted or given.
-    world_from_base : Rigid
-        Pose of the base, for up, the axes and the place.
-    seen : Observed
-        r observations.
-    weighting : Weighting
-        σ of the observations, up to a common factor.
-    explained : (r, w, k) array
-        Derivatives by the parameters that were fitted to these observations.
-    weights : (r,) array, optional
-        Weights of the observations; those below 0.5 are errors and left out.
+    state : chain and tools, as fitted or given
+    world_from_base : pose of the base, for up, the axes and the place
+    seen : r observations
+    weighting : σ of the observations, up to a common factor
+    explained : (r, w, k) derivatives by the parameters that were fitted to these observations
+    weights : (r,) weights of the observations; those below 0.5 are errors and left out
 
     Returns
     -------

@@ -112,25 +112,19 @@ class Elasticity:
 
     Parameters
     ----------
-    compliance : (n, 2) array
-        rad/(N m): about the joint's axis, and across it.
-    moment : (n, 3) array
-        N m: weight of the link times the vector from the joint to its centre of mass, what follows being put at the
-        next joint; in the frame of the joint that has moved. Of compliance and moment, poses show the products alone.
-    periodic : (n, 4) array
-        rad: of sin q, cos q, sin 2q, cos 2q of revolute joints.
-    gravity : (3,) array
-        Its direction, of length 1: in the base of a robot, in the first joint's frame of a :class:`Chain`.
-    hysteresis : (n,) array
-        rad: what revolute joints are turned farther by that came from below, and less by that came from above.
-    pivot : (n, 3) array
-        Place about which each link turns when it gives way, mm, in its joint's frame: on the joint's axis for a
-        revolute joint. The origin of that frame if not given; always so of a :class:`Chain`.
-    payload_kg : float
-        Mass that is carried where nothing else is said of joint vectors.
-    payload_centre : (3,) array
-        Its centre, mm: in the flange's frame of a robot, in that of the joint that carries it, as it has moved, of a
-        :class:`Chain`.
+    compliance : (n, 2) rad/(N m): about the joint's axis, and across it
+    moment : (n, 3) N m: weight of the link times the vector from the joint to its centre of mass, what follows being
+        put at the next joint; in the frame of the joint that has moved. Of compliance and moment, poses show the
+        products alone.
+    periodic : (n, 4) rad: of sin q, cos q, sin 2q, cos 2q of revolute joints
+    gravity : (3,) its direction, of length 1: in the base of a robot, in the first joint's frame of a :class:`Chain`
+    hysteresis : (n,) rad: what revolute joints are turned farther by that came from below, and less by that came from
+        above
+    pivot : (n, 3) place about which each link turns when it gives way, mm, in its joint's frame: on the joint's axis
+        for a revolute joint. The origin of that frame if not given; always so of a :class:`Chain`.
+    payload_kg : mass that is carried where nothing else is said of joint vectors
+    payload_centre : (3,) its centre, mm: in the flange's frame of a robot, in that of the joint that carries it, as it
+        has moved, of a :class:`Chain`
 
     Raises
     ------
@@ -293,16 +287,11 @@ class Robot:
 
         Parameters
         ----------
-        table : (n, 4) or (n, 5) array
-            a (mm), α (rad), d (mm), θ (rad) of each joint, from the base; and Hayati's β (rad).
-        convention : {"standard", "modified"}
-            Of all rows; see :class:`DHRow`.
-        limits : (n, 2) array, optional
-            Lowest and highest value of each joint, rad or mm; unlimited if not given.
-        types : sequence of {"revolute", "prismatic"}, optional
-            One for each joint; all revolute if not given.
-        name : str
-            For messages and reports.
+        table : (n, 4) a (mm), α (rad), d (mm), θ (rad) of each joint, from the base; and Hayati's β (rad)
+        convention : {"standard", "modified"}: of all rows; see :class:`DHRow`
+        limits : (n, 2) lowest and highest value of each joint, rad or mm; unlimited if not given
+        types : sequence of {"revolute", "prismatic"}, optional: one for each joint; all revolute if not given
+        name : for messages and reports
 
         Raises
         ------

@@ -67,20 +67,13 @@ class Evaluated:
 
     Parameters
     ----------
-    robot : Robot
-        With base and tools as fitted.
-    state : State
-        Its chain and tools.
-    residuals : (r, 3) or (r, 1) array
-        Measured minus modelled position in the base's axes, or distance; mm.
-    rotation_rad : (r,) array
-        Errors of orientations; empty if none were measured.
-    placed : tuple of Placed
-        Base and tools.
-    left : tuple of Finding or None
-        What the residuals go with; None where rows are too few to tell.
-    beyond : tuple of Finding or None
-        The same of what would be left by all parameters of the kinematics fitted to these rows.
+    robot : with base and tools as fitted
+    state : its chain and tools
+    residuals : (r, 3) measured minus modelled position in the base's axes, or distance; mm
+    rotation_rad : (r,) errors of orientations; empty if none were measured
+    placed : base and tools
+    left : what the residuals go with; None where rows are too few to tell
+    beyond : the same of what would be left by all parameters of the kinematics fitted to these rows
     """
 
     robot: Robot
@@ -121,16 +114,11 @@ class Evaluation:
 
     Parameters
     ----------
-    refit : str
-        What was fitted of each robot: base, tool, both or nothing.
-    seen : Observed
-        The r observations: positions or distances.
-    robots : tuple of Evaluated
-        In the order given.
-    wrong : (r,) array of bool
-        Rows that no robot explains: wrong, or something that all models lack; nothing was fitted to them.
-    differences : tuple of Difference
-        The robot of least mean error against each other one, in order of their means.
+    refit : what was fitted of each robot: base, tool, both or nothing
+    seen : the r observations: positions or distances
+    robots : in the order given
+    wrong : (r,) rows that no robot explains: wrong, or something that all models lack; nothing was fitted to them
+    differences : the robot of least mean error against each other one, in order of their means
     """
 
     refit: Refit
@@ -154,12 +142,10 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
 
     Parameters
     ----------
-    robots : mapping of str to Robot
-        By the names that they are to have; mm, rad.
-    data : Measurements
-        Joint values with what was measured there, in the instrument's frame.
-    refit : {"none", "base", "tool", "base-tool"}
-        What is fitted by least squares with each robot's own axes; the rest is as its file has it.
+    robots : by the names that they are to have; mm, rad
+    data : joint values with what was measured there, in the instrument's frame
+    refit : {"none", "base", "tool", "base-tool"}: what is fitted by least squares with each robot's own axes; the rest
+        is as its file has it
 
     Returns
     -------

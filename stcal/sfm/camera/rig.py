@@ -254,12 +254,9 @@ def calibrate_rig(cameras: Mapping[str, CameraCalibration], board: BoardDesign, 
 
     Parameters
     ----------
-    cameras : mapping
-        Calibrations of the single cameras by name. Views of one instant have the same name except for the suffix.
-    board : BoardDesign
-        Board that all cameras saw.
-    unique : bool
-        Whether the board's points are identified uniquely, as on a ChArUco board.
+    cameras : calibrations of the single cameras by name. Views of one instant have the same name except for the suffix.
+    board : board that all cameras saw
+    unique : whether the board's points are identified uniquely, as on a ChArUco board
 
     Returns
     -------

@@ -52,22 +52,14 @@ class Side:
 
     Parameters
     ----------
-    rotation, translation : (m, 3, 3), (m, 3) arrays
-        Rotation and translation of each pose; lengths in ``unit``.
-    places : tuple of str
-        Place of each pose in its file: ``line 7``.
-    turned : str
-        How rotations are written, in words.
-    unit, frames
-        None where the file does not say.
-    names : tuple of str
-        Image or timestamp of each pose; empty where there are none.
-    trajectory : bool
-        Whether poses are those of a moving body in a world, as in files of trajectories.
-    scaled : bool
-        Whether the lengths have no unit at all, like those of a COLMAP model.
-    covariance : (m, 6, 6) array, optional
-        Covariances of the transforms of ``frames``, mm and rad.
+    rotation, translation : (m, 3, 3) rotation and translation of each pose; lengths in ``unit``
+    places : place of each pose in its file: ``line 7``
+    turned : how rotations are written, in words
+    unit, frames : None where the file does not say
+    names : image or timestamp of each pose; empty where there are none
+    trajectory : whether poses are those of a moving body in a world, as in files of trajectories
+    scaled : whether the lengths have no unit at all, like those of a COLMAP model
+    covariance : (m, 6, 6) covariances of the transforms of ``frames``, mm and rad
     """
 
     rotation: np.ndarray
