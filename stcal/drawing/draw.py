@@ -41,7 +41,7 @@ def draw(
 
     ``design`` : a ``target.toml`` or a board file of any kind; ``paper`` : one of :data:`~stcal.drawing.sheets.PAPERS`,
     or ``own``; if not given, A4 for PDF, ``own`` for SVG and DXF; ``margin_mm`` : distance from the outermost circles
-    to the edge of a plate, if the design has no outline; ``net`` : true unfolds the plates of a target into one plane,
+    to the edge of a plate, if the design has no outline; ``net`` : True unfolds the plates of a target into one plane,
     by their outlines and rough poses.
 
     Raises InputError: the design cannot be read or drawn, the file has another suffix, or the paper does not suit the

@@ -101,7 +101,7 @@ def estimate_offset(
     seconds : (m,) times of the pairs after the stream's origin, by the camera's clock, s
     setup : {"eye-in-hand", "eye-to-hand"}: what carries the camera
     noise : known σ of the errors
-    with_scale : true if the board's size is an unknown
+    with_scale : True if the board's size is an unknown
 
     Returns
     -------

@@ -19,7 +19,7 @@ from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods.noise import UNKNOWNS
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
-from stcal.parallel import one_thread, run_parallel
+from stcal.parallel import one_thread, run_in_order
 
 SETUP_SPLITS = 6
 """Number of splits that decide which setup is meant."""
@@ -171,12 +171,8 @@ def cross_validate(
         pairs, views, options = repaired.pairs, repaired.views, replace(options, symmetries=())
     rows = splits(len(pairs)) if rows is None else rows
     jobs = [(pairs, setup, method, views, options, out) for out in rows]
-    errors_of_split: list[dict[str, np.ndarray]] = [{}] * len(jobs)
     slow = views is not None and method in (None, "reprojection")
-    for done, (i, errors) in enumerate(run_parallel(errors_without, jobs, workers if slow else 1), 1):
-        errors_of_split[i] = errors
-        if progress:
-            progress(done, len(jobs))
+    errors_of_split = run_in_order(errors_without, jobs, workers if slow else 1, progress)
     return HeldOutPoses(
         rows, **{name: np.array([errors[name] for errors in errors_of_split]) for name in errors_of_split[0]}
     )

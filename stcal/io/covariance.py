@@ -57,7 +57,7 @@ def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fau
     ----------
     matrices : (m, n, n) array
     rows : names of the rows, and the variances that count as zero
-    definite : true if eigenvalues must be positive, since the matrix will be inverted
+    definite : True if eigenvalues must be positive, since the matrix will be inverted
 
     Returns
     -------

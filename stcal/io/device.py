@@ -45,7 +45,7 @@ class OpenCVSource:
     """A camera of this machine.
 
     ``device`` : number, or path such as ``/dev/video0``; ``gain`` : in the driver's unit; None leaves it unchanged;
-    ``by_hand`` : true if exposures are set manually, False for the camera's automatic exposure.
+    ``by_hand`` : True if exposures are set manually, False for the camera's automatic exposure.
 
     Raises InputError: there is no such camera, or its driver accepts no gain.
     """

@@ -36,7 +36,7 @@ def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, reme
 class Reading:
     """A hypothesis on the true content of columns that were read as w, x, y, z.
 
-    ``held`` : true content, in words; ``remedy`` : correction, in words; ``order`` : indices of the true w, x, y, z
+    ``held`` : True content, in words; ``remedy`` : correction, in words; ``order`` : indices of the true w, x, y, z
     among the components read; ``conjugated`` : True if the sign of the vector part is inverted.
     """
 

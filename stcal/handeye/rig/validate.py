@@ -12,7 +12,7 @@ from stcal.handeye.data.pairs import Setup
 from stcal.handeye.data.rig import RigPoses
 from stcal.handeye.rig.solve import POSE, Rig, RigOptions, alone, handeye_rig
 from stcal.handeye.validate import HeldOutPoses, predicted, scatter_notes, scatter_of
-from stcal.parallel import one_thread, run_parallel
+from stcal.parallel import one_thread, run_in_order
 
 ERRORS = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
 
@@ -104,11 +104,7 @@ def cross_validate_rig(
         A split cannot be solved; see :func:`~stcal.handeye.handeye_rig`.
     """
     jobs = [(given, setup, options, out) for out in rows]
-    results: list[tuple[list[dict], np.ndarray]] = [([], np.zeros(0))] * len(jobs)
-    for done, (i, errors) in enumerate(run_parallel(_errors_without, jobs, workers), 1):
-        results[i] = errors
-        if progress:
-            progress(done, len(jobs))
+    results = run_in_order(_errors_without, jobs, workers, progress)
     cameras = []
     for i in range(len(given.cameras)):
         parts = [errors[i] for errors, _ in results]

@@ -1,8 +1,7 @@
 """Checks of calibrated intrinsics: σ of projections, halves of the views, cross-validation of lens models."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -14,7 +13,7 @@ from stcal.errors import ConvergenceError, DegenerateError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis, parameter_names
 from stcal.labels import Label
-from stcal.parallel import run_parallel
+from stcal.parallel import run_in_order
 from stcal.sfm.adjust.refine import eccentricity_px, moved_poses
 from stcal.sfm.camera.intrinsics import (
     Intrinsics,
@@ -245,7 +244,11 @@ def choose_model(
     Raises StcalError: no model can be calibrated with four fifths of the views.
     """
     fitted = dict(
-        zip(CANDIDATES, _all(_fitted, [(views, board, known.camera, m) for m in CANDIDATES], workers), strict=True)
+        zip(
+            CANDIDATES,
+            run_in_order(_fitted, [(views, board, known.camera, m) for m in CANDIDATES], workers),
+            strict=True,
+        )
     )
     factors = {m: entry.factors.centres for m, entry in fitted.items() if isinstance(entry, Intrinsics)}
     why = {m: str(entry) for m, entry in fitted.items() if isinstance(entry, StcalError)}
@@ -255,7 +258,7 @@ def choose_model(
             why[model] = f"residuals {factor / factors[least]:.3g} times those of {least}"
     jobs = {m: (views, board, entry) for m, entry in fitted.items() if isinstance(entry, Intrinsics) and m not in why}
     fared: dict[str, HeldOut] = {}
-    for model, outcome in zip(jobs, _all(_tried, list(jobs.values()), workers), strict=True):
+    for model, outcome in zip(jobs, run_in_order(_tried, list(jobs.values()), workers), strict=True):
         if isinstance(outcome, HeldOut):
             fared[model] = outcome
         else:
@@ -286,11 +289,6 @@ def _row(model: str, outcome: HeldOut | None, squares: dict[str, np.ndarray], be
     apart = squares[model] - squares[best]
     sigma = float(apart.std(ddof=1) / np.sqrt(len(apart)))
     return Candidate(model, count, outcome.rms_px(), float(apart.mean()), sigma)
-
-
-def _all(function: Callable[..., T], jobs: list[tuple], workers: int | None) -> list[T]:
-    """Returns the results in the order of the jobs."""
-    return [result for _, result in sorted(run_parallel(function, jobs, workers), key=itemgetter(0))]
 
 
 def _fitted(views, board: BoardDesign, known: Camera, model: str) -> Intrinsics | StcalError:

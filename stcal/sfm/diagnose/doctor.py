@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode
-from stcal.parallel import run_parallel
+from stcal.parallel import run_in_order
 from stcal.sfm.data.model import MIN_POINTS, ImageObservations, MetricModel
 from stcal.sfm.data.patterns import Pattern, ideal_border, in_view, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -102,7 +103,7 @@ def diagnose(
     except (KeyError, TypeError) as error:
         raise InputError("E-RUN-VERSION", f"run {run.folder}: of another version ({error}); run it again") from error
     jobs = _jobs(run, images or run.images, models, circles)
-    examined = _side_by_side(_examine, [(job,) for job in jobs], "examine", workers, progress)
+    examined = run_in_order(_examine, [(job,) for job in jobs], workers, progress and partial(progress, "examine"))
     options = _try_options(run, jobs, examined, workers, progress)
     for job, (verdicts, problem) in zip(jobs, examined, strict=True):
         findings += _findings(job, verdicts, problem, options.get(job.name, {}))
@@ -110,16 +111,6 @@ def diagnose(
     findings = [_with_options(finding, options, shown) for finding in findings]
     observed = sum(len(model.image_index) for model in models)
     return Diagnosis(files, len(run.observations), len(mapped), observed, in_order(findings))
-
-
-def _side_by_side(function: Callable, jobs: list[tuple], stage: str, workers, progress) -> list:
-    """Runs the jobs in parallel and returns their results in the order of the jobs."""
-    results = [None] * len(jobs)
-    for done, (i, result) in enumerate(run_parallel(function, jobs, workers), start=1):
-        results[i] = result
-        if progress:
-            progress(stage, done, len(jobs))
-    return results
 
 
 def _files(run: SavedRun) -> list[Finding]:
@@ -311,7 +302,7 @@ def _try_options(run: SavedRun, jobs, examined, workers, progress) -> dict[str, 
         useful = [trial for trial in all_trials if trial.gate in gates]
         if useful and not problem:
             attempts.append((job, useful))
-    results = _side_by_side(_try, attempts, "try options", workers, progress)
+    results = run_in_order(_try, attempts, workers, progress and partial(progress, "try options"))
     return {job.name: labels for (job, _), labels in zip(attempts, results, strict=True)}
 
 
