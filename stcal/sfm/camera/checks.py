@@ -243,13 +243,8 @@ def choose_model(
 
     Raises StcalError: no model can be calibrated with four fifths of the views.
     """
-    fitted = dict(
-        zip(
-            CANDIDATES,
-            run_in_order(_fitted, [(views, board, known.camera, m) for m in CANDIDATES], workers),
-            strict=True,
-        )
-    )
+    starts = [(views, board, known.camera, model) for model in CANDIDATES]
+    fitted = dict(zip(CANDIDATES, run_in_order(_fitted, starts, workers), strict=True))
     factors = {m: entry.factors.centres for m, entry in fitted.items() if isinstance(entry, Intrinsics)}
     why = {m: str(entry) for m, entry in fitted.items() if isinstance(entry, StcalError)}
     least = min(factors, key=factors.__getitem__, default="")
