@@ -71,7 +71,7 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
                     sigma,
                     held_out,
                     *_split_half(result),
-                    plots(plot(lambda: distortion_figure(lens), "What the lens moves", css="")),
+                    plot(lambda: distortion_figure(lens), "What the lens moves"),
                 ],
                 terminal=True,
             ),
