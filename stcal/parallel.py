@@ -106,6 +106,20 @@ def run_parallel(
         yield from processes.run(function, jobs)
 
 
+def run_briefly(function: Callable[..., R], jobs: Sequence[tuple]) -> list[R]:
+    """Returns the results of ``function(*job)`` in the order of the jobs, for jobs of about a tenth of a second each.
+
+    The jobs run in the processes of :func:`kept_processes` if there are any, else in this process.
+    """
+    processes = _kept.get()
+    if processes and processes.workers > 1:
+        try:
+            return [result for _, result in sorted(processes.run(function, jobs), key=itemgetter(0))]
+        except BrokenExecutor:  # a process was ended from outside: the jobs run in this process, more slowly
+            pass
+    return [function(*job) for job in jobs]
+
+
 def run_in_order(
     function: Callable[..., R],
     jobs: Sequence[tuple],
@@ -120,20 +134,6 @@ def run_in_order(
         if progress:
             progress(len(results), len(jobs))
     return [results[i] for i in range(len(jobs))]
-
-
-def run_briefly(function: Callable[..., R], jobs: Sequence[tuple]) -> list[R]:
-    """Returns the results of ``function(*job)`` in the order of the jobs, for jobs of about a tenth of a second each.
-
-    The jobs run in the processes of :func:`kept_processes` if there are any, else in this process.
-    """
-    processes = _kept.get()
-    if processes and processes.workers > 1:
-        try:
-            return [result for _, result in sorted(processes.run(function, jobs), key=itemgetter(0))]
-        except BrokenExecutor:  # a process was ended from outside: the jobs run in this process, more slowly
-            pass
-    return [function(*job) for job in jobs]
 
 
 @contextlib.contextmanager
