@@ -128,6 +128,22 @@ def run_briefly(
     return [results[i] for i in range(len(jobs))]
 
 
+def run_in_order(
+    function: Callable[..., R],
+    jobs: Sequence[tuple],
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[R]:
+    """Returns the results of :func:`run_parallel` in the order of the jobs. ``progress`` : called with the number of
+    jobs done, and the number of all jobs."""
+    results = {}
+    for i, result in run_parallel(function, jobs, workers):
+        results[i] = result
+        if progress:
+            progress(len(results), len(jobs))
+    return [results[i] for i in range(len(jobs))]
+
+
 @contextlib.contextmanager
 def kept_processes(workers: int | None = None) -> Iterator[None]:
     """Keeps the processes of :func:`run_parallel` from call to call, so that libraries are loaded only once.

@@ -1,11 +1,11 @@
 """Commands ``stcal camera``: camera files of other programs are shown, converted and compared."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.help import PLAIN, Commands
 from stcal.cli.terminal import print_each, say
 from stcal.errors import InputError
@@ -22,44 +22,25 @@ app = typer.Typer(
 )
 
 
-class Form(StrEnum):
-    """Format of a camera file."""
-
-    colmap = "colmap"
-    colmap_bin = "colmap-bin"
-    opencv = "opencv"
-    ros = "ros"
-    kalibr = "kalibr"
-    mrcal = "mrcal"
-    metashape = "metashape"
-    metashape_cameras = "metashape-cameras"
-    matlab = "matlab"
-    zhang = "zhang"
+Form = Literal[
+    "colmap", "colmap-bin", "opencv", "ros", "kalibr", "mrcal", "metashape", "metashape-cameras", "matlab", "zhang"
+]
+"""Format of a camera file."""
 
 
-NameOption = Annotated[
-    str, typer.Option("--name", help="Choose this camera of a file of several, such as cam1 or 2; and write this name.")
-]
-SizeOption = Annotated[
-    str,
-    typer.Option("--size", metavar="WxH", help="Take images of this size, px, where the file states none."),
-]
-PlotFile = Annotated[
-    Path | None, typer.Option("--plot", writable=True, help="Draw a picture into this file (PNG or SVG).")
-]
+NameOption = Annotated[str, "Choose this camera of a file of several, such as cam1 or 2; and write this name."]
+SizeOption = Annotated[str, "Take images of this size, px, where the file states none.", Opt(metavar="WxH")]
+PlotFile = Annotated[Path | None, "Draw a picture into this file (PNG or SVG).", WRITES]
 
 
 @app.command()
 def convert(
-    source: Annotated[Path, typer.Argument(metavar="A", help="Read the camera from this file, of any form.")],
-    out: Annotated[Path, typer.Argument(metavar="B", writable=True, help="Write the camera to this file.")],
+    source: Annotated[Path, "Read the camera from this file, of any form.", Arg("A")],
+    out: Annotated[Path, "Write the camera to this file.", Arg("B", writes=True)],
     form: Annotated[
         Form | None,
-        typer.Option(
-            "--form",
-            help="Write this form; if not given that of B's suffix: .txt colmap, .bin colmap-bin, .yaml opencv, "
-            ".cameramodel mrcal, .xml metashape, .mat matlab.",
-        ),
+        "Write this form; if not given that of B's suffix: .txt colmap, .bin colmap-bin, .yaml opencv, "
+        ".cameramodel mrcal, .xml metashape, .mat matlab.",
     ] = None,
     name: NameOption = "",
     size: SizeOption = "",
@@ -67,7 +48,7 @@ def convert(
     """Convert a camera file to the form of another program, and say what that has no place for."""
     from stcal.io.cameras.write import form_of, save_camera
 
-    kind = form_of(out, form.value if form else None)
+    kind = form_of(out, form)
     camera = _camera(source, name, size)
     lost = save_camera(out, camera, kind, name)
     say(f"{source}: {camera.colmap_model}, {camera.width}×{camera.height} px; written as {kind}")
@@ -77,7 +58,7 @@ def convert(
 
 @app.command()
 def show(
-    source: Annotated[Path, typer.Argument(metavar="A", help="Read the camera from this file, of any form.")],
+    source: Annotated[Path, "Read the camera from this file, of any form.", Arg("A")],
     name: NameOption = "",
     size: SizeOption = "",
     plot: PlotFile = None,
@@ -95,8 +76,8 @@ def show(
 
 @app.command()
 def compare(
-    first: Annotated[Path, typer.Argument(metavar="A", help="Read a camera from this file, of any form.")],
-    second: Annotated[Path, typer.Argument(metavar="B", help="Read the camera to compare from this file.")],
+    first: Annotated[Path, "Read a camera from this file, of any form.", Arg("A")],
+    second: Annotated[Path, "Read the camera to compare from this file.", Arg("B")],
     name: NameOption = "",
     size: SizeOption = "",
     plot: PlotFile = None,

@@ -1,22 +1,13 @@
 """Commands ``stcal locate``: a planar target of several tags is calibrated, located under any light, and judged."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.help import PLAIN, Commands
-from stcal.cli.options import (
-    CameraFile,
-    FlatBoardFile,
-    JsonFile,
-    LayoutFile,
-    QuaternionOrder,
-    Quaternions,
-    ReportFile,
-    Workers,
-)
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
 
@@ -29,18 +20,15 @@ app = typer.Typer(
 NOTHING_ACCEPTED = 3
 
 
-class MethodName(StrEnum):
-    """Name of the method that finds and judges the pose."""
-
-    joint = "joint"
-    patent = "patent"
+MethodName = Literal["joint", "patent"]
+"""Name of the method that finds and judges the pose."""
 
 
 @app.command()
 def schedule(
-    shortest: Annotated[float, typer.Argument(help="Start with this exposure time, in any unit.")],
-    longest: Annotated[float, typer.Argument(help="End with this exposure time, in the same unit.")],
-    count: Annotated[int, typer.Argument(min=1, max=1000, help="Print so many exposure times.")],
+    shortest: Annotated[float, "Start with this exposure time, in any unit.", Arg()],
+    longest: Annotated[float, "End with this exposure time, in the same unit.", Arg()],
+    count: Annotated[int, "Print so many exposure times.", Arg(min=1, max=1000)],
 ) -> None:
     """Print exposure times in a geometric series."""
     from stcal.locate.data.exposures import exposure_times
@@ -51,29 +39,20 @@ def schedule(
 
 @app.command()
 def capture(
-    out: Annotated[
-        Path, typer.Argument(metavar="SCENES", help="Write the scene's folder of images below this folder.")
-    ] = Path("scenes"),
-    scene: Annotated[str, typer.Option(help="Name the scene like this; its folder must not exist.")] = "scene-1",
-    device: Annotated[
-        str, typer.Option(help="Use this camera: a number, or a place such as /dev/video0 (V4L2, UVC).")
-    ] = "0",
+    out: Annotated[Path, "Write the scene's folder of images below this folder.", Arg("SCENES")] = Path("scenes"),
+    scene: Annotated[str, "Name the scene like this; its folder must not exist."] = "scene-1",
+    device: Annotated[str, "Use this camera: a number, or a place such as /dev/video0 (V4L2, UVC)."] = "0",
     shortest: Annotated[
-        float, typer.Option(min=1e-9, max=1e9, help="Start with this exposure, in the driver's unit; V4L2: 100 µs.")
+        float, "Start with this exposure, in the driver's unit; V4L2: 100 µs.", Opt(min=1e-9, max=1e9)
     ] = 10.0,
-    longest: Annotated[
-        float, typer.Option(min=1e-9, max=1e9, help="End with this exposure, in the driver's unit.")
-    ] = 1000.0,
-    count: Annotated[int, typer.Option(min=1, max=1000, help="Take so many, in a geometric series.")] = 5,
+    longest: Annotated[float, "End with this exposure, in the driver's unit.", Opt(min=1e-9, max=1e9)] = 1000.0,
+    count: Annotated[int, "Take so many, in a geometric series.", Opt(min=1, max=1000)] = 5,
     gain: Annotated[
-        float | None, typer.Option(min=0, max=1e6, help="Set this gain, in the driver's unit; as it is if not given.")
+        float | None, "Set this gain, in the driver's unit; as it is if not given.", Opt(min=0, max=1e6)
     ] = None,
-    settle: Annotated[
-        float, typer.Option("--settle-s", min=0, max=60, help="Give the camera this time after each change, s.")
-    ] = 0.3,
+    settle: Annotated[float, "Give the camera this time after each change, s.", Opt("--settle-s", min=0, max=60)] = 0.3,
     simulate: Annotated[
-        Path | None,
-        typer.Option(help="Use a simulated camera that sees this image at exposure 1, in place of --device."),
+        Path | None, "Use a simulated camera that sees this image at exposure 1, in place of --device."
     ] = None,
 ) -> None:
     """Take an exposure series with a camera of this machine, for run: SCENES/<scene>/<exposure>.png."""
@@ -102,17 +81,13 @@ def capture(
 
 @app.command()
 def calibrate(
-    images: Annotated[
-        Path, typer.Argument(help="Read photographs of the target with a board in the same plane from this folder.")
-    ],
-    camera: CameraFile,
-    board: FlatBoardFile,
-    layout: LayoutFile,
-    out: Annotated[
-        Path, typer.Option("--out", writable=True, help="Write the calibrated layout to this file (TOML).")
-    ] = Path("calibrated.toml"),
-    workers: Workers = None,
-    json_file: JsonFile = None,
+    images: Annotated[Path, "Read photographs of the target with a board in the same plane from this folder.", Arg()],
+    camera: shared.CameraFile,
+    board: shared.FlatBoardFile,
+    layout: shared.LayoutFile,
+    out: Annotated[Path, "Write the calibrated layout to this file (TOML).", WRITES] = Path("calibrated.toml"),
+    workers: shared.Workers = None,
+    json_file: shared.JsonFile = None,
 ) -> None:
     """Find where the corners of the target's tags lie, with σ, in a frame in the middle of the layout's origin tag."""
     from stcal.boards.file import load_flat_board
@@ -138,91 +113,51 @@ def calibrate(
 @app.command()
 def run(
     exposures: Annotated[
-        Path,
-        typer.Argument(help="Read one image, a folder of exposures of one scene, or a folder of such folders."),
+        Path, "Read one image, a folder of exposures of one scene, or a folder of such folders.", Arg()
     ],
-    layout: LayoutFile,
-    camera: CameraFile,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the accepted poses to this file (CSV).")
-    ] = None,
+    layout: shared.LayoutFile,
+    camera: shared.CameraFile,
+    out: Annotated[Path | None, "Write the accepted poses to this file (CSV).", WRITES] = None,
     method: Annotated[
-        MethodName, typer.Option(help="Use joint, all exposures together, or patent, each by itself as published.")
-    ] = MethodName.joint,
-    hand_eye: Annotated[
-        Path | None,
-        typer.Option("--hand-eye", help="Add poses in the robot's base by this result of `stcal handeye` (JSON)."),
-    ] = None,
-    robot_poses: Annotated[
-        Path | None,
-        typer.Option("--robot-poses", help="Read base_from_flange of each scene from this file (CSV)."),
-    ] = None,
-    key: Annotated[str, typer.Option("--key", help="Match scenes and rows of --robot-poses by this column.")] = "scene",
-    columns: Annotated[
-        Path | None,
-        typer.Option("--columns", help="Read --robot-poses with the columns, delimiter … of this file (TOML)."),
-    ] = None,
+        MethodName, "Use joint, all exposures together, or patent, each by itself as published."
+    ] = "joint",
+    hand_eye: Annotated[Path | None, "Add poses in the robot's base by this result of `stcal handeye` (JSON)."] = None,
+    robot_poses: Annotated[Path | None, "Read base_from_flange of each scene from this file (CSV)."] = None,
+    key: Annotated[str, "Match scenes and rows of --robot-poses by this column."] = "scene",
+    columns: Annotated[Path | None, "Read --robot-poses with the columns, delimiter … of this file (TOML)."] = None,
     registration: Annotated[
         Path | None,
-        typer.Option(
-            "--registration",
-            help="Add poses in the robot's base by this result of `stcal register` (JSON): a the camera, b the base.",
-        ),
+        "Add poses in the robot's base by this result of `stcal register` (JSON): a the camera, b the base.",
     ] = None,
-    quaternions: Quaternions = QuaternionOrder.wxyz,
+    quaternions: shared.Quaternions = "wxyz",
     offset: Annotated[
-        Path | None,
-        typer.Option(
-            "--offset", help="Add goal poses by obj_from_goal, 4×4 in the target's frame, of this file (JSON)."
-        ),
+        Path | None, "Add goal poses by obj_from_goal, 4×4 in the target's frame, of this file (JSON)."
     ] = None,
-    min_tags: Annotated[int, typer.Option(min=1, max=10_000, help="Reject a pose from fewer tags.")] = 1,
-    min_spread_px: Annotated[
-        float, typer.Option("--min-spread-px", min=0, max=1e5, help="Reject a pose whose corners extend over less, px.")
-    ] = 12.0,
+    min_tags: Annotated[int, "Reject a pose from fewer tags.", Opt(min=1, max=10_000)] = 1,
+    min_spread_px: Annotated[float, "Reject a pose whose corners extend over less, px.", Opt(min=0, max=1e5)] = 12.0,
     min_foreshortening: Annotated[
         float,
-        typer.Option(
-            min=0, max=1, help="Reject a pose with a smaller cosine between the target's normal and the line of sight."
-        ),
+        "Reject a pose with a smaller cosine between the target's normal and the line of sight.",
+        Opt(min=0, max=1),
     ] = 0.17,
-    max_p: Annotated[float, typer.Option(help="Reject a pose whose χ² p-value is below this.")] = 1e-4,
-    flip_odds: Annotated[
-        float, typer.Option(help="Call a pose ambiguous whose second solution has larger odds than this.")
-    ] = 1e-6,
+    max_p: Annotated[float, "Reject a pose whose χ² p-value is below this."] = 1e-4,
+    flip_odds: Annotated[float, "Call a pose ambiguous whose second solution has larger odds than this."] = 1e-6,
     sigma_margin: Annotated[
-        float, typer.Option(min=1, max=1000, help="Allow for σ that are all too small by up to this factor.")
+        float, "Allow for σ that are all too small by up to this factor.", Opt(min=1, max=1000)
     ] = 1.5,
-    equal_deg: Annotated[
-        float, typer.Option("--equal-deg", min=0, max=180, help="Treat two solutions nearer than this as one.")
-    ] = 1.0,
-    max_sigma_deg: Annotated[
-        float, typer.Option("--max-sigma-deg", help="Reject a pose whose largest σ of rotation exceeds this.")
-    ] = 2.0,
+    equal_deg: Annotated[float, "Treat two solutions nearer than this as one.", Opt(min=0, max=180)] = 1.0,
+    max_sigma_deg: Annotated[float, "Reject a pose whose largest σ of rotation exceeds this."] = 2.0,
     max_sigma_mm: Annotated[
-        float | None,
-        typer.Option("--max-sigma-mm", help="Reject a pose whose largest σ of position exceeds this; none by default."),
+        float | None, "Reject a pose whose largest σ of position exceeds this; none by default."
     ] = None,
-    moved_px: Annotated[
-        float, typer.Option("--moved-px", help="Treat a tag as moved that shifts by more than this between exposures.")
-    ] = 0.5,
-    s_dis: Annotated[
-        float, typer.Option("--s-dis", help="Set the patent's share of the largest area, for --method patent.")
-    ] = 0.8,
-    j_lim: Annotated[
-        float, typer.Option("--j-lim", help="Set the patent's limit of det J, 1/mm², for --method patent.")
-    ] = 1e-8,
-    e_lim_px: Annotated[
-        float, typer.Option("--e-lim-px", help="Set the patent's limit of the error, px, for --method patent.")
-    ] = 1.0,
-    e_ratio: Annotated[
-        float, typer.Option("--e-ratio", help="Set the patent's limit of the errors' ratio, for --method patent.")
-    ] = 2.0,
-    workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Use this many threads; one per core if not given.")
-    ] = None,
-    json_file: JsonFile = None,
-    report: ReportFile = None,
+    moved_px: Annotated[float, "Treat a tag as moved that shifts by more than this between exposures."] = 0.5,
+    s_dis: Annotated[float, "Set the patent's share of the largest area, for --method patent."] = 0.8,
+    j_lim: Annotated[float, "Set the patent's limit of det J, 1/mm², for --method patent."] = 1e-8,
+    e_lim_px: Annotated[float, "Set the patent's limit of the error, px, for --method patent."] = 1.0,
+    e_ratio: Annotated[float, "Set the patent's limit of the errors' ratio, for --method patent."] = 2.0,
+    workers: Annotated[int | None, "Use this many threads; one per core if not given.", Opt(min=1, max=1024)] = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
 ) -> None:
     """Find the pose of the target in each scene, with its 6×6 covariance, and accept, ambiguous or reject.
 
@@ -254,7 +189,7 @@ def run(
             "--offset: only with --hand-eye or --registration, which lead from the camera to the robot",
         )
     if hand_eye:
-        chain = read_chain(hand_eye, robot_poses, offset, quaternions.value, key, columns)
+        chain = read_chain(hand_eye, robot_poses, offset, quaternions, key, columns)
     elif registration:
         chain = read_registered(registration, offset)
     target, model = load_layout(layout), read_camera(camera)
@@ -277,7 +212,7 @@ def run(
             "E-ROBOT-POSES-SCENE",
             f"robot poses {robot_poses}: none of scene {missing[0]}; add a row, or take the scene away",
         )
-    results = list(located(scenes, target, model, LocateOptions(method.value, limits, patent, moved_px, workers)))
+    results = list(located(scenes, target, model, LocateOptions(method, limits, patent, moved_px, workers)))
     doubts = on_chain(chain, {each.name: uncertain(each) for each in accepted(results)}) if chain else ()
     document = run_report(results, scenes, target, model, chain)
     say(document.text())

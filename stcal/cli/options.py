@@ -6,14 +6,14 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
-from enum import StrEnum
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stcal.cli.help import Command, panel_of
+from stcal.cli.declare import Arg, Opt, declared
+from stcal.cli.help import Command
 from stcal.cli.terminal import STANDARD_OUTPUT, manner, print_each, said_apart, say
 from stcal.errors import ChecksFailed, InputError, InputNote, StcalError
 from stcal.io.files import keep_apart
@@ -24,89 +24,53 @@ if TYPE_CHECKING:
     from stcal.sfm.detect.circles.candidates import EllipseOptions
 
 
-Images = Annotated[Path, typer.Argument(help="Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.")]
-Run = Annotated[Path, typer.Argument(metavar="RUN", help="Read the finished run in this folder.")]
+Images = Annotated[Path, "Read the images of this folder: IMAGES/<group>/*.jpg, png, tif, bmp.", Arg()]
+Run = Annotated[Path, "Read the finished run in this folder.", Arg("RUN")]
 CameraFile = Annotated[
-    Path,
-    typer.Option(
-        "--camera", help="Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB."
-    ),
+    Path, "Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB."
 ]
 OptionalCamera = Annotated[
     Path | None,
-    typer.Option(
-        "--camera",
-        help="Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB; found from "
-        "the board's dots or the target's printed faces if not given.",
-    ),
+    "Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB; found "
+    "from the board's dots or the target's printed faces if not given.",
 ]
 CAMERA = "--camera"
 CameraName = Annotated[
-    str,
-    typer.Option("--camera-name", help="Take this camera of a --camera file of several: its name, or COLMAP's number."),
+    str, "Take this camera of a --camera file of several: its name, or COLMAP's number.", Opt("--camera-name")
 ]
 """Option that every command with ``--camera`` has."""
 Bayer = Annotated[
-    str,
-    typer.Option(
-        "--bayer", help="Take images for mosaics of a sensor with this Bayer pattern: RGGB, BGGR, GRBG or GBRG."
-    ),
+    str, "Take images for mosaics of a sensor with this Bayer pattern: RGGB, BGGR, GRBG or GBRG.", Opt("--bayer")
 ]
 """Option that every command has that reads a folder of images."""
-TargetFile = Annotated[
-    Path | None,
-    typer.Option("--target", help="Read the target's design from this target.toml, in place of the reference design."),
-]
+TargetFile = Annotated[Path | None, "Read the target's design from this target.toml, in place of the reference design."]
 BoardFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--board", help="Read the board from this file (TOML, or Kalibr's YAML), in place of the reference board."
-    ),
+    Path | None, "Read the board from this file (TOML, or Kalibr's YAML), in place of the reference board."
 ]
 PlateMargin = Annotated[
     float,
-    typer.Option(
-        "--margin-mm",
-        min=0,
-        max=1e4,
-        help="Assume that plates without outline_mm in target.toml end this far beyond the rims of their circles.",
-    ),
+    "Assume that plates without outline_mm in target.toml end this far beyond the rims of their circles.",
+    Opt("--margin-mm", min=0, max=1e4),
 ]
-FlatBoardFile = Annotated[
-    Path, typer.Option("--board", help="Read the board from this file: dots, chessboard, ChArUco or tags (TOML).")
-]
-RobotFile = Annotated[
-    Path, typer.Option("--robot", help="Read the robot from this file (TOML); `stcal robot init` writes one.")
-]
-LayoutFile = Annotated[Path, typer.Option("--layout", help="Read the target's tags from this file (TOML).")]
+FlatBoardFile = Annotated[Path, "Read the board from this file: dots, chessboard, ChArUco or tags (TOML)."]
+RobotFile = Annotated[Path, "Read the robot from this file (TOML); `stcal robot init` writes one.", Opt("--robot")]
+LayoutFile = Annotated[Path, "Read the target's tags from this file (TOML)."]
 JsonFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--json", writable=True, help="Also write everything to this file (JSON); to standard output with `-`."
-    ),
+    Path | None, "Also write everything to this file (JSON); to standard output with `-`.", Opt("--json", writes=True)
 ]
 ReportFile = Annotated[
-    Path | None,
-    typer.Option("--report", writable=True, help="Also write a page with tables and plots to this file (HTML)."),
+    Path | None, "Also write a page with tables and plots to this file (HTML).", Opt("--report", writes=True)
 ]
 Exclude = Annotated[
     list[str] | None,
-    typer.Option(
-        "--exclude",
-        metavar="IMAGE",
-        help="Take this image out, by its name in results, such as 12/IMG_1003.jpg; again for each further one.",
-    ),
+    "Take this image out, by its name in results, such as 12/IMG_1003.jpg; again for each further one.",
+    Opt(metavar="IMAGE"),
 ]
-Strict = Annotated[
-    bool,
-    typer.Option("--strict", help="End with exit code 4 where a check has failed; results are written all the same."),
-]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace output files that are there.")]
+Strict = Annotated[bool, "End with exit code 4 where a check has failed; results are written all the same."]
+Overwrite = Annotated[bool, "Replace output files that are there.", Opt("--overwrite")]
 """Option of every command that writes a file."""
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and errors.")]
-Verbose = Annotated[
-    bool, typer.Option("--verbose", "-v", help="Say more: each step, the time that stages take, what images show.")
-]
+Quiet = Annotated[bool, "Say nothing but warnings and errors.", Opt("--quiet -q")]
+Verbose = Annotated[bool, "Say more: each step, the time that stages take, what images show.", Opt("--verbose -v")]
 ALWAYS_NEW = ("export_database", "export_run")
 """Commands that never replace a file, as other programs work on their outputs."""
 WRITE_NOTHING = ("serve", "live", "dry_run")
@@ -115,99 +79,54 @@ _replacing: ContextVar[bool] = ContextVar("_replacing", default=True)
 """Whether a command may replace existing outputs."""
 MOST_SEED = 2**63 - 1
 """Largest seed: other programs read seeds in result files as signed 64-bit integers."""
-Workers = Annotated[
-    int | None, typer.Option("--workers", min=1, max=1024, help="Use this many processes; one per core if not given.")
-]
+Workers = Annotated[int | None, "Use this many processes; one per core if not given.", Opt(min=1, max=1024)]
 
 Scheduler = Annotated[
-    str | None,
-    typer.Option(
-        "--scheduler", help="Hand the images to the Dask cluster with the scheduler at this address, tcp://host:8786."
-    ),
+    str | None, "Hand the images to the Dask cluster with the scheduler at this address, tcp://host:8786."
 ]
-SendImages = Annotated[
-    bool,
-    typer.Option(
-        "--send-images", help="Send the images' content to the cluster, whose machines do not see their folder."
-    ),
-]
+SendImages = Annotated[bool, "Send the images' content to the cluster, whose machines do not see their folder."]
 
 
-class QuaternionOrder(StrEnum):
-    """Order of the four columns of a quaternion."""
-
-    wxyz = "wxyz"
-    xyzw = "xyzw"
+QuaternionOrder = Literal["wxyz", "xyzw"]
+"""Order of the four columns of a quaternion."""
 
 
 Quaternions = Annotated[
-    QuaternionOrder,
-    typer.Option(
-        "--quaternions",
-        help="Take quaternions as their columns are named, wxyz, or in the order in which these stand, xyzw.",
-    ),
+    QuaternionOrder, "Take quaternions as their columns are named, wxyz, or in the order in which these stand, xyzw."
 ]
 Rotation = Annotated[
     str | None,
-    typer.Option(
-        "--rotation",
-        help="Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, yaskawa …, rotvec, xyz "
-        "(fixed axes), ZYX (turned axes).",
-    ),
+    "Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, yaskawa …, rotvec, xyz "
+    "(fixed axes), ZYX (turned axes).",
 ]
 PayloadKg = Annotated[
     float | None,
-    typer.Option(
-        "--payload-kg",
-        min=0,
-        max=1e4,
-        help="Take this mass at the flange in all rows, where no column payload_kg says it; by default the robot "
-        "file's.",
-    ),
+    "Take this mass at the flange in all rows, where no column payload_kg says it; by default the robot file's.",
+    Opt(min=0, max=1e4),
 ]
 MinDiameter = Annotated[
     float | None,
-    typer.Option(
-        "--min-diameter",
-        min=4,
-        max=1e6,
-        help="Ignore circles smaller than this, px; 4.5, and 9 over 8 megapixels, if not given.",
-    ),
+    "Ignore circles smaller than this, px; 4.5, and 9 over 8 megapixels, if not given.",
+    Opt(min=4, max=1e6),
 ]
-MaxDiameter = Annotated[
-    float, typer.Option("--max-diameter", min=8, max=1e6, help="Ignore circles larger than this, px.")
-]
+MaxDiameter = Annotated[float, "Ignore circles larger than this, px.", Opt(min=8, max=1e6)]
 
 
 FirstTable = Annotated[
-    Path | None,
-    typer.Option("--a", help="Read rows from this file (CSV), in place of the one named first, and join those of --b."),
+    Path | None, "Read rows from this file (CSV), in place of the one named first, and join those of --b.", Opt("--a")
 ]
-SecondTable = Annotated[
-    Path | None, typer.Option("--b", help="Read what belongs to the rows of --a from this file (CSV).")
-]
-Key = Annotated[
-    str,
-    typer.Option(
-        "--key", help="Match rows of --a and --b by this column; or by A=B, a column of --a and another one of --b."
-    ),
-]
+SecondTable = Annotated[Path | None, "Read what belongs to the rows of --a from this file (CSV).", Opt("--b")]
+Key = Annotated[str, "Match rows of --a and --b by this column; or by A=B, a column of --a and another one of --b."]
 
 
 ColumnsFile = Annotated[
     Path | None,
-    typer.Option(
-        "--columns",
-        help="Read the measurements, of --a and --b those of --b, with the columns, delimiter and lines to skip of "
-        "this file (TOML).",
-    ),
+    "Read the measurements, of --a and --b those of --b, with the columns, delimiter and lines to skip of "
+    "this file (TOML).",
 ]
 
 
-FirstColumns = Annotated[
-    Path | None,
-    typer.Option("--columns-a", help="Read the file of --a with the columns, delimiter … of this file (TOML)."),
-]
+FirstColumns = Annotated[Path | None, "Read the file of --a with the columns, delimiter … of this file (TOML)."]
 
 
 def one_table(
@@ -262,14 +181,17 @@ def several_tables(
 
 def exports_of(words: Sequence[str], require_form: Callable[[str], None]) -> list[tuple[str, Path]]:
     """Returns form and file of each FORM=FILE of --export."""
-    exports = []
     for word in words:
         form, _, path = word.partition("=")
         require_form(form)
         if not path:
             raise InputError("E-OPTION-VALUE", f"--export {word}: no file; give {form}=FILE")
-        exports.append((form, Path(path)))
-    return exports
+    return _exports(words)
+
+
+def _exports(words: Sequence[str]) -> list[tuple[str, Path]]:
+    parts = [word.partition("=") for word in words]
+    return [(form, Path(path)) for form, _, path in parts if path]
 
 
 def name_of(source: "Path | Table") -> str:
@@ -343,18 +265,11 @@ def protect_outputs(application: typer.Typer) -> None:
 def _protected(command: Callable) -> Callable:
     if hasattr(command, "outputs"):  # reached through two applications
         return command
-    words, outputs, reads_images = {}, set(), False
     signature = inspect.signature(command, eval_str=True)
-    for name, parameter in signature.parameters.items():
-        for info in get_args(parameter.annotation)[1:]:
-            # With Annotated, Typer takes an option's first name for its default.
-            names = [each for each in (info.default, *(info.param_decls or ())) if isinstance(each, str)]
-            words[name] = names[0] if names else name
-            writes = bool(getattr(info, "writable", False))
-            outputs |= {name} if writes else set()
-            of_images = name in ("images", "exposures") or "IMAGES" in str(getattr(info, "metavar", ""))
-            reads_images |= of_images and "Path" in str(parameter.annotation) and command.__name__ != "capture"
-            info.rich_help_panel = panel_of(name, "Path" in str(parameter.annotation), writes)
+    parameters = {name: declared(name, each.annotation) for name, each in signature.parameters.items()}
+    words = {name: each.word for name, each in parameters.items()}
+    outputs = {name for name, each in parameters.items() if each.writes}
+    reads_images = command.__name__ != "capture" and any(each.reads_images for each in parameters.values())
 
     @wraps(command)
     def checked(
@@ -374,6 +289,7 @@ def _protected(command: Callable) -> Callable:
         written, read = (
             [(words[n], p) for n, p in paths if (n in outputs) == is_output] for is_output in (True, False)
         )
+        written += [("--export", path) for _, path in _exports(given.get("export") or ())]
         to_stdout = [option for option, path in written if path == STANDARD_OUTPUT]
         for option in to_stdout:
             if option != "--json":
@@ -392,23 +308,17 @@ def _protected(command: Callable) -> Callable:
             _replacing.reset(token)
 
     checked.outputs = frozenset(outputs)  # type: ignore[attr-defined]
-    further = {"quiet": Quiet, "verbose": Verbose}
-    if outputs and command.__name__ not in ALWAYS_NEW:
-        further = {"overwrite": Overwrite, **further}
-    added = [
-        inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=a) for n, a in further.items()
-    ]
-    if CAMERA in words.values():
-        further["camera_name"] = CameraName
-        name = inspect.Parameter("camera_name", inspect.Parameter.KEYWORD_ONLY, default="", annotation=CameraName)
-        added.insert(0, name)
-    if reads_images:
-        pattern = inspect.Parameter("bayer", inspect.Parameter.KEYWORD_ONLY, default="", annotation=Bayer)
-        further["bayer"] = Bayer
-        added.insert(0, pattern)
+    further: dict[str, tuple[Any, Any]] = {"bayer": (Bayer, "")} if reads_images else {}
+    further |= {"camera_name": (CameraName, "")} if CAMERA in words.values() else {}
+    further |= {"overwrite": (Overwrite, False)} if outputs and command.__name__ not in ALWAYS_NEW else {}
+    further |= {"quiet": (Quiet, False), "verbose": (Verbose, False)}
+    every = [each.replace(annotation=parameters[name].annotation) for name, each in signature.parameters.items()]
+    for name, (annotation, default) in further.items():
+        kind = declared(name, annotation, in_panel=False).annotation
+        every.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind))
     # Typer reads both.
-    checked.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *added])  # type: ignore[attr-defined]
-    checked.__annotations__ = {**command.__annotations__, **further}
+    checked.__signature__ = signature.replace(parameters=every)  # type: ignore[attr-defined]
+    checked.__annotations__ = {each.name: each.annotation for each in every} | {"return": None}
     return checked
 
 
@@ -447,12 +357,8 @@ def designs_told(
 
     Errors within the context name the assumed designs.
 
-    Parameters
-    ----------
-    target, board : path, optional
-        Files that were given.
-    with_target, with_board : bool
-        Whether the reference design replaces a file that was not given.
+    ``target``, ``board`` : files that were given; ``with_target``, ``with_board`` : whether the reference design
+    replaces a file that was not given.
     """
     from stcal.boards.target import body_of
     from stcal.sfm.detect.sightings import likeness_notes

@@ -1,108 +1,61 @@
 """Command ``stcal register``: the transform between two instruments' frames from corresponding points."""
 
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-import typer
-
-from stcal.cli.options import (
-    MOST_SEED,
-    ColumnsFile,
-    FirstColumns,
-    FirstTable,
-    Key,
-    ReportFile,
-    SecondTable,
-    name_of,
-    one_table,
-)
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.terminal import print_each, say, write, write_if
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 
-
-class ModelName(StrEnum):
-    """Model of the transform."""
-
-    rigid = "rigid"
-    similarity = "similarity"
-    affine = "affine"
+ModelName = Literal["rigid", "similarity", "affine"]
+"""Model of the transform."""
 
 
-class Method(StrEnum):
-    """Method of the fit."""
-
-    robust = "robust"
-    least_squares = "least-squares"
-    liu2017 = "liu2017"
+Method = Literal["robust", "least-squares", "liu2017"]
+"""Method of the fit."""
 
 
 def register(
     pairs_file: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="PAIRS", help="Read ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm of the same points from this file (CSV)."
-        ),
+        Path | None, "Read ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm of the same points from this file (CSV).", Arg("PAIRS")
     ] = None,
-    model: Annotated[ModelName, typer.Option(help="Fit a transform of this kind.")] = ModelName.rigid,
-    method: Annotated[
-        Method, typer.Option(help="Fit it with this method; liu2017 is a published one, always affine.")
-    ] = Method.robust,
+    model: Annotated[ModelName, "Fit a transform of this kind."] = "rigid",
+    method: Annotated[Method, "Fit it with this method; liu2017 is a published one, always affine."] = "robust",
     threshold: Annotated[
         float | None,
-        typer.Option(
-            "--threshold",
-            "--threshold-mm",
-            help="Count points nearer than this as inliers, mm; if not given estimated from the data, liu2017 0.2.",
-        ),
+        "Count points nearer than this as inliers, mm; if not given estimated from the data, liu2017 0.2.",
+        Opt("--threshold --threshold-mm"),
     ] = None,
     sample: Annotated[
-        int | None, typer.Option(min=4, max=100_000, help="Draw samples of so many points, liu2017; 30 if not given.")
+        int | None, "Draw samples of so many points, liu2017; 30 if not given.", Opt(min=4, max=100_000)
     ] = None,
     share: Annotated[
         float | None,
-        typer.Option(
-            min=1e-9, max=1, help="Accept a sample when more than this share of the others are inliers, liu2017; 0.85."
-        ),
+        "Accept a sample when more than this share of the others are inliers, liu2017; 0.85.",
+        Opt(min=1e-9, max=1),
     ] = None,
-    tries: Annotated[
-        int | None, typer.Option(min=1, max=1_000_000, help="Draw so many samples, liu2017; 1000 if not given.")
-    ] = None,
+    tries: Annotated[int | None, "Draw so many samples, liu2017; 1000 if not given.", Opt(min=1, max=1_000_000)] = None,
     orthogonality: Annotated[
         float | None,
-        typer.Option(
-            min=1e-12,
-            max=1e6,
-            help="Reject a sample whose 3×3 part R has an entry of RᵀR − 1 beyond this, liu2017; 0.01.",
-        ),
+        "Reject a sample whose 3×3 part R has an entry of RᵀR − 1 beyond this, liu2017; 0.01.",
+        Opt(min=1e-12, max=1e6),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw random samples and folds with this seed.")] = 0,
-    folds: Annotated[
-        int, typer.Option(min=0, max=100_000, help="Cross-validate with this many folds; 0 for none.")
-    ] = 6,
-    allow_ambiguous: Annotated[
-        bool, typer.Option("--allow-ambiguous", help="Answer even where another transform is about as good.")
-    ] = False,
+    seed: Annotated[int, "Draw random samples and folds with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    folds: Annotated[int, "Cross-validate with this many folds; 0 for none.", Opt(min=0, max=100_000)] = 6,
+    allow_ambiguous: Annotated[bool, "Answer even where another transform is about as good."] = False,
     robot_file: Annotated[
-        Path | None,
-        typer.Option("--robot", help="Solve base and kinematics of this robot (TOML) together; PAIRS needs q1_deg …."),
+        Path | None, "Solve base and kinematics of this robot (TOML) together; PAIRS needs q1_deg ….", Opt("--robot")
     ] = None,
-    identified: Annotated[
-        Path | None,
-        typer.Option(
-            "--identified", writable=True, help="Write the robot identified with --robot to this file (TOML)."
-        ),
-    ] = None,
-    first: FirstTable = None,
-    second: SecondTable = None,
-    key: Key = "name",
-    columns: ColumnsFile = None,
-    columns_a: FirstColumns = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write everything to this file (JSON).")
-    ] = None,
-    report: ReportFile = None,
+    identified: Annotated[Path | None, "Write the robot identified with --robot to this file (TOML).", WRITES] = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "name",
+    columns: shared.ColumnsFile = None,
+    columns_a: shared.FirstColumns = None,
+    out: Annotated[Path | None, "Write everything to this file (JSON).", WRITES] = None,
+    report: shared.ReportFile = None,
 ) -> None:
     """Find b_from_a from points measured in two frames, some of them wrong; with σ, outliers and where it holds."""
     from stcal.register import register as registered
@@ -116,15 +69,15 @@ def register(
         raise InputError("E-OPTION-NEEDS", f"--identified {identified}: only with --robot FILE")
     published = {"sample": sample, "share": share, "tries": tries, "orthogonal_within": orthogonality}
     published = {name: value for name, value in published.items() if value is not None}
-    if published and method != Method.liu2017:
+    if published and method != "liu2017":
         raise InputError("E-OPTION-NEEDS", "--sample, --share, --tries, --orthogonality: only with --method liu2017")
-    liu2017 = replace(Liu2017Options(), **published) if method == Method.liu2017 else None
-    source = one_table(pairs_file, first, second, key, "PAIRS", ("a", "b"), columns=columns, columns_a=columns_a)
+    liu2017 = replace(Liu2017Options(), **published) if method == "liu2017" else None
+    source = shared.one_table(pairs_file, first, second, key, "PAIRS", ("a", "b"), columns=columns, columns_a=columns_a)
     pairs = read_pairs(source)
     if not isinstance(source, Path) and any("cov_" in column for column in source.columns):
         say("note: the covariances of --a and --b are not used; the noise of the points is estimated")
     allow_ambiguous |= robot_file is not None  # a bent arm may look like two motions; the kinematics show it
-    options = {"model": model.value, "method": method.value, "threshold_mm": threshold, "seed": seed}
+    options = {"model": model, "method": method, "threshold_mm": threshold, "seed": seed}
     options |= {"liu2017_options": liu2017} if liu2017 else {}
     result = registered(
         pairs.xyz_a,
@@ -153,7 +106,7 @@ def register(
             content = content.model_copy(update={"robot": robot_part(beside)})
             sections.append(comparison_section(beside))
             if identified:
-                comments = [f"Identified from {name_of(source)}: {beside.identified.rank} parameters."]
+                comments = [f"Identified from {shared.name_of(source)}: {beside.identified.rank} parameters."]
                 write(identified, robot_toml(beside.identified.robot, comments))
                 require_identified_written(identified, beside.identified)
         except (DegenerateError, ConvergenceError) as error:  # the transform is valid without it

@@ -39,21 +39,13 @@ def draw(
 ) -> Drawn:
     """Draw a target or a board 1:1 to a file, whose suffix gives the form.
 
-    Parameters
-    ----------
-    design : path
-        A ``target.toml`` or a board file of any kind.
-    paper : str
-        One of :data:`~stcal.drawing.sheets.PAPERS`, or ``own``; if not given, A4 for PDF, ``own`` for SVG and DXF.
-    margin_mm : float
-        Distance from the outermost circles to the edge of a plate, if the design has no outline.
-    net : bool
-        True unfolds the plates of a target into one plane, by their outlines and rough poses.
+    ``design`` : a ``target.toml`` or a board file of any kind; ``paper`` : one of :data:`~stcal.drawing.sheets.PAPERS`,
+    or ``own``; if not given, A4 for PDF, ``own`` for SVG and DXF; ``margin_mm`` : distance from the outermost circles
+    to the edge of a plate, if the design has no outline; ``net`` : True unfolds the plates of a target into one plane,
+    by their outlines and rough poses.
 
-    Raises
-    ------
-    InputError
-        The design cannot be read or drawn, the file has another suffix, or the paper does not suit the form.
+    Raises InputError: the design cannot be read or drawn, the file has another suffix, or the paper does not suit the
+    form.
     """
     path = Path(path)
     paper = _paper(path, paper)
@@ -93,10 +85,7 @@ def sheets_of(parts: list[Part], paper: str, title: str, apart: bool) -> list[Sh
 def content_of(sheets: list[Sheet], path: Path) -> str | bytes:
     """Return the content of a file in the form of its suffix.
 
-    Raises
-    ------
-    InputError
-        There are more or larger sheets than the form holds.
+    Raises InputError: there are more or larger sheets than the form holds.
     """
     suffix = path.suffix.lower()
     if suffix == ".pdf":

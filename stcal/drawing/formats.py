@@ -81,10 +81,7 @@ APPLICATION = "STCAL"
 def new_drawing():
     """Return an empty drawing, R2010, mm.
 
-    Raises
-    ------
-    InputError
-        ``stereo-target-calibration[cad]`` is not installed.
+    Raises InputError: ``stereo-target-calibration[cad]`` is not installed.
     """
     try:
         from ezdxf import units
@@ -107,10 +104,7 @@ def dxf(sheet: Sheet) -> str:
     It holds ``CIRCLE``, closed ``LWPOLYLINE`` (the area between it and those inside it is inked) and ``TEXT``. Labels
     of circles and the ink are extended data ``STCAL``.
 
-    Raises
-    ------
-    InputError
-        ``stereo-target-calibration[cad]`` is not installed.
+    Raises InputError: ``stereo-target-calibration[cad]`` is not installed.
     """
     drawing = new_drawing()
     drawing.appids.add(APPLICATION)

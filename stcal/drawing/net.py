@@ -46,10 +46,7 @@ class _Plate:
 def net_parts(target: TargetDesign) -> list[Part]:
     """Return the net in few pieces, in each of which no plates overlap.
 
-    Raises
-    ------
-    InputError
-        A face has no outline or rough pose, or no two plates share an edge.
+    Raises InputError: a face has no outline or rough pose, or no two plates share an edge.
     """
     for face in target.faces:
         if face.outline_mm is None or face.rough_target_from_face is None:

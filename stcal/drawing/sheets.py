@@ -86,10 +86,7 @@ def one_sheet(parts: Sequence[Part], title: str) -> Sheet:
 def paper_sheets(parts: Sequence[Part], paper: str, title: str) -> list[Sheet]:
     """Return the sheets of a paper for all parts, as few as possible for each part.
 
-    Raises
-    ------
-    InputError
-        There would be more than :data:`MOST_SHEETS`.
+    Raises InputError: there would be more than :data:`MOST_SHEETS`.
     """
     split = [min(_ways(part, paper), key=lambda way: way.count()) for part in parts]
     total = sum(way.count() for way in split)

@@ -98,19 +98,14 @@ class Choice:
 
     Parameters
     ----------
-    tried : tuple of Tried
-        All candidates, those that trust the files first.
-    chosen : Candidate
-        The candidate that was chosen.
-    result : HandEye
-        Its solution from all poses. Its σ are widened where another answer that predicts as well differs by more than
-        the σ allow.
-    held_out : HeldOutPoses
-        Errors of the choice as a whole: in each split, of the candidate that the errors on all other poses choose.
-    sentence : str
-        The choice, what it gains, and what it says about camera file, board and robot.
-    notes : tuple of str
-        Notes on answers that contradict each other.
+    tried : all candidates, those that trust the files first
+    chosen : the candidate that was chosen
+    result : its solution from all poses. Its σ are widened where another answer that predicts as well differs by more
+        than the σ allow.
+    held_out : errors of the choice as a whole: in each split, of the candidate that the errors on all other poses
+        choose
+    sentence : the choice, what it gains, and what it says about camera file, board and robot
+    notes : notes on answers that contradict each other
     """
 
     tried: tuple[Tried, ...]
@@ -213,16 +208,12 @@ def choose(
 
     Parameters
     ----------
-    pairs, setup, views, options
-        See :func:`~stcal.handeye.handeye`; the scale and the intrinsics of ``options`` are overwritten.
-    prior : CameraPrior, optional
-        Prior of the intrinsics; they are never solved for if None.
-    rows : (s, k) int array
-        Poses to hold out in each split.
-    workers : int or None
-        Number of processes; as many as cores if None.
-    progress : callable, optional
-        Called with the number of solutions done, and the number of all solutions of the stage.
+    pairs, setup, views, options : see :func:`~stcal.handeye.handeye`; the scale and the intrinsics of ``options`` are
+        overwritten
+    prior : prior of the intrinsics; they are never solved for if None
+    rows : (s, k) poses to hold out in each split
+    workers : number of processes; as many as cores if None
+    progress : called with the number of solutions done, and the number of all solutions of the stage
 
     Returns
     -------

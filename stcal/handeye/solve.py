@@ -24,14 +24,15 @@ from stcal.handeye.methods.camera_error import of_poses
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, solve_closed_form
 from stcal.handeye.methods.convex import convex
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
+from stcal.handeye.methods.joint import Adjusted, adjust_views
 from stcal.handeye.methods.noise import Noise
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution, adjust_poses
-from stcal.handeye.methods.reprojection import CAMERA_GAIN, AdjustedViews, adjust_views, resected
+from stcal.handeye.methods.reprojection import CAMERA_GAIN, resected
 from stcal.handeye.result import HandEye
 from stcal.io.cameras.model import CameraPrior
 from stcal.parallel import one_thread
 
-S = TypeVar("S", PoseSolution, AdjustedViews)
+S = TypeVar("S", PoseSolution, Adjusted)
 OTHERS = ("zhao", "de", "de-polished", "pose", "reprojection")
 METHODS = (*AX_XB, *AX_ZB, *OTHERS)
 """Names of all methods."""
@@ -119,10 +120,12 @@ class _Task:
         return replace(self, pairs=self.pairs[rows], loop=self.loop[rows], views=views)
 
 
-def _guess(options: HandEyeOptions, seen: Observability, loop: Loop, with_scale: bool) -> tuple[Rigid, Rigid, float]:
+def _guess(
+    options: HandEyeOptions, observability: Observability, loop: Loop, with_scale: bool
+) -> tuple[Rigid, Rigid, float]:
     """Returns the first X, Z and scale."""
     if options.four_dof:
-        return closed_form.about_one_axis(loop, seen.mount_axis, with_scale)
+        return closed_form.about_one_axis(loop, observability.mount_axis, with_scale)
     return closed_form.robust(loop, with_scale)
 
 
@@ -212,7 +215,7 @@ class Solved:
 
     task: _Task
     result: HandEye
-    solution: PoseSolution | AdjustedViews | None = None
+    solution: PoseSolution | Adjusted | None = None
 
     def without(self, out: np.ndarray) -> HandEye:
         """Returns the result without the poses ``out``, (k,) rows: X, Z, scale, camera and board. All else, σ and
@@ -220,10 +223,7 @@ class Solved:
 
         Adjustments move from the solution of all poses by its equations; other methods are solved again.
 
-        Raises
-        ------
-        StcalError
-            The method fails without these poses.
+        Raises StcalError: the method fails without these poses.
         """
         task, solution = self.task, self.solution
         if solution is None:
@@ -232,9 +232,9 @@ class Solved:
                 self.result, mount_from_camera=again.mount_from_camera, stand_from_board=again.stand_from_board
             )
         board = None
-        if isinstance(solution, AdjustedViews):
-            state = solution.without(out)
-            found, corners = solution.found, state.scale * state.corners
+        if isinstance(solution, Adjusted):
+            state = solution.without(out).of(0)
+            found, corners = solution.found[0], state.scale * state.corners
             board = replace(found, camera=state.camera, corners=corners)
         else:
             state = solution.without(task.loop, out)
@@ -366,24 +366,25 @@ def _by_views(task: _Task, views: Views) -> Solved:
     options, names = task.options, task.pairs.names
     first = task.guess(task.loop, options.with_scale)
 
-    def adjusted_by(loop: Loop, noise: Noise) -> AdjustedViews:
+    def adjusted_by(loop: Loop, noise: Noise) -> Adjusted:
         flange = task.pairs.base_from_flange
         intrinsics, camera = options.intrinsics, options.camera
         return adjust_views(loop, flange, views, first, noise, intrinsics, options.with_scale, camera, options.arm)
 
     solution, contradicted = _by_true_robot(task, adjusted_by)
+    state, outliers, found = solution.state.of(0), ~solution.used[0], solution.found[0]
     if solution.sigma_scale is not None:
-        require_scale(solution.state.scale, solution.sigma_scale, task.loop, task.pairs.where)
-    x, z = solution.state.mount_from_camera, solution.state.stand_from_board
+        require_scale(state.scale, solution.sigma_scale, task.loop, task.pairs.where)
+    x, z = state.mount_from_camera, state.stand_from_board
     notes, covariance = task.notes + contradicted, solution.covariance
     if options.four_dof:
-        x, z, covariance, notes = _without_slide(task, x, z, solution.normal)
+        x, z, covariance, notes = _without_slide(task, x, z, solution.normal())
     if solution.camera_error is not None:
         covariance = solution.camera_error.covariance(covariance)
-    adjusted = replace(solution.loop, camera_from_board=resected(names, views, solution.found))
+    adjusted = replace(solution.loops[0], camera_from_board=resected(names, views, found))
     residuals = adjusted.residuals(x, z)
-    notes += _remarks(task, x, solution.outliers, residuals, solution.scale_hint)
-    notes += of_camera_file(solution.camera_gain, solution.sigma)
+    notes += _remarks(task, x, outliers, residuals, solution.scale_hint)
+    notes += of_camera_file(float(solution.camera_gain[0]), solution.sigma)
     result = HandEye(
         method="reprojection",
         setup=task.setup,
@@ -391,14 +392,14 @@ def _by_views(task: _Task, views: Views) -> Solved:
         stand_from_board=z,
         residuals=residuals,
         names=names,
-        outliers=solution.outliers,
+        outliers=outliers,
         covariance=covariance[:6, :6],
         stand_covariance=covariance[6:12, 6:12],
-        scale=solution.state.scale,
+        scale=state.scale,
         sigma_scale=solution.sigma_scale,
         sigma=solution.sigma,
         estimated=solution.estimated,
-        reprojection=solution.found,
+        reprojection=found,
         observability=task.seen,
         notes=notes + remarks.of_rounds(solution.settled),
     )

@@ -46,18 +46,12 @@ class TimeOffset:
 
     Parameters
     ----------
-    seconds : float
-        Robot's clock minus camera's: an image stamped t was taken when the robot's clock showed t + ``seconds``.
-    sigma_s : float
-        σ of the offset, from an adjustment of X, Z and the offset.
-    slope : (12,) array
-        Change of X and Z, (rotation rad, translation mm) of each, per second of offset.
-    kept : (m,) bool array
-        Poses whose time, corrected by the offset, lies within the stream.
-    base_from_flange : Poses
-        The robot's poses at the corrected times of the poses kept, mm.
-    speed_rad_s, speed_mm_s : float
-        RMS speed of the flange at the images.
+    seconds : robot's clock minus camera's: an image stamped t was taken when the robot's clock showed t + ``seconds``
+    sigma_s : σ of the offset, from an adjustment of X, Z and the offset
+    slope : (12,) change of X and Z, (rotation rad, translation mm) of each, per second of offset
+    kept : (m,) poses whose time, corrected by the offset, lies within the stream
+    base_from_flange : the robot's poses at the corrected times of the poses kept, mm
+    speed_rad_s, speed_mm_s : RMS speed of the flange at the images
     """
 
     seconds: float
@@ -102,18 +96,12 @@ def estimate_offset(
 
     Parameters
     ----------
-    pairs : HandEyePoses
-        The m pairs; only their poses of the board are used.
-    stream : Stream
-        The robot's poses over time by its clock.
-    seconds : (m,) array
-        Times of the pairs after the stream's origin, by the camera's clock, s.
-    setup : {"eye-in-hand", "eye-to-hand"}
-        What carries the camera.
-    noise : Noise, optional
-        Known σ of the errors.
-    with_scale : bool
-        True if the board's size is an unknown.
+    pairs : the m pairs; only their poses of the board are used
+    stream : the robot's poses over time by its clock
+    seconds : (m,) times of the pairs after the stream's origin, by the camera's clock, s
+    setup : {"eye-in-hand", "eye-to-hand"}: what carries the camera
+    noise : known σ of the errors
+    with_scale : True if the board's size is an unknown
 
     Returns
     -------
@@ -180,7 +168,7 @@ def estimate_offset(
 
 
 def _inside(stream: Stream, seconds: np.ndarray) -> np.ndarray:
-    """Returns for times (m,) whether they lie within the stream."""
+    """Returns a mask (m,) of the times that lie within the stream."""
     return (seconds >= 0) & (seconds <= stream.seconds[-1])
 
 

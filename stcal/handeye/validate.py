@@ -19,7 +19,7 @@ from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods.noise import UNKNOWNS
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
-from stcal.parallel import one_thread, run_parallel
+from stcal.parallel import one_thread, run_in_order
 
 SETUP_SPLITS = 6
 """Number of splits that decide which setup is meant."""
@@ -171,12 +171,8 @@ def cross_validate(
         pairs, views, options = repaired.pairs, repaired.views, replace(options, symmetries=())
     rows = splits(len(pairs)) if rows is None else rows
     jobs = [(pairs, setup, method, views, options, out) for out in rows]
-    errors_of_split: list[dict[str, np.ndarray]] = [{}] * len(jobs)
     slow = views is not None and method in (None, "reprojection")
-    for done, (i, errors) in enumerate(run_parallel(errors_without, jobs, workers if slow else 1), 1):
-        errors_of_split[i] = errors
-        if progress:
-            progress(done, len(jobs))
+    errors_of_split = run_in_order(errors_without, jobs, workers if slow else 1, progress)
     return HeldOutPoses(
         rows, **{name: np.array([errors[name] for errors in errors_of_split]) for name in errors_of_split[0]}
     )
@@ -212,10 +208,7 @@ def _without(pairs: HandEyePoses, out: np.ndarray, error: DegenerateError) -> De
 def require_solvable_without(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, out: np.ndarray) -> None:
     """Checks that the poses besides ``out``, (k,), determine the answer.
 
-    Raises
-    ------
-    DegenerateError
-        They do not. The message names the poses that were held out.
+    Raises DegenerateError: they do not. The message names the poses that were held out.
     """
     remaining = np.setdiff1d(np.arange(len(pairs)), out)
     try:
@@ -282,10 +275,8 @@ def better_setup(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, row
 
     Parameters
     ----------
-    pairs, setup, options
-        See :func:`~stcal.handeye.handeye`.
-    rows : (s, k) int array
-        Poses to hold out.
+    pairs, setup, options : see :func:`~stcal.handeye.handeye`
+    rows : (s, k) poses to hold out
 
     Returns
     -------
@@ -414,10 +405,8 @@ def scatter(result: HandEye, held_out: HeldOutPoses) -> float:
 
     Parameters
     ----------
-    result : HandEye
-        Solution from all poses.
-    held_out : HeldOutPoses
-        Cross-validation of the same poses, with ``mount_from_camera``.
+    result : solution from all poses
+    held_out : cross-validation of the same poses, with ``mount_from_camera``
 
     Returns
     -------

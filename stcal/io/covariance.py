@@ -56,10 +56,8 @@ def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fau
     Parameters
     ----------
     matrices : (m, n, n) array
-    rows : Rows
-        Names of the rows, and the variances that count as zero.
-    definite : bool
-        True if eigenvalues must be positive, since the matrix will be inverted.
+    rows : names of the rows, and the variances that count as zero
+    definite : True if eigenvalues must be positive, since the matrix will be inverted
 
     Returns
     -------
@@ -92,10 +90,7 @@ def first_fault(matrices: np.ndarray, rows: Rows, definite: bool = False) -> Fau
 def require_covariance(matrix: np.ndarray, size: int, rows: Rows, definite: bool = False) -> None:
     """Refuse a matrix that is not a covariance of ``size`` rows; see :func:`first_fault`.
 
-    Raises
-    ------
-    InputError
-        The message states measured and needed values; the caller adds whose covariance it is.
+    Raises InputError: the message states measured and needed values; the caller adds whose covariance it is.
     """
     if matrix.shape != (size, size):
         raise InputError(

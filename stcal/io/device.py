@@ -52,19 +52,10 @@ class Source(Protocol):
 class OpenCVSource:
     """A camera of this machine.
 
-    Parameters
-    ----------
-    device
-        Number, or path such as ``/dev/video0``.
-    gain
-        In the driver's unit; None leaves it unchanged.
-    by_hand
-        True if exposures are set manually, False for the camera's automatic exposure.
+    ``device`` : number, or path such as ``/dev/video0``; ``gain`` : in the driver's unit; None leaves it unchanged;
+    ``by_hand`` : True if exposures are set manually, False for the camera's automatic exposure.
 
-    Raises
-    ------
-    InputError
-        There is no such camera, or its driver accepts no gain.
+    Raises InputError: there is no such camera, or its driver accepts no gain.
     """
 
     def __init__(self, device: str, gain: float | None = None, by_hand: bool = True):
@@ -116,19 +107,10 @@ class OpenCVSource:
 class SimulatedSource:
     """A simulated camera that shows given images. They belong to exposure 1; brightness is proportional to exposure.
 
-    Parameters
-    ----------
-    images
-        An image that is shown for ever, or a folder whose images are shown one after another, by name.
-    gain
-        Factor on the brightness; 1 if None.
-    seed
-        Seed of the noise.
+    ``images`` : an image that is shown for ever, or a folder whose images are shown one after another, by name;
+    ``gain`` : factor on the brightness; 1 if None; ``seed`` : seed of the noise.
 
-    Raises
-    ------
-    InputError
-        There is no image, or one cannot be read.
+    Raises InputError: there is no image, or one cannot be read.
     """
 
     def __init__(self, images: str | Path, gain: float | None = None, seed: int = 0):
@@ -168,10 +150,7 @@ def png(image: np.ndarray) -> bytes:
 def checked_name(name: str, what: str) -> str:
     """Return ``name`` if it is a valid name of a folder.
 
-    Raises
-    ------
-    InputError
-        The name is not valid.
+    Raises InputError: the name is not valid.
     """
     if not re.fullmatch(r"[\w][\w .-]{0,99}", name):
         raise InputError(

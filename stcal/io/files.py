@@ -30,10 +30,7 @@ MODEL_BYTES = 1000 * MB
 def read_bytes(path: str | Path, most: int) -> bytes:
     """Return the whole content of a file.
 
-    Raises
-    ------
-    OSError
-        It cannot be read, or is larger than ``most`` bytes.
+    Raises OSError: it cannot be read, or is larger than ``most`` bytes.
     """
     chunks, remaining = [], most + 1
     with open(path, "rb") as stream:
@@ -49,10 +46,7 @@ def read_bytes(path: str | Path, most: int) -> bytes:
 def text_of(content: bytes) -> str:
     """Return the text of a file in UTF-8, or in UTF-16 with a byte-order mark; each line ends in a line feed.
 
-    Raises
-    ------
-    UnicodeDecodeError
-        It is neither.
+    Raises UnicodeDecodeError: it is neither.
     """
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     text = content.decode("utf-16" if wide else "utf-8-sig")
@@ -62,10 +56,7 @@ def text_of(content: bytes) -> str:
 def require_size(path: str | Path, most: int) -> None:
     """Refuse a file that is too large; for files that another program's library reads.
 
-    Raises
-    ------
-    OSError
-        The file is larger than ``most`` bytes.
+    Raises OSError: the file is larger than ``most`` bytes.
     """
     if Path(path).stat().st_size > most:
         raise _too_large(path, most)
@@ -113,10 +104,7 @@ and COLMAP's models and databases from folders."""
 def save(path: Path, content: str | bytes) -> None:
     """Write a file atomically; a missing folder is made.
 
-    Raises
-    ------
-    InputError
-        The file cannot be written.
+    Raises InputError: the file cannot be written.
     """
     if not path.name or path.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{path}: is a folder; the name of a file needed")
@@ -140,10 +128,7 @@ def save(path: Path, content: str | bytes) -> None:
 def require_new_folder(out: Path, images: Path) -> None:
     """Refuse, before the work, an output folder that is not empty, lies among the photographs, or cannot be written.
 
-    Raises
-    ------
-    InputError
-        The message names the reason.
+    Raises InputError: the message names the reason.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError("E-OUTPUT-EXISTS", f"--out {out}: is not a new or empty folder; give another place")
@@ -167,16 +152,11 @@ def require_written(
 
     Parameters
     ----------
-    path : str or Path
-        The file, for the message.
-    read : callable
-        Reads the file with the reader of later commands, and returns what it predicts.
-    reported : array
-        The same quantity from the result in memory; nan where there is none.
-    most : float
-        Largest difference of one value: rounding by the decimals of the file.
-    unit : str
-        Unit of the values.
+    path : the file, for the message
+    read : reads the file with the reader of later commands, and returns what it predicts
+    reported : the same quantity from the result in memory; nan where there is none
+    most : largest difference of one value: rounding by the decimals of the file
+    unit : unit of the values
 
     Raises
     ------
@@ -217,10 +197,7 @@ def require_same(path: str | Path, read: Callable[[], object], content: object) 
 def save_folder(out: Path, files: dict[str, str]) -> None:
     """Write all files into a new folder, or none of them.
 
-    Raises
-    ------
-    InputError
-        The files cannot be written.
+    Raises InputError: the files cannot be written.
     """
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
@@ -278,14 +255,9 @@ def _key(key) -> str:
 def keep_apart(outputs: Sequence[tuple[str, Path]], inputs: Sequence[tuple[str, Path]]) -> None:
     """Refuse, before the work, outputs that would replace an input, a file in an input folder, or each other.
 
-    Parameters
-    ----------
-    outputs, inputs : (option, path); an input may be a folder
+    ``outputs``, ``inputs`` : (option, path); an input may be a folder.
 
-    Raises
-    ------
-    InputError
-        The message names the output, and what it would replace.
+    Raises InputError: the message names the output, and what it would replace.
     """
     places: dict[Path, str] = {}
     for option, path in outputs:

@@ -33,13 +33,9 @@ def spread(executor: Executor, at_once: int = AT_ONCE, send_images: bool = False
 
     The executor stays open. With the same libraries, results equal those of local processes bit by bit.
 
-    Parameters
-    ----------
-    executor : concurrent.futures.Executor
-    at_once : int
-        Number of images that are handed over at a time; it bounds the memory for their contents.
-    send_images : bool
-        True sends images with their content; False sends paths on storage that all machines share.
+    ``executor`` : concurrent.futures.Executor; ``at_once`` : number of images that are handed over at a time; it bounds
+    the memory for their contents; ``send_images`` : True sends images with their content; False sends paths on storage
+    that all machines share.
     """
     token = _current.set(_Spread(executor, at_once, send_images))
     try:
@@ -55,17 +51,10 @@ def run_on_images(
 
     The first argument of a job is an image file, or a list of them; a job needs nothing else of this machine.
 
-    Parameters
-    ----------
-    kept : bool
-        True if the caller keeps finished results, so that a second try continues there.
+    ``kept`` : True if the caller keeps finished results, so that a second try continues there.
 
-    Raises
-    ------
-    DetectionError
-        A process was ended from outside, or the executor is broken.
-    InputError
-        A worker does not see the folder of an image that it should read.
+    Raises DetectionError: a process was ended from outside, or the executor is broken. Raises InputError: a worker does
+    not see the folder of an image that it should read.
     """
     current = _current.get()
     try:

@@ -127,10 +127,7 @@ _bayer: ContextVar[str] = ContextVar("_bayer", default="")
 def mosaic_of(pattern: str) -> Iterator[None]:
     """Read images as mosaics of this pattern, or as they are if it is empty; for all images that are found meanwhile.
 
-    Raises
-    ------
-    InputError
-        The pattern is unknown.
+    Raises InputError: the pattern is unknown.
     """
     if pattern and pattern.upper() not in PATTERNS:
         raise InputError("E-OPTION-VALUE", f"--bayer {pattern[:20]}: one of {', '.join(PATTERNS)} needed")
@@ -186,10 +183,7 @@ def _say_mosaic(files: Sequence[ImageFile]) -> None:
 def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
     """Return the image files below ``folder``, sorted by group and name, and the files that are skipped.
 
-    Raises
-    ------
-    InputError
-        The folder is missing, or holds no image.
+    Raises InputError: the folder is missing, or holds no image.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -228,10 +222,7 @@ def chosen_images(folder: str | Path, exclude: Sequence[str] = ()) -> tuple[list
 
     ``exclude`` : names of images in results (``12/IMG_1003.jpg``), or their paths.
 
-    Raises
-    ------
-    InputError
-        As for :func:`find_images`; an excluded image does not exist, or no image is left.
+    Raises InputError: as for :func:`find_images`; an excluded image does not exist, or no image is left.
     """
     return without_excluded(*find_images(folder), exclude, folder)
 
@@ -298,10 +289,7 @@ def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.nd
     EXIF orientation is ignored: pixels are as the sensor gave them. Only where ``size``, width and height of the
     camera's images, is given and the image has its sides swapped, the image is turned as its EXIF says.
 
-    Raises
-    ------
-    InputError
-        The data are empty, truncated or unreadable.
+    Raises InputError: the data are empty, truncated or unreadable.
     """
     if not data:
         raise InputError("E-IMAGE-EMPTY", f"{name}: empty file (0 bytes); copy it again")
@@ -400,10 +388,7 @@ def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | Non
 def require_common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str]:
     """Return width and height, px, of most of the images, and the name of one of them.
 
-    Raises
-    ------
-    InputError
-        No image is readable.
+    Raises InputError: no image is readable.
     """
     found = common_size(files)
     if found is None:
@@ -432,10 +417,7 @@ def size_fault(name: str, own: tuple[int, int], wanted: tuple[int, int], stated_
 def stated_size(data: bytes, name: str) -> tuple[int, int]:
     """Return width and height, px, from the header of an image file, without decoding it.
 
-    Raises
-    ------
-    InputError
-        The data are no image, or have more pixels than any camera.
+    Raises InputError: the data are no image, or have more pixels than any camera.
     """
     try:
         with warnings.catch_warnings():
@@ -455,10 +437,7 @@ def stated_size(data: bytes, name: str) -> tuple[int, int]:
 def grey_of(image: np.ndarray, name: str) -> np.ndarray:
     """Return the grey image (height, width) of an array, grey or with three channels RGB.
 
-    Raises
-    ------
-    InputError
-        The array has another shape, or its values are not of 8 or 16 bit.
+    Raises InputError: the array has another shape, or its values are not of 8 or 16 bit.
     """
     image = np.asarray(image)
     if not image.size or image.shape[2:] not in ((), (1,), (3,)) or image.ndim < 2:
@@ -488,10 +467,7 @@ def grey_fine(image: np.ndarray) -> np.ndarray:
 def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "image") -> None:
     """Refuse an array that is no grey image of 8 or 16 bits, or not of the camera's ``size``, (width, height) px.
 
-    Raises
-    ------
-    InputError
-        The message begins with ``name``.
+    Raises InputError: the message begins with ``name``.
     """
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         remedy = "; of colours, give one: image[:, :, 1] is green" if image.ndim == 3 else ""
@@ -512,10 +488,7 @@ def same_photograph(image: np.ndarray, other: np.ndarray) -> bool:
     Such files share their noise, except for losses by compression. The noise of two exposures from one place is
     independent: they differ by √2 times the noise.
 
-    Parameters
-    ----------
-    image, other : (height, width) uint8 or uint16
-        Their brightness may differ by a factor and a constant.
+    ``image``, ``other`` : (height, width) their brightness may differ by a factor and a constant.
     """
     if image.shape != other.shape:
         return False

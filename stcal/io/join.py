@@ -37,19 +37,13 @@ def join(
 
     Parameters
     ----------
-    a, b
-        Files with a column ``key`` that holds each value once; or tables read from them.
-    key
-        Name of the key column; or ``image=Point Name``, that of ``a`` and that of ``b``.
-    prefixes
-        Prefix for the columns of a pose or a position in each file, ``x_mm`` to ``qz`` and covariances. Other columns
-        keep their names; if both files have a column of that name, the one of ``a`` is used.
-    quaternions
-        See :func:`~stcal.io.table.read_table`.
-    columns
-        Map of the columns of ``b``, see :func:`~stcal.io.poses.columns.read_mapped`.
-    columns_a
-        Map of the columns of ``a``.
+    a, b : files with a column ``key`` that holds each value once; or tables read from them
+    key : name of the key column; or ``image=Point Name``, that of ``a`` and that of ``b``
+    prefixes : prefix for the columns of a pose or a position in each file, ``x_mm`` to ``qz`` and covariances. Other
+        columns keep their names; if both files have a column of that name, the one of ``a`` is used.
+    quaternions : see :func:`~stcal.io.table.read_table`
+    columns : map of the columns of ``b``, see :func:`~stcal.io.poses.columns.read_mapped`
+    columns_a : map of the columns of ``a``
 
     Returns
     -------
@@ -106,10 +100,7 @@ def stack(tables: Sequence[Table], names: Sequence[str], called: dict[str, str],
     ``names`` : name of each table, written into the new column ``column``; ``called`` : second names of some columns,
     which are added as copies.
 
-    Raises
-    ------
-    InputError
-        A name occurs twice.
+    Raises InputError: a name occurs twice.
     """
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

@@ -38,10 +38,7 @@ def load_yaml(text: str):
 
     ``cv2.FileStorage`` begins its files with ``%YAML:1.0``, which is no valid YAML directive; it is removed.
 
-    Raises
-    ------
-    yaml.YAMLError
-        The text is not YAML, has aliases, or a key twice.
+    Raises yaml.YAMLError: the text is not YAML, has aliases, or a key twice.
     """
     return yaml.load(_without_directive(text), _Loader)
 
@@ -49,10 +46,7 @@ def load_yaml(text: str):
 def load_documents(text: str) -> list:
     """Return the values of each document of a text, as ``rostopic echo`` ends each with ``---``.
 
-    Raises
-    ------
-    yaml.YAMLError
-        The text is not YAML, has aliases, or a key twice.
+    Raises yaml.YAMLError: the text is not YAML, has aliases, or a key twice.
     """
     return list(yaml.load_all(_without_directive(text), _Loader))
 

@@ -18,10 +18,7 @@ def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, reme
 
     ``place`` : returns the place of row i in ``where``; ``remedy`` : end of the message.
 
-    Raises
-    ------
-    InputError
-        The message names the first such quaternion, its length, and the number of further ones.
+    Raises InputError: the message names the first such quaternion, its length, and the number of further ones.
     """
     with np.errstate(over="ignore"):  # quaternions that are refused
         length = np.linalg.norm(wxyz, axis=1)
@@ -39,7 +36,7 @@ def require_unit(wxyz: np.ndarray, place: Callable[[int], str], where: str, reme
 class Reading:
     """A hypothesis on the true content of columns that were read as w, x, y, z.
 
-    ``held`` : true content, in words; ``remedy`` : correction, in words; ``order`` : indices of the true w, x, y, z
+    ``held`` : True content, in words; ``remedy`` : correction, in words; ``order`` : indices of the true w, x, y, z
     among the components read; ``conjugated`` : True if the sign of the vector part is inverted.
     """
 

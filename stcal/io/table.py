@@ -154,10 +154,7 @@ class Table:
     def pose_covariances(self, prefix: str = "") -> np.ndarray | None:
         """Return the covariances (m, 6, 6) of the columns :data:`COVARIANCE`; None if there are no such columns.
 
-        Raises
-        ------
-        InputError
-            Only some of the columns exist, or a matrix is not positive definite.
+        Raises InputError: only some of the columns exist, or a matrix is not positive definite.
         """
         present = [name for name in COVARIANCE if prefix + name in self.columns]
         if not present:
@@ -177,10 +174,7 @@ class Table:
     def require_covariances(self, full: np.ndarray, rows: Rows) -> None:
         """Refuse covariances (m, n, n) of the rows unless all are positive definite.
 
-        Raises
-        ------
-        InputError
-            The message names the first bad line and its fault.
+        Raises InputError: the message names the first bad line and its fault.
         """
         fault = first_fault(full, rows, definite=True)
         if fault is not None:
@@ -192,10 +186,7 @@ class Table:
     def common_errors(self, covariance: np.ndarray | None) -> np.ndarray | None:
         """Return the common errors (m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …, or None.
 
-        Raises
-        ------
-        InputError
-            Only some of the columns exist, or they exceed the covariance (m, 6, 6), which includes them.
+        Raises InputError: only some of the columns exist, or they exceed the covariance (m, 6, 6), which includes them.
         """
         count = len({name.split("_")[0] for name in self.columns if COMMON.fullmatch(name)})
         if not count:
@@ -244,11 +235,8 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     ``path`` : a :class:`Table` is returned unchanged; ``quaternions`` : ``xyzw`` if the quaternion columns hold x, y,
     z, w in this order, whatever their names.
 
-    Raises
-    ------
-    InputError
-        The file is unreadable, not UTF-8, has no header or no rows, a column name occurs twice, a row has another
-        length than the header, or its commas may be of decimals or of thousands.
+    Raises InputError: the file is unreadable, not UTF-8, has no header or no rows, a column name occurs twice, a row
+    has another length than the header, or its commas may be of decimals or of thousands.
     """
     if isinstance(path, Table):
         return path
@@ -416,10 +404,7 @@ def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> t
     Semicolons stand between columns where commas are decimal. Tabs and spaces do elsewhere too, so that a number must
     show that its comma is not of thousands.
 
-    Raises
-    ------
-    InputError
-        There are decimal points, too, or no number shows what the commas are.
+    Raises InputError: there are decimal points, too, or no number shows what the commas are.
     """
     numeric = {name: cells for name, cells in columns.items() if all(re.fullmatch(_COMMA_NUMBER, c) for c in cells)}
     with_comma = {name: cells for name, cells in numeric.items() if any("," in cell for cell in cells)}

@@ -277,7 +277,7 @@ def _robust(problem: Problem, threshold: float | None, seed: int) -> tuple[Fitte
 
 
 def _as_assigned(problem: Problem, group: np.ndarray, threshold: float | None) -> Fitted:
-    """Returns the fit to a group that no threshold separates from the other, as its own σ reaches into that group."""
+    """Returns the fit to one of two groups that overlap: no threshold separates them, but their assignment is known."""
     part = problem[group]
     transform = part.fit()
     square = part.squares(transform)

@@ -291,11 +291,11 @@ def columns(*parts: Sequence[Block], css: str = "columns") -> Html | None:
 
 
 def bullets(texts: Sequence[str]) -> Html | None:
-    return macro("bullets", texts) if texts else None
+    return macro("bullets", [sentence(text) for text in texts]) if texts else None
 
 
 def alarms(texts: Sequence[str]) -> Html | None:
-    return macro("alarms", texts) if texts else None
+    return macro("alarms", [sentence(text) for text in texts]) if texts else None
 
 
 def tiles(values: Sequence[tuple[str, str, str]]) -> Html:

@@ -45,14 +45,9 @@ NO_PANGO = (
 def pdf_of(page: str) -> bytes:
     """Return the PDF of a page as its style sheet prints it, A4 with page numbers; equal pages give equal bytes.
 
-    Parameters
-    ----------
-    page : HTML with all of its content embedded; external resources are not loaded
+    ``page`` : HTML with all of its content embedded; external resources are not loaded.
 
-    Raises
-    ------
-    InputError
-        WeasyPrint, or Pango, which it uses, is not installed.
+    Raises InputError: WeasyPrint, or Pango, which it uses, is not installed.
     """
     try:
         from weasyprint import HTML
@@ -69,9 +64,6 @@ def pdf_of(page: str) -> bytes:
 def require_pdf() -> None:
     """Refuse, before the work, if no PDF can be made.
 
-    Raises
-    ------
-    InputError
-        The message names the missing library, and how to install it.
+    Raises InputError: the message names the missing library, and how to install it.
     """
     pdf_of("<p></p>")

@@ -277,10 +277,7 @@ def images_of_centres(
 ) -> np.ndarray:
     """Returns the images (n, 2) of the centres of a flat board's circles, px, from their ellipses' centres (n, 2).
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than four circles, or all on a line.
+    Raises DegenerateError: fewer than four circles, or all on a line.
     """
     corrected_px = centre_px
     for _ in range(CENTRING_ROUNDS):
@@ -342,14 +339,9 @@ def detect_boards(
 
     An image that cannot be used is skipped.
 
-    Parameters
-    ----------
-    progress : called with the number of images done, and the number of all images
+    ``progress`` : called with the number of images done, and the number of all images.
 
-    Raises
-    ------
-    InputError
-        No image is readable, or the camera is not that of the images; the message names the first.
+    Raises InputError: no image is readable, or the camera is not that of the images; the message names the first.
     """
     if not files:
         raise InputError("E-IMAGES-NONE", "no image; images of the board needed")

@@ -66,16 +66,11 @@ def calibrate_camera_by_corners(
 
     Parameters
     ----------
-    images
-        Folder of photographs, or of folders of them.
-    board
-        The board, mm, with the σ of its corners.
-    colmap_model
-        COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``.
-    workers
-        Number of processes; one per core if None.
-    progress
-        Called with (stage, done, total).
+    images : folder of photographs, or of folders of them
+    board : the board, mm, with the σ of its corners
+    colmap_model : COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``
+    workers : number of processes; one per core if None
+    progress : called with (stage, done, total)
 
     Returns
     -------
@@ -182,10 +177,7 @@ eccentricity shrinks to less than a tenth with each round. Corners of chessboard
 def corner_grid(board: FlatBoard) -> CornerBoard:
     """Returns the points of a board as a board of dots without extent.
 
-    Raises
-    ------
-    InputError
-        A board of another kind, whose points are not on a grid.
+    Raises InputError: a board of another kind, whose points are not on a grid.
     """
     if isinstance(board, TagLayout):
         raise InputError(
@@ -234,10 +226,7 @@ class Models:
     def of(cls, given: Sequence[str], default: str) -> "Models":
         """Returns the models from words NAME=MODEL, and one word MODEL.
 
-        Raises
-        ------
-        InputError
-            Two models for one camera, or two words MODEL.
+        Raises InputError: two models for one camera, or two words MODEL.
         """
         model_of: dict[str, str] = {}
         common = [word for word in given if "=" not in word]
@@ -267,19 +256,11 @@ def calibrate_rig_from_photographs(
 ) -> RigCalibration:
     """Calibrate each camera by itself, then all together.
 
-    Parameters
-    ----------
-    folder
-        Folder with a folder of photographs for each camera; images of one instant have the same name in all.
-    target, board, workers, progress
-        As in :func:`calibrate_camera`; boards of corners are possible too.
-    models
-        COLMAP's models, or ``auto``.
+    ``folder`` : folder with a folder of photographs for each camera; images of one instant have the same name in all;
+    ``target``, ``board``, ``workers``, ``progress`` : as in :func:`calibrate_camera`; boards of corners are possible
+    too; ``models`` : COLMAP's models, or ``auto``.
 
-    Raises
-    ------
-    StcalError
-        One of its subclasses; the message names the camera.
+    Raises StcalError: one of its subclasses; the message names the camera.
     """
     names = camera_names(folder)
     unknown = [name for name in models.own if name not in names]
@@ -315,10 +296,7 @@ def calibrate_rig_from_photographs(
 def camera_names(folder: Path) -> list[str]:
     """Returns the names of the folders in a folder.
 
-    Raises
-    ------
-    InputError
-        Not a folder, fewer than two folders in it, or names that no file can have.
+    Raises InputError: not a folder, fewer than two folders in it, or names that no file can have.
     """
     if not folder.is_dir():
         raise InputError(

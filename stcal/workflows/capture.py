@@ -48,16 +48,9 @@ class Taken:
 class Trigger:
     """Trigger of photographs: at each Enter, or at fixed intervals.
 
-    Parameters
-    ----------
-    count : int, optional
-        Number of photographs after which it ends.
-    every_s : float, optional
-        Interval; if None, a photograph is taken at each line of ``keys``.
-    keys : text stream
-        The trigger ends with this stream.
-    say : callable
-        Called with the text that prompts the user.
+    ``count`` : number of photographs after which it ends; ``every_s`` : interval; if None, a photograph is taken at
+    each line of ``keys``; ``keys`` : the trigger ends with this stream; ``say`` : called with the text that prompts the
+    user.
     """
 
     def __init__(self, count: int | None, every_s: float | None, keys: TextIO, say: Callable[[str], object]):

@@ -30,17 +30,11 @@ SAME = ("stcal", "numpy", "scipy", "opencv-python-headless")
 def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
     """Hand the work on single images to a Dask cluster for the duration of the context.
 
-    Parameters
-    ----------
-    address : str
-        Address of the scheduler, ``tcp://host:8786``.
-    send_images : bool
-        Whether images are sent by content. Otherwise they are sent by path, on storage that all workers share.
+    ``address`` : address of the scheduler, ``tcp://host:8786``; ``send_images`` : whether images are sent by content.
+    Otherwise they are sent by path, on storage that all workers share.
 
-    Raises
-    ------
-    InputError
-        The extra ``dask`` is not installed, no scheduler answers, it has no workers, or a worker has other versions.
+    Raises InputError: the extra ``dask`` is not installed, no scheduler answers, it has no workers, or a worker has
+    other versions.
     """
     with _connected(address) as workers, spread(workers, AT_ONCE * workers.threads, send_images):
         yield
@@ -50,10 +44,7 @@ def dask_cluster(address: str, send_images: bool = False) -> Iterator[None]:
 def executor_of(address: str | None = None) -> Iterator[Executor]:
     """Yield the workers of a Dask cluster, or, without an address, processes of this machine, one per core.
 
-    Raises
-    ------
-    InputError
-        For the reasons given in :func:`dask_cluster`.
+    Raises InputError: for the reasons given in :func:`dask_cluster`.
     """
     with ProcessPoolExecutor() if address is None else _connected(address) as executor:
         yield executor

@@ -74,25 +74,21 @@ class Comparison:
 
 @one_thread()
 def compared(
-    pairs: Pairs, file: Path | Table, robot_file: Path, found: Findings, options: dict, folds: int
+    pairs: Pairs, file: Path | Table, robot_file: Path, findings: Findings, options: dict, folds: int
 ) -> Comparison:
     """Identify base and kinematics from the joint values of ``file``, and compute held-out errors of both methods.
 
-    ``options`` : of :func:`stcal.register.pipeline`, by which ``found`` was computed.
+    ``options`` : of :func:`stcal.register.pipeline`, by which ``findings`` was computed.
 
-    Raises
-    ------
-    InputError
-        There are no joint values, or the robot does not fit them.
-    DegenerateError
-        Too few points for the robot's parameters.
+    Raises InputError: there are no joint values, or the robot does not fit them. Raises DegenerateError: too few points
+    for the robot's parameters.
     """
     robot = load_robot(robot_file)
     data = _measurements(pairs, file, robot)
     settings = IdentifyOptions("position", folds=0, seed=options["seed"], partial=True)
-    good = found.registration.inliers.copy()
-    if found.field is not None:
-        good[found.field.taken_back] = True
+    good = findings.registration.inliers.copy()
+    if findings.field is not None:
+        good[findings.field.taken_back] = True
     identified, used = grown(robot, data, good, settings)
 
     def by_transform(train: np.ndarray, test: np.ndarray) -> np.ndarray:
@@ -110,11 +106,20 @@ def compared(
 
     parts = dealt(len(data), folds, np.random.default_rng([options["seed"], 4]))
     done, rows, (by_one, by_both) = held_out_errors([by_transform, by_kinematics], parts)
-    outliers_of_both = ~(found.registration.inliers | used)[rows]
+    outliers_of_both = ~(findings.registration.inliers | used)[rows]
     nominal = positions(robot, data)
     off_mm = float(np.sqrt(((pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal) ** 2).sum(1).mean()))
     return Comparison(
-        robot, identified, found.registration.model, pairs.lines, done, rows, by_one, by_both, outliers_of_both, off_mm
+        robot,
+        identified,
+        findings.registration.model,
+        pairs.lines,
+        done,
+        rows,
+        by_one,
+        by_both,
+        outliers_of_both,
+        off_mm,
     )
 
 

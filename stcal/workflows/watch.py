@@ -32,16 +32,9 @@ RELOAD_S = 5
 class WatchOptions:
     """Options of watching a folder.
 
-    Parameters
-    ----------
-    interval_s : float
-        Interval at which the folder is looked at, s; a photograph counts when it has not changed between two looks.
-    idle_s : float, optional
-        Time without a new photograph after which watching ends, s; never if None.
-    views : int
-        Number of views to advise after each run; none where 0.
-    run : RunOptions
-        Options of the runs.
+    ``interval_s`` : interval at which the folder is looked at, s; a photograph counts when it has not changed between
+    two looks; ``idle_s`` : time without a new photograph after which watching ends, s; never if None; ``views`` :
+    number of views to advise after each run; none where 0; ``run`` : options of the runs.
     """
 
     interval_s: float = 1.0

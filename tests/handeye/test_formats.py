@@ -7,6 +7,7 @@ import pytest
 from markupsafe import escape
 
 from stcal.geometry.rigid import Poses
+from stcal.report.document import sentence
 from tests.boards.drawn import chessboard_mm
 from tests.handeye.photographed import looks, photographs
 from tests.handeye.test_cli import EXACT, INPUT, NOISE, command, poses_file  # noqa: F401
@@ -41,7 +42,7 @@ def test_the_report_says_what_files_were_taken_for(command, tmp_path, truth):  #
     page = tmp_path / "report.html"
     code, shown, _ = command(*FORMATS["KUKA"](tmp_path, truth.pairs), *QUICK, "--report", page)
     assert code == 0
-    assert f"<li>{escape(shown.splitlines()[0])}</li>" in page.read_text()
+    assert f"<li>{escape(sentence(shown.splitlines()[0]))}</li>" in page.read_text()
 
 
 def test_a_dry_run_says_what_it_understood_and_writes_nothing(command, tmp_path, truth):  # noqa: F811

@@ -2,45 +2,14 @@
 
 import math
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
-from stcal.cli.handeye.inputs import (
-    LengthUnit,
-    OwnBoard,
-    OwnCamera,
-    PosesAre,
-    PosesFile,
-    RotationOption,
-    SetupName,
-    SetupOption,
-    SourceFile,
-    TimeTolerance,
-    source_of,
-)
-from stcal.cli.options import (
-    MOST_SEED,
-    ColumnsFile,
-    FirstColumns,
-    FirstTable,
-    JsonFile,
-    Key,
-    QuaternionOrder,
-    Quaternions,
-    ReportFile,
-    SecondTable,
-    Strict,
-    Workers,
-    exports_of,
-    require_new,
-    require_passed,
-)
+import stcal.cli.handeye.inputs as params
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
-from stcal.io.files import keep_apart
 
 if TYPE_CHECKING:
     from stcal.handeye import EvolutionOptions
@@ -55,212 +24,125 @@ SCALED = ("pose", "reprojection")
 """Methods that can find the board's size."""
 
 
-class CameraFrameName(StrEnum):
-    """Name of one of ROS's two frames of a camera."""
-
-    optical = "optical"
-    link = "link"
+CameraFrameName = Literal["optical", "link"]
+"""Name of one of ROS's two frames of a camera."""
 
 
 def handeye(
-    source: SourceFile = None,
-    poses: PosesFile = None,
-    camera: OwnCamera = None,
-    board: OwnBoard = None,
-    setup: SetupOption = None,
-    rotation: RotationOption = None,
-    length_unit: LengthUnit = None,
-    poses_are: PosesAre = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print what was understood of the files, and solve and write nothing.")
-    ] = False,
+    source: params.SourceFile = None,
+    poses: params.PosesFile = None,
+    camera: params.OwnCamera = None,
+    board: params.OwnBoard = None,
+    setup: params.SetupOption = None,
+    rotation: params.RotationOption = None,
+    length_unit: params.LengthUnit = None,
+    poses_are: params.PosesAre = None,
+    dry_run: Annotated[bool, "Print what was understood of the files, and solve and write nothing."] = False,
     method: Annotated[
         str | None,
-        typer.Option(
-            help="Use this method, or compare all. If not given, by poses and by corners, with camera and board as "
-            "filed and solved for: what predicts poses held out best."
-        ),
+        "Use this method, or compare all. If not given, by poses and by corners, with camera and board as filed "
+        "and solved for: what predicts poses held out best.",
     ] = None,
     sigma_robot_mm: Annotated[
-        float | None,
-        typer.Option("--sigma-robot-mm", min=0, help="Set σ of the flange's position, mm; needs --sigma-robot-deg."),
+        float | None, "Set σ of the flange's position, mm; needs --sigma-robot-deg.", Opt(min=0)
     ] = None,
     sigma_robot_deg: Annotated[
-        float | None,
-        typer.Option("--sigma-robot-deg", min=0, help="Set σ of the flange's rotation; estimated if not given."),
+        float | None, "Set σ of the flange's rotation; estimated if not given.", Opt(min=0)
     ] = None,
     sigma_camera_mm: Annotated[
-        float | None,
-        typer.Option("--sigma-camera-mm", min=0, help="Set σ of the board's position, mm; needs --sigma-camera-deg."),
+        float | None, "Set σ of the board's position, mm; needs --sigma-camera-deg.", Opt(min=0)
     ] = None,
-    sigma_camera_deg: Annotated[
-        float | None, typer.Option("--sigma-camera-deg", min=0, help="Set σ of the board's rotation.")
-    ] = None,
+    sigma_camera_deg: Annotated[float | None, "Set σ of the board's rotation.", Opt(min=0)] = None,
     sigma_px: Annotated[
-        float | None,
-        typer.Option("--sigma-px", min=1e-9, help="Set σ of a corner, px; of dots and tags, in units of their own σ."),
+        float | None, "Set σ of a corner, px; of dots and tags, in units of their own σ.", Opt(min=1e-9)
     ] = None,
     sigma_board_mm: Annotated[
-        float | None,
-        typer.Option("--sigma-board-mm", min=0, help="Set σ of a corner's place on the board, mm; 0 if exact."),
+        float | None, "Set σ of a corner's place on the board, mm; 0 if exact.", Opt(min=0)
     ] = None,
-    refine_camera: Annotated[
-        bool, typer.Option("--refine-camera", help="Adjust the intrinsics too, from the given ones with their σ.")
-    ] = False,
-    with_scale: Annotated[
-        bool, typer.Option("--with-scale", help="Find the board's true size from the robot's motion.")
-    ] = False,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too, from the given ones with their σ."] = False,
+    with_scale: Annotated[bool, "Find the board's true size from the robot's motion."] = False,
     with_kinematics: Annotated[
         Path | None,
-        typer.Option(
-            "--with-kinematics",
-            help="Adjust the parameters of this robot (TOML) and the intrinsics too, from images and joint values: "
-            "columns q1_deg … of --poses.",
-        ),
+        "Adjust the parameters of this robot (TOML) and the intrinsics too, from images and joint values: "
+        "columns q1_deg … of --poses.",
     ] = None,
     robot_out: Annotated[
-        Path | None,
-        typer.Option(
-            "--robot-out", writable=True, help="Write the robot of --with-kinematics to this file, as adjusted (TOML)."
-        ),
+        Path | None, "Write the robot of --with-kinematics to this file, as adjusted (TOML).", WRITES
     ] = None,
     undo_flips: Annotated[
         bool,
-        typer.Option(
-            "--undo-flips",
-            help="Replace poses of a flat target by the second pose of its plane, tilted the other way, where only "
-            "that agrees with the others; not with images.",
-        ),
+        "Replace poses of a flat target by the second pose of its plane, tilted the other way, where only that "
+        "agrees with the others; not with images.",
     ] = False,
-    four_dof: Annotated[
-        bool,
-        typer.Option("--four-dof", help="Solve for what a flange that turns about one axis only (SCARA) tells."),
-    ] = False,
+    four_dof: Annotated[bool, "Solve for what a flange that turns about one axis only (SCARA) tells."] = False,
     held_out: Annotated[
-        int | None,
-        typer.Option(
-            "--held-out", min=1, max=100_000, help="Hold out so many poses in each split; a quarter if not given."
-        ),
+        int | None, "Hold out so many poses in each split; a quarter if not given.", Opt(min=1, max=100_000)
     ] = None,
-    splits: Annotated[
-        int, typer.Option("--splits", min=0, max=100_000, help="Cross-validate over this many splits; 0 for none.")
-    ] = 15,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the splits with this seed.")] = 0,
+    splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
+    seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
     time_offset: Annotated[
-        bool,
-        typer.Option(
-            "--time-offset",
-            help="Find the offset of the robot's clock from the camera's, of poses by time, and use it.",
-        ),
+        bool, "Find the offset of the robot's clock from the camera's, of poses by time, and use it."
     ] = False,
     image_times: Annotated[
-        Path | None,
-        typer.Option(
-            "--image-times",
-            help="Read the times of the images from this file: image, time_s (CSV); their names if not given.",
-        ),
+        Path | None, "Read the times of the images from this file: image, time_s (CSV); their names if not given."
     ] = None,
     times_columns: Annotated[
-        Path | None,
-        typer.Option("--times-columns", help="Read --image-times with the columns, delimiter … of this file (TOML)."),
+        Path | None, "Read --image-times with the columns, delimiter … of this file (TOML)."
     ] = None,
-    time_tolerance: TimeTolerance = 0.02,
+    time_tolerance: params.TimeTolerance = 0.02,
     motions_held_out: Annotated[
         int | None,
-        typer.Option(
-            "--motions-held-out",
-            min=1,
-            max=100_000,
-            help="Hold out so many last motions and predict them by the solution of those before, as the paper on "
-            "differential evolution does with 6 of 24.",
-        ),
+        "Hold out so many last motions and predict them by the solution of those before, as the paper on "
+        "differential evolution does with 6 of 24.",
+        Opt(min=1, max=100_000),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the result to this file (JSON).")
-    ] = None,
-    ros: Annotated[
-        Path | None,
-        typer.Option("--ros", writable=True, help="Write a static transform of ROS to this file (YAML, metres)."),
-    ] = None,
-    urdf: Annotated[
-        Path | None,
-        typer.Option("--urdf", writable=True, help="Write a fixed joint with its origin to this file (URDF, metres)."),
-    ] = None,
-    opencv: Annotated[
-        Path | None, typer.Option("--opencv", writable=True, help="Write OpenCV's FileStorage to this file (YAML, mm).")
-    ] = None,
+    out: Annotated[Path | None, "Write the result to this file (JSON).", WRITES] = None,
+    ros: Annotated[Path | None, "Write a static transform of ROS to this file (YAML, metres).", WRITES] = None,
+    urdf: Annotated[Path | None, "Write a fixed joint with its origin to this file (URDF, metres).", WRITES] = None,
+    opencv: Annotated[Path | None, "Write OpenCV's FileStorage to this file (YAML, mm).", WRITES] = None,
     export: Annotated[
         list[str] | None,
-        typer.Option(
-            "--export",
-            metavar="FORM=FILE",
-            help="Write the transform to this file, again for each further one; forms: ros2, moveit, moveit2, "
-            "easy-handeye, easy-handeye2, zivid, kuka, abb, ur, fanuc.",
-        ),
+        "Write the transform to this file, again for each further one; forms: ros2, moveit, moveit2, "
+        "easy-handeye, easy-handeye2, zivid, kuka, abb, ur, fanuc.",
+        Opt(metavar="FORM=FILE"),
     ] = None,
-    parent: Annotated[str, typer.Option(help="Name the flange or base like this in ROS and URDF.")] = "",
-    child: Annotated[str, typer.Option(help="Name the camera like this in ROS and URDF.")] = "",
+    parent: Annotated[str, "Name the flange or base like this in ROS and URDF."] = "",
+    child: Annotated[str, "Name the camera like this in ROS and URDF."] = "",
     camera_frame: Annotated[
         CameraFrameName,
-        typer.Option(
-            "--camera-frame",
-            help="Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with the optical "
-            "frame in it.",
-        ),
-    ] = CameraFrameName.optical,
+        "Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with the optical "
+        "frame in it.",
+    ] = "optical",
     camera_out: Annotated[
-        Path | None,
-        typer.Option(
-            "--camera-out", writable=True, help="Write the camera of --refine-camera with σ to this file (cameras.txt)."
-        ),
+        Path | None, "Write the camera of --refine-camera with σ to this file (cameras.txt).", WRITES
     ] = None,
     de_bounds_deg: Annotated[
         str | None,
-        typer.Option(
-            "--de-bounds-deg",
-            help="Begin --method de within ± this rotation about zero, about X,Y,Z,± (rotation vector) or "
-            "closed-form,±; 180 if not given.",
-        ),
+        "Begin --method de within ± this rotation about zero, about X,Y,Z,± (rotation vector) or closed-form,±; "
+        "180 if not given.",
     ] = None,
     de_bounds_mm: Annotated[
         str | None,
-        typer.Option(
-            "--de-bounds-mm",
-            help="Begin --method de within ± this translation, X,Y,Z,± or closed-form,±; the farthest pose if not "
-            "given.",
-        ),
+        "Begin --method de within ± this translation, X,Y,Z,± or closed-form,±; the farthest pose if not given.",
     ] = None,
-    de_population: Annotated[
-        int | None, typer.Option("--de-population", min=4, max=100_000, help="Use M candidates; 30, the paper's.")
-    ] = None,
-    de_f: Annotated[
-        float | None, typer.Option("--de-f", min=1e-6, max=2, help="Use this mutation factor F; 0.5, the paper's.")
-    ] = None,
-    de_cr: Annotated[
-        float | None, typer.Option("--de-cr", min=0, max=1, help="Use this crossover factor CR; 0.9, the paper's.")
-    ] = None,
+    de_population: Annotated[int | None, "Use M candidates; 30, the paper's.", Opt(min=4, max=100_000)] = None,
+    de_f: Annotated[float | None, "Use this mutation factor F; 0.5, the paper's.", Opt(min=1e-6, max=2)] = None,
+    de_cr: Annotated[float | None, "Use this crossover factor CR; 0.9, the paper's.", Opt(min=0, max=1)] = None,
     de_lambda: Annotated[
-        float | None,
-        typer.Option(
-            "--de-lambda", min=1e-12, max=1e12, help="Multiply translations, m, squared by λ; 1, the paper's."
-        ),
+        float | None, "Multiply translations, m, squared by λ; 1, the paper's.", Opt(min=1e-12, max=1e12)
     ] = None,
-    de_generations: Annotated[
-        int | None, typer.Option("--de-generations", min=0, max=100_000, help="End after these; 100, the paper's.")
-    ] = None,
-    de_seed: Annotated[
-        int | None, typer.Option("--de-seed", min=0, max=MOST_SEED, help="Draw the population with this seed.")
-    ] = None,
-    first: FirstTable = None,
-    second: SecondTable = None,
-    key: Key = "image",
-    columns: ColumnsFile = None,
-    columns_a: FirstColumns = None,
-    quaternions: Quaternions = QuaternionOrder.wxyz,
-    workers: Workers = None,
-    json_file: JsonFile = None,
-    report: ReportFile = None,
-    strict: Strict = False,
+    de_generations: Annotated[int | None, "End after these; 100, the paper's.", Opt(min=0, max=100_000)] = None,
+    de_seed: Annotated[int | None, "Draw the population with this seed.", Opt(min=0, max=shared.MOST_SEED)] = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "image",
+    columns: shared.ColumnsFile = None,
+    columns_a: shared.FirstColumns = None,
+    quaternions: shared.Quaternions = "wxyz",
+    workers: shared.Workers = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
+    strict: shared.Strict = False,
 ) -> None:
     """Find where a camera sits on a robot's flange, or in its base, and how well that is known."""
     from stcal.handeye import HandEyeOptions, Noise
@@ -286,28 +168,18 @@ def handeye(
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
-    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
+    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup)
     if times_columns is not None and image_times is None:
         raise InputError("E-OPTION-NEEDS", f"--times-columns {times_columns}: of times of images; give --image-times")
     timing = Timing(time_tolerance, image_times, time_offset, times_columns)
-    pairs = source_of(source, first, second, key, statements, quaternions.value, timing, columns, columns_a)
+    pairs = params.source_of(source, first, second, key, statements, quaternions, timing, columns, columns_a)
     folder = isinstance(pairs, Path) and pairs.is_dir()
     statements = replace(statements, columns=columns) if folder else statements
     _require_fitting(not folder, method, refine_camera, camera_out, with_kinematics is not None)
     _require_arm(folder, method, four_dof, with_kinematics, robot_out)
     robot_model = load_robot(with_kinematics) if with_kinematics else None
-    exports = exports_of(export or [], require_form)
-    written = {"--out": out, "--ros": ros, "--urdf": urdf, "--opencv": opencv, "--camera-out": camera_out}
-    written |= {"--robot-out": robot_out}
-    written |= {"--json": json_file, "--report": report}
-    read = {"source": source, "--poses": poses, "--camera": camera, "--board": board, "--a": first, "--b": second}
-    read |= {"--with-kinematics": with_kinematics, "--image-times": image_times, "--times-columns": times_columns}
-    keep_apart(
-        [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
-        [(name, path) for name, path in read.items() if path],
-    )
-    require_new([("--export", path) for _, path in exports])
-    _require_frames(ros or urdf, exports, (setup or SetupName.in_hand).value, parent, child, camera_frame.value)
+    exports = shared.exports_of(export or [], require_form)
+    _require_frames(ros or urdf, exports, setup or "eye-in-hand", parent, child, camera_frame)
     if not folder and (sigma_px is not None or sigma_board_mm is not None):
         raise InputError(
             "E-OPTION-NEEDS",
@@ -329,11 +201,11 @@ def handeye(
         seed=de_seed,
     )
     if dry_run:
-        say("\n".join(understood(pairs, poses, camera, board, quaternions.value, statements, timing, robot_model)))
+        say("\n".join(understood(pairs, poses, camera, board, quaternions, statements, timing, robot_model)))
         return
     with StageProgress() as progress:
         inputs = read_input(
-            pairs, poses, camera, board, workers, progress, quaternions.value, statements, timing, robot_model
+            pairs, poses, camera, board, workers, progress, quaternions, statements, timing, robot_model
         )
         for line in inputs.understood:
             say(line)
@@ -363,15 +235,15 @@ def handeye(
         say(f"left out {name}: {reason}")
     print_each("note", outcome.all_notes())
     write_if(out, lambda: HandEyeFile.of(outcome))
-    write_if(ros, lambda: ros_yaml(result, parent, child, camera_frame.value))
-    write_if(urdf, lambda: urdf_joint(result, parent, child, camera_frame.value))
+    write_if(ros, lambda: ros_yaml(result, parent, child, camera_frame))
+    write_if(urdf, lambda: urdf_joint(result, parent, child, camera_frame))
     write_if(opencv, lambda: opencv_yaml(result))
     for path, kind in ((out, "json"), (ros, "ros"), (urdf, "urdf"), (opencv, "opencv")):
         if path:
-            require_export_written(path, kind, result, parent, child, camera_frame.value)
+            require_export_written(path, kind, result, parent, child, camera_frame)
     write_if(report, document.page)
     for form, path in exports:
-        write(path, text := exported(result, form, path.stem, parent, child, camera_frame.value))
+        write(path, text := exported(result, form, path.stem, parent, child, camera_frame))
         require_same(path, path.read_text, text)  # which gave the transform back
     if camera_out:
         _save_camera(camera_out, outcome)
@@ -379,7 +251,7 @@ def handeye(
         save_robot(robot_out, inputs.arm.identified(result.reprojection.arm))
         say(f"written: {robot_out}")
     write_if(json_file, lambda: HandEyeFile.of(outcome, whole=True))
-    require_passed(strict, judged(outcome).failed(), report)
+    shared.require_passed(strict, judged(outcome).failed(), report)
 
 
 def _require_arm(

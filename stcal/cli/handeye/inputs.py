@@ -1,11 +1,9 @@
 """Inputs of the commands of hand-eye, and their options."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
+from stcal.cli.declare import Arg, Opt
 from stcal.cli.options import one_table
 
 if TYPE_CHECKING:
@@ -15,80 +13,50 @@ if TYPE_CHECKING:
     from stcal.workflows.handeye.times import Timing
 
 
-class SetupName(StrEnum):
-    """Name of the setup, by the carrier of the camera."""
-
-    in_hand = "eye-in-hand"
-    to_hand = "eye-to-hand"
+SetupName = Literal["eye-in-hand", "eye-to-hand"]
+"""Name of the setup, by the carrier of the camera."""
 
 
 SourceFile = Annotated[
     Path | None,
-    typer.Argument(
-        metavar="POSES|IMAGES",
-        help="Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV, JSON, YAML, npz), "
-        "or samples of easy_handeye or MoveIt; or photographs of a board from this folder.",
-    ),
+    "Read pose pairs from this file: base_from_flange_… and camera_from_board_… (CSV, JSON, YAML, npz), or "
+    "samples of easy_handeye or MoveIt; or photographs of a board from this folder.",
+    Arg("POSES|IMAGES"),
 ]
 PosesFile = Annotated[
     Path | None,
-    typer.Option(
-        "--poses",
-        help="Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, "
-        "ROS …; or from this folder, a file for each image.",
-    ),
+    "Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, ROS "
+    "…; or from this folder, a file for each image.",
 ]
-OwnCamera = Annotated[
-    Path | None,
-    typer.Option("--camera", help="Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."),
-]
+OwnCamera = Annotated[Path | None, "Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."]
 OwnBoard = Annotated[
     Path | None,
-    typer.Option(
-        "--board",
-        help="Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid, asymmetric "
-        "circles, tags, or several boards.",
-    ),
+    "Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid, asymmetric "
+    "circles, tags, or several boards.",
 ]
 SetupOption = Annotated[
     SetupName | None,
-    typer.Option(
-        help="Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange; as the file says, or "
-        "eye-in-hand, if not given."
-    ),
+    "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange; as the file says, or "
+    "eye-in-hand, if not given.",
 ]
 RotationOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--rotation",
-        help="Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, xyz "
-        "(fixed axes), ZYX (turned axes) …; robot=… or camera=… for one side.",
-    ),
+    "Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, xyz (fixed "
+    "axes), ZYX (turned axes) …; robot=… or camera=… for one side.",
 ]
 LengthUnit = Annotated[
     list[str] | None,
-    typer.Option(
-        "--length-unit",
-        help="Take lengths in files that do not say it in this unit: mm, m, cm, um, in; robot=… or camera=… for "
-        "one side.",
-    ),
+    "Take lengths in files that do not say it in this unit: mm, m, cm, um, in; robot=… or camera=… for one side.",
 ]
 PosesAre = Annotated[
     list[str] | None,
-    typer.Option(
-        "--poses-are",
-        help="Take poses in files that do not say it as base_from_flange or flange_from_base, or as "
-        "camera_from_board or board_from_camera; once for each side.",
-    ),
+    "Take poses in files that do not say it as base_from_flange or flange_from_base, or as "
+    "camera_from_board or board_from_camera; once for each side.",
 ]
 TimeTolerance = Annotated[
     float,
-    typer.Option(
-        "--time-tolerance",
-        min=0,
-        max=3600,
-        help="Take the nearest of the robot's poses within this time, s, where none can be interpolated.",
-    ),
+    "Take the nearest of the robot's poses within this time, s, where none can be interpolated.",
+    Opt(min=0, max=3600),
 ]
 
 
@@ -97,7 +65,7 @@ def source_of(
     first: Path | None,
     second: Path | None,
     key: str,
-    said: "Said",
+    statements: "Said",
     quaternions: "Order",
     timing: "Timing | None" = None,
     columns: Path | None = None,
@@ -109,11 +77,11 @@ def source_of(
     from stcal.workflows.handeye.times import Timing
 
     if source is None and first is not None and second is not None:
-        told = two_files(first, second, key, said, quaternions, timing or Timing(), (columns_a, columns))
+        told = two_files(first, second, key, statements, quaternions, timing or Timing(), (columns_a, columns))
         if told is not None:
             return told
     if source is not None and columns is not None and source.is_file():
-        return mapped_pairs(source, columns, said, key, quaternions)
+        return mapped_pairs(source, columns, statements, key, quaternions)
     if source is not None and source.is_dir():
         columns = None  # of the robot's poses
     prefixes = ("base_from_flange_", "camera_from_board_")

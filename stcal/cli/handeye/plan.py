@@ -4,63 +4,37 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from stcal.cli.handeye.inputs import (
-    LengthUnit,
-    OwnBoard,
-    OwnCamera,
-    PosesAre,
-    PosesFile,
-    RotationOption,
-    SetupOption,
-    SourceFile,
-    source_of,
-)
-from stcal.cli.options import (
-    MOST_SEED,
-    ColumnsFile,
-    FirstColumns,
-    FirstTable,
-    JsonFile,
-    Key,
-    QuaternionOrder,
-    Quaternions,
-    SecondTable,
-    Workers,
-)
+import stcal.cli.handeye.inputs as params
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write_if
 
 
 def plan(
-    source: SourceFile = None,
-    poses: PosesFile = None,
-    camera: OwnCamera = None,
-    board: OwnBoard = None,
-    setup: SetupOption = None,
-    rotation: RotationOption = None,
-    length_unit: LengthUnit = None,
-    poses_are: PosesAre = None,
+    source: params.SourceFile = None,
+    poses: params.PosesFile = None,
+    camera: params.OwnCamera = None,
+    board: params.OwnBoard = None,
+    setup: params.SetupOption = None,
+    rotation: params.RotationOption = None,
+    length_unit: params.LengthUnit = None,
+    poses_are: params.PosesAre = None,
     robot_file: Annotated[
         Path | None,
-        typer.Option(
-            "--robot",
-            help="Plan only what this robot reaches within its joint limits (TOML), and name its joint values.",
-        ),
+        "Plan only what this robot reaches within its joint limits (TOML), and name its joint values.",
+        Opt("--robot"),
     ] = None,
-    count: Annotated[int, typer.Option(min=1, max=100, help="Name so many poses.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the candidates with this seed.")] = 0,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the poses to this file (CSV).")
-    ] = None,
-    first: FirstTable = None,
-    second: SecondTable = None,
-    key: Key = "image",
-    columns: ColumnsFile = None,
-    columns_a: FirstColumns = None,
-    quaternions: Quaternions = QuaternionOrder.wxyz,
-    workers: Workers = None,
-    json_file: JsonFile = None,
+    count: Annotated[int, "Name so many poses.", Opt(min=1, max=100)] = 3,
+    seed: Annotated[int, "Draw the candidates with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    out: Annotated[Path | None, "Write the poses to this file (CSV).", WRITES] = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "image",
+    columns: shared.ColumnsFile = None,
+    columns_a: shared.FirstColumns = None,
+    quaternions: shared.Quaternions = "wxyz",
+    workers: shared.Workers = None,
+    json_file: shared.JsonFile = None,
 ) -> None:
     """Name the robot poses that would lower the worst σ at the board most, after those of a hand-eye calibration."""
     from stcal.handeye.data.formats.record import Said
@@ -70,12 +44,12 @@ def plan(
     from stcal.workflows.handeye.inputs import read_input, setup_of
     from stcal.workflows.handeye.plan import plan_next
 
-    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup and setup.value)
-    pairs = source_of(source, first, second, key, statements, quaternions.value, None, columns, columns_a)
+    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup)
+    pairs = params.source_of(source, first, second, key, statements, quaternions, None, columns, columns_a)
     statements = replace(statements, columns=columns) if isinstance(pairs, Path) and pairs.is_dir() else statements
     robot = load_robot(robot_file) if robot_file else None
     with StageProgress() as progress:
-        inputs = read_input(pairs, poses, camera, board, workers, progress, quaternions.value, statements)
+        inputs = read_input(pairs, poses, camera, board, workers, progress, quaternions, statements)
     for line in inputs.understood:
         say(line)
     planned = plan_next(inputs, setup_of(statements, inputs.setup, inputs.where), count, robot, seed)

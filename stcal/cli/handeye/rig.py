@@ -3,19 +3,9 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.handeye.inputs import LengthUnit, PosesAre, RotationOption, TimeTolerance
-from stcal.cli.options import (
-    MOST_SEED,
-    JsonFile,
-    QuaternionOrder,
-    Quaternions,
-    ReportFile,
-    Strict,
-    Workers,
-    require_passed,
-)
 from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.io.files import keep_apart
 
@@ -23,50 +13,35 @@ from stcal.io.files import keep_apart
 def rig(
     rig_file: Annotated[
         Path,
-        typer.Argument(
-            metavar="RIG.toml",
-            help="Read setup, board, the robot's poses, and the images and intrinsics of each camera from this file "
-            "(TOML).",
-        ),
+        "Read setup, board, the robot's poses, and the images and intrinsics of each camera from this file (TOML).",
+        Arg("RIG.toml"),
     ],
-    refine_camera: Annotated[
-        bool, typer.Option("--refine-camera", help="Adjust the intrinsics too, of each camera from its own with σ.")
-    ] = False,
-    with_scale: Annotated[
-        bool, typer.Option("--with-scale", help="Find the board's true size from the robot's motion.")
-    ] = False,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too, of each camera from its own with σ."] = False,
+    with_scale: Annotated[bool, "Find the board's true size from the robot's motion."] = False,
     rotation: RotationOption = None,
     length_unit: LengthUnit = None,
     poses_are: PosesAre = None,
-    quaternions: Quaternions = QuaternionOrder.wxyz,
+    quaternions: shared.Quaternions = "wxyz",
     time_tolerance: TimeTolerance = 0.02,
     held_out: Annotated[
         int | None,
-        typer.Option(
-            "--held-out",
-            min=1,
-            max=100_000,
-            help="Hold out so many poses of the robot in each split; a quarter if not given.",
-        ),
+        "Hold out so many poses of the robot in each split; a quarter if not given.",
+        Opt(min=1, max=100_000),
     ] = None,
-    splits: Annotated[
-        int, typer.Option("--splits", min=0, max=100_000, help="Cross-validate over this many splits; 0 for none.")
-    ] = 15,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the splits with this seed.")] = 0,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the result to this file (JSON).")
-    ] = None,
-    workers: Workers = None,
-    json_file: JsonFile = None,
-    report: ReportFile = None,
-    strict: Strict = False,
+    splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
+    seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    out: Annotated[Path | None, "Write the result to this file (JSON).", WRITES] = None,
+    workers: shared.Workers = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
+    strict: shared.Strict = False,
 ) -> None:
     """Find where several cameras sit on one flange, or in one base, and in each other, from one adjustment."""
     from stcal.handeye.data.formats.record import Said
     from stcal.handeye.data.rig import read_rig_file
     from stcal.handeye.report.file import HandEyeRigFile
     from stcal.handeye.report.outcome import rig_judged
-    from stcal.handeye.report.page import rig_report
+    from stcal.handeye.report.rig_page import rig_report
     from stcal.workflows.handeye.calibrate import Splits
     from stcal.workflows.handeye.rig import calibrate_rig, read_rig
 
@@ -75,7 +50,7 @@ def rig(
     keep_apart([(name, path) for name, path in written.items() if path], files.read())
     statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], None)
     with StageProgress() as progress:
-        inputs = read_rig(files, workers, progress, quaternions.value, statements, time_tolerance)
+        inputs = read_rig(files, workers, progress, quaternions, statements, time_tolerance)
         print_each("understood", inputs.understood)
         validation = Splits(splits, held_out, seed, workers)
         outcome = calibrate_rig(inputs, refine_camera, with_scale, validation, progress)
@@ -87,4 +62,4 @@ def rig(
     write_if(out, lambda: HandEyeRigFile.of(outcome))
     write_if(report, document.page)
     write_if(json_file, lambda: HandEyeRigFile.of(outcome, whole=True))
-    require_passed(strict, rig_judged(outcome).failed(), report)
+    shared.require_passed(strict, rig_judged(outcome).failed(), report)

@@ -4,21 +4,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from stcal.cli.options import (
-    ColumnsFile,
-    FirstColumns,
-    FirstTable,
-    JsonFile,
-    Key,
-    ReportFile,
-    RobotFile,
-    Rotation,
-    SecondTable,
-    name_of,
-    one_table,
-)
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.terminal import print_each, say, write_if
 from stcal.errors import InputError
 
@@ -27,34 +14,27 @@ if TYPE_CHECKING:
 
 
 def axes(
-    robot_file: RobotFile,
+    robot_file: shared.RobotFile,
     sweeps: Annotated[
-        Path | None,
-        typer.Argument(help="Read joint values and positions of reflectors in sweeps from this file (CSV)."),
+        Path | None, "Read joint values and positions of reflectors in sweeps from this file (CSV).", Arg()
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", writable=True, help="Write the robot that the axes make to this file (TOML)."),
-    ] = None,
+    out: Annotated[Path | None, "Write the robot that the axes make to this file (TOML).", WRITES] = None,
     still_deg: Annotated[
-        float,
-        typer.Option(min=1e-9, max=1.0, help="Take joints that change by less than this as standing still, degrees."),
+        float, "Take joints that change by less than this as standing still, degrees.", Opt(min=1e-9, max=1.0)
     ] = 0.0015,
     orientations: Annotated[
         str,
-        typer.Option(
-            help="Use measured orientations too, as reflectors so far from the target, mm, where an error of rotation "
-            "is worth one of position; auto, by their stated σ and not without, or off."
-        ),
+        "Use measured orientations too, as reflectors so far from the target, mm, where an error of rotation is "
+        "worth one of position; auto, by their stated σ and not without, or off.",
     ] = "auto",
-    rotation: Rotation = None,
-    first: FirstTable = None,
-    second: SecondTable = None,
-    key: Key = "image",
-    columns_a: FirstColumns = None,
-    columns: ColumnsFile = None,
-    json_file: JsonFile = None,
-    report: ReportFile = None,
+    rotation: shared.Rotation = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "image",
+    columns_a: shared.FirstColumns = None,
+    columns: shared.ColumnsFile = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
 ) -> None:
     """Find each joint's axis from sweeps of that joint alone, and the robot that follows (the axis method)."""
     from stcal.robot.axes.model import robot_from_sweeps
@@ -64,7 +44,7 @@ def axes(
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
-    source = one_table(sweeps, first, second, key, "SWEEPS", columns=columns, columns_a=columns_a)
+    source = shared.one_table(sweeps, first, second, key, "SWEEPS", columns=columns, columns_a=columns_a)
     data = read_measurements(source, nominal, rotation=rotation)
     if len(set(data.stations)) > 1:
         raise InputError(
@@ -80,7 +60,7 @@ def axes(
     elif data.rotations is not None:
         say("orientations: not used; state σ (cov_… columns), or give --orientations a length")
     print_each(f"warning: {data.where}", result.notes)
-    write_if(out, lambda: robot_toml(result.robot, [f"Identified by the axis method from {name_of(source)}."]))
+    write_if(out, lambda: robot_toml(result.robot, [f"Identified by the axis method from {shared.name_of(source)}."]))
     if out:
         require_robot_written(out, result.robot, result.chain)
     write_if(json_file, lambda: axes_file(result))

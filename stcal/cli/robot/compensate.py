@@ -1,87 +1,48 @@
 """Command ``stcal robot compensate``: joint values that reach commanded poses."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-import typer
-
-from stcal.cli.options import (
-    ColumnsFile,
-    FirstColumns,
-    FirstTable,
-    JsonFile,
-    Key,
-    PayloadKg,
-    QuaternionOrder,
-    Quaternions,
-    ReportFile,
-    Rotation,
-    SecondTable,
-    exports_of,
-    one_table,
-    require_new,
-)
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.terminal import print_each, say, write, write_if
 from stcal.errors import DegenerateError, InputError
-from stcal.io.files import keep_apart
 
-
-class ExportAs(StrEnum):
-    """Content of the files for controllers."""
-
-    joints = "joints"
-    poses = "poses"
+ExportAs = Literal["joints", "poses"]
+"""Content of the files for controllers."""
 
 
 def compensate(
-    robot_file: Annotated[Path, typer.Option("--robot", help="Read the identified robot from this file (TOML).")],
-    targets: Annotated[
-        Path | None, typer.Argument(help="Read commanded poses or joint values from this file (CSV).")
-    ] = None,
-    nominal: Annotated[
-        Path | None, typer.Option("--nominal", help="Read the robot as its controller has it from this file (TOML).")
-    ] = None,
+    robot_file: Annotated[Path, "Read the identified robot from this file (TOML).", Opt("--robot")],
+    targets: Annotated[Path | None, "Read commanded poses or joint values from this file (CSV).", Arg()] = None,
+    nominal: Annotated[Path | None, "Read the robot as its controller has it from this file (TOML)."] = None,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out", writable=True, help="Write joint values to send, with status and errors, to this file (CSV)."
-        ),
+        Path | None, "Write joint values to send, with status and errors, to this file (CSV).", WRITES
     ] = None,
     export: Annotated[
         list[str] | None,
-        typer.Option(
-            "--export",
-            metavar="FORM=FILE",
-            help="Write the points that are reached to this file, again for each further one; forms: yaskawa (JBI), "
-            "fanuc (LS), kuka (dat), abb (mod), ur (script).",
-        ),
+        "Write the points that are reached to this file, again for each further one; forms: yaskawa (JBI), "
+        "fanuc (LS), kuka (dat), abb (mod), ur (script).",
+        Opt(metavar="FORM=FILE"),
     ] = None,
     export_as: Annotated[
-        ExportAs,
-        typer.Option(
-            "--export-as",
-            help="Write joint values, or the poses of the nominal robot there, which the controller is told for them.",
-        ),
-    ] = ExportAs.joints,
+        ExportAs, "Write joint values, or the poses of the nominal robot there, which the controller is told for them."
+    ] = "joints",
     pulses_per_deg: Annotated[
         str | None,
-        typer.Option(
-            "--pulses-per-deg",
-            help="Write joint values for yaskawa by these pulses per degree of each joint, with commas between; poses "
-            "if not given.",
-        ),
+        "Write joint values for yaskawa by these pulses per degree of each joint, with commas between; poses if "
+        "not given.",
     ] = None,
-    quaternions: Quaternions = QuaternionOrder.wxyz,
-    rotation: Rotation = None,
-    payload_kg: PayloadKg = None,
-    first: FirstTable = None,
-    second: SecondTable = None,
-    key: Key = "pose",
-    columns: ColumnsFile = None,
-    columns_a: FirstColumns = None,
-    json_file: JsonFile = None,
-    report: ReportFile = None,
+    quaternions: shared.Quaternions = "wxyz",
+    rotation: shared.Rotation = None,
+    payload_kg: shared.PayloadKg = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "pose",
+    columns: shared.ColumnsFile = None,
+    columns_a: shared.FirstColumns = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
 ) -> None:
     """Compute joint values that really reach commanded poses, beside the nominal ones."""
     from stcal.io.files import require_same
@@ -91,19 +52,12 @@ def compensate(
     from stcal.robot.use.report import compensation_report
     from stcal.robot.use.targets import read_targets
 
-    exports, pulses = exports_of(export or [], require_form), _pulses(pulses_per_deg)
-    read = {"TARGETS": targets, "--robot": robot_file, "--nominal": nominal, "--a": first, "--b": second}
-    written = {"--out": out, "--json": json_file, "--report": report}
-    keep_apart(
-        [*((name, path) for name, path in written.items() if path), *(("--export", path) for _, path in exports)],
-        [(name, path) for name, path in read.items() if path],
-    )
-    require_new([("--export", path) for _, path in exports])
+    exports, pulses = shared.exports_of(export or [], require_form), _pulses(pulses_per_deg)
     identified = load_robot(robot_file)
-    source = one_table(
-        targets, first, second, key, "TARGETS", quaternions=quaternions.value, columns=columns, columns_a=columns_a
+    source = shared.one_table(
+        targets, first, second, key, "TARGETS", quaternions=quaternions, columns=columns, columns_a=columns_a
     )
-    wanted = read_targets(source, identified, quaternions.value, rotation, payload_kg)
+    wanted = read_targets(source, identified, quaternions, rotation, payload_kg)
     result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
     document = compensation_report(result, identified)
     say(document.text())
@@ -115,7 +69,7 @@ def compensate(
     write_if(json_file, lambda: stage.compensation_file(result, identified))
     write_if(report, document.page)
     for form, path in exports if result.found.usable.any() else ():
-        exported_file = exported(result, identified, form, path, export_as.value, pulses)
+        exported_file = exported(result, identified, form, path, export_as, pulses)
         write(path, exported_file.text)
         require_same(path, path.read_bytes, exported_file.text.encode())  # which gave the points back
         print_each("note", exported_file.notes)

@@ -1,11 +1,9 @@
 """Commands ``stcal robot init`` and ``convert``: robot files."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
-
+from stcal.cli.declare import Arg
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import InputError
 
@@ -17,44 +15,27 @@ LEAST_OFF_MM = 1e-3
 """A micrometre: what angles of few digits round off."""
 
 
-class ConventionName(StrEnum):
-    """Convention of Denavit–Hartenberg rows."""
-
-    standard = "standard"
-    modified = "modified"
+ConventionName = Literal["standard", "modified"]
+"""Convention of Denavit–Hartenberg rows."""
 
 
 def convert(
     source: Annotated[
         Path,
-        typer.Argument(
-            metavar="A",
-            help="Read the robot from this file: a robot file (TOML), URDF, or the calibration of an arm of Universal "
-            "Robots: YAML of ur_calibration, or calibration.conf.",
-        ),
+        "Read the robot from this file: a robot file (TOML), URDF, or the calibration of an arm of Universal "
+        "Robots: YAML of ur_calibration, or calibration.conf.",
+        Arg("A"),
     ],
-    out: Annotated[
-        Path, typer.Argument(metavar="B", writable=True, help="Write the other form to this file: .toml or .urdf.")
-    ],
-    from_link: Annotated[
-        str, typer.Option("--from-link", help="Begin at this link of a URDF; at its root if not given.")
-    ] = "",
+    out: Annotated[Path, "Write the other form to this file: .toml or .urdf.", Arg("B", writes=True)],
+    from_link: Annotated[str, "Begin at this link of a URDF; at its root if not given."] = "",
     to_link: Annotated[
         list[str] | None,
-        typer.Option(
-            "--to-link",
-            help="End at this link of a URDF; at the only one that can be if not given. Repeat it for the hands of "
-            "several arms on a trunk.",
-        ),
+        "End at this link of a URDF; at the only one that can be if not given. Repeat it for the hands of "
+        "several arms on a trunk.",
     ] = None,
-    convention: Annotated[
-        ConventionName, typer.Option(help="Write rows of Denavit and Hartenberg in this convention.")
-    ] = ConventionName.standard,
+    convention: Annotated[ConventionName, "Write rows of Denavit and Hartenberg in this convention."] = "standard",
     nominal: Annotated[
-        Path | None,
-        typer.Option(
-            "--nominal", help="Add the deviations of a calibration.conf to the rows of this robot file (TOML)."
-        ),
+        Path | None, "Add the deviations of a calibration.conf to the rows of this robot file (TOML)."
     ] = None,
 ) -> None:
     """Write a robot file as URDF, or the joints of a URDF or an arm of Universal Robots as a robot file."""
@@ -64,7 +45,7 @@ def convert(
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
-    made = None if source.suffix.lower() in (*XML, ".toml") else _of_universal(source, nominal, convention.value)
+    made = None if source.suffix.lower() in (*XML, ".toml") else _of_universal(source, nominal, convention)
     if made is None and nominal is not None:
         raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
     if made is not None:
@@ -86,14 +67,14 @@ def convert(
             f"{source}, {out}: both are {'URDF' if _is_xml(source) else 'robot files'}; one of each needed",
         )
     if _is_xml(source):
-        urdf = load_urdf(source, from_link, to_link or "", convention.value)
+        urdf = load_urdf(source, from_link, to_link or "", convention)
         joints = ", ".join(urdf.joints)
         say(f"robot {urdf.robot.name}: {len(urdf.joints)} joints from {urdf.from_link} to {urdf.to_link}: {joints}")
         print_each(f"note: {source}", urdf.notes)
         write(out, robot_toml(urdf.robot, [f"From {source.name}, {urdf.from_link} to {urdf.to_link}: {joints}."]))
         require_robot_written(out, urdf.robot)
         return
-    if from_link or to_link or convention is not ConventionName.standard:
+    if from_link or to_link or convention != "standard":
         raise InputError(
             "E-OPTION-NEEDS", "--from-link, --to-link, --convention: only of a URDF that is read; leave them out"
         )
@@ -146,7 +127,7 @@ def _is_xml(path: Path) -> bool:
 
 
 def init(
-    file: Annotated[Path, typer.Argument(writable=True, help="Write the robot file here.")] = Path("robot.toml"),
+    file: Annotated[Path, "Write the robot file here.", Arg(writes=True)] = Path("robot.toml"),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
     from stcal.robot.kinematics.file import require_robot_written, robot_toml

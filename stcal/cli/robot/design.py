@@ -1,44 +1,28 @@
 """Command ``stcal robot design``: choice of measurement poses."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-import typer
-
+from stcal.cli.declare import WRITES, Opt
 from stcal.cli.options import MOST_SEED, JsonFile, ReportFile, RobotFile
 from stcal.cli.terminal import say, write_if
 from stcal.errors import InputError
 
-
-class ObservedKind(StrEnum):
-    """Quantity that the instrument measures."""
-
-    pose = "pose"
-    position = "position"
+ObservedKind = Literal["pose", "position"]
+"""Quantity that the instrument measures."""
 
 
 def design(
     robot_file: RobotFile,
-    count: Annotated[int, typer.Option(min=1, max=2000, help="Choose this many poses.")] = 40,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw the candidates with this seed.")] = 0,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the poses to this file (CSV).")
-    ] = None,
-    observe: Annotated[
-        ObservedKind, typer.Option(help="Plan for an instrument that measures this.")
-    ] = ObservedKind.position,
-    candidates: Annotated[int, typer.Option(min=2, max=100_000, help="Choose from this many random poses.")] = 1000,
-    sigma_mm: Annotated[
-        float, typer.Option("--sigma-mm", help="Assume this σ of measured positions, mm per axis.")
-    ] = 0.05,
-    sigma_rad: Annotated[
-        float, typer.Option("--sigma-rad", help="Assume this σ of measured orientations, rad per axis.")
-    ] = 2e-4,
-    box: Annotated[
-        str | None, typer.Option(help="Keep the tool inside this box, mm in the base: xmin,ymin,zmin,xmax,ymax,zmax.")
-    ] = None,
-    target: Annotated[str, typer.Option(help="Measure the target (tool) of this name.")] = "",
+    count: Annotated[int, "Choose this many poses.", Opt(min=1, max=2000)] = 40,
+    seed: Annotated[int, "Draw the candidates with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    out: Annotated[Path | None, "Write the poses to this file (CSV).", WRITES] = None,
+    observe: Annotated[ObservedKind, "Plan for an instrument that measures this."] = "position",
+    candidates: Annotated[int, "Choose from this many random poses.", Opt(min=2, max=100_000)] = 1000,
+    sigma_mm: Annotated[float, "Assume this σ of measured positions, mm per axis."] = 0.05,
+    sigma_rad: Annotated[float, "Assume this σ of measured orientations, rad per axis."] = 2e-4,
+    box: Annotated[str | None, "Keep the tool inside this box, mm in the base: xmin,ymin,zmin,xmax,ymax,zmax."] = None,
+    target: Annotated[str, "Measure the target (tool) of this name."] = "",
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
@@ -48,14 +32,14 @@ def design(
     from stcal.robot.use.report import design_report
 
     options = stage.DesignOptions(
-        count, seed, observe.value, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target
+        count, seed, observe, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target
     )
     robot = load_robot(robot_file)
     result = stage.design(robot, options)
     document = design_report(result, robot)
     say(document.text())
-    also = f" and {sigma_rad:g} rad" if observe is ObservedKind.pose else ""
-    say(f"for an instrument whose {observe.value}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
+    also = f" and {sigma_rad:g} rad" if observe == "pose" else ""
+    say(f"for an instrument whose {observe}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
     write_if(out, lambda: stage.design_csv(result, robot))
     if out:
         stage.require_design_written(out, result, robot, target)

@@ -1,62 +1,35 @@
 """Commands ``stcal robot evaluate`` and ``verify``: robots are judged by new measurements."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-import typer
-
-from stcal.cli.options import (
-    ColumnsFile,
-    FirstColumns,
-    FirstTable,
-    JsonFile,
-    Key,
-    PayloadKg,
-    QuaternionOrder,
-    Quaternions,
-    ReportFile,
-    SecondTable,
-    one_table,
-    several_tables,
-)
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.terminal import print_each, say, write, write_if
 from stcal.errors import InputError
 
-
-class RefitParts(StrEnum):
-    """Transforms that are fitted again to the new measurements."""
-
-    none = "none"
-    base = "base"
-    tool = "tool"
-    both = "base-tool"
+RefitParts = Literal["none", "base", "tool", "base-tool"]
+"""Transforms that are fitted again to the new measurements."""
 
 
 def evaluate(
-    robot_files: Annotated[
-        list[Path], typer.Option("--robot", help="Read a robot from this file (TOML); give it again for others.")
-    ],
+    robot_files: Annotated[list[Path], "Read a robot from this file (TOML); give it again for others.", Opt("--robot")],
     data_file: Annotated[
-        Path | None,
-        typer.Argument(metavar="DATA", help="Read joint values with what was measured there from this file (CSV)."),
+        Path | None, "Read joint values with what was measured there from this file (CSV).", Arg("DATA")
     ] = None,
     refit: Annotated[
-        RefitParts,
-        typer.Option(help="Fit this to the data with each robot's own axes; the rest is taken from its file."),
-    ] = RefitParts.both,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the residuals of each row to this file (CSV).")
-    ] = None,
-    quaternions: Quaternions = QuaternionOrder.wxyz,
-    payload_kg: PayloadKg = None,
-    first: FirstTable = None,
-    second: SecondTable = None,
-    key: Key = "image",
-    columns: ColumnsFile = None,
-    columns_a: FirstColumns = None,
-    json_file: JsonFile = None,
-    report: ReportFile = None,
+        RefitParts, "Fit this to the data with each robot's own axes; the rest is taken from its file."
+    ] = "base-tool",
+    out: Annotated[Path | None, "Write the residuals of each row to this file (CSV).", WRITES] = None,
+    quaternions: shared.Quaternions = "wxyz",
+    payload_kg: shared.PayloadKg = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "image",
+    columns: shared.ColumnsFile = None,
+    columns_a: shared.FirstColumns = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
 ) -> None:
     """Compare robot files on new measurements, and tell what their residuals go with."""
     from stcal.robot.kinematics.file import load_robot
@@ -65,13 +38,13 @@ def evaluate(
     from stcal.robot.use.evaluation import evaluate as evaluated
 
     robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
-    source = one_table(
-        data_file, first, second, key, "DATA", quaternions=quaternions.value, columns=columns, columns_a=columns_a
+    source = shared.one_table(
+        data_file, first, second, key, "DATA", quaternions=quaternions, columns=columns, columns_a=columns_a
     )
     data = [  # within reach of each
-        read_measurements(source, robot, quaternions.value, payload_kg=payload_kg) for robot in robots.values()
+        read_measurements(source, robot, quaternions, payload_kg=payload_kg) for robot in robots.values()
     ]
-    result = evaluated(robots, data[0], refit.value)
+    result = evaluated(robots, data[0], refit)
     document = shown.evaluation_report(result)
     say(document.text())
     print_each("note", data[0].notes)
@@ -84,27 +57,20 @@ def evaluate(
 
 def verify(
     measured: Annotated[
-        Path | None,
-        typer.Argument(help="Read commanded_x_mm … beside measured x_mm … from this file; set: before, after (CSV)."),
+        Path | None, "Read commanded_x_mm … beside measured x_mm … from this file; set: before, after (CSV).", Arg()
     ] = None,
-    plot: Annotated[
-        Path | None,
-        typer.Option("--plot", writable=True, help="Draw the error of each pose and set to this file (.png or .svg)."),
-    ] = None,
-    first: FirstTable = None,
+    plot: Annotated[Path | None, "Draw the error of each pose and set to this file (.png or .svg).", WRITES] = None,
+    first: shared.FirstTable = None,
     seconds: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--b",
-            metavar="<path>",
-            help="Read what was measured from this file (CSV); several are sets, called like them.",
-        ),
+        "Read what was measured from this file (CSV); several are sets, called like them.",
+        Opt("--b", metavar="<path>"),
     ] = None,
-    key: Key = "pose",
-    columns_a: FirstColumns = None,
-    columns: ColumnsFile = None,
-    json_file: JsonFile = None,
-    report: ReportFile = None,
+    key: shared.Key = "pose",
+    columns_a: shared.FirstColumns = None,
+    columns: shared.ColumnsFile = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
 ) -> None:
     """Compare distances of measured positions from the first with the commanded ones, before and after."""
     from stcal.io.join import stack
@@ -113,7 +79,7 @@ def verify(
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
         raise InputError("E-OUTPUT-SUFFIX", f"--plot {plot}: a name ending in .png or .svg needed")
-    tables = several_tables(
+    tables = shared.several_tables(
         measured, first, seconds or [], key, "MEASURED", ("commanded_", ""), columns=columns, columns_a=columns_a
     )
     source = (

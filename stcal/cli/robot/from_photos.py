@@ -3,54 +3,32 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from stcal.cli.declare import Arg
 from stcal.cli.options import CameraFile, RobotFile, TargetFile, Workers, load_ahead
 from stcal.cli.robot.identify import Model
 from stcal.cli.terminal import StageProgress, print_each, say
 
 
 def from_photos(
-    images: Annotated[
-        Path, typer.Argument(metavar="VIEWS", help="Read the photographs of this folder and of its subfolders.")
-    ],
+    images: Annotated[Path, "Read the photographs of this folder and of its subfolders.", Arg("VIEWS")],
     camera: CameraFile,
-    faces: Annotated[Path, typer.Option("--faces", help="Read the calibrated target from this faces.json.")],
-    joints: Annotated[
-        Path,
-        typer.Option("--joints", help="Read the joint values of each photograph from this file, by --key (CSV)."),
-    ],
+    faces: Annotated[Path, "Read the calibrated target from this faces.json."],
+    joints: Annotated[Path, "Read the joint values of each photograph from this file, by --key (CSV)."],
     robot_file: RobotFile,
     out: Annotated[
         Path,
-        typer.Option(
-            "--out",
-            help="Write all results to this new folder; for more options give its poses.csv with the joint values to "
-            "robot axes and identify, its identified.toml to robot compensate.",
-        ),
+        "Write all results to this new folder; for more options give its poses.csv with the joint values to "
+        "robot axes and identify, its identified.toml to robot compensate.",
     ],
     targets: Annotated[
-        Path | None,
-        typer.Option(
-            "--targets", help="Compute joint values for the poses of this file, or in place of its joint values (CSV)."
-        ),
+        Path | None, "Compute joint values for the poses of this file, or in place of its joint values (CSV)."
     ] = None,
     target: TargetFile = None,
-    board: Annotated[
-        Path | None,
-        typer.Option("--board", help="Tell the dots of the board of this board.toml apart, if it is in view."),
-    ] = None,
-    model: Annotated[
-        Model, typer.Option(help="Take the arm as rigid, or as elastic; auto chooses by rows held out.")
-    ] = Model.rigid,
-    partial: Annotated[
-        bool, typer.Option("--partial", help="Keep parameters nominal that the photographs leave open.")
-    ] = False,
-    key: Annotated[str, typer.Option("--key", help="Match photographs and joint values by this column.")] = "image",
-    columns: Annotated[
-        Path | None,
-        typer.Option("--columns", help="Read --joints with the columns, delimiter … of this file (TOML)."),
-    ] = None,
+    board: Annotated[Path | None, "Tell the dots of the board of this board.toml apart, if it is in view."] = None,
+    model: Annotated[Model, "Take the arm as rigid, or as elastic; auto chooses by rows held out."] = "rigid",
+    partial: Annotated[bool, "Keep parameters nominal that the photographs leave open."] = False,
+    key: Annotated[str, "Match photographs and joint values by this column."] = "image",
+    columns: Annotated[Path | None, "Read --joints with the columns, delimiter … of this file (TOML)."] = None,
     workers: Workers = None,
 ) -> None:
     """Measure the target on an arm in photographs, find axes and kinematics, and compensate targets: one folder."""
@@ -79,7 +57,7 @@ def from_photos(
             load_board(board) if board else None,
             key,
             MeasureOptions(workers=workers),
-            IdentifyOptions(model=model.value, partial=partial),
+            IdentifyOptions(model=model, partial=partial),
             progress,
             columns,
         )

@@ -1,117 +1,60 @@
 """Command ``stcal robot identify``: kinematics from poses, positions or distances."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-import typer
-
-from stcal.cli.options import (
-    MOST_SEED,
-    ColumnsFile,
-    FirstColumns,
-    FirstTable,
-    JsonFile,
-    Key,
-    PayloadKg,
-    QuaternionOrder,
-    Quaternions,
-    ReportFile,
-    RobotFile,
-    Rotation,
-    SecondTable,
-    name_of,
-    one_table,
-)
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.terminal import say, write, write_if
 
-
-class Kind(StrEnum):
-    """Quantity that is used of the measurements."""
-
-    pose = "pose"
-    position = "position"
-    distance = "distance"
+Kind = Literal["pose", "position", "distance"]
+"""Quantity that is used of the measurements."""
 
 
-class Model(StrEnum):
-    """Model of the arm."""
-
-    rigid = "rigid"
-    elastic = "elastic"
-    auto = "auto"
+Model = Literal["rigid", "elastic", "auto"]
+"""Model of the arm."""
 
 
 def identify(
-    robot_file: RobotFile,
+    robot_file: shared.RobotFile,
     data_file: Annotated[
-        Path | None,
-        typer.Argument(metavar="DATA", help="Read joint values with what was measured there from this file (CSV)."),
+        Path | None, "Read joint values with what was measured there from this file (CSV).", Arg("DATA")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Write the identified robot to this file (TOML).")
-    ] = None,
+    out: Annotated[Path | None, "Write the identified robot to this file (TOML).", WRITES] = None,
     offsets: Annotated[
-        Path | None,
-        typer.Option(
-            "--offsets", writable=True, help="Write mastering offsets and differences of D-H values to this file (CSV)."
-        ),
+        Path | None, "Write mastering offsets and differences of D-H values to this file (CSV).", WRITES
     ] = None,
-    observe: Annotated[
-        Kind | None, typer.Option(help="Use this of the measurements; the most that was measured if not given.")
-    ] = None,
+    observe: Annotated[Kind | None, "Use this of the measurements; the most that was measured if not given."] = None,
     sigma_mm: Annotated[
-        float | None,
-        typer.Option(
-            "--sigma-mm", min=1e-9, max=1e4, help="Set σ of a measured position, mm per axis; estimated if not given."
-        ),
+        float | None, "Set σ of a measured position, mm per axis; estimated if not given.", Opt(min=1e-9, max=1e4)
     ] = None,
     sigma_rad: Annotated[
-        float | None,
-        typer.Option(
-            "--sigma-rad",
-            min=1e-12,
-            max=4,
-            help="Set σ of a measured orientation, rad per axis; estimated if not given.",
-        ),
+        float | None, "Set σ of a measured orientation, rad per axis; estimated if not given.", Opt(min=1e-12, max=4)
     ] = None,
-    folds: Annotated[
-        int, typer.Option(min=0, max=100_000, help="Cross-validate with this many folds; 0 for none.")
-    ] = 6,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Divide the rows into folds with this seed.")] = 0,
-    robust: Annotated[
-        bool, typer.Option("--robust/--least-squares", help="Give outliers less weight, or all rows the same.")
-    ] = True,
-    partial: Annotated[
-        bool,
-        typer.Option(
-            "--partial", help="Keep parameters nominal that the data leave open, rather than refuse the data."
-        ),
-    ] = False,
+    folds: Annotated[int, "Cross-validate with this many folds; 0 for none.", Opt(min=0, max=100_000)] = 6,
+    seed: Annotated[int, "Divide the rows into folds with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    robust: Annotated[bool, "Give outliers less weight, or all rows the same.", Opt("--robust/--least-squares")] = True,
+    partial: Annotated[bool, "Keep parameters nominal that the data leave open, rather than refuse the data."] = False,
     adjust: Annotated[
         str,
-        typer.Option(
-            metavar="WHAT",
-            help="Adjust base and tools (base,tool), also zero positions of joints (zeros), or their geometry, or all.",
-        ),
+        "Adjust base and tools (base,tool), also zero positions of joints (zeros), or their geometry, or all.",
+        Opt(metavar="WHAT"),
     ] = "all",
     model: Annotated[
         Model,
-        typer.Option(
-            help="Take the arm as rigid, or as elastic: links give way to gravity, gears turn unevenly; auto chooses "
-            "by rows held out."
-        ),
-    ] = Model.rigid,
-    quaternions: Quaternions = QuaternionOrder.wxyz,
-    rotation: Rotation = None,
-    payload_kg: PayloadKg = None,
-    first: FirstTable = None,
-    second: SecondTable = None,
-    key: Key = "image",
-    columns_a: FirstColumns = None,
-    columns: ColumnsFile = None,
-    json_file: JsonFile = None,
-    report: ReportFile = None,
+        "Take the arm as rigid, or as elastic: links give way to gravity, gears turn unevenly; auto chooses by "
+        "rows held out.",
+    ] = "rigid",
+    quaternions: shared.Quaternions = "wxyz",
+    rotation: shared.Rotation = None,
+    payload_kg: shared.PayloadKg = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "image",
+    columns_a: shared.FirstColumns = None,
+    columns: shared.ColumnsFile = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
 ) -> None:
     """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
     from stcal.robot.identification.prior import adjusted
@@ -122,13 +65,12 @@ def identify(
     from stcal.robot.kinematics.measurements import read_measurements
 
     nominal = load_robot(robot_file)
-    source = one_table(
-        data_file, first, second, key, "DATA", quaternions=quaternions.value, columns=columns, columns_a=columns_a
+    source = shared.one_table(
+        data_file, first, second, key, "DATA", quaternions=quaternions, columns=columns, columns_a=columns_a
     )
-    data = read_measurements(source, nominal, quaternions.value, rotation, payload_kg)
-    kind = observe.value if observe else None
+    data = read_measurements(source, nominal, quaternions, rotation, payload_kg)
     options = IdentifyOptions(
-        kind, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model.value, adjust=adjusted(adjust)
+        observe, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model, adjust=adjusted(adjust)
     )
     result = identified_from(nominal, data, options)
     document = identified_report(result, nominal)
@@ -136,7 +78,7 @@ def identify(
     if out:
         write(
             out,
-            robot_toml(result.robot, [f"Identified from {name_of(source)}: {result.rank} parameters."]),
+            robot_toml(result.robot, [f"Identified from {shared.name_of(source)}: {result.rank} parameters."]),
         )
         require_identified_written(out, result)
     if offsets:

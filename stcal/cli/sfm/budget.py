@@ -18,42 +18,22 @@ def budget(
     run: Run,
     statement: Annotated[
         Path | None,
-        typer.Option(
-            "--statement",
-            help="Read temperatures, expansion, the σ of the board's pitch and fields of the head from this file "
-            "(TOML).",
-        ),
+        "Read temperatures, expansion, the σ of the board's pitch and fields of the head from this file (TOML).",
     ] = None,
     field: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--field", help="Write NAME=VALUE into the head, such as operator='A. Smith'; may be given several times."
-        ),
+        list[str] | None, "Write NAME=VALUE into the head, such as operator='A. Smith'; may be given several times."
     ] = None,
     check_lengths: Annotated[
         Path | None,
-        typer.Option(
-            "--check-lengths",
-            help="Compare distances between circles with the lengths in this file (CSV: from, to, length_mm, "
-            "sigma_mm).",
-        ),
+        "Compare distances between circles with the lengths in this file (CSV: from, to, length_mm, sigma_mm).",
     ] = None,
-    columns: Annotated[
-        Path | None,
-        typer.Option("--columns", help="Read --check-lengths with the columns, delimiter … of this file (TOML)."),
-    ] = None,
-    lengths: Annotated[
-        Path | None,
-        typer.Option("--lengths", help="Compare the longest distances with the second calibration in this folder."),
-    ] = None,
+    columns: Annotated[Path | None, "Read --check-lengths with the columns, delimiter … of this file (TOML)."] = None,
+    lengths: Annotated[Path | None, "Compare the longest distances with the second calibration in this folder."] = None,
     lengths_statement: Annotated[
-        Path | None,
-        typer.Option("--lengths-statement", help="Read what is stated of that run from this file; --statement if not."),
+        Path | None, "Read what is stated of that run from this file; --statement if not."
     ] = None,
     page: ReportFile = None,
-    pdf: Annotated[
-        bool, typer.Option("--pdf", help="Also write the page as PDF, beside it (needs the extra `pdf`).")
-    ] = False,
+    pdf: Annotated[bool, "Also write the page as PDF, beside it (needs the extra `pdf`)."] = False,
     out: JsonFile = None,
 ) -> None:
     """Compute the uncertainty budget of faces and of the target's longest distances (GUM), each contribution apart."""
@@ -100,10 +80,8 @@ def budget(
 def _require_pdf(page: Path | None, run: Path) -> None:
     """Refuses, before the work, a PDF without a page or a place.
 
-    Raises
-    ------
-    InputError
-        If there is no page, the page itself has the suffix of a PDF, or the extra ``pdf`` is not installed.
+    Raises InputError if there is no page, the page itself has the suffix of a PDF, or the extra ``pdf`` is not
+    installed.
     """
     from stcal.report.page import require_pdf
 

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.options import ReportFile, Strict, TargetFile, Workers, designs_told, require_new, require_passed
 from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, write, write_if
 from stcal.errors import InputError
@@ -16,54 +17,38 @@ app = typer.Typer()
 def calibrate_camera(
     images: Annotated[
         Path,
-        typer.Argument(
-            help="Read photographs that show the board from this folder, or from IMAGES/<group>/ as run; with --rig "
-            "from IMAGES/<camera>/."
-        ),
+        "Read photographs that show the board from this folder, or from IMAGES/<group>/ as run; with --rig from "
+        "IMAGES/<camera>/.",
+        Arg(),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            writable=True,
-            help="Write the camera to this file, cameras.txt if not given; with --rig all "
-            "cameras to this folder, which must be new, rig if not given.",
-        ),
+        "Write the camera to this file, cameras.txt if not given; with --rig all cameras to this folder, which "
+        "must be new, rig if not given.",
+        WRITES,
     ] = None,
     target: TargetFile = None,
     board: Annotated[
         Path | None,
-        typer.Option(
-            "--board",
-            help="Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid or "
-            "asymmetric circles, in place of the reference board.",
-        ),
+        "Read the board from this file, TOML or Kalibr's YAML: dots, chessboard, ChArUco, AprilGrid or "
+        "asymmetric circles, in place of the reference board.",
     ] = None,
     rig: Annotated[
         bool,
-        typer.Option(
-            "--rig",
-            help="Calibrate cameras that are fixed to each other: a folder of photographs for each, those of one "
-            "instant named alike.",
-        ),
+        "Calibrate cameras that are fixed to each other: a folder of photographs for each, those of one instant "
+        "named alike.",
     ] = False,
     model: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Fit this model of COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV; of "
-            "wide lenses SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, THIN_PRISM_FISHEYE; or `auto`: the "
-            "simplest that foretells held-out views as well as the best. OPENCV if not given; with --rig also "
-            "CAMERA=MODEL, for each camera that differs."
-        ),
+        "Fit this model of COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV; of wide "
+        "lenses SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, THIN_PRISM_FISHEYE; or `auto`: the "
+        "simplest that foretells held-out views as well as the best. OPENCV if not given; with --rig also "
+        "CAMERA=MODEL, for each camera that differs.",
     ] = None,
     json_file: Annotated[
         Path | None,
-        typer.Option(
-            "--json",
-            writable=True,
-            help="Write figures and checks to this file (JSON); to standard output with `-`; beside --out if not "
-            "given.",
-        ),
+        "Write figures and checks to this file (JSON); to standard output with `-`; beside --out if not given.",
+        Opt("--json", writes=True),
     ] = None,
     report: ReportFile = None,
     strict: Strict = False,

@@ -6,21 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.options import (
-    MOST_SEED,
-    BoardFile,
-    CameraFile,
-    JsonFile,
-    MaxDiameter,
-    MinDiameter,
-    PlateMargin,
-    Run,
-    TargetFile,
-    Workers,
-    designs_told,
-    ellipse_options,
-    load_ahead,
-)
+from stcal.cli import options as shared
+from stcal.cli.declare import Arg, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.errors import InputError
 
@@ -32,38 +19,28 @@ app = typer.Typer()
 
 @app.command()
 def plan(
-    images: Annotated[int, typer.Option("--images", min=2, max=500, help="Plan this many images in each group.")] = 10,
-    spread: Annotated[float, typer.Option(min=2, max=80, help="Spread the views by ± this, degrees.")] = 40.0,
-    distance: Annotated[float, typer.Option(min=50, max=1e5, help="Place the camera at this distance, mm.")] = 1000.0,
+    images: Annotated[int, "Plan this many images in each group.", Opt(min=2, max=500)] = 10,
+    spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
+    distance: Annotated[float, "Place the camera at this distance, mm.", Opt(min=50, max=1e5)] = 1000.0,
     width: Annotated[
-        int, typer.Option(min=320, max=100_000, help="Take images of this width, px; 3:2 images of a 24 mm lens.")
+        int, "Take images of this width, px; 3:2 images of a 24 mm lens.", Opt(min=320, max=100_000)
     ] = 5184,
-    camera: Annotated[
-        Path | None, typer.Option("--camera", help="Read the camera from this file, in place of --width.")
-    ] = None,
-    noise: Annotated[float | None, typer.Option(min=1e-5, max=10, help="Assume this σ of every centre, px.")] = None,
-    run: Annotated[
-        Path | None, typer.Option("--run", help="Take the σ of centres from the finished run in this folder.")
-    ] = None,
-    target: TargetFile = None,
-    faces: Annotated[
-        Path | None,
-        typer.Option("--faces", help="Place the faces of --target as in this faces.json of an earlier run."),
-    ] = None,
-    board: BoardFile = None,
+    camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
+    noise: Annotated[float | None, "Assume this σ of every centre, px.", Opt(min=1e-5, max=10)] = None,
+    run: Annotated[Path | None, "Take the σ of centres from the finished run in this folder."] = None,
+    target: shared.TargetFile = None,
+    faces: Annotated[Path | None, "Place the faces of --target as in this faces.json of an earlier run."] = None,
+    board: shared.BoardFile = None,
     groups: Annotated[
-        str | None,
-        typer.Option(help="Photograph these pairs of faces together, such as 12,14,15,23 or front-right,front-top."),
+        str | None, "Photograph these pairs of faces together, such as 12,14,15,23 or front-right,front-top."
     ] = None,
-    refine_camera: Annotated[bool, typer.Option("--refine-camera", help="Adjust the intrinsics too.")] = False,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
     one_board: Annotated[
-        bool, typer.Option("--one-board/--own-boards", help="Use one plate in all groups, or a new print for each.")
+        bool, "Use one plate in all groups, or a new print for each.", Opt("--one-board/--own-boards")
     ] = True,
-    seed: Annotated[
-        int, typer.Option(min=0, max=MOST_SEED, help="Place board and cameras at random with this seed.")
-    ] = 0,
-    margin: PlateMargin = 15.0,
-    out: JsonFile = None,
+    seed: Annotated[int, "Place board and cameras at random with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    margin: shared.PlateMargin = 15.0,
+    out: shared.JsonFile = None,
 ) -> None:
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
     from stcal.boards.target import body_of
@@ -105,7 +82,7 @@ def plan(
         seed,
         margin,
     )
-    with designs_told(target, board):
+    with shared.designs_told(target, board):
         nominal = nominal_poses(design, faces)
         result = plan_body(options, design, nominal) if printed else planned(options, design, board_of(board), nominal)
     say(plan_text(result, source))
@@ -114,12 +91,12 @@ def plan(
 
 @app.command()
 def advise(
-    run: Run,
-    count: Annotated[int, typer.Option("--count", min=1, max=50, help="Advise this many views.")] = 5,
-    out: JsonFile = None,
+    run: shared.Run,
+    count: Annotated[int, "Advise this many views.", Opt(min=1, max=50)] = 5,
+    out: shared.JsonFile = None,
 ) -> None:
     """Compute from a run's own geometry which further photographs would lower the σ of its worst face most."""
-    load_ahead(None)
+    shared.load_ahead(None)
     from stcal.sfm.planning.advise import advise as advice_for
     from stcal.sfm.planning.advise import doubts, known_of
     from stcal.sfm.planning.file import AdviceFile, advice_text
@@ -138,39 +115,38 @@ def advise(
 @app.command()
 def watch(
     images: Annotated[
-        Path, typer.Argument(help="Follow this folder, IMAGES/<group>/*.jpg, png, tif, bmp; it may be empty at first.")
+        Path, "Follow this folder, IMAGES/<group>/*.jpg, png, tif, bmp; it may be empty at first.", Arg()
     ],
-    camera: CameraFile,
-    out: Annotated[Path, typer.Option("--out", help="Write the run to this folder: new, empty, or of an earlier run.")],
-    target: TargetFile = None,
-    board: BoardFile = None,
+    camera: shared.CameraFile,
+    out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
+    target: shared.TargetFile = None,
+    board: shared.BoardFile = None,
     interval: Annotated[
-        float, typer.Option(min=0.1, max=3600, help="Look at the folder so often, s; files must stand still for it.")
+        float, "Look at the folder so often, s; files must stand still for it.", Opt(min=0.1, max=3600)
     ] = 1.0,
     idle: Annotated[
-        float | None,
-        typer.Option(min=0.1, max=1e6, help="End when nothing has come for so long, s; by Ctrl-C if not given."),
+        float | None, "End when nothing has come for so long, s; by Ctrl-C if not given.", Opt(min=0.1, max=1e6)
     ] = None,
-    views: Annotated[int, typer.Option(min=0, max=50, help="Compute so many views that would help; 0 for none.")] = 1,
-    refine_camera: Annotated[bool, typer.Option("--refine-camera", help="Adjust the intrinsics too.")] = False,
-    min_diameter: MinDiameter = None,
-    max_diameter: MaxDiameter = 450.0,
-    workers: Workers = None,
+    views: Annotated[int, "Compute so many views that would help; 0 for none.", Opt(min=0, max=50)] = 1,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
+    min_diameter: shared.MinDiameter = None,
+    max_diameter: shared.MaxDiameter = 450.0,
+    workers: shared.Workers = None,
 ) -> None:
     """Calibrate while photographs are taken: after each, what was found, the worst σ so far and the view that would
     help most. RUN/report.html is kept up to date and reloads itself."""
-    load_ahead(workers)
+    shared.load_ahead(workers)
     from stcal.sfm.runs.options import RunOptions
     from stcal.workflows.watch import WatchOptions
     from stcal.workflows.watch import watch as updates
 
     run_options = RunOptions(
-        refine_camera=refine_camera, ellipses=ellipse_options(min_diameter, max_diameter), workers=workers
+        refine_camera=refine_camera, ellipses=shared.ellipse_options(min_diameter, max_diameter), workers=workers
     )
     options = WatchOptions(interval, idle, views, run_options)
     say(f"watching {images}; report: {out / 'report.html'}")
     sys.stdout.flush()
-    with designs_told(target, board):
+    with shared.designs_told(target, board):
         for update in updates(images, camera, out, target, board, options):
             _say_update(update)
 
@@ -195,67 +171,56 @@ def _say_update(update: "Update") -> None:
 
 @app.command()
 def capture(
-    images: Annotated[
-        Path, typer.Argument(help="Write photographs to this folder, IMAGES/<group>/IMG_0001.png; earlier ones stay.")
-    ],
-    camera: CameraFile,
-    out: Annotated[Path, typer.Option("--out", help="Write the run to this folder: new, empty, or of an earlier run.")],
-    group: Annotated[
-        str, typer.Option(help="Name the group like this; between its photographs only the camera may move.")
-    ],
-    target: TargetFile = None,
-    board: BoardFile = None,
-    device: Annotated[
-        str, typer.Option(help="Use this camera: a number, or a place such as /dev/video0 (V4L2, UVC).")
-    ] = "0",
+    images: Annotated[Path, "Write photographs to this folder, IMAGES/<group>/IMG_0001.png; earlier ones stay.", Arg()],
+    camera: shared.CameraFile,
+    out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
+    group: Annotated[str, "Name the group like this; between its photographs only the camera may move."],
+    target: shared.TargetFile = None,
+    board: shared.BoardFile = None,
+    device: Annotated[str, "Use this camera: a number, or a place such as /dev/video0 (V4L2, UVC)."] = "0",
     exposure: Annotated[
         float | None,
-        typer.Option(
-            min=1e-9, max=1e9, help="Set this exposure, in the driver's unit; left to the camera if not given."
-        ),
+        "Set this exposure, in the driver's unit; left to the camera if not given.",
+        Opt(min=1e-9, max=1e9),
     ] = None,
     gain: Annotated[
-        float | None, typer.Option(min=0, max=1e6, help="Set this gain, in the driver's unit; as it is if not given.")
+        float | None, "Set this gain, in the driver's unit; as it is if not given.", Opt(min=0, max=1e6)
     ] = None,
     settle: Annotated[
-        float, typer.Option("--settle-s", min=0, max=60, help="Give the camera this time before each photograph, s.")
+        float, "Give the camera this time before each photograph, s.", Opt("--settle-s", min=0, max=60)
     ] = 0.3,
     count: Annotated[
-        int | None, typer.Option(min=1, max=100_000, help="End after so many; by Ctrl-C or Ctrl-D if not given.")
+        int | None, "End after so many; by Ctrl-C or Ctrl-D if not given.", Opt(min=1, max=100_000)
     ] = None,
     every: Annotated[
-        float | None,
-        typer.Option("--every", min=0, max=86_400, help="Take one each so many seconds; at each Enter if not given."),
+        float | None, "Take one each so many seconds; at each Enter if not given.", Opt(min=0, max=86_400)
     ] = None,
     simulate: Annotated[
-        Path | None,
-        typer.Option(
-            help="Use a simulated camera that sees this image, or those of this folder, in place of --device."
-        ),
+        Path | None, "Use a simulated camera that sees this image, or those of this folder, in place of --device."
     ] = None,
-    views: Annotated[int, typer.Option(min=0, max=50, help="Compute so many views that would help; 0 for none.")] = 1,
-    refine_camera: Annotated[bool, typer.Option("--refine-camera", help="Adjust the intrinsics too.")] = False,
-    min_diameter: MinDiameter = None,
-    max_diameter: MaxDiameter = 450.0,
-    workers: Workers = None,
+    views: Annotated[int, "Compute so many views that would help; 0 for none.", Opt(min=0, max=50)] = 1,
+    refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
+    min_diameter: shared.MinDiameter = None,
+    max_diameter: shared.MaxDiameter = 450.0,
+    workers: shared.Workers = None,
 ) -> None:
     """Take photographs with a camera of this machine and calibrate meanwhile: after each, what was found, blur,
     saturation, the worst σ so far and the view that would help most."""
-    load_ahead(workers)
+    shared.load_ahead(workers)
     from stcal.io.device import OpenCVSource, SimulatedSource
     from stcal.sfm.runs.options import RunOptions
     from stcal.workflows.capture import Trigger, photograph
     from stcal.workflows.watch import Growing, WatchOptions
 
     run_options = RunOptions(
-        refine_camera=refine_camera, ellipses=ellipse_options(min_diameter, max_diameter), workers=workers
+        refine_camera=refine_camera, ellipses=shared.ellipse_options(min_diameter, max_diameter), workers=workers
     )
     growing = Growing.of(images, camera, out, target, board, WatchOptions(views=views, run=run_options))
     source = SimulatedSource(simulate, gain) if simulate else OpenCVSource(device, gain, exposure is not None)
     trigger = Trigger(count, every, sys.stdin, lambda text: (say(text), sys.stdout.flush()))
     try:
         say(f"{source.name}; report: {out / 'report.html'}")
-        with designs_told(target, board):
+        with shared.designs_told(target, board):
             for photo in photograph(source, growing, group, exposure, settle, trigger.ready):
                 say(f"taken {photo.name}: {photo.light()}")
                 _say_update(photo.update)

@@ -1,11 +1,11 @@
 """Commands ``stcal-sfm`` for the exchange with COLMAP and other programs, and for images and circles left out."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.options import JsonFile, Run, Workers
 from stcal.cli.terminal import StageProgress, say, write_if
 from stcal.errors import InputError, MappingError
@@ -13,11 +13,8 @@ from stcal.errors import InputError, MappingError
 app = typer.Typer()
 
 
-class Chained(StrEnum):
-    """Way in which the faces of single groups are combined."""
-
-    chain = "chain"
-    paper = "paper"
+Chained = Literal["chain", "paper"]
+"""Way in which the faces of single groups are combined."""
 
 
 SHOWN_PAIRS = 10
@@ -26,18 +23,8 @@ SHOWN_PAIRS = 10
 @app.command(name="export-database")
 def export_database(
     run: Run,
-    out: Annotated[
-        Path,
-        typer.Argument(
-            metavar="OUT.db", writable=True, help="Write the copy to this new file; nothing is overwritten."
-        ),
-    ],
-    schema: Annotated[
-        str,
-        typer.Option(
-            "--schema", help="Write for this version of COLMAP: 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0 (and 4.1), 4.2."
-        ),
-    ],
+    out: Annotated[Path, "Write the copy to this new file; nothing is overwritten.", Arg("OUT.db", writes=True)],
+    schema: Annotated[str, "Write for this version of COLMAP: 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0 (and 4.1), 4.2."],
 ) -> None:
     """Copy the run's database for another version of COLMAP to open; ids, orders and values stay."""
     from stcal.sfm.interop.crosscheck import database_text
@@ -52,16 +39,8 @@ def export_database(
 @app.command(name="export-model")
 def export_model(
     run: Run,
-    out: Annotated[
-        Path,
-        typer.Argument(
-            metavar="OUT",
-            help="Write here: a new file for ply and nvm, a new or empty folder for the others.",
-        ),
-    ],
-    kind: Annotated[
-        str, typer.Option("--format", help="Write this format: colmap-bin, colmap-txt, ply, nvm or bundler.")
-    ],
+    out: Annotated[Path, "Write here: a new file for ply and nvm, a new or empty folder for the others.", Arg("OUT")],
+    kind: Annotated[str, "Write this format: colmap-bin, colmap-txt, ply, nvm or bundler.", Opt("--format")],
 ) -> None:
     """Write the run's final model, mm, target frame, for other programs; labels beside it."""
     from stcal.sfm.interop.crosscheck import model_text
@@ -76,23 +55,15 @@ def export_run(
     run: Run,
     out: Annotated[
         Path,
-        typer.Argument(
-            metavar="FILE",
-            writable=True,
-            help="Write this new file; its suffix tells the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 "
-            "and 1), .yml (OpenCV), .csv, .ply, .dxf, .gltf, .glb or .rrd (Rerun).",
-        ),
+        "Write this new file; its suffix tells the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 and "
+        "1), .yml (OpenCV), .csv, .ply, .dxf, .gltf, .glb or .rrd (Rerun).",
+        Arg("FILE", writes=True),
     ],
     form: Annotated[
         str,
-        typer.Option(
-            help="Take this form whatever the suffix: urdf, xacro, tf2, ros2, ros1, opencv, csv, ply, dxf, gltf, glb "
-            "or rerun."
-        ),
+        "Take this form whatever the suffix: urdf, xacro, tf2, ros2, ros1, opencv, csv, ply, dxf, gltf, glb or rerun.",
     ] = "",
-    name: Annotated[
-        str, typer.Option(help="Name the target frame; faces are NAME_FACE, circles NAME_FACE_CIRCLE.")
-    ] = "target",
+    name: Annotated[str, "Name the target frame; faces are NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
 ) -> None:
     """Write faces and circles, with σ and cameras where the form holds them, for robots, drawings and viewers."""
     from stcal.sfm.interop.crosscheck import export_text
@@ -104,36 +75,25 @@ def export_run(
 @app.command()
 def crosscheck(
     run: Run,
-    colmap: Annotated[
-        Path | None, typer.Option("--colmap", help="Run this native program; `colmap` on the PATH if not given.")
-    ] = None,
+    colmap: Annotated[Path | None, "Run this native program; `colmap` on the PATH if not given."] = None,
     tolerance_sigma: Annotated[
         float,
-        typer.Option(
-            min=0,
-            max=1e6,
-            help="Accept differences of our answer from the native models up to this, in σ of faces and circles.",
-        ),
+        "Accept differences of our answer from the native models up to this, in σ of faces and circles.",
+        Opt(min=0, max=1e6),
     ] = 0.5,
     tolerance_um: Annotated[
-        float | None,
-        typer.Option(min=0, max=1e6, help="Accept differences of faces and circles up to this, µm; any if not given."),
+        float | None, "Accept differences of faces and circles up to this, µm; any if not given.", Opt(min=0, max=1e6)
     ] = None,
     tolerance_mdeg: Annotated[
-        float | None,
-        typer.Option(min=0, max=1e6, help="Accept differences of faces up to this, millidegrees; any if not given."),
+        float | None, "Accept differences of faces up to this, millidegrees; any if not given.", Opt(min=0, max=1e6)
     ] = None,
     camera_tolerance_um: Annotated[
-        float | None,
-        typer.Option(min=0, max=1e6, help="Accept differences of camera positions up to this, µm; any if not given."),
+        float | None, "Accept differences of camera positions up to this, µm; any if not given.", Opt(min=0, max=1e6)
     ] = None,
     camera_tolerance_mdeg: Annotated[
-        float | None,
-        typer.Option(min=0, max=1e6, help="Accept differences of camera attitudes up to this, mdeg; any if not given."),
+        float | None, "Accept differences of camera attitudes up to this, mdeg; any if not given.", Opt(min=0, max=1e6)
     ] = None,
-    timeout: Annotated[
-        float, typer.Option(min=1, max=1e6, help="Stop the native mapper after this time for one group, s.")
-    ] = 600.0,
+    timeout: Annotated[float, "Stop the native mapper after this time for one group, s.", Opt(min=1, max=1e6)] = 600.0,
 ) -> None:
     """Map the same database with the native COLMAP and compare faces, circles and cameras, into the report."""
     from stcal.sfm.interop.crosscheck import comparison_text, crosscheck_run
@@ -157,23 +117,14 @@ def crosscheck(
 
 @app.command()
 def faces(
-    model: Annotated[
-        Path,
-        typer.Argument(
-            metavar="MODEL", help="Read this COLMAP model, or the folder of several, of the run's database."
-        ),
-    ],
-    run: Annotated[Path, typer.Option("--run", help="Read the run in this folder, whose database was mapped.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", writable=True, help="Also write the faces to this file, as faces.json.")
-    ] = None,
+    model: Annotated[Path, "Read this COLMAP model, or the folder of several, of the run's database.", Arg("MODEL")],
+    run: Annotated[Path, "Read the run in this folder, whose database was mapped."],
+    out: Annotated[Path | None, "Also write the faces to this file, as faces.json.", WRITES] = None,
     solve: Annotated[
         Chained,
-        typer.Option(
-            help="Solve by chain, every way to a face weighed, or as in the paper: λ by rows, three-point "
-            "frames, single transforms."
-        ),
-    ] = Chained.chain,
+        "Solve by chain, every way to a face weighed, or as in the paper: λ by rows, three-point frames, single "
+        "transforms.",
+    ] = "chain",
 ) -> None:
     """Find scale and faces from a COLMAP model made or edited elsewhere; labels come by (image, keypoint)."""
     from stcal.sfm.interop.crosscheck import faces_text
@@ -183,18 +134,18 @@ def faces(
     if out is not None and not out.parent.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{out}: no folder {out.parent}; make it, or give another place with --out")
     saved = load_run(run)
-    calibration = calibrate_models(model, saved, solve.value)
+    calibration = calibrate_models(model, saved, solve)
     say(faces_text(calibration, saved))
     if out is not None:
-        write_faces(out, calibration, saved, solve.value)
+        write_faces(out, calibration, saved, solve)
         say(f"faces: {out}")
 
 
 @app.command()
 def pairs(
     run: Run,
-    group: Annotated[str | None, typer.Option("--group", help="Show this group only.")] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Show all pairs; the first ten if not given.")] = False,
+    group: Annotated[str | None, "Show this group only."] = None,
+    everything: Annotated[bool, "Show all pairs; the first ten if not given.", Opt("--all")] = False,
     out: JsonFile = None,
 ) -> None:
     """Rank the initial pairs, and show how each fares at every gate: ours, and COLMAP's as set and at its defaults."""
@@ -215,12 +166,9 @@ def pairs(
 def doctor(
     run: Run,
     images: Annotated[
-        Path | None,
-        typer.Option(
-            "--images", help="Read the photographs from this folder, if they are no longer where the run had them."
-        ),
+        Path | None, "Read the photographs from this folder, if they are no longer where the run had them."
     ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Show all lines; the first forty if not given.")] = False,
+    everything: Annotated[bool, "Show all lines; the first forty if not given.", Opt("--all")] = False,
     out: JsonFile = None,
     workers: Workers = None,
 ) -> None:

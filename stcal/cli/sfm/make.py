@@ -2,13 +2,13 @@
 
 import os
 from dataclasses import replace
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.options import MOST_SEED
 from stcal.cli.terminal import StageProgress, print_each, say
 from stcal.errors import InputError
@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-class TagBody(StrEnum):
-    cube = "cube"
-    dodecahedron = "dodecahedron"
+TagBody = Literal["cube", "dodecahedron"]
 
 
 CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"
@@ -31,26 +29,15 @@ CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"
 
 @app.command()
 def draw(
-    design: Annotated[
-        Path, typer.Argument(metavar="DESIGN", help="Read this target.toml, or this board file of any kind.")
-    ],
-    out: Annotated[
-        Path,
-        typer.Option("--out", writable=True, help="Write this file; its suffix tells the form: .pdf, .svg or .dxf."),
-    ],
+    design: Annotated[Path, "Read this target.toml, or this board file of any kind.", Arg("DESIGN")],
+    out: Annotated[Path, "Write this file; its suffix tells the form: .pdf, .svg or .dxf.", WRITES],
     paper: Annotated[
         str,
-        typer.Option(
-            help="Print on sheets of this paper, as many as needed: A5 … A0, Letter, Legal or Tabloid; own for pages "
-            "as large as what they show. A4 for .pdf and own for the others if not given."
-        ),
+        "Print on sheets of this paper, as many as needed: A5 … A0, Letter, Legal or Tabloid; own for pages as "
+        "large as what they show. A4 for .pdf and own for the others if not given.",
     ] = "",
-    margin: Annotated[
-        float, typer.Option("--margin-mm", min=0, max=1e4, help="Add this around the outermost circles, mm.")
-    ] = 10.0,
-    net: Annotated[
-        bool, typer.Option("--net", help="Draw a target's plates as one net to fold, by outline_mm and rough_pose.")
-    ] = False,
+    margin: Annotated[float, "Add this around the outermost circles, mm.", Opt("--margin-mm", min=0, max=1e4)] = 10.0,
+    net: Annotated[bool, "Draw a target's plates as one net to fold, by outline_mm and rough_pose."] = False,
 ) -> None:
     """Draw a target or a board 1:1, with dimensions, cut marks and scale bars, to print, cut or mill."""
     from stcal.design import TargetDesign
@@ -65,53 +52,36 @@ def draw(
 
 @app.command()
 def design(
-    folder: Annotated[
-        Path, typer.Argument(help="Write target.toml to this folder, and board.toml where there is none.")
-    ],
+    folder: Annotated[Path, "Write target.toml to this folder, and board.toml where there is none.", Arg()],
     size: Annotated[
         str,
-        typer.Option(
-            "--size",
-            help="Make it for a box of this width, height and depth: W,H,D in mm; with --tags this width between "
-            "opposite faces.",
-        ),
+        "Make it for a box of this width, height and depth: W,H,D in mm; with --tags this width between "
+        "opposite faces.",
     ],
-    tags: Annotated[
-        TagBody | None, typer.Option("--tags", help="Make a cube or dodecahedron with a tag on each face, no board.")
-    ] = None,
-    dictionary: Annotated[str, typer.Option(help="Take the tags of --tags from this dictionary.")] = DICTIONARY,
-    first_id: Annotated[int, typer.Option(min=0, max=100_000, help="Count the tags of --tags up from this id.")] = 0,
+    tags: Annotated[TagBody | None, "Make a cube or dodecahedron with a tag on each face, no board."] = None,
+    dictionary: Annotated[str, "Take the tags of --tags from this dictionary."] = DICTIONARY,
+    first_id: Annotated[int, "Count the tags of --tags up from this id.", Opt(min=0, max=100_000)] = 0,
     faces: Annotated[
         str,
-        typer.Option(
-            help="Place circles on these sides, of front, right, back, left and top; on all five if not given. The "
-            "first is the reference face."
-        ),
+        "Place circles on these sides, of front, right, back, left and top; on all five if not given. The first "
+        "is the reference face.",
     ] = "",
-    circles: Annotated[int, typer.Option(min=9, max=40, help="Place this many circles on each face.")] = CIRCLES,
+    circles: Annotated[int, "Place this many circles on each face.", Opt(min=9, max=40)] = CIRCLES,
     radius: Annotated[
         float | None,
-        typer.Option(
-            "--radius-mm",
-            min=0.01,
-            max=1e4,
-            help="Draw the smaller circles with this radius; one that suits box and camera if not given.",
-        ),
+        "Draw the smaller circles with this radius; one that suits box and camera if not given.",
+        Opt("--radius-mm", min=0.01, max=1e4),
     ] = None,
-    distance: Annotated[
-        float, typer.Option("--distance-mm", min=50, max=1e5, help="Place the camera at this distance.")
-    ] = 1000.0,
+    distance: Annotated[float, "Place the camera at this distance.", Opt("--distance-mm", min=50, max=1e5)] = 1000.0,
     width: Annotated[
-        int, typer.Option(min=320, max=100_000, help="Take images of this width, px; 3:2 images of a 24 mm lens.")
+        int, "Take images of this width, px; 3:2 images of a 24 mm lens.", Opt(min=320, max=100_000)
     ] = 5184,
-    camera: Annotated[
-        Path | None, typer.Option("--camera", help="Read the camera from this file, in place of --width.")
-    ] = None,
+    camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     bright: Annotated[
-        bool, typer.Option("--bright/--dark", help="Make bright circles on dark plates, or dark ones on bright.")
+        bool, "Make bright circles on dark plates, or dark ones on bright.", Opt("--bright/--dark")
     ] = False,
-    images: Annotated[int, typer.Option("--images", min=2, max=500, help="Plan this many images in each group.")] = 10,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw everything random with this seed.")] = 0,
+    images: Annotated[int, "Plan this many images in each group.", Opt(min=2, max=500)] = 10,
+    seed: Annotated[int, "Draw everything random with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
 ) -> None:
     """Make a target for a box: circles on its sides that name each face with any three hidden; or a cube or
     dodecahedron of tags; and forecast its σ."""
@@ -174,7 +144,7 @@ def _tag_body(path: Path, kind: TagBody, size: str, tags: "tuple[str, int]", pla
     from stcal.sfm.planning.noise import expected_noise
     from stcal.synthetic.designs import made_text, tag_body
 
-    target = tag_body(kind.value, size, *tags)
+    target = tag_body(kind, size, *tags)
     noise, source = expected_noise(of_corners=True)
     forecast = plan_body(replace(planned, noise=noise), target, target.rough_poses())
     save_body(path, target)

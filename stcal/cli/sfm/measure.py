@@ -11,22 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stcal.cli.options import (
-    CameraFile,
-    MaxDiameter,
-    MinDiameter,
-    ReportFile,
-    Scheduler,
-    SendImages,
-    Strict,
-    TargetFile,
-    Workers,
-    designs_told,
-    ellipse_options,
-    handed_over,
-    load_ahead,
-    require_passed,
-)
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.terminal import STANDARD_OUTPUT, StageProgress, print_each, say, write, write_if, write_out
 from stcal.errors import InputError
 
@@ -40,110 +26,65 @@ SAY_EVERY_S = 1.0
 
 @app.command()
 def measure(
-    camera: CameraFile,
-    faces: Annotated[Path, typer.Option("--faces", help="Read the calibrated target from this faces.json.")],
+    camera: shared.CameraFile,
+    faces: Annotated[Path, "Read the calibrated target from this faces.json."],
     images: Annotated[
         Path | None,
-        typer.Argument(
-            help="Read the images of this folder and of its subfolders; none with --serve, and with --live none, a "
-            "stream's URL or a video file.",
-            show_default=False,
-        ),
+        "Read the images of this folder and of its subfolders; none with --serve, and with --live none, a stream's "
+        "URL or a video file.",
+        Arg(),
     ] = None,
-    target: TargetFile = None,
-    out: Annotated[
-        Path, typer.Option("--out", writable=True, help="Write the table of poses to this file (CSV).")
-    ] = Path("poses.csv"),
+    target: shared.TargetFile = None,
+    out: Annotated[Path, "Write the table of poses to this file (CSV).", WRITES] = Path("poses.csv"),
     json_file: Annotated[
         Path | None,
-        typer.Option(
-            "--json",
-            writable=True,
-            help="Also write everything to this file, both solutions of an undecided image too (JSON); to standard "
-            "output with `-`.",
-        ),
+        "Also write everything to this file, both solutions of an undecided image too (JSON); to standard "
+        "output with `-`.",
+        Opt("--json", writes=True),
     ] = None,
-    report: ReportFile = None,
+    report: shared.ReportFile = None,
     joints: Annotated[
-        Path | None,
-        typer.Option(
-            "--joints",
-            help="Add to the table the columns of this file, joint values say; it needs a column image (CSV).",
-        ),
+        Path | None, "Add to the table the columns of this file, joint values say; it needs a column image (CSV)."
     ] = None,
-    columns: Annotated[
-        Path | None,
-        typer.Option("--columns", help="Read --joints with the columns, delimiter … of this file (TOML)."),
-    ] = None,
-    board: Annotated[
-        Path | None,
-        typer.Option("--board", help="Tell the dots of the board of this board.toml apart, if it is in view."),
-    ] = None,
-    previous: Annotated[
-        bool, typer.Option("--previous", help="Decide between two solutions by the image before, as motions are small.")
-    ] = False,
+    columns: Annotated[Path | None, "Read --joints with the columns, delimiter … of this file (TOML)."] = None,
+    board: Annotated[Path | None, "Tell the dots of the board of this board.toml apart, if it is in view."] = None,
+    previous: Annotated[bool, "Decide between two solutions by the image before, as motions are small."] = False,
     sequence: Annotated[
         bool,
-        typer.Option(
-            "--sequence",
-            help="Follow the target from image to image of each folder, in order of name, and search an image as a "
-            "whole only where it is lost. An undecided pose is decided as with --previous.",
-        ),
+        "Follow the target from image to image of each folder, in order of name, and search an image as a whole "
+        "only where it is lost. An undecided pose is decided as with --previous.",
     ] = False,
     sigma_factor: Annotated[
         float | None,
-        typer.Option(
-            "--sigma-factor",
-            min=1e-3,
-            max=1e3,
-            help="Multiply the centres' σ by this; by the factor of faces.json if not given.",
-        ),
+        "Multiply the centres' σ by this; by the factor of faces.json if not given.",
+        Opt(min=1e-3, max=1e3),
     ] = None,
-    strict: Strict = False,
-    min_diameter: MinDiameter = None,
-    max_diameter: MaxDiameter = 450.0,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    send_images: SendImages = False,
+    strict: shared.Strict = False,
+    min_diameter: shared.MinDiameter = None,
+    max_diameter: shared.MaxDiameter = 450.0,
+    workers: shared.Workers = None,
+    scheduler: shared.Scheduler = None,
+    send_images: shared.SendImages = False,
     serve: Annotated[
-        bool,
-        typer.Option(
-            "--serve", help="Answer images that programs send over HTTP, POST /measure, with a JSON each, until Ctrl-C."
-        ),
+        bool, "Answer images that programs send over HTTP, POST /measure, with a JSON each, until Ctrl-C."
     ] = False,
     live: Annotated[
         bool,
-        typer.Option(
-            "--live",
-            help="Show a page with the pictures of a camera, or of the stream or video IMAGES, and the target's pose "
-            "in each, until Ctrl-C. A line is printed each second, each pose with `--json -`.",
-        ),
+        "Show a page with the pictures of a camera, or of the stream or video IMAGES, and the target's pose in each, "
+        "until Ctrl-C. A line is printed each second, each pose with `--json -`.",
     ] = False,
-    camera_index: Annotated[
-        int,
-        typer.Option(
-            "--camera-index", min=0, max=99, help="Take the pictures of --live from the camera of this number."
-        ),
-    ] = 0,
-    host: Annotated[
-        str, typer.Option(help="Listen at this address with --serve or --live; other machines reach 0.0.0.0.")
-    ] = "127.0.0.1",
+    camera_index: Annotated[int, "Take the pictures of --live from the camera of this number.", Opt(min=0, max=99)] = 0,
+    host: Annotated[str, "Listen at this address with --serve or --live; other machines reach 0.0.0.0."] = "127.0.0.1",
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Listen at this port with --serve or --live; at a free one with 0.")
+        int, "Listen at this port with --serve or --live; at a free one with 0.", Opt(min=0, max=65535)
     ] = 8765,
-    max_megabytes: Annotated[
-        float,
-        typer.Option("--max-megabytes", min=0.01, max=2000, help="Accept image files up to this size with --serve."),
-    ] = 64.0,
+    max_megabytes: Annotated[float, "Accept image files up to this size with --serve.", Opt(min=0.01, max=2000)] = 64.0,
     token: Annotated[
-        str,
-        typer.Option(
-            envvar="STCAL_TOKEN", help="Answer with --serve only requests with `Authorization: Bearer` and this word."
-        ),
+        str, "Answer with --serve only requests with `Authorization: Bearer` and this word.", Opt(envvar="STCAL_TOKEN")
     ] = "",
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
-    ellipses = ellipse_options(min_diameter, max_diameter)
+    ellipses = shared.ellipse_options(min_diameter, max_diameter)
     if serve or live:
         mode = "--live" if live else "--serve"
         alone = {"--serve": serve and live, "--report": report, "--joints": joints, "--columns": columns}
@@ -174,7 +115,7 @@ def measure(
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, --serve or --live")
     if columns is not None and joints is None:
         raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of joint values; give it with --joints")
-    load_ahead(workers)
+    shared.load_ahead(workers)
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
@@ -191,8 +132,8 @@ def measure(
     circles = read_target(faces, design)
     table = table_of(joints, columns, "joints") if joints else None
     options = work.MeasureOptions(PoseOptions(sigma_factor=sigma_factor), previous, sequence, ellipses, workers)
-    told = designs_told(target, board, with_board=False)
-    with told, handed_over(scheduler, send_images), StageProgress() as progress:
+    told = shared.designs_told(target, board, with_board=False)
+    with told, shared.handed_over(scheduler, send_images), StageProgress() as progress:
         result = work.measure(
             images, read_camera(camera), circles, design, load_board(board) if board else None, options, progress
         )
@@ -205,7 +146,7 @@ def measure(
     write_if(json_file, lambda: output.poses_file(result), "as JSON")
     write_if(report, document.page, "report")
     failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
-    require_passed(strict, [f"χ² of {name}" for name in failed], report)
+    shared.require_passed(strict, [f"χ² of {name}" for name in failed], report)
 
 
 def _setting(camera, faces, target, board, sigma_factor, ellipses) -> "Setting":

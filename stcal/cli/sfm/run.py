@@ -1,29 +1,12 @@
 """Commands ``stcal-sfm run``, ``detect``, ``verify`` and ``report``: calibration of the target from images."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from stcal.cli.options import (
-    BoardFile,
-    Exclude,
-    Images,
-    JsonFile,
-    MaxDiameter,
-    MinDiameter,
-    OptionalCamera,
-    Run,
-    Scheduler,
-    SendImages,
-    TargetFile,
-    Workers,
-    designs_told,
-    ellipse_options,
-    handed_over,
-    load_ahead,
-)
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, verbose, write_if
 from stcal.errors import ChecksFailed, InputError
 from stcal.io.files import keep_apart
@@ -31,131 +14,85 @@ from stcal.io.files import keep_apart
 app = typer.Typer()
 
 
-class Frame(StrEnum):
-    """Definition of a face's frame."""
-
-    plane = "plane"
-    three_point = "three-point"
+Frame = Literal["plane", "three-point"]
+"""Definition of a face's frame."""
 
 
-class PairsChoice(StrEnum):
-    """Choice of the pairs of images that are matched."""
-
-    all = "all"
-    sparse = "sparse"
+PairsChoice = Literal["all", "sparse"]
+"""Choice of the pairs of images that are matched."""
 
 
-class ComparedWith(StrEnum):
-    """Method with which a run's result is compared."""
-
-    paper = "paper"
+ComparedWith = Literal["paper"]
+"""Method with which a run's result is compared."""
 
 
-class Solve(StrEnum):
-    """Way in which the groups are solved."""
-
-    joint = "joint"
-    chain = "chain"
-    paper = "paper"
+Solve = Literal["joint", "chain", "paper"]
+"""Way in which the groups are solved."""
 
 
 @app.command()
 def run(
-    images: Images,
-    out: Annotated[Path, typer.Option("--out", help="Write the run to this folder: new, empty, or of an earlier run.")],
-    camera: OptionalCamera = None,
-    target: TargetFile = None,
-    board: BoardFile = None,
+    images: shared.Images,
+    out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
+    camera: shared.OptionalCamera = None,
+    target: shared.TargetFile = None,
+    board: shared.BoardFile = None,
     solve: Annotated[
         Solve | None,
-        typer.Option(
-            help="Use joint, one adjustment over all groups, the default; chain, group by group; or paper, all of "
-            "Zhang & Wei (2017) as published, from detection on, for comparison."
-        ),
+        "Use joint, one adjustment over all groups, the default; chain, group by group; or paper, all of Zhang "
+        "& Wei (2017) as published, from detection on, for comparison.",
     ] = None,
     frame: Annotated[
         Frame | None,
-        typer.Option(
-            help="Lay a face's frame by plane, Z from the plane of all its circles, the default; or by three-point, "
-            "as in the paper."
-        ),
+        "Lay a face's frame by plane, Z from the plane of all its circles, the default; or by three-point, as "
+        "in the paper.",
     ] = None,
     reference_face: Annotated[
-        str | None,
-        typer.Option(
-            "--reference-face", help="Take the frame of this face as the target frame; the first if not given."
-        ),
+        str | None, "Take the frame of this face as the target frame; the first if not given."
     ] = None,
     eccentricity: Annotated[
         bool,
-        typer.Option(
-            "--eccentricity/--no-eccentricity",
-            help="Correct the eccentricity of circles, or not: the uncorrected control, chained as in the paper.",
-        ),
+        "Correct the eccentricity of circles, or not: the uncorrected control, chained as in the paper.",
+        Opt("--eccentricity/--no-eccentricity"),
     ] = True,
     max_angle: Annotated[
         float | None,
-        typer.Option(
-            "--max-angle",
-            min=2,
-            max=170,
-            help="Reject an initial pair with a larger median ray angle, degrees; 60, and the smallest beyond it, if "
-            "not given.",
-        ),
+        "Reject an initial pair with a larger median ray angle, degrees; 60, and the smallest beyond it, if not given.",
+        Opt(min=2, max=170),
     ] = None,
-    flatness: Annotated[
-        str, typer.Option(help="Set σ of a circle about the plane of its face, mm, for --solve joint; or off.")
-    ] = "0.02",
-    refine_camera: Annotated[
-        bool,
-        typer.Option("--refine-camera", help="Adjust the intrinsics too, from the given ones with their σ."),
-    ] = False,
-    rim: Annotated[
-        bool,
-        typer.Option("--rim", help="Compute the rim in front of circles, and give faces of the surface behind it."),
-    ] = False,
-    board_only: Annotated[
-        bool,
-        typer.Option("--board-only", help="Take the board alone, though other circles are in view: λ and residuals."),
-    ] = False,
+    flatness: Annotated[str, "Set σ of a circle about the plane of its face, mm, for --solve joint; or off."] = "0.02",
+    refine_camera: Annotated[bool, "Adjust the intrinsics too, from the given ones with their σ."] = False,
+    rim: Annotated[bool, "Compute the rim in front of circles, and give faces of the surface behind it."] = False,
+    board_only: Annotated[bool, "Take the board alone, though other circles are in view: λ and residuals."] = False,
     compare: Annotated[
         ComparedWith | None,
-        typer.Option(
-            help="Solve the same photographs as published too, and show what each step from there is worth: paper."
-        ),
+        "Solve the same photographs as published too, and show what each step from there is worth: paper.",
     ] = None,
     pairs: Annotated[
         PairsChoice | None,
-        typer.Option(
-            help="Match all pairs of images, or sparse, as many as hold every circle together; "
-            "sparse above 80 images if not given."
-        ),
+        "Match all pairs of images, or sparse, as many as hold every circle together; sparse above 80 images if "
+        "not given.",
     ] = None,
-    exclude: Exclude = None,
+    exclude: shared.Exclude = None,
     expect_faces: Annotated[
         str | None,
-        typer.Option(
-            "--expect-faces",
-            metavar="FACES",
-            help="Answer no where one of these faces, such as 1,2, is not in the result; those that the groups are "
-            "named after, such as 12, if not given.",
-        ),
+        "Answer no where one of these faces, such as 1,2, is not in the result; those that the groups are named "
+        "after, such as 12, if not given.",
+        Opt(metavar="FACES"),
     ] = None,
     strict: Annotated[
         bool,
-        typer.Option(
-            "--strict/--no-strict",
-            help="End with exit code 4 where the answer is no, or with 0 all the same; results are written.",
-        ),
+        "End with exit code 4 where the answer is no, or with 0 all the same; results are written.",
+        Opt("--strict/--no-strict"),
     ] = True,
-    min_diameter: MinDiameter = None,
-    max_diameter: MaxDiameter = 450.0,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    send_images: SendImages = False,
+    min_diameter: shared.MinDiameter = None,
+    max_diameter: shared.MaxDiameter = 450.0,
+    workers: shared.Workers = None,
+    scheduler: shared.Scheduler = None,
+    send_images: shared.SendImages = False,
 ) -> None:
     """Calibrate the target: detect, map, scale, chain and adjust; writes faces.json and report.html."""
-    load_ahead(workers)
+    shared.load_ahead(workers)
     import numpy as np
 
     from stcal.sfm import pipeline
@@ -164,23 +101,23 @@ def run(
     from stcal.sfm.runs.text import found_lines, run_text
 
     options = RunOptions(
-        solve=solve.value if solve is not None else None,
-        frame=frame.value if frame is not None else None,
+        solve=solve,
+        frame=frame,
         eccentricity=eccentricity,
         reference_face=reference_face,
         flatness_mm=_flatness(flatness),
         refine_camera=refine_camera,
         rim=rim,
         board_only=board_only,
-        compare=compare.value if compare is not None else None,
-        graph=pairs.value if pairs is not None else None,
+        compare=compare,
+        graph=pairs,
         pairs=PairOptions(None if max_angle is None else float(np.radians(max_angle))),
-        ellipses=ellipse_options(min_diameter, max_diameter),
+        ellipses=shared.ellipse_options(min_diameter, max_diameter),
         workers=workers,
         exclude=tuple(exclude or ()),
         expect_faces=tuple(face.strip() for face in (expect_faces or "").split(",") if face.strip()),
     )
-    with designs_told(target, board), handed_over(scheduler, send_images), StageProgress() as progress:
+    with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as progress:
         result = pipeline.run(images, camera, out, target, board, options, progress)
     if verbose():
         say("\n".join(found_lines(result.labelled)))
@@ -196,25 +133,21 @@ def run(
 
 @app.command()
 def detect(
-    images: Images,
-    camera: OptionalCamera = None,
-    out: Annotated[Path, typer.Option("--out", help="Write detections.csv and overlays/ to this folder.")] = Path(
-        "detect"
-    ),
-    target: TargetFile = None,
-    board: BoardFile = None,
-    solve: Annotated[
-        Solve | None, typer.Option(help="Detect as `run` does with the same option: paper, by the published rules.")
-    ] = None,
-    exclude: Exclude = None,
-    min_diameter: MinDiameter = None,
-    max_diameter: MaxDiameter = 450.0,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    send_images: SendImages = False,
+    images: shared.Images,
+    camera: shared.OptionalCamera = None,
+    out: Annotated[Path, "Write detections.csv and overlays/ to this folder."] = Path("detect"),
+    target: shared.TargetFile = None,
+    board: shared.BoardFile = None,
+    solve: Annotated[Solve | None, "Detect as `run` does with the same option: paper, by the published rules."] = None,
+    exclude: shared.Exclude = None,
+    min_diameter: shared.MinDiameter = None,
+    max_diameter: shared.MaxDiameter = 450.0,
+    workers: shared.Workers = None,
+    scheduler: shared.Scheduler = None,
+    send_images: shared.SendImages = False,
 ) -> None:
     """Detect circles alone: detections.csv and an overlay picture of every image."""
-    load_ahead(workers)
+    shared.load_ahead(workers)
     from stcal.boards.file import run_board_of as board_of
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
@@ -227,8 +160,8 @@ def detect(
     target_design = body_of(target)
     board_design = None if board is None and target_design.has_scale else board_of(board)
     options = RunOptions(
-        solve=solve.value if solve is not None else None,
-        ellipses=ellipse_options(min_diameter, max_diameter),
+        solve=solve,
+        ellipses=shared.ellipse_options(min_diameter, max_diameter),
         workers=workers,
         exclude=tuple(exclude or ()),
     )
@@ -242,8 +175,8 @@ def detect(
         print_each("note", ["no --camera: a lens is assumed, and centres are good for a look, not for measuring"])
     inputs = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with (
-        designs_told(target, board),
-        handed_over(scheduler, send_images),
+        shared.designs_told(target, board),
+        shared.handed_over(scheduler, send_images),
         run_folder(out, MarkerFile.of(images, None), inputs) as folder,
         StageProgress() as progress,
     ):
@@ -253,7 +186,7 @@ def detect(
 
 
 @app.command()
-def verify(run: Run, out: JsonFile = None) -> None:
+def verify(run: shared.Run, out: shared.JsonFile = None) -> None:
     """Compare all files of a run's folder with the hashes that the run kept, and its version with this one."""
     from stcal.sfm.runs.verify import require_whole, verified_text
     from stcal.sfm.runs.verify import verify as verified
@@ -266,14 +199,9 @@ def verify(run: Run, out: JsonFile = None) -> None:
 
 @app.command()
 def report(
-    run: Run,
-    pdf: Annotated[
-        bool, typer.Option("--pdf", help="Also write the page as PDF, beside it (needs the extra `pdf`).")
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", writable=True, help="Write the page to this file (HTML), not into the run's folder."),
-    ] = None,
+    run: shared.Run,
+    pdf: Annotated[bool, "Also write the page as PDF, beside it (needs the extra `pdf`)."] = False,
+    out: Annotated[Path | None, "Write the page to this file (HTML), not into the run's folder.", WRITES] = None,
 ) -> None:
     """Write the report of a finished run again, from the files in its folder: the page, and a PDF of it."""
     from stcal.sfm.runs.folder import report_again

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from stcal.cli.declare import Arg, Opt
 from stcal.cli.options import MOST_SEED, BoardFile, JsonFile, PlateMargin, TargetFile, Workers, designs_told
 from stcal.cli.terminal import StageProgress, say, write_if
 from stcal.errors import InputError
@@ -23,7 +24,7 @@ app = typer.Typer()
 
 
 @app.command()
-def init(folder: Annotated[Path, typer.Argument(help="Write the two files to this folder.")]) -> None:
+def init(folder: Annotated[Path, "Write the two files to this folder.", Arg()]) -> None:
     """Write target.toml and board.toml of the reference design, commented, to edit."""
     from stcal.design import reference_board, reference_target
     from stcal.io.design import save_design
@@ -40,76 +41,52 @@ def init(folder: Annotated[Path, typer.Argument(help="Write the two files to thi
 
 @app.command()
 def simulate(
-    folder: Annotated[Path, typer.Argument(help="Write the data set to this new folder.")],
-    width: Annotated[
-        int, typer.Option(min=320, max=50_000, help="Render images of this width, px; 3:2 images.")
-    ] = 2592,
-    images: Annotated[int, typer.Option("--images", min=2, max=500, help="Render this many images in each group.")] = 6,
-    distance: Annotated[float, typer.Option(min=200, max=1e5, help="Place the camera at this distance, mm.")] = 1000.0,
-    spread: Annotated[float, typer.Option(min=2, max=80, help="Spread the views by ± this, degrees.")] = 40.0,
+    folder: Annotated[Path, "Write the data set to this new folder.", Arg()],
+    width: Annotated[int, "Render images of this width, px; 3:2 images.", Opt(min=320, max=50_000)] = 2592,
+    images: Annotated[int, "Render this many images in each group.", Opt(min=2, max=500)] = 6,
+    distance: Annotated[float, "Place the camera at this distance, mm.", Opt(min=200, max=1e5)] = 1000.0,
+    spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
     fisheye: Annotated[
         float | None,
-        typer.Option(
-            min=60,
-            max=170,
-            help="Use an equidistant lens of this field over the diagonal, degrees, that looks past the target.",
-        ),
+        "Use an equidistant lens of this field over the diagonal, degrees, that looks past the target.",
+        Opt(min=60, max=170),
     ] = None,
-    noise: Annotated[float, typer.Option(min=0, max=0.2, help="Add noise of this fraction of full scale.")] = 0.01,
-    blur: Annotated[float, typer.Option(min=0, max=10, help="Blur by this standard deviation, px.")] = 0.7,
+    noise: Annotated[float, "Add noise of this fraction of full scale.", Opt(min=0, max=0.2)] = 0.01,
+    blur: Annotated[float, "Blur by this standard deviation, px.", Opt(min=0, max=10)] = 0.7,
     f_number: Annotated[
-        float | None,
-        typer.Option("--f-number", min=0.5, max=100, help="Use a thin lens of this f-number; all in focus if none."),
+        float | None, "Use a thin lens of this f-number; all in focus if none.", Opt(min=0.5, max=100)
     ] = None,
     focus: Annotated[
         float | None,
-        typer.Option(
-            "--focus-mm",
-            min=10,
-            max=1e7,
-            help="Set the lens's plane of focus at this depth; at --distance if none.",
-        ),
+        "Set the lens's plane of focus at this depth; at --distance if none.",
+        Opt("--focus-mm", min=10, max=1e7),
     ] = None,
     focal: Annotated[
         float | None,
-        typer.Option(
-            "--focal-mm",
-            min=0.5,
-            max=5000,
-            help="Set the focal length of the thin lens; that on a 22.3 mm sensor if none.",
-        ),
+        "Set the focal length of the thin lens; that on a 22.3 mm sensor if none.",
+        Opt("--focal-mm", min=0.5, max=5000),
     ] = None,
     rim: Annotated[
-        float,
-        typer.Option(
-            "--rim-mm", min=-20, max=20, help="Set the height of rims before the faces' circles; raised if < 0."
-        ),
+        float, "Set the height of rims before the faces' circles; raised if < 0.", Opt("--rim-mm", min=-20, max=20)
     ] = 0.0,
-    clutter: Annotated[bool, typer.Option("--clutter/--clean", help="Add lamps, discs and a checkered wall.")] = False,
+    clutter: Annotated[bool, "Add lamps, discs and a checkered wall.", Opt("--clutter/--clean")] = False,
     reflectance: Annotated[
         float | None,
-        typer.Option(
-            "--table-reflectance", min=0, max=1, help="Add a table below that mirrors all of target and board."
-        ),
+        "Add a table below that mirrors all of target and board.",
+        Opt("--table-reflectance", min=0, max=1),
     ] = None,
     target: TargetFile = None,
     board: BoardFile = None,
     groups: Annotated[
         str | None,
-        typer.Option(
-            help="Photograph these pairs of faces together, such as 12,14 or front-right,front-top; all that show "
-            "together if none."
-        ),
+        "Photograph these pairs of faces together, such as 12,14 or front-right,front-top; all that show "
+        "together if none.",
     ] = None,
-    camera: Annotated[
-        Path | None, typer.Option("--camera", help="Render with the camera of this file, in place of --width.")
-    ] = None,
-    second_design: Annotated[
-        bool, typer.Option("--second-design", help="Use three faces, dark on white, and another board.")
-    ] = False,
-    png: Annotated[bool, typer.Option("--png", help="Write PNG in place of JPEG.")] = False,
-    sixteen_bit: Annotated[bool, typer.Option("--16-bit", help="Write 16-bit PNG.")] = False,
-    seed: Annotated[int, typer.Option(min=0, max=MOST_SEED, help="Draw everything random with this seed.")] = 0,
+    camera: Annotated[Path | None, "Render with the camera of this file, in place of --width."] = None,
+    second_design: Annotated[bool, "Use three faces, dark on white, and another board."] = False,
+    png: Annotated[bool, "Write PNG in place of JPEG."] = False,
+    sixteen_bit: Annotated[bool, "Write 16-bit PNG.", Opt("--16-bit")] = False,
+    seed: Annotated[int, "Draw everything random with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
     margin: PlateMargin = 15.0,
     workers: Workers = None,
 ) -> None:
@@ -276,8 +253,8 @@ def _scene(
 
 @app.command()
 def compare(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Read this finished run, or its faces.json.")],
-    truth: Annotated[Path, typer.Argument(help="Read the truth from this truth.json.")],
+    run: Annotated[Path, "Read this finished run, or its faces.json.", Arg("RUN")],
+    truth: Annotated[Path, "Read the truth from this truth.json.", Arg()],
     out: JsonFile = None,
 ) -> None:
     """Compare a run with a known truth, as a table and as JSON."""
@@ -300,10 +277,7 @@ def compare(
 
 @app.command()
 def demo(
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Keep data set and run in this folder; a temporary one if not given."),
-    ] = None,
+    out: Annotated[Path | None, "Keep data set and run in this folder; a temporary one if not given."] = None,
     workers: Workers = None,
 ) -> None:
     """Render a small data set with known truth, calibrate it, and print the faces against the truth."""

@@ -66,7 +66,7 @@ class Told:
     timed: Timed | None = None
 
 
-def read_pairs(path: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Told | None:
+def read_pairs(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Told | None:
     """Returns the pose pairs of one file; None where it is one of the package's own tables.
 
     Raises
@@ -74,27 +74,24 @@ def read_pairs(path: Path, said: Said, key: str = "image", quaternions: Order = 
     InputError
         The message says what is wrong with the file, or that it holds poses of one side only.
     """
-    content = read_content(path, said, key, quaternions)
-    return None if content is None else _told(content, path, said)
+    content = read_content(path, statements, key, quaternions)
+    return None if content is None else _told(content, path, statements)
 
 
-def mapped_pairs(path: Path, columns: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Told:
+def mapped_pairs(path: Path, columns: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Told:
     """Returns the pose pairs of a table with a map of its ``columns``; errors as :func:`read_pairs`."""
-    return _told(mapped_content(path, columns, said, key, quaternions), path, said)
+    return _told(mapped_content(path, columns, statements, key, quaternions), path, statements)
 
 
-def mapped_content(path: Path, columns: Path, said: Said, key: str, quaternions: Order) -> Content:
+def mapped_content(path: Path, columns: Path, statements: Said, key: str, quaternions: Order) -> Content:
     """Returns the poses of a table with a map of its ``columns``.
 
-    Raises
-    ------
-    InputError
-        The map does not fit the table, or there are no poses in its columns.
+    Raises InputError: the map does not fit the table, or there are no poses in its columns.
     """
-    return _of_table(read_mapped(path, columns, "table", quaternions), said, key)
+    return _of_table(read_mapped(path, columns, "table", quaternions), statements, key)
 
 
-def _told(content: Content, path: Path, said: Said) -> Told:
+def _told(content: Content, path: Path, statements: Said) -> Told:
     """Returns the pose pairs of a file's content; errors as :func:`read_pairs`."""
     if not content.both:
         side = content.sides[0]
@@ -102,7 +99,7 @@ def _told(content: Content, path: Path, said: Said) -> Told:
         raise InputError(
             "E-POSES-MIXED", f"{path}: {content.form} with {held}; give the robot's file as --a and the camera's as --b"
         )
-    robot, camera = (settled(_side(content, role, path), role, content, path, said) for role in FRAMES)
+    robot, camera = (settled(_side(content, role, path), role, content, path, statements) for role in FRAMES)
     if robot.guessed != camera.guessed and robot.guessed and camera.guessed:
         raise InputError(
             "E-POSES-UNITS",
@@ -117,7 +114,7 @@ def _told(content: Content, path: Path, said: Said) -> Told:
 def read_two(
     first: Path,
     second: Path,
-    said: Said,
+    statements: Said,
     key: str,
     quaternions: Order = "wxyz",
     tolerance_s: float = TOLERANCE_S,
@@ -130,24 +127,21 @@ def read_two(
     order where neither file has names. Where times are not equal, and for all rows where ``timed``, the robot's poses
     are those at the camera's times, within ``tolerance_s``. ``columns`` : maps of the columns of both files.
 
-    Raises
-    ------
-    InputError
-        The message says what is wrong with a file, or that no rows belong together.
+    Raises InputError: the message says what is wrong with a file, or that no rows belong together.
     """
     keys = keys_of(key)
     contents = [
-        read_content(path, said.of(role), own, quaternions)
+        read_content(path, statements.of(role), own, quaternions)
         if form is None
-        else mapped_content(path, form, said.of(role), own, quaternions)
+        else mapped_content(path, form, statements.of(role), own, quaternions)
         for role, path, form, own in zip(FRAMES, (first, second), columns, keys, strict=True)
     ]
     if contents[0] is None and contents[1] is None:
         return None
     sides = []
     for role, path, content, own in zip(FRAMES, (first, second), contents, keys, strict=True):
-        content_of_side = content or own_table(path, said, own, quaternions)
-        sides.append(settled(_side(content_of_side, role, path), role, content_of_side, path, said))
+        content_of_side = content or own_table(path, statements, own, quaternions)
+        sides.append(settled(_side(content_of_side, role, path), role, content_of_side, path, statements))
     robot, camera = sides
     setup = next((content.setup for content in contents if content is not None and content.setup), None)
     if (
@@ -179,19 +173,16 @@ def _stamped(robot: Posed, camera: Posed, rows: Sequence[int]) -> Timed | None:
     return Timed(stream, stream.after_origin([times[1][j] for j in rows]))
 
 
-def read_robot(path: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
+def read_robot(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Posed | None:
     """Returns the robot's poses of a file or folder; None where it is one of the package's own tables.
 
-    Raises
-    ------
-    InputError
-        The message says what is wrong with the file or folder.
+    Raises InputError: the message says what is wrong with the file or folder.
     """
-    if said.columns is not None:
-        content = mapped_content(path, said.columns, said.of("robot"), key, quaternions)
+    if statements.columns is not None:
+        content = mapped_content(path, statements.columns, statements.of("robot"), key, quaternions)
     else:
-        content = read_content(path, said.of("robot"), key, quaternions)
-    return None if content is None else settled(_side(content, "robot", path), "robot", content, path, said)
+        content = read_content(path, statements.of("robot"), key, quaternions)
+    return None if content is None else settled(_side(content, "robot", path), "robot", content, path, statements)
 
 
 def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
@@ -211,23 +202,20 @@ def own_told(source: Path | Table, quaternions: Order = "wxyz") -> list[str]:
 def require_own(path: Path, quaternions: Order = "wxyz") -> None:
     """Refuse a table without poses in its columns.
 
-    Raises
-    ------
-    InputError
-        The message says which columns are needed.
+    Raises InputError: the message says which columns are needed.
     """
     table = read_table(path, "table", quaternions)
     if not todays(table):
         raise _no_poses(table)
 
 
-def own_table(path: Path, said: Said, key: str, quaternions: Order) -> Content:
+def own_table(path: Path, statements: Said, key: str, quaternions: Order) -> Content:
     """Returns the poses of one of the package's own tables, of one side."""
-    return _of_table(read_table(path, "table", quaternions), said, key)
+    return _of_table(read_table(path, "table", quaternions), statements, key)
 
 
-def _of_table(table: Table, said: Said, key: str) -> Content:
-    content = read_columns(table, key, said)
+def _of_table(table: Table, statements: Said, key: str) -> Content:
+    content = read_columns(table, key, statements)
     if content is None:
         raise _no_poses(table)
     return content
@@ -292,23 +280,20 @@ def _side(content: Content, role: Role, path: Path) -> Side:
     return side
 
 
-def settled(side: Side, role: Role, content: Content, path: Path, said: Said) -> Posed:
+def settled(side: Side, role: Role, content: Content, path: Path, statements: Said) -> Posed:
     """Returns poses in the direction that is needed, mm, with a line on how they were read.
 
-    Raises
-    ------
-    InputError
-        The unit cannot be recognised, or an option contradicts the file.
+    Raises InputError: the unit cannot be recognised, or an option contradicts the file.
     """
-    said = said.of(role)
+    statements = statements.of(role)
     far = np.flatnonzero(np.abs(side.translation).max(axis=1) > FARTHEST)
     if len(far):
         measured = np.abs(side.translation[far[0]]).max()
         raise InputError(
             "E-VALUE-TOO-FAR", f"{path}: {side.places[far[0]]}: a length of {measured:.3g}, up to {FARTHEST:g} possible"
         )
-    frames = _direction(side, role, path, said)
-    factor, unit, guessed = _unit(side, frames.name, path, said)
+    frames = _direction(side, role, path, statements)
+    factor, unit, guessed = _unit(side, frames.name, path, statements)
     poses = Poses(side.rotation, factor * side.translation)
     covariance = side.covariance
     wanted = FRAMES[role][0]
@@ -319,14 +304,14 @@ def settled(side: Side, role: Role, content: Content, path: Path, said: Said) ->
     if content.passed_over:
         ellipsis = " …" if len(content.passed_over) > SHOWN else ""
         parts.append(f"passed over: {', '.join(content.passed_over[:SHOWN])}{ellipsis}")
-    scaled = side.scaled and said.length_unit is None
+    scaled = side.scaled and statements.length_unit is None
     return Posed(poses, side.names, side.places, covariance, str(path), "; ".join(parts), scaled, guessed)
 
 
-def _direction(side: Side, role: Role, path: Path, said: Said) -> Frames:
+def _direction(side: Side, role: Role, path: Path, statements: Said) -> Frames:
     """Returns the direction that the file or the user states. The default is base_from_flange and camera_from_board,
     and for trajectories the pose of the moving body in its world."""
-    option = said.frames_of(role)
+    option = statements.frames_of(role)
     if option is not None:
         if side.frames is not None and side.frames.stated and side.frames.name != option:
             raise InputError(
@@ -342,14 +327,14 @@ def _direction(side: Side, role: Role, path: Path, said: Said) -> Frames:
     return Frames(FRAMES[role][0], "by default")
 
 
-def _unit(side: Side, name: str, path: Path, said: Said) -> tuple[float, str, str]:
+def _unit(side: Side, name: str, path: Path, statements: Said) -> tuple[float, str, str]:
     """Returns the factor from a unit of length to mm, how the unit is known, and the unit where it was guessed from the
     size of lengths."""
     stated = side.unit
     if stated is not None and stated.stated:
         return LENGTHS[stated.name], f"{stated.name} {stated.by}", ""
-    if said.length_unit is not None:
-        return LENGTHS[said.length_unit], f"{said.length_unit} as you say", ""
+    if statements.length_unit is not None:
+        return LENGTHS[statements.length_unit], f"{statements.length_unit} as you say", ""
     if side.scaled:
         return 1.0, "lengths without a unit, whose scale is solved for", ""
     if stated is not None:
@@ -390,10 +375,7 @@ def matched(robot: Posed, camera: Posed, key: str) -> tuple[list[tuple[int, int]
 
     The description of the match is empty where the names are the same.
 
-    Raises
-    ------
-    InputError
-        No rows belong together.
+    Raises InputError: no rows belong together.
     """
     if not robot.names and not camera.names:
         if len(robot) != len(camera):

@@ -79,21 +79,12 @@ class HandEyePoses:
     ) -> "HandEyePoses":
         """Returns pose pairs from homogeneous matrices (m, 4, 4), or from :class:`stcal.Poses`.
 
-        Parameters
-        ----------
-        base_from_flange, camera_from_board : (m, 4, 4) arrays or Poses
-            Row i of both belongs together.
-        names : sequence of str, optional
-            Names of the pairs in messages.
-        where : str
-            Source of the poses.
-        unit : {"mm", "m", "cm", "um", "in"}
-            Unit of the translations.
+        ``base_from_flange``, ``camera_from_board`` : (m, 4, 4) row i of both belongs together; ``names`` : names of the
+        pairs in messages; ``where`` : source of the poses; ``unit`` : {"mm", "m", "cm", "um", "in"}: unit of the
+        translations.
 
-        Raises
-        ------
-        InputError
-            A matrix that is not finite, left-handed, scaled or transposed; the message names it. Another unit.
+        Raises InputError: a matrix that is not finite, left-handed, scaled or transposed; the message names it. Another
+        unit.
         """
         if unit not in LENGTHS:
             raise InputError("E-OPTION-VALUE", f"{where}: unit {unit!r}: not a choice; use {', '.join(LENGTHS)}")
@@ -155,10 +146,7 @@ class HandEyePoses:
         Commanded poses may be equal, and images at one of them differ by noise and by wrong numberings or flips of the
         board; so the board must have turned and moved, each by more than :data:`STALE` of what poses usually do.
 
-        Raises
-        ------
-        InputError
-            The poses of the flange were not read anew.
+        Raises InputError: the poses of the flange were not read anew.
         """
         flange, board = self.base_from_flange, self.camera_from_board
         rows: dict[bytes, list[int]] = {}
@@ -407,10 +395,7 @@ class Motions:
     def with_log(self, method: str) -> "Motions":
         """Returns the motions that satisfy :meth:`has_log`.
 
-        Raises
-        ------
-        DegenerateError
-            Fewer than two motions do.
+        Raises DegenerateError: fewer than two motions do.
         """
         good = self.has_log()
         if good.sum() < 2:

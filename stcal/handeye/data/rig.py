@@ -175,10 +175,8 @@ class RigFiles:
 def read_rig_file(path: Path) -> RigFiles:
     """Read a rig file. All paths in it are relative to its folder.
 
-    Raises
-    ------
-    InputError
-        Not TOML, not of the required form, two cameras of one name, or a camera without poses of the robot.
+    Raises InputError: not TOML, not of the required form, two cameras of one name, or a camera without poses of the
+    robot.
     """
     content = load_toml(path, _RigFile, WHAT, "give a file with setup, board, poses and a [[camera]] for each camera")
     folder, cameras = path.parent, []

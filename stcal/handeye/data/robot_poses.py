@@ -50,10 +50,7 @@ class RobotPoses:
         The first two are those of :meth:`rows`. Where no name fits, images are matched by times or by the numbers at
         the ends of names; poses without names, by order. The last result is empty where images are matched by name.
 
-        Raises
-        ------
-        InputError
-            A name fits two images, or poses without names are not as many as the images.
+        Raises InputError: a name fits two images, or poses without names are not as many as the images.
         """
         if not self.images:
             if len(names) != len(self.base_from_flange):
@@ -110,30 +107,28 @@ class RobotPoses:
         return row_of_image, tuple(missing)
 
 
-def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", said: Said | None = None) -> RobotPoses:
+def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: Said | None = None) -> RobotPoses:
     """Read the robot's poses in any format of :mod:`stcal.handeye.data.formats`.
 
     A CSV file may have a column ``image``, or ``time_s``, and ``base_from_flange_x_mm`` … (or ``flange_from_base_…``).
 
     ROS-Industrial's calibration data are read too: a folder of YAML files, one for each image, of the same name, with
     ``x, y, z`` in metres and ``qx, qy, qz, qw``; or a YAML list of such files, each a ``pose`` with its ``image``.
-    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand; ``said`` : the user's
-    statements about what a file of another program does not state itself.
+    ``quaternions`` : ``xyzw`` where the columns hold x, y, z, w in the order in which they stand;
+    ``statements`` : the user's statements about what a file of another program does not state itself.
 
-    Raises
-    ------
-    InputError
-        Missing columns, values that are not finite or quaternions that are not of unit length, named by line, or an
-        image that has two rows; another order of quaternions than their names say, in YAML.
+    Raises InputError: missing columns, values that are not finite or quaternions that are not of unit length, named by
+    line, or an image that has two rows; another order of quaternions than their names say, in YAML.
     """
-    path, said = Path(path), said or Said()
-    if (poses_of_others := _of_others(path, said, quaternions)) is not None:
+    path, statements = Path(path), statements or Said()
+    if (poses_of_others := _of_others(path, statements, quaternions)) is not None:
         return poses_of_others
-    if said.options():
+    if statements.options():
         if path.is_file() and path.suffix.lower() not in YAML:
             require_own(path, quaternions)
         raise InputError(
-            "E-OPTION-NEEDS", f"robot poses {path}: its columns or keys say all; leave {', '.join(said.options())} out"
+            "E-OPTION-NEEDS",
+            f"robot poses {path}: its columns or keys say all; leave {', '.join(statements.options())} out",
         )
     if quaternions != "wxyz" and (path.is_dir() or path.suffix.lower() in YAML):
         raise InputError(
@@ -163,13 +158,13 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", said: Said |
     return RobotPoses(tuple(images), poses, covariance, places, table.where, understood, timed=timed)
 
 
-def _of_others(path: Path, said: Said, quaternions: Order) -> RobotPoses | None:
+def _of_others(path: Path, statements: Said, quaternions: Order) -> RobotPoses | None:
     """Returns poses from formats of other programs. Returns None for tables, and for data of ROS-Industrial, whose
     readers follow."""
     if path.is_dir() and _industrial(path):
         return None
     try:
-        poses = read_robot(path, said, "image", quaternions)
+        poses = read_robot(path, statements, "image", quaternions)
     except NotToldError:
         if path.suffix.lower() in YAML:  # a list of images and files
             return None

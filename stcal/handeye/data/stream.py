@@ -54,10 +54,7 @@ class Stream:
     def of(cls, times: Sequence[Decimal], poses: Poses, where: str) -> "Stream":
         """Returns the stream of samples that may be in any order.
 
-        Raises
-        ------
-        InputError
-            Fewer than two samples, or two samples of one time.
+        Raises InputError: fewer than two samples, or two samples of one time.
         """
         if len(times) < 2:
             raise InputError(

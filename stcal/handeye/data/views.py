@@ -111,10 +111,8 @@ class Resection:
 def resect(views: Views, names: tuple[str, ...]) -> Resection:
     """Returns the pose of the board in each view by itself, of least reprojection error.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than four corners in a view, or in all its planes, or all on a line; the message names the view.
+    Raises DegenerateError: fewer than four corners in a view, or in all its planes, or all on a line; the message names
+    the view.
     """
     poses, normals, cost = [], [], 0.0
     for view, name in zip(views.views, names, strict=True):

@@ -42,17 +42,11 @@ def check_conventions(
     Otherwise return notes on what the fit cannot decide. With both sides inverted, X and Z change places and the
     residuals stay the same. Only a board behind the camera shows this error.
 
-    Parameters
-    ----------
-    loop : the loop of ``pairs``
-    guess : function of a loop and of whether the board's scale is free; it returns X, Z and the scale
-    with_scale : whether the board's scale is free
-    by_images : whether the board's poses come from images, so that only the robot's poses can be named wrongly
+    ``loop`` : the loop of ``pairs``; ``guess`` : function of a loop and of whether the board's scale is free; it
+    returns X, Z and the scale; ``with_scale`` : whether the board's scale is free; ``by_images`` : whether the board's
+    poses come from images, so that only the robot's poses can be named wrongly.
 
-    Raises
-    ------
-    InputError
-        The message says what is mixed up, and the remedy.
+    Raises InputError: the message says what is mixed up, and the remedy.
     """
     as_read, notes = _typical(loop, guess, with_scale), ()
     if as_read[0] > WELL[0] or as_read[1] > WELL[1]:

@@ -36,18 +36,11 @@ then drawn at random."""
 class Observability:
     """Measures of how well a loop of m poses determines X.
 
-    Parameters
-    ----------
-    turns_rad : (3,) array
-        RMS rotations between poses about ``axes``, in descending order: singular values of the stacked log R_A over
-        √(number of motions). The second one is 0 where all axes are parallel: X then slides along the axis.
-    axes : (3, 3) array
-        Rows: the principal axes of all rotations, in the flange's frame.
-    mount_axis : (3,) array
-        The first principal axis in the mount's frame.
-    sigma_rad, sigma_mm : float
-        σ of the worst direction of X from poses of a common camera (:data:`COMMON_RAD`, :data:`COMMON_MM`); infinite
-        where it is not determined.
+    ``turns_rad`` : (3,) RMS rotations between poses about ``axes``, in descending order: singular values of the stacked
+    log R_A over √(number of motions). The second one is 0 where all axes are parallel: X then slides along the axis.
+    ``axes`` : (3, 3) rows: the principal axes of all rotations, in the flange's frame; ``mount_axis`` : (3,) the first
+    principal axis in the mount's frame; ``sigma_rad``, ``sigma_mm`` : σ of the worst direction of X from poses of a
+    common camera (:data:`COMMON_RAD`, :data:`COMMON_MM`); infinite where it is not determined.
     """
 
     turns_rad: np.ndarray
@@ -97,10 +90,8 @@ class Observability:
 def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability:
     """Refuse a loop that cannot be solved, and return its observability.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than three poses, rotations about one axis only (unless ``four_dof``), or no rotations.
+    Raises DegenerateError: fewer than three poses, rotations about one axis only (unless ``four_dof``), or no
+    rotations.
     """
     if len(loop) < LEAST_POSES:
         raise DegenerateError(
@@ -142,10 +133,7 @@ def scale_is_seen(scale: float, sigma: float, poses: int) -> bool:
 def require_scale(scale: float, sigma: float, loop: Loop, where: str) -> None:
     """Refuse a scale that the motions do not determine, or that is implausible.
 
-    Raises
-    ------
-    DegenerateError
-        The message says how far the flange moves, and that it should move farther.
+    Raises DegenerateError: the message says how far the flange moves, and that it should move farther.
     """
     if scale_is_seen(scale, sigma, len(loop)):
         if not 1 / LARGEST_SCALE < scale < LARGEST_SCALE:

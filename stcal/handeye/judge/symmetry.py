@@ -38,15 +38,9 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
     Between two poses, robot and camera turn by the same angle and advance by the same length along the axis, whatever X
     is. This tells which numberings belong together. The most common numbering is kept.
 
-    Parameters
-    ----------
-    symmetries : tuple of Rigid
-        All board_from_board but the identity that leave the look of the board as it is.
+    ``symmetries`` : all board_from_board but the identity that leave the look of the board as it is.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than three poses.
+    Raises DegenerateError: fewer than three poses.
     """
     loop, every = Loop.of(pairs, setup), (Rigid(), *symmetries)
     as_numbered = loop.camera_from_board

@@ -88,10 +88,6 @@ class Corners:
         """Returns base_from_flange after a step (k,) of the arm's parameters; as reported without an arm."""
         return self.base_from_flange if self.arm is None else self.arm.moved(self.base_from_flange, step)
 
-    def count(self) -> int:
-        """Returns the number of unknowns."""
-        return max(place.stop for place in self.places().values())
-
     def robot_weight(self) -> np.ndarray:
         """Returns the whitening (m, 6, 6) of errors of base_from_flange."""
         if self.robot is not None:
@@ -171,10 +167,6 @@ class Corners:
         """Returns the same problem with other σ."""
         return replace(self, sigma=sigma)
 
-    def with_board_scale(self) -> "Corners":
-        """Returns the same problem with the board's scale among the unknowns."""
-        return replace(self, with_scale=True)
-
     def with_intrinsics(self, basis: np.ndarray, information: np.ndarray) -> "Corners":
         """Returns the same problem with intrinsics among the unknowns, about ``camera``. The factors of their prior σ
         start at 1."""
@@ -188,14 +180,6 @@ class Corners:
     def kept(self) -> int:
         """Returns the number of unknowns besides the corners of the board, which come last."""
         return self.places()["board"].start
-
-    def parts(self, state: Bundle) -> dict[str, Part]:
-        """Returns all observations by the name of their σ: the corners seen, and the prior knowledge."""
-        return {name: part for group in self.groups(state) for name, part in group.parts.items()}
-
-    def groups(self, state: Bundle) -> "list[Group]":
-        """Returns all observations: the corners seen, and the prior knowledge."""
-        return [*self.own_groups(state), *self.shared_groups(state)]
 
     def own_groups(self, state: Bundle) -> "list[Group]":
         """Returns the observations of this camera: the corners seen, and the prior knowledge of its intrinsics."""
@@ -225,12 +209,6 @@ class Corners:
                 white = root @ (self.arm.parameters + state.arm)[rows]
                 groups.append(self._prior(name, white, root, at["arm"].start + rows))
         return groups
-
-    def linear(self, state: Bundle) -> Equations:
-        """Returns cost and normal equations; the cost is infinite where a corner lies behind the camera."""
-        if not self.in_front(state):
-            return Equations.impossible(self.kept(), self._corners())
-        return summed(self.groups(state))
 
     def _corners(self) -> int:
         """Returns the number of corners that are unknowns."""
@@ -340,7 +318,7 @@ def summed(groups: Sequence[Group]) -> Equations:
 POSE_PARAMETERS = 6
 """Number of unknowns of a pose."""
 SHARED = ("scale", "arm", "robot", "board")
-"""Unknowns of all cameras together, in their order. Those of an arm are empty here."""
+"""Unknowns of all cameras together, in their order."""
 OWN = ("corner_px", "camera")
 """First parts of the names of the groups that each camera has of its own."""
 
@@ -348,7 +326,7 @@ OWN = ("corner_px", "camera")
 @dataclass(frozen=True, slots=True, eq=False)
 class RigBundle:
     """The unknowns: X and intrinsics of each camera, Z, the true base_from_flange (m), the board's corners (K, 3) and
-    scale."""
+    scale, and a step of the arm's parameters (k,)."""
 
     mount_from_camera: tuple[Rigid, ...]
     stand_from_board: Rigid
@@ -356,18 +334,19 @@ class RigBundle:
     corners: np.ndarray
     camera: tuple[Camera, ...]
     scale: float = 1.0
+    arm: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def of(self, i: int) -> Bundle:
         """Returns the unknowns of one camera's problem."""
         x, camera = self.mount_from_camera[i], self.camera[i]
-        return Bundle(x, self.stand_from_board, self.base_from_flange, self.corners, camera, self.scale)
+        return Bundle(x, self.stand_from_board, self.base_from_flange, self.corners, camera, self.scale, self.arm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigCorners:
     """``names`` : of the cameras; ``each`` : measurements of each camera, with the same poses of the robot, the same
     corners of the board and the same σ of both. The name of a σ that belongs to one camera ends in a colon and the
-    camera's name."""
+    camera's name, unless that is empty."""
 
     names: tuple[str, ...]
     each: tuple[Corners, ...]
@@ -421,6 +400,10 @@ class RigCorners:
             factor_of_kind |= {_renamed(key, name): value for key, value in corners.factors().items()}
         return factor_of_kind
 
+    def only(self, keep: np.ndarray) -> "RigCorners":
+        """Returns the problem of the poses ``keep``, a mask (m,)."""
+        return replace(self, each=tuple(own.only(keep) for own in self.each))
+
     def with_sigma(self, sigma: dict[str, float]) -> "RigCorners":
         """Returns the same problem with other σ."""
         problems = []
@@ -430,7 +413,7 @@ class RigCorners:
 
     def with_board_scale(self) -> "RigCorners":
         """Returns the same problem with the board's scale among the unknowns."""
-        return replace(self, each=tuple(own.with_board_scale() for own in self.each))
+        return replace(self, each=tuple(replace(own, with_scale=True) for own in self.each))
 
     def with_intrinsics(self, known: dict[int, tuple[np.ndarray, np.ndarray]]) -> "RigCorners":
         """Returns the same problem with intrinsics of some cameras among the unknowns: basis and information, by number
@@ -443,7 +426,13 @@ class RigCorners:
         moved = [corners.moved(state.of(i), step[self.columns(i)]) for i, corners in enumerate(self.each)]
         x, cameras, first = (m.mount_from_camera for m in moved), (m.camera for m in moved), moved[0]
         return RigBundle(
-            tuple(x), first.stand_from_board, first.base_from_flange, first.corners, tuple(cameras), first.scale
+            tuple(x),
+            first.stand_from_board,
+            first.base_from_flange,
+            first.corners,
+            tuple(cameras),
+            first.scale,
+            first.arm,
         )
 
     def parts(self, state: RigBundle) -> dict[str, Part]:
@@ -468,7 +457,7 @@ class RigCorners:
 
 
 def _renamed(key: str, name: str) -> str:
-    return f"{key}:{name}" if key.startswith(OWN) else key
+    return f"{key}:{name}" if name and key.startswith(OWN) else key
 
 
 def _among(group: Group, columns: np.ndarray, count: int, name: str) -> Group:

@@ -7,7 +7,6 @@ Methods for Discrete Sequential Estimation", 1977, ch. VIII): their prior covari
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
-from typing import Any
 
 import numpy as np
 
@@ -16,8 +15,8 @@ from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import Loop
 from stcal.handeye.data.views import Views, whitened
-from stcal.handeye.methods.bundle import Bundle, Corners, camera_parts
-from stcal.handeye.methods.noise import Problem, estimated
+from stcal.handeye.methods.bundle import RigBundle, RigCorners, camera_parts
+from stcal.handeye.methods.noise import estimated
 from stcal.handeye.methods.pose_adjustment import LoopState, PoseSolution
 from stcal.io.cameras.model import CameraPrior
 
@@ -43,13 +42,7 @@ class CameraError:
         return without_camera + moved @ self.moment @ moved.T
 
 
-def of_corners(corners: Corners, state: Bundle, prior: CameraPrior, free: tuple[str, ...]) -> CameraError:
-    """Returns the camera error of a reprojection adjustment that kept the intrinsics as filed."""
-    known = np.linalg.inv(prior.covariance)
-    return considered(corners.with_intrinsics(intrinsic_basis(prior.colmap_model), known), state, free)
-
-
-def considered(wider: Problem, state: Any, free: tuple[str, ...]) -> CameraError:
+def considered(wider: RigCorners, state: RigBundle, free: tuple[str, ...]) -> CameraError:
     """Returns the effect of intrinsics that were not solved for, but are among the unknowns of ``wider``.
 
     Corners that are off by the camera's error make all ``free`` σ too large. These σ are therefore estimated again with

@@ -29,10 +29,7 @@ def robust(loop: Loop, with_scale: bool = False) -> tuple[Rigid, Rigid, float]:
     medians. Rotations are found by Shah (2013), then translations, and the board's scale where wanted, by linear least
     squares. No logarithms are used, so that half turns are motions like any other.
 
-    Raises
-    ------
-    DegenerateError
-        Fewer than three poses.
+    Raises DegenerateError: fewer than three poses.
     """
     m = len(loop)
     if m < 3:
@@ -181,10 +178,7 @@ def solve_closed_form(loop: Loop, method: str, unit_mm: float = 1000.0) -> tuple
 
     AX = XB does not contain Z: Z is then the mean of the chains.
 
-    Raises
-    ------
-    ConvergenceError
-        OpenCV fails, or its result is not a rigid transform.
+    Raises ConvergenceError: OpenCV fails, or its result is not a rigid transform.
     """
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     try:

@@ -21,10 +21,7 @@ GAP = 1e-4
 def convex(motions: Motions, unit_mm: float = 1000.0) -> Rigid:
     """Returns X by L∞ minimisation; ``unit_mm`` is the length that weighs like one radian.
 
-    Raises
-    ------
-    ConvergenceError
-        The bound is not reached, or the matrix is not a rotation.
+    Raises ConvergenceError: the bound is not reached, or the matrix is not a rotation.
     """
     c, d = equations(motions, unit_mm)
     x, *_ = np.linalg.lstsq(c.reshape(-1, 12), d.ravel(), rcond=None)
@@ -55,10 +52,7 @@ def equations(motions: Motions, unit_mm: float) -> tuple[np.ndarray, np.ndarray]
 def smallest_largest(c: np.ndarray, d: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Returns the x that minimises the largest ‖C_i x − d_i‖, from a start.
 
-    Raises
-    ------
-    ConvergenceError
-        The result is not proven to be within :data:`GAP` of the minimum.
+    Raises ConvergenceError: the result is not proven to be within :data:`GAP` of the minimum.
     """
     scale = np.linalg.norm(np.einsum("kij,j->ki", c, x) - d, axis=1).max()
     if scale < 1e-12:  # the start has no residuals

@@ -169,28 +169,28 @@ class Components:
     def at(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Returns the log of the restricted likelihood at x (p,), and its gradient (p,)."""
         share = np.exp(-2 * x)
-        each = [part.equations for part in self.parts]
-        weighted = [own.times(factor) for own, factor in zip(each, share, strict=True)]
+        free = [part.equations for part in self.parts]
+        weighted = [equations.times(factor) for equations, factor in zip(free, share, strict=True)]
         whole = reduce(add, weighted if self.fixed is None else [*weighted, self.fixed])
-        left = whole.eliminated(self.held)
-        kept, corners = left.step()
-        inverse = np.linalg.inv(left.normal)
-        mixed, of_corners = None, left.inverse
-        if left.from_kept is not None:
-            mixed = -left.from_kept @ inverse
-            of_corners = left.inverse - mixed @ np.swapaxes(left.from_kept, 1, 2)
-        square, taken = np.zeros((2, len(each)))
-        for i, own in enumerate(each):
-            square[i] = own.cost + 2 * float(kept @ own.gradient + (corners * own.slope).sum())
-            square[i] += own.bent(kept, corners)
-            taken[i] = float((inverse * own.normal).sum() + (of_corners * own.block).sum())
-            if own.cross is not None and mixed is not None:
-                taken[i] += 2 * float((mixed * own.cross).sum())
+        reduced = whole.eliminated(self.held)
+        kept, corners = reduced.step()
+        inverse = np.linalg.inv(reduced.normal)
+        mixed, of_corners = None, reduced.inverse
+        if reduced.from_kept is not None:
+            mixed = -reduced.from_kept @ inverse
+            of_corners = reduced.inverse - mixed @ np.swapaxes(reduced.from_kept, 1, 2)
+        square, taken = np.zeros((2, len(free)))
+        for i, equations in enumerate(free):
+            square[i] = equations.cost + 2 * float(kept @ equations.gradient + (corners * equations.slope).sum())
+            square[i] += equations.bent(kept, corners)
+            taken[i] = float((inverse * equations.normal).sum() + (of_corners * equations.block).sum())
+            if equations.cross is not None and mixed is not None:
+                taken[i] += 2 * float((mixed * equations.cross).sum())
         fixed = 0.0
         if self.fixed is not None:
             fixed = self.fixed.cost + 2 * float(kept @ self.fixed.gradient + (corners * self.fixed.slope).sum())
             fixed += self.fixed.bent(kept, corners)
-        size = np.linalg.slogdet(left.normal)[1] + np.linalg.slogdet(left.block)[1].sum()
+        size = np.linalg.slogdet(reduced.normal)[1] + np.linalg.slogdet(reduced.block)[1].sum()
         counted = np.array([part.count for part in self.parts]) - self.caution
         value = -float(x @ counted) - 0.5 * (float(share @ square) + fixed + size)
         return value, share * (square + taken) - counted

@@ -21,17 +21,10 @@ EXACT = 1e-24
 class Bounds:
     """Bounds of three coordinates of the first population.
 
-    Parameters
-    ----------
-    half_width : float
-        mm, or rad of the rotation vector.
-    centre : (3,) tuple, optional
-        Centre of the bounds; where None, that of the closed-form solution (Park & Martin 1994).
+    ``half_width`` : mm, or rad of the rotation vector; ``centre`` : (3,) centre of the bounds; where None, that of the
+    closed-form solution (Park & Martin 1994).
 
-    Raises
-    ------
-    InputError
-        The half width is not positive, or a number is not finite.
+    Raises InputError: the half width is not positive, or a number is not finite.
     """
 
     half_width: float
@@ -153,14 +146,8 @@ def evolve(objective: Objective, options: EvolutionOptions, reach_mm: float, clo
 
     The bounds limit the first population only; mutants may leave them.
 
-    Parameters
-    ----------
-    objective : Objective
-    options : EvolutionOptions
-    reach_mm : float
-        Half width of the translation's bounds where the options have none.
-    closed_form : Rigid, optional
-        Centre of bounds that have no centre.
+    ``reach_mm`` : half width of the translation's bounds
+    where the options have none; ``closed_form`` : centre of bounds that have no centre.
     """
     rng, size = np.random.default_rng(options.seed), options.population
     about = np.zeros(6) if closed_form is None else closed_form.log()
@@ -193,10 +180,7 @@ def three_others(rng: np.random.Generator, size: int) -> np.ndarray:
 def polish(objective: Objective, x: Rigid) -> Rigid:
     """Returns the minimum of the objective next to X.
 
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
+    Raises ConvergenceError: no minimum is reached.
     """
     minimum = minimise(x, objective.linear, perturbed, least_gain=EXACT)
     return minimum.required("differential evolution", "check the poses that fit worst").state

@@ -3,17 +3,17 @@
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
-from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.least_squares import minimise
-from stcal.geometry.rigid import Poses, Rigid
+from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import robust_sigma
 from stcal.geometry.variances import component_variances
 from stcal.handeye.data.pairs import Loop
-from stcal.handeye.methods.equations import Components, Equations, Part
+from stcal.handeye.methods.bundle import RigBundle, RigCorners
+from stcal.handeye.methods.equations import Components, Equations
 
 LEAST = {"rad": 1e-9, "mm": 1e-6, "factor": 1e-2}
 """Lower limits of estimated σ, by kind: exact data would give 0."""
@@ -166,12 +166,8 @@ def variance_components(
     They are computed from residuals (m, 6) near a solution. Redundancy that the parameters take up does not count
     (Patterson & Thompson 1971), nor does :data:`CAUTION`.
 
-    Parameters
-    ----------
-    jacobian : (m, 6, k) array
-        Derivative of the residuals by the parameters solved for; dependent columns do no harm.
-    first : (f,) array
-        The first guess, from :meth:`LoopComponents.first`.
+    ``jacobian`` : (m, 6, k) derivative of the residuals by the parameters solved for; dependent columns do no harm;
+    ``first`` : (f,) the first guess, from :meth:`LoopComponents.first`.
     """
     least = np.maximum(parts.least(), LEAST_SHARE * first)
     most = np.maximum(first, least) * np.exp(2 * FARTHEST)
@@ -197,79 +193,21 @@ HELD = 1e-10
 WORST = "check the poses that fit worst"
 
 
-class Problem(Protocol):
-    """An adjustment problem: the corners of one camera, or of several cameras about the same board."""
-
-    @property
-    def sigma(self) -> dict[str, float]:
-        """σ of each group."""
-        ...
-
-    @property
-    def base_from_flange(self) -> Poses:
-        """The poses of the flange, as reported."""
-        ...
-
-    def with_sigma(self, sigma: dict[str, float]) -> Any:
-        """Returns the same problem with other σ."""
-        ...
-
-    def with_board_scale(self) -> Any:
-        """Returns the same problem with the board's scale among the unknowns."""
-        ...
-
-    def places(self) -> dict[str, slice]:
-        """Returns the places of the unknowns in a step."""
-        ...
-
-    def factors(self) -> dict[str, float]:
-        """Returns a factor of 1 for each kind of the intrinsics solved for."""
-        ...
-
-    def robot_weight(self) -> np.ndarray:
-        """Returns the whitening (m, 6, 6) of errors of base_from_flange."""
-        ...
-
-    def count(self) -> int:
-        """Returns the number of unknowns."""
-        ...
-
-    def moved(self, state: Any, step: np.ndarray) -> Any:
-        """Returns a state after a step of all unknowns."""
-        ...
-
-    def parts(self, state: Any) -> dict[str, Part]:
-        """Returns all observations by the name of their σ: the corners seen, and the prior knowledge. The name of a
-        part without a σ is empty."""
-        ...
-
-    def linear(self, state: Any) -> Equations:
-        """Returns cost and normal equations."""
-        ...
-
-
-P = TypeVar("P", bound=Problem)
-S = TypeVar("S")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class BundleSolution(Generic[P, S]):
+class BundleSolution:
     """``corners`` : problem with the estimated σ; ``state``, and the normal equations about it, ``linear``; ``settled``
     : whether the σ settled within :data:`ROUNDS`."""
 
-    corners: P
-    state: S
+    corners: RigCorners
+    state: RigBundle
     linear: Equations
     settled: bool
 
 
-def adjust(corners: P, start: S, free: tuple[str, ...]) -> BundleSolution[P, S]:
+def adjust(corners: RigCorners, start: RigBundle, free: tuple[str, ...]) -> BundleSolution:
     """Solve the problem, and estimate the σ of the ``free`` groups in rounds.
 
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
+    Raises ConvergenceError: no minimum is reached.
     """
     state, settled = start, not free
     for _ in range(ROUNDS if free else 0):
@@ -284,7 +222,7 @@ def adjust(corners: P, start: S, free: tuple[str, ...]) -> BundleSolution[P, S]:
     return BundleSolution(corners, minimum.state, minimum.linear, settled)
 
 
-def estimated(corners: Problem, state: Any, free: tuple[str, ...]) -> dict[str, float]:
+def estimated(corners: RigCorners, state: RigBundle, free: tuple[str, ...]) -> dict[str, float]:
     """Returns restricted maximum-likelihood σ of the ``free`` groups, with all else linear about a state (like
     :func:`~stcal.handeye.methods.noise.variance_components`)."""
     parts = corners.parts(state)

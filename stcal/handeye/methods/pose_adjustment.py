@@ -70,10 +70,7 @@ def adjust_poses(
     This is the maximum-likelihood solution for Gaussian errors of robot and camera (Strobl & Hirzinger 2006 without
     their metric's free parameter). Errors of both are carried to the board's origin, to first order.
 
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
+    Raises ConvergenceError: no minimum is reached.
     """
     count = 13 if with_scale else 12
     state = start

@@ -227,7 +227,7 @@ def enlargement(off: np.ndarray, width: float) -> float:
     return max(1.0, round_below(LONGEST * width / usual)) if usual else 1.0
 
 
-def turns_figure(turns: np.ndarray, seen: Observability | None):
+def turns_figure(turns: np.ndarray, observability: Observability | None):
     """Draws the axes of the turns (n, 3) between poses on the half sphere, and a histogram of their angles."""
     figure = new_figure(9.4, 4.1)
     axes = figure.add_axes((0.01, 0.03, 0.44, 0.94))
@@ -247,8 +247,8 @@ def turns_figure(turns: np.ndarray, seen: Observability | None):
     dots = axes.scatter(
         *points.T, c=np.degrees(angle[large]), s=11, cmap="viridis_r", vmin=0, lw=0, alpha=0.85, zorder=2
     )
-    if seen is not None:
-        for k, axis in enumerate(np.where(seen.axes[:, 2:] < 0, -seen.axes, seen.axes), 1):
+    if observability is not None:
+        for k, axis in enumerate(np.where(observability.axes[:, 2:] < 0, -observability.axes, observability.axes), 1):
             x, y = equal_area(axis[None])[0]
             axes.plot(x, y, "o", mfc="none", mec=BAD, ms=11, mew=1.6, zorder=3)
             axes.text(x + 0.07, y, str(k), fontsize=SMALL + 1.5, color=BAD, weight="bold", va="center", zorder=3)

@@ -372,9 +372,12 @@ def _method(each: Compared, names: tuple[str, ...]) -> MethodRow:
     )
 
 
-def _observability(seen: Observability | None) -> SeenTurns | None:
-    return seen and SeenTurns(
-        turns_rad=seen.turns_rad, axes_flange=seen.axes, sigma_rad=seen.sigma_rad, sigma_mm=seen.sigma_mm
+def _observability(observability: Observability | None) -> SeenTurns | None:
+    return observability and SeenTurns(
+        turns_rad=observability.turns_rad,
+        axes_flange=observability.axes,
+        sigma_rad=observability.sigma_rad,
+        sigma_mm=observability.sigma_mm,
     )
 
 

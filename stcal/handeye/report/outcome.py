@@ -25,16 +25,9 @@ from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 class ArmFound:
     """The arm's parameters, if they were solved for.
 
-    Parameters
-    ----------
-    robot : str
-        Name of the robot.
-    names : tuple of str
-        Names of the k parameters: small motions of the axes, such as J2 ry in rad, J2 x in mm.
-    parameters, sigma : (k,) arrays
-        Deviation of the axes from the robot's file, and its σ.
-    plain : HeldOutPoses, optional
-        Errors on the same held-out poses, of the solution without these parameters.
+    ``robot`` : name of the robot; ``names`` : names of the k parameters: small motions of the axes, such as J2 ry in
+    rad, J2 x in mm; ``parameters``, ``sigma`` : (k,) deviation of the axes from the robot's file, and its σ; ``plain``
+    : errors on the same held-out poses, of the solution without these parameters.
     """
 
     robot: str
@@ -50,41 +43,24 @@ class Outcome:
 
     Parameters
     ----------
-    where : str
-        Names of the files that were solved.
+    where : names of the files that were solved
     result : HandEye
-    held_out : HeldOutPoses, optional
-        Errors of the result's method on held-out poses.
-    compared : tuple of Compared
-        Results of every method, if a comparison was asked for.
-    pitch_mm : float, optional
-        Pitch of dots or squares, as the board's file states it.
-    colmap_model : str
-        Model of the camera whose intrinsics were solved for.
-    own_sigmas : bool
-        Whether corners came with covariances. The result's ``corner_px`` is then their factor.
-    left_out : tuple of (str, str)
-        Images and rows that did not take part, and why.
-    notes : tuple of str
-        Notes in addition to those of the result.
-    motions : HeldOutMotions, optional
-        Errors of the last motions, held out.
-    choice : Choice, optional
-        The candidates that were tried, if no method was named.
-    pairs : HandEyePoses, optional
-        The pairs that were solved, after repair of the numbering of a symmetric board.
-    views : Views, optional
-        The corners after the same repair, if there were images.
-    folder : Path, optional
-        Folder of the images; the pairs hold their names.
-    understood : tuple of str
-        How files of other programs were interpreted.
-    unit_mm : float, optional
-        Unit that was assumed for a model without a unit, in mm: the camera's lengths were multiplied by it.
-    arm : ArmFound, optional
-        The arm's parameters, if they were solved for.
-    time_offset : TimeOffset, optional
-        Offset of the robot's clock from the camera's, if it was solved for. σ of the result contain its σ.
+    held_out : errors of the result's method on held-out poses
+    compared : results of every method, if a comparison was asked for
+    pitch_mm : pitch of dots or squares, as the board's file states it
+    colmap_model : model of the camera whose intrinsics were solved for
+    own_sigmas : whether corners came with covariances. The result's ``corner_px`` is then their factor.
+    left_out : images and rows that did not take part, and why
+    notes : notes in addition to those of the result
+    motions : errors of the last motions, held out
+    choice : the candidates that were tried, if no method was named
+    pairs : the pairs that were solved, after repair of the numbering of a symmetric board
+    views : the corners after the same repair, if there were images
+    folder : folder of the images; the pairs hold their names
+    understood : how files of other programs were interpreted
+    unit_mm : unit that was assumed for a model without a unit, in mm: the camera's lengths were multiplied by it
+    arm : the arm's parameters, if they were solved for
+    time_offset : offset of the robot's clock from the camera's, if it was solved for. σ of the result contain its σ
     """
 
     where: str
@@ -337,21 +313,14 @@ class RigOutcome:
 
     Parameters
     ----------
-    where : str
-        Names of the files that were solved.
-    rig : Rig
-    cameras : tuple of Outcome
-        The part of each camera, as the outcome of a calibration of its own.
-    alone : tuple of HandEye or None
-        Solution of each camera by itself; None if it cannot be solved alone.
-    held_out : RigHeldOut, optional
-        Errors on held-out poses of the robot.
-    notes : tuple of str
-        Notes in addition to those of the rig.
-    understood : tuple of str
-        How files were interpreted.
-    widened : float
-        Factor by which σ of the transforms were widened, because solutions from subsets of the poses scatter more.
+    where : names of the files that were solved
+    rig : rig
+    cameras : the part of each camera, as the outcome of a calibration of its own
+    alone : solution of each camera by itself; None if it cannot be solved alone
+    held_out : errors on held-out poses of the robot
+    notes : notes in addition to those of the rig
+    understood : how files were interpreted
+    widened : factor by which σ of the transforms were widened, because solutions from subsets of the poses scatter more
     """
 
     where: str

@@ -1,12 +1,12 @@
-"""Reports of hand-eye calibrations, of one camera or of a rig."""
+"""Report of a hand-eye calibration of one camera, and what it shares with that of a rig."""
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
 
 from stcal.geometry.camera import PARAMETER_NAMES, parameter_names
 from stcal.geometry.rigid import Rigid
+from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.judge.remarks import Aside
@@ -23,10 +23,10 @@ from stcal.handeye.report.figures import (
     turns_between,
     turns_figure,
 )
-from stcal.handeye.report.outcome import ArmFound, Outcome, RigOutcome, Verdict, asides, judged, rig_judged
+from stcal.handeye.report.outcome import ArmFound, Outcome, Verdict, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
-from stcal.handeye.validate import Compared
+from stcal.handeye.validate import Compared, HeldOutMotions
 from stcal.report.document import (
     Block,
     Document,
@@ -69,26 +69,6 @@ SIGMA_NAMES = {
     "arm_mm": ("axis of the arm, place", "mm", 1.0),
     **{key: (f"camera file, {name}", "times its σ", 1.0) for key, name in FACTORS.items()},
 }
-
-
-def _motions_text(outcome: Outcome) -> str:
-    motions = outcome.motions
-    return f"motions predicted by those before (Jin et al., eqs. 24–26): fitted to {motions.fitted}" if motions else ""
-
-
-def _motion_cells(outcome: Outcome) -> list[list[str]]:
-    """Returns heads, one row per held-out motion, and the means."""
-    motions = outcome.motions
-    if motions is None:
-        return []
-    rows = [
-        [f"{first} → {second}", number(shift, 3), number(np.degrees(turn), 4)]
-        for (first, second), shift, turn in zip(
-            motions.names, motions.translation_mm, motions.rotation_rad, strict=True
-        )
-    ]
-    means = ["mean", number(motions.translation_mm.mean(), 3), number(np.degrees(motions.rotation_rad.mean()), 4)]
-    return [["<motion held out", "mm", "°"], *rows, means]
 
 
 def scale_text(outcome: Outcome, sigma_scale: float) -> str:
@@ -149,46 +129,9 @@ def sigma_rows(outcome: Outcome) -> list[list[str]]:
     return rows
 
 
-def turns_text(seen: Observability) -> str:
-    turns = ", ".join(f"{t:.1f}°" for t in np.degrees(seen.turns_rad))
+def turns_text(observability: Observability) -> str:
+    turns = ", ".join(f"{t:.1f}°" for t in np.degrees(observability.turns_rad))
     return f"the flange turns between poses by {turns} (RMS) about its principal axes"
-
-
-def _compared_cells(outcome: Outcome) -> list[list[str]]:
-    """Returns heads, and one row per method: mean errors on held-out poses, and distance from the result."""
-    kinds = [name for name in ERRORS if any(c.held_out and name in c.held_out.means() for c in outcome.compared)]
-    rows = []
-    for each in outcome.compared:
-        means = each.held_out.means() if each.held_out else {}
-        cells = [number(means.get(n, np.nan) * ERRORS[n][1], ERRORS[n][2]) for n in kinds]
-        rows.append([each.method, *cells, *_off(each, outcome.result), each.reason])
-    rows.insert(0, ["<method", *(ERRORS[name][0] for name in kinds), "off mm", "off °", "<"])
-    return rows if any(row[-1] for row in rows[1:]) else [row[:-1] for row in rows]
-
-
-def _arm_cells(arm: ArmFound) -> list[list[str]]:
-    """Returns heads, and one row per axis: its deviation from the robot's file, and σ."""
-    cells_of_axis: dict[str, list[str]] = {}
-    for name, value, sigma in zip(arm.names, arm.parameters, arm.sigma, strict=True):
-        axis, component = name.split()
-        unit, factor, digits = ("°", np.degrees(1.0), 4) if component.startswith("r") else ("mm", 1.0, 3)
-        text = f"{component} {number(value * factor, digits)} ± {number(sigma * factor, digits)} {unit}"
-        cells_of_axis.setdefault(axis, []).append(text)
-    width = max(len(cells) for cells in cells_of_axis.values())
-    rows = [[axis, *cells, *[""] * (width - len(cells))] for axis, cells in cells_of_axis.items()]
-    return [[f"<axis of {arm.robot}", "off its file", *[""] * (width - 1)], *rows]
-
-
-def _choice_cells(outcome: Outcome) -> list[list[str]]:
-    """Returns heads, and one row per way of solving that was tried."""
-    choice = outcome.choice
-    if choice is None:
-        return []
-    rows = [["<solved by", "held out mm", "splits", "<"]]
-    for each in choice.tried:
-        outcome_of_way = "taken" if each.candidate == choice.chosen else each.reason
-        rows.append([each.candidate.name, number(each.mean_mm(), 3), str(len(each.error_mm)), outcome_of_way])
-    return rows
 
 
 def _off(each: Compared, result: HandEye) -> list[str]:
@@ -209,7 +152,7 @@ def outcome_report(outcome: Outcome) -> Document:
     camera = adjusted(outcome)
     answer: list[Block] = [
         tiles(_tiles(outcome)),
-        *(block for item in _transforms(result) for block in _transform(*item)),
+        *(block for item in _transforms(result) for block in transform_blocks(*item)),
         page_only(EXPLAINED),
         "" if outcome.time_offset is None else f"{outcome.time_offset.in_words()}; the σ above hold that of the offset",
         f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
@@ -219,8 +162,8 @@ def outcome_report(outcome: Outcome) -> Document:
         "" if result.sigma_scale is None else scale_text(outcome, result.sigma_scale),
         "" if result.observability is None else turns_text(result.observability),
         fold("Camera, as adjusted (first pixel's centre at 0, 0)", Table(["<", "value", "± σ", "<unit"], camera or [])),
-        *_remarks([note for note in outcome.all_notes() if isinstance(note, Aside)], outcome.understood),
-        _findings(judged(outcome)),
+        *remark_blocks([note for note in outcome.all_notes() if isinstance(note, Aside)], outcome.understood),
+        findings_fold(judged(outcome)),
     ]
     heads = ["<pose", "rotation °", "mm", "x mm", "y mm", "z mm", *(["corners px"] if result.reprojection else []), "<"]
     return Document(
@@ -228,27 +171,27 @@ def outcome_report(outcome: Outcome) -> Document:
         f"{outcome.where}: {_headline(outcome)}",
         [
             Section("Result", answer, terminal=True),
-            Section("What was tried", _tried(outcome), terminal=True),
+            Section("What was tried", _tried(outcome.choice), terminal=True),
             Section("The arm", _arm(outcome.arm), terminal=True),
             Section("Methods", _methods(outcome), terminal=True),
-            Section("Motions held out", _motions(outcome), terminal=True),
+            Section("Motions held out", _motions(outcome.motions), terminal=True),
             Section(
                 "Poses",
-                _poses(
+                pose_blocks(
                     result, heads, "By how much the chain through each pose misses the board", len(outcome.outliers())
                 ),
             ),
-            Section("Coverage of the image", [Html(lambda: html(*_coverage(outcome)))]),
+            Section("Coverage of the image", [Html(lambda: html(*coverage_blocks(outcome)))]),
             Section("What the motions tell", _turns(outcome)),
-            Section("Overlays", _photographs(outcome)),
+            Section("Overlays", photograph_blocks(outcome)),
             Section("Left out", [page_only(Table(["<image", "<reason"], outcome.left_out))]),
         ],
-        banner=_verdict(judged(outcome)),
+        banner=verdict_blocks(judged(outcome)),
     )
 
 
 EXPLAINED = (
-    "The rotation vector is axis times angle, no roll, pitch and yaw. σ are of turns about the axes, and of shifts "
+    "The rotation vector is axis times angle, not roll, pitch and yaw. σ are of turns about the axes, and of shifts "
     "along the axes, of the frame named first"
 )
 CHANCE = (
@@ -258,90 +201,121 @@ CHANCE = (
 )
 
 
-def _verdict(found: Verdict) -> list[Block]:
+def verdict_blocks(found: Verdict) -> list[Block]:
     """Returns the verdict with its reasons and remedies."""
     reasons = [sentence(": ".join(filter(None, (finding.said, finding.remedy)))) for finding in found.reasons()]
     return [Printed([f"verdict: {found.sentence()}"]), macro("judged", found.word, tone_of(found.word), reasons)]
 
 
-def _findings(found: Verdict) -> Block:
+def findings_fold(found: Verdict) -> Block:
     """Returns the findings that the verdict rests on, folded."""
     rows = [[f.title, VerdictWord(f.word), f.value or NONE, f.limit or NONE, f.said] for f in found.findings]
     table = Table(["<Judged", "<Verdict", "Value", "Limit", "<Found"], rows, css="text")
     return fold("What the verdict rests on", table, CHANCE)
 
 
-def _remarks(notes: Sequence[str], understood: Sequence[str]) -> list[Block]:
+def remark_blocks(notes: Sequence[str], understood: Sequence[str]) -> list[Block]:
     blocks: list[Block] = [subheading("To know"), bullets(notes)] if notes else []
     return blocks + ([subheading("What the files were taken for"), bullets(understood)] if understood else [])
 
 
-def _transform(name: str, pose: Rigid, covariance: np.ndarray | None) -> list[Block]:
+def transform_blocks(name: str, pose: Rigid, covariance: np.ndarray | None) -> list[Block]:
     """Returns a transform with σ, and its matrix, folded."""
     matrix = "\n".join(" ".join(f"{v:14.9f}" for v in row) for row in pose.matrix())
     table = Table(["<" + name, *HEADS[1:]], transform_rows(pose, covariance))
     return [table, fold(f"{name}: 4×4 matrix, mm", macro("verbatim", matrix))]
 
 
-def _tried(outcome: Outcome) -> list[Block]:
-    return (
+def _tried(choice: Choice | None) -> list[Block]:
+    """Returns a table with a row per way of solving that was tried."""
+    if choice is None:
+        return []
+    rows = [
         [
-            _rows(_choice_cells(outcome)),
-            page_only(
-                "Each way solves with the other poses and predicts where the board is in those held out. The best "
-                "is taken, unless one that trusts the files more, or knows its σ, is behind it by no more than chance. "
-                "The errors above are those of the choice as a whole: in each split "
-                "of the way that the errors on all other poses name"
-            ),
+            each.candidate.name,
+            number(each.mean_mm(), 3),
+            str(len(each.error_mm)),
+            "taken" if each.candidate == choice.chosen else each.reason,
         ]
-        if outcome.choice
-        else []
-    )
+        for each in choice.tried
+    ]
+    return [
+        Table(["<solved by", "held out mm", "splits", "<"], rows, css="text"),
+        page_only(
+            "Each way solves with the other poses and predicts where the board is in those held out. The best is "
+            "taken, unless one that trusts the files more, or knows its σ, is behind it by no more than chance. The "
+            "errors above are those of the choice as a whole: in each split of the way that the errors on all other "
+            "poses name"
+        ),
+    ]
 
 
 def _arm(arm: ArmFound | None) -> list[Block]:
-    return (
-        [
-            _rows(_arm_cells(arm)),
-            page_only(
-                "By how much each axis is off the robot's file, and σ: turns (rx, ry) and shifts (x, y) of the joint's "
-                "frame, one after the other from the base. What poses do not tell stays near 0 by the σ of all axes, "
-                "which is estimated"
-            ),
-        ]
-        if arm
-        else []
-    )
+    """Returns a table with a row per axis: its deviation from the robot's file, and σ."""
+    if arm is None:
+        return []
+    cells_of_axis: dict[str, list[str]] = {}
+    for name, value, sigma in zip(arm.names, arm.parameters, arm.sigma, strict=True):
+        axis, component = name.split()
+        unit, factor, digits = ("°", np.degrees(1.0), 4) if component.startswith("r") else ("mm", 1.0, 3)
+        text = f"{component} {number(value * factor, digits)} ± {number(sigma * factor, digits)} {unit}"
+        cells_of_axis.setdefault(axis, []).append(text)
+    width = max(len(cells) for cells in cells_of_axis.values())
+    rows = [[axis, *cells, *[""] * (width - len(cells))] for axis, cells in cells_of_axis.items()]
+    return [
+        Table([f"<axis of {arm.robot}", "off its file", *[""] * (width - 1)], rows, css="text"),
+        page_only(
+            "By how much each axis is off the robot's file, and σ: turns (rx, ry) and shifts (x, y) of the joint's "
+            "frame, one after the other from the base. What poses do not tell stays near 0 by the σ of all axes, which "
+            "is estimated"
+        ),
+    ]
 
 
 def _methods(outcome: Outcome) -> list[Block]:
+    """Returns a table with a row per method: mean errors on held-out poses, and distance from the result."""
     if not outcome.compared:
         return []
-    cells = _compared_cells(outcome)
+    kinds = [name for name in ERRORS if any(c.held_out and name in c.held_out.means() for c in outcome.compared)]
+    rows = []
+    for each in outcome.compared:
+        means = each.held_out.means() if each.held_out else {}
+        cells = [number(means.get(n, np.nan) * ERRORS[n][1], ERRORS[n][2]) for n in kinds]
+        rows.append([each.method, *cells, *_off(each, outcome.result), each.reason])
+    heads = ["<method", *(ERRORS[name][0] for name in kinds), "off mm", "off °", "<"]
+    if not any(row[-1] for row in rows):
+        heads, rows = heads[:-1], [row[:-1] for row in rows]
     board = (
         " 3-D at the board: how far from each corner the ray on which the camera saw it meets the board where the "
         "robot has put it; by pose: distance from the corners by the pose that the image gives alone."
     )
     return [
         f"means over the same {_splits_text(outcome)} held out; off: from {FRAMES[outcome.result.setup].camera} above",
-        _rows(cells),
+        Table(heads, rows, css="text"),
         page_only(
             "Each time all methods solve with the others and predict where the board is."
-            f"{board if ERRORS['board_mm'][0] in cells[0] else ''}"
+            f"{board if 'board_mm' in kinds else ''}"
         ),
     ]
 
 
-def _motions(outcome: Outcome) -> list[Block]:
-    return [_motions_text(outcome), _rows(_motion_cells(outcome))] if outcome.motions else []
+def _motions(motions: HeldOutMotions | None) -> list[Block]:
+    """Returns a table with a row per held-out motion, and the means."""
+    if motions is None:
+        return []
+    shifts, turns = motions.translation_mm, np.degrees(motions.rotation_rad)
+    rows = [
+        [f"{first} → {second}", number(shift, 3), number(turn, 4)]
+        for (first, second), shift, turn in zip(motions.names, shifts, turns, strict=True)
+    ]
+    means = ["mean", number(shifts.mean(), 3), number(turns.mean(), 4)]
+    return [
+        f"motions predicted by those before (Jin et al., eqs. 24–26): fitted to {motions.fitted}",
+        Table(["<motion held out", "mm", "°"], [*rows, means], css="text"),
+    ]
 
 
-def _rows(cells: list[list[str]]) -> Table:
-    """Returns the table of cells whose first row holds the heads."""
-    return Table(cells[0], cells[1:], css="text")
-
-
-def _poses(result: HandEye, heads: list[str], caption: str, contradicting: int) -> list[Block]:
+def pose_blocks(result: HandEye, heads: list[str], caption: str, contradicting: int) -> list[Block]:
     """Returns the chart of each pose's residuals, and their table, folded."""
     colours = {"used": GOOD, "left out, contradicting the others": BAD} if contradicting else {}
     rows = pose_rows(result)
@@ -352,7 +326,7 @@ def _poses(result: HandEye, heads: list[str], caption: str, contradicting: int) 
     ]
 
 
-def _coverage(outcome: Outcome) -> list[Block]:
+def coverage_blocks(outcome: Outcome) -> list[Block]:
     """Returns how much of the image the board covered, with the residuals over it."""
     views, pairs, board = outcome.views, outcome.pairs, outcome.result.reprojection
     if views is None or pairs is None:
@@ -409,7 +383,7 @@ def _turns(outcome: Outcome) -> list[Block]:
     ]
 
 
-def _photographs(outcome: Outcome) -> list[Block]:
+def photograph_blocks(outcome: Outcome) -> list[Block]:
     """Returns some photographs with their corners; read when the page is written."""
     if outcome.pairs is None or outcome.views is None or outcome.folder is None:
         return []
@@ -446,9 +420,8 @@ def _tiles(outcome: Outcome) -> list[tuple[str, str, str]]:
         headline.append((f"{1e3 * offset.seconds:.2f} ms", "", said))
     if result.sigma_scale is not None:
         pitch = "" if outcome.pitch_mm is None else f": pitch {outcome.pitch_mm * result.scale:.3f} mm"
-        headline.append(
-            (f"{result.scale:.4f}", "", f"times its stated size is the board, ± {result.sigma_scale:.4f}{pitch}")
-        )
+        what = f"true size of the board over its stated one, ± {result.sigma_scale:.4f}{pitch}"
+        headline.append((f"{result.scale:.4f}", "", what))
     return headline
 
 
@@ -479,181 +452,3 @@ def pose_rows(result: HandEye) -> list[list[str]]:
             row.append(number(result.reprojection.rms_px(i), 3))
         rows.append([*row, "left out" if result.outliers[i] else ""])
     return rows
-
-
-def rig_report(outcome: RigOutcome) -> Document:
-    """Returns the report of ``handeye rig``."""
-    rig, frames, first = outcome.rig, FRAMES[outcome.rig.setup], outcome.rig.cameras[0]
-    cameras = [
-        block
-        for name, camera in zip(rig.names, rig.cameras, strict=True)
-        for block in _transform(f"{frames.mount}_from_{name}", camera.mount_from_camera, camera.covariance)
-    ]
-    relative = [
-        block
-        for one, two in combinations(rig.names, 2)
-        for block in _transform(f"{one}_from_{two}", *rig.relative(one, two))
-    ]
-    answer: list[Block] = [
-        tiles(_rig_tiles(outcome)),
-        *cameras,
-        *_transform(frames.board, rig.stand_from_board, first.stand_covariance),
-        page_only(EXPLAINED),
-        Table(["<what errs, and by how much", "σ", "<"], _shared_sigmas(outcome)),
-        "" if first.sigma_scale is None else scale_text(outcome.cameras[0], first.sigma_scale),
-        "" if first.observability is None else turns_text(first.observability),
-        *_remarks(asides(outcome), outcome.understood),
-        _findings(rig_judged(outcome)),
-    ]
-    alone: list[Block] = [
-        _rows(_camera_cells(outcome)),
-        page_only(
-            "σ of a camera's place and turn in their worst directions, as the adjustment of all cameras and that of "
-            "this one alone have them"
-        ),
-    ]
-    if outcome.held_out is not None:
-        alone += [
-            f"poses of the robot held out ({_rig_splits_text(outcome)}), 3-D at the board, all cameras or each alone",
-            _rows(_held_out_cells(outcome)),
-            page_only(
-                "Each time all cameras together, and each by itself, are solved for with the images of the other "
-                "poses, and predict where the board is in the images of those held out: how far from each corner the "
-                "ray on which the camera saw it meets the board where the robot has put it. Gain: by how much that is "
-                "less together"
-            ),
-        ]
-    told = page_only("From the joint covariance: what board and robot do to both cameras alike does not count")
-    return Document(
-        f"Hand-eye calibration of a rig: {', '.join(rig.names)}",
-        f"{outcome.where}: {_rig_headline(outcome)}",
-        [
-            Section("Result", answer, terminal=True),
-            Section("The cameras in each other", [*relative, told] if relative else [], terminal=True),
-            Section("Together, and each alone", alone, terminal=True),
-            Section("Cameras", [block for k in range(len(rig.names)) for block in _camera(outcome, k)]),
-            Section("Left out", [Table(["<camera", "<image", "<reason"], outcome.left_out())]),
-        ],
-        banner=_verdict(rig_judged(outcome)),
-    )
-
-
-def _camera(outcome: RigOutcome, k: int) -> list[Block]:
-    """Returns residuals, adjusted parameters, coverage and photographs of a camera of the rig."""
-    name, camera, own = outcome.rig.names[k], outcome.rig.cameras[k], outcome.cameras[k]
-    turn, shift = camera.rms()
-    errors = {} if own.held_out is None else own.held_out.means()
-    heads = ["<image", "rotation °", "mm", "x mm", "y mm", "z mm", "corners px", "<"]
-    parameters = Table(["<", "value", "± σ", "<unit"], adjusted(own) or [])
-    caption = f"By how much the chain through each image of {name} misses the board"
-    return [
-        subheading(name),
-        f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
-        f"held out: {means_text(errors)}" if errors else "",
-        *_poses(camera, heads, caption, len(own.outliers())),
-        fold("Camera, as adjusted (first pixel's centre at 0, 0)", parameters),
-        Html(lambda: html(*_coverage(own))),
-        fold("Photographs with their corners", *_photographs(own)),
-    ]
-
-
-def _rig_headline(outcome: RigOutcome) -> str:
-    rig = outcome.rig
-    images = sum(int((~camera.outliers).sum()) for camera in rig.cameras)
-    bad = [name for name, out in zip(rig.poses, rig.outliers, strict=True) if out]
-    bad += [f"{n}: {i}" for n, c in zip(rig.names, outcome.cameras, strict=True) for i in c.outliers()]
-    without = f", without {len(bad)} that contradict the others: {', '.join(bad)}" if bad else ""
-    cameras = f"{len(rig.names)} camera{'s' * (len(rig.names) > 1)}"
-    return f"{rig.setup}: {cameras}, {images} images from {len(rig.poses)} poses of the robot{without}"
-
-
-def _rig_splits_text(outcome: RigOutcome) -> str:
-    held = outcome.held_out
-    return "" if held is None else f"{held.rows.shape[0]} × {held.rows.shape[1]} of {len(outcome.rig.poses)}"
-
-
-def _camera_cells(outcome: RigOutcome) -> list[list[str]]:
-    """Returns heads, and one row per camera: images, σ of corners, residuals, σ of its pose jointly and alone."""
-    rows = [
-        [
-            "<camera",
-            "images",
-            "corner σ",
-            "<",
-            "residual °",
-            "residual mm",
-            "σ place mm",
-            "alone mm",
-            "σ turn °",
-            "alone °",
-        ]
-    ]
-    for name, camera, camera_outcome, alone in zip(
-        outcome.rig.names, outcome.rig.cameras, outcome.cameras, outcome.alone, strict=True
-    ):
-        turn, shift = camera.rms()
-        unit = "× its own" if camera_outcome.own_sigmas else "px"
-        joint, single = _worst(camera, outcome.widened), _worst(alone)
-        cells = [str(int((~camera.outliers).sum())), number(camera.sigma["corner_px"], 3), unit]
-        cells += [number(np.degrees(turn), 4), number(shift, 3)]
-        rows.append([name, *cells, joint[1], single[1], joint[0], single[0]])
-    return rows
-
-
-def _worst(result: HandEye | None, widened: float = 1.0) -> tuple[str, str]:
-    """Returns σ of rotation (°) and place (mm) in their worst directions, from the adjustment, before widening."""
-    if result is None or result.covariance is None:
-        return NONE, NONE
-    parts = result.covariance[:3, :3], result.covariance[3:, 3:]
-    turn, place = (float(np.sqrt(np.linalg.eigvalsh(part)[-1])) / widened for part in parts)
-    return number(np.degrees(turn), 4), number(place, 3)
-
-
-def _held_out_cells(outcome: RigOutcome) -> list[list[str]]:
-    rows = [["<camera", "views", "together mm", "alone mm", "<gain", "together °", "alone °"]]
-    if outcome.held_out is None:
-        return rows
-    for name, held in zip(outcome.rig.names, outcome.held_out.cameras, strict=True):
-        joint, alone, gain = held.means(), held.means("alone"), held.gain()
-        gain_text = "cannot be found alone" if gain is None else _percent(gain)
-        columns = [(joint, "board_mm", 1.0, 3), (alone, "board_mm", 1.0, 3)]
-        columns += [(joint, "rotation_rad", np.degrees(1.0), 4), (alone, "rotation_rad", np.degrees(1.0), 4)]
-        cells = [number(means.get(key, np.nan) * unit, digits) for means, key, unit, digits in columns]
-        rows.append([name, str(len(held.view)), *cells[:2], gain_text, *cells[2:]])
-    return rows
-
-
-def _percent(share: float) -> str:
-    return f"{round(100 * share)} %"
-
-
-def _shared_sigmas(outcome: RigOutcome) -> list[list[str]]:
-    """Returns rows of σ: those of robot and board once, those of each camera with its name."""
-    rows = []
-    for name, camera in zip(outcome.rig.names, outcome.cameras, strict=True):
-        for text, value, how in sigma_rows(camera):
-            shared = text.startswith("robot") or text.startswith("corner on")
-            row = [text if shared else f"{name}, {text}", value, how]
-            if row not in rows:
-                rows.append(row)
-    return sorted(rows, key=lambda row: "," in row[0] and not row[0].startswith("robot"))
-
-
-def _rig_tiles(outcome: RigOutcome) -> list[tuple[str, str, str]]:
-    """Returns the tiles of the headline: (value, unit, text)."""
-    rig, headline = outcome.rig, []
-    if outcome.held_out is not None:
-        for name, held in zip(rig.names, outcome.held_out.cameras, strict=True):
-            if means := held.means():
-                gain = held.gain()
-                comparison = (
-                    "" if gain is None else f", {number(held.means('alone')['board_mm'], 3)} mm if solved alone"
-                )
-                headline.append(
-                    (f"{means['board_mm']:.3f} mm", "", f"{name}: 3-D error at the board, held out{comparison}")
-                )
-    sigma = rig.cameras[0].sigma
-    if "robot_mm" in sigma:
-        robot = f"σ of the robot's poses an axis, and {np.degrees(sigma.get('robot_rad', 0)):.3f}°"
-        headline.append((f"{sigma['robot_mm']:.3f} mm", "", robot))
-    return headline

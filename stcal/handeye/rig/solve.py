@@ -17,9 +17,9 @@ from stcal.handeye.judge.observability import LEAST_POSES, Observability, check,
 from stcal.handeye.judge.remarks import Aside, Grave
 from stcal.handeye.judge.symmetry import repair, turned_view
 from stcal.handeye.methods import closed_form
+from stcal.handeye.methods.joint import Adjusted, adjust_rig
 from stcal.handeye.methods.noise import Noise, kind
 from stcal.handeye.methods.reprojection import GROSS_RAD, GROSS_SHARE, resected
-from stcal.handeye.methods.rig import AdjustedRig, adjust_rig
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import HandEyeOptions, handeye, of_camera_file
 from stcal.parallel import one_thread
@@ -87,8 +87,7 @@ class Rig:
 
         Parameters
         ----------
-        first, second : str
-            Names of two cameras.
+        first, second : names of two cameras
 
         Returns
         -------
@@ -225,10 +224,7 @@ def handeye_rig(given: RigPoses, setup: Setup = "eye-in-hand", options: RigOptio
 def same_numbering(given: RigPoses, setup: Setup, symmetries: tuple[Rigid, ...]) -> RigPoses:
     """Renumbers views of a symmetric board that were numbered from another end, as :func:`handeye_rig` does.
 
-    Raises
-    ------
-    StcalError
-        See :func:`handeye_rig`.
+    Raises StcalError as :func:`handeye_rig`.
     """
     if not symmetries:
         return given
@@ -240,10 +236,7 @@ def same_numbering(given: RigPoses, setup: Setup, symmetries: tuple[Rigid, ...])
 def alone(given: RigPoses, i: int, setup: Setup, options: RigOptions) -> HandEye:
     """Solves for one camera of a rig by itself, with :func:`~stcal.handeye.handeye` and method ``reprojection``.
 
-    Raises
-    ------
-    StcalError
-        See :func:`~stcal.handeye.handeye`.
+    Raises StcalError as :func:`~stcal.handeye.handeye`.
     """
     camera = given.cameras[i]
     prior, one = camera.prior, options
@@ -369,9 +362,9 @@ def _by_board(given: RigPoses, i: int, setup: Setup, z: Rigid, scale: float) -> 
 
 
 def _rig(
-    given: RigPoses, setup: Setup, options: RigOptions, solution: AdjustedRig, first_notes: dict[int, tuple[str, ...]]
+    given: RigPoses, setup: Setup, options: RigOptions, solution: Adjusted, first_notes: dict[int, tuple[str, ...]]
 ) -> Rig:
-    state, c = solution.state, len(given.cameras)
+    state, c, covariance = solution.state, len(given.cameras), solution.whole_covariance()
     loops = [Loop.of(given.pairs(i), setup) for i in range(c)]
     rows = np.unique(np.concatenate([camera.rows for camera in given.cameras]))
     flange = given.base_from_flange[rows[~solution.outliers[rows]]]
@@ -407,8 +400,8 @@ def _rig(
                 residuals=residuals,
                 names=camera.images,
                 outliers=~used,
-                covariance=solution.covariance[place, place],
-                stand_covariance=solution.covariance[6 * c :, 6 * c :],
+                covariance=covariance[place, place],
+                stand_covariance=covariance[6 * c :, 6 * c :],
                 scale=state.scale,
                 sigma_scale=solution.sigma_scale,
                 sigma=sigma_of_camera,
@@ -427,7 +420,7 @@ def _rig(
         notes += remarks.of_size(largest, solution.scale_hint, options.noise)
     notes += remarks.of_rounds(solution.settled)
     names = tuple(camera.name for camera in given.cameras)
-    return Rig(names, tuple(cameras), solution.covariance, given.names, solution.outliers, notes)
+    return Rig(names, tuple(cameras), covariance, given.names, solution.outliers, notes)
 
 
 def alone_or_none(given: RigPoses, i: int, setup: Setup, options: RigOptions) -> HandEye | None:

@@ -12,7 +12,7 @@ from stcal.handeye.data.pairs import Setup
 from stcal.handeye.data.rig import RigPoses
 from stcal.handeye.rig.solve import POSE, Rig, RigOptions, alone, handeye_rig
 from stcal.handeye.validate import HeldOutPoses, predicted, scatter_notes, scatter_of
-from stcal.parallel import one_thread, run_parallel
+from stcal.parallel import one_thread, run_in_order
 
 ERRORS = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
 
@@ -21,13 +21,9 @@ ERRORS = ("rotation_rad", "translation_mm", "board_mm", "pose_mm")
 class CameraHeldOut:
     """Errors of one camera on n views from held-out poses of the robot.
 
-    Parameters
-    ----------
-    split, view : (n,) int arrays
-        Number of the split, and of the camera's view.
-    joint, alone : dict of str to (n,) array
-        Errors of :class:`~stcal.handeye.HeldOutPoses` by name: from all cameras solved together, and from this camera
-        alone with the same poses of the robot. NaN if the camera cannot be solved alone.
+    ``split``, ``view`` : (n,) number of the split, and of the camera's view; ``joint``, ``alone`` : errors of
+    :class:`~stcal.handeye.HeldOutPoses` by name: from all cameras solved together, and from this camera alone with the
+    same poses of the robot. NaN if the camera cannot be solved alone.
     """
 
     split: np.ndarray
@@ -93,14 +89,10 @@ def cross_validate_rig(
 
     Parameters
     ----------
-    given, setup, options
-        See :func:`~stcal.handeye.handeye_rig`.
-    rows : (s, k) int array
-        Poses of the robot to hold out, from :func:`~stcal.handeye.splits`.
-    workers : int or None
-        Number of processes; as many as cores if None.
-    progress : callable, optional
-        Called with the number of splits done, and the number of all splits.
+    given, setup, options : see :func:`~stcal.handeye.handeye_rig`
+    rows : (s, k) poses of the robot to hold out, from :func:`~stcal.handeye.splits`
+    workers : number of processes; as many as cores if None
+    progress : called with the number of splits done, and the number of all splits
 
     Returns
     -------
@@ -112,11 +104,7 @@ def cross_validate_rig(
         A split cannot be solved; see :func:`~stcal.handeye.handeye_rig`.
     """
     jobs = [(given, setup, options, out) for out in rows]
-    results: list[tuple[list[dict], np.ndarray]] = [([], np.zeros(0))] * len(jobs)
-    for done, (i, errors) in enumerate(run_parallel(_errors_without, jobs, workers), 1):
-        results[i] = errors
-        if progress:
-            progress(done, len(jobs))
+    results = run_in_order(_errors_without, jobs, workers, progress)
     cameras = []
     for i in range(len(given.cameras)):
         parts = [errors[i] for errors, _ in results]

@@ -75,7 +75,7 @@ class SizedLens:
         return np.where((met & self.lens.determined(pixels))[:, None], unit, np.nan)
 
     def determined(self, pixels: np.ndarray) -> np.ndarray:
-        """Return which pixels (n, 2) lie in the region in which the lens was determined, (n,) bool."""
+        """Return a mask (n,) of the pixels (n, 2) that lie in the region in which the lens was determined."""
         return self.lens.determined(pixels)
 
 
@@ -84,17 +84,9 @@ def camera_difference(one: Camera | SizedLens, two: Camera | SizedLens) -> Camer
 
     Images that differ by a rotation of the camera count as equal: it acts like a shift of the principal point.
 
-    Parameters
-    ----------
-    one, two : Camera or SizedLens
-        Cameras of the same image size. Of a lens with a region only this is compared.
+    ``one``, ``two`` : cameras of the same image size. Of a lens with a region only this is compared.
 
-    Raises
-    ------
-    InputError
-        The image sizes differ.
-    DegenerateError
-        Too few pixels have a ray in both cameras.
+    Raises InputError: the image sizes differ. Raises DegenerateError: too few pixels have a ray in both cameras.
     """
     if (one.width, one.height) != (two.width, two.height):
         raise InputError(
@@ -188,17 +180,9 @@ class FittedLens:
 def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:
     """Return the supported camera model that is nearest to a lens over the image.
 
-    Parameters
-    ----------
-    lens : ForeignLens
-        Lens to approximate.
-    width, height : int
-        Image size, px.
+    ``lens`` : lens to approximate; ``width``, ``height`` : image size, px.
 
-    Raises
-    ------
-    InputError
-        The lens projects nearly no ray into the image.
+    Raises InputError: the lens projects nearly no ray into the image.
     """
     rays, pixels, share = _rays(lens, width, height)
     straight = _best(lens, rays, pixels, share, (width, height), False)

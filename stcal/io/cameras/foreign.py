@@ -129,10 +129,7 @@ def _colmap_normalised(rays: np.ndarray, model: str, own: np.ndarray) -> np.ndar
 def of_database(path: Path, choice: str) -> CameraModel | ForeignLens:
     """Return the camera of a COLMAP database, or the one of number ``choice``; the file is opened read-only.
 
-    Raises
-    ------
-    InputError
-        There is no camera, there are several and no choice, or the model is unknown.
+    Raises InputError: there is no camera, there are several and no choice, or the model is unknown.
     """
     try:
         # Without its log a database is read as it stands: SQLite would write files beside it.
@@ -174,10 +171,7 @@ def numbered(cameras: Collection[str], choice: str) -> str:
 def one_of(names: list[str], choice: str, source: str) -> str:
     """Return the name of the camera ``choice`` of a file, or of its only camera.
 
-    Raises
-    ------
-    InputError
-        There is no camera, the choice is unknown, or there are several cameras and no choice.
+    Raises InputError: there is no camera, the choice is unknown, or there are several cameras and no choice.
     """
     if not names:
         raise InputError("E-CAMERA-NONE", f"camera file {source}: no camera in it, 1 needed")
@@ -194,10 +188,7 @@ def one_of(names: list[str], choice: str, source: str) -> str:
 def of_opencv(lens, given: np.ndarray, width: float, height: float, source: str) -> CameraModel | ForeignLens:
     """Return the perspective camera of fx, fy, cx, cy and OpenCV's coefficients, also thin prisms and tilted sensor.
 
-    Raises
-    ------
-    InputError
-        The number of coefficients is wrong, or values are impossible.
+    Raises InputError: the number of coefficients is wrong, or values are impossible.
     """
     if len(given) not in (12, 14) or not given[8:].any():
         return camera_from_opencv(lens, given, False, width, height, source)
@@ -224,10 +215,7 @@ def of_skewed(
 
     ``skew`` : px, u = fx x + skew y + cx.
 
-    Raises
-    ------
-    InputError
-        The number of coefficients is wrong, or values are impossible.
+    Raises InputError: the number of coefficients is wrong, or values are impossible.
     """
     if abs(skew) <= SQUARE * abs(lens[0]):
         return camera_from_opencv(lens, given, False, width, height, source)
@@ -241,17 +229,12 @@ def of_parts(
 
     Parameters
     ----------
-    lens : sequence of 4 float
-        fx, fy, cx, cy, px.
-    skew : float
-        px, u = fx x + skew y + cx.
-    given : (k,) array
-        Coefficients in OpenCV's order: k1, k2, p1, p2, k3 …; k1 to k4 of an equidistant lens.
-    kind : str
-        perspective, equidistant, or unified: Mei's projection with ``xi``, of OpenCV's omnidir, Kalibr's omni and
-        camodocal's MEI.
-    width, height : float
-        Image size, px; 0 if the file states none.
+    lens : fx, fy, cx, cy, px
+    skew : px, u = fx x + skew y + cx
+    given : (k,) coefficients in OpenCV's order: k1, k2, p1, p2, k3 …; k1 to k4 of an equidistant lens
+    kind : perspective, equidistant, or unified: Mei's projection with ``xi``, of OpenCV's omnidir, Kalibr's omni and
+        camodocal's MEI
+    width, height : image size, px; 0 if the file states none
 
     Raises
     ------
@@ -358,10 +341,7 @@ def _scaled(xy: np.ndarray, kind: str, k: np.ndarray) -> np.ndarray:
 def of_splines(name: str, numbers: list[float], width: float, height: float, source: str) -> ForeignLens:
     """Return mrcal's splined stereographic lens: pixels are f · (u + B-spline of u), |u| = 2 tan(θ / 2).
 
-    Raises
-    ------
-    InputError
-        The name is unknown, or numbers are missing.
+    Raises InputError: the name is unknown, or numbers are missing.
     """
     match = SPLINED.fullmatch(name)
     if match is None:

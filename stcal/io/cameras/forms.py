@@ -69,10 +69,7 @@ class Written:
 def from_mrcal(text: str, source: str) -> CameraModel | ForeignLens:
     """Return the camera of a ``.cameramodel`` whose lens model is OpenCV's, CAHVOR, or splined.
 
-    Raises
-    ------
-    InputError
-        The text is no such file, or has another lens model.
+    Raises InputError: the text is no such file, or has another lens model.
     """
     try:
         values = ast.literal_eval(text.strip())
@@ -127,10 +124,8 @@ def is_colmap_binary(content: bytes) -> bool:
 def from_colmap_binary(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
     """Return the camera of ``cameras.bin``, or the one of number ``choice``.
 
-    Raises
-    ------
-    InputError
-        The content has another form, there are several cameras and no choice, or the model is not supported.
+    Raises InputError: the content has another form, there are several cameras and no choice, or the model is not
+    supported.
     """
     try:
         (count,) = struct.unpack_from("<Q", content, 0)
@@ -167,19 +162,10 @@ def name_to_write(name: str) -> str:
 def written(camera: Camera, form: str, name: str) -> Written:
     """Return the file of a camera.
 
-    Parameters
-    ----------
-    camera : Camera
-        Camera to write.
-    form : str
-        One of :data:`WRITERS`.
-    name : str
-        Name of the camera, for forms that have a place for it.
+    ``camera`` : camera to write; ``form`` : one of :data:`WRITERS`; ``name`` : name of the camera, for forms that have
+    a place for it.
 
-    Raises
-    ------
-    InputError
-        The form cannot hold the lens (the message names one that can), or the name is no word.
+    Raises InputError: the form cannot hold the lens (the message names one that can), or the name is no word.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise InputError(
@@ -266,10 +252,7 @@ def kalibr_chain(cameras: Sequence[tuple[str, Camera, Rigid]]) -> str:
 
     Kalibr numbers the cameras, and states the pose of each relative to the camera before it, in metres.
 
-    Raises
-    ------
-    InputError
-        The form cannot hold a lens.
+    Raises InputError: the form cannot hold a lens.
     """
     parts = []
     for number, (name, camera, pose) in enumerate(cameras):

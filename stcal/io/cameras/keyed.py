@@ -116,11 +116,8 @@ NEUTRAL = {
 def from_keys(values: dict, choice: str, source: str) -> CameraModel | ForeignLens:
     """Return a camera of keys and values; ``choice`` : its name or number if there are several.
 
-    Raises
-    ------
-    InputError
-        There is no camera, several and no choice, an unsupported lens, a key that may change the projection, or a value
-        is impossible.
+    Raises InputError: there is no camera, several and no choice, an unsupported lens, a key that may change the
+    projection, or a value is impossible.
     """
     cameras = cameras_of(values)
     if not cameras:
@@ -135,7 +132,7 @@ def from_keys(values: dict, choice: str, source: str) -> CameraModel | ForeignLe
 
 
 def _role_of(path: tuple[str, ...], table: Table) -> str | None:
-    """Return what a key holds; containers around it add nothing, ORB-SLAM's ``Camera.`` neither."""
+    """Return the role of a key. Containers around the key do not count, nor does ORB-SLAM's prefix ``Camera.``."""
     parts = [part for key in path for part in key.split(".")]
     while len(parts) > 1 and CONTAINERS.match(plain(parts[0])):
         parts = parts[1:]

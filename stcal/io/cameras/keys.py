@@ -140,19 +140,10 @@ def require_known(unread: Mapping, source: str, harmless: Collection[str] = ()) 
 
     Harmless ones pass in silence, others with an :class:`InputNote`.
 
-    Parameters
-    ----------
-    unread : Mapping
-        Keys and values; values may hold further keys.
-    source : str
-        Camera file, for messages.
-    harmless : collection of str
-        Further harmless keys of the format, or beginnings of them that end in ``*``; as :func:`plain` writes them.
+    ``unread`` : keys and values; values may hold further keys; ``source`` : camera file, for messages; ``harmless`` :
+    further harmless keys of the format, or beginnings of them that end in ``*``; as :func:`plain` writes them.
 
-    Raises
-    ------
-    InputError
-        A key may change the projection, and its value is not 0 or empty.
+    Raises InputError: a key may change the projection, and its value is not 0 or empty.
     """
     beginnings = (*HARMLESS_BEGINNINGS, *(word[:-1] for word in harmless if word.endswith("*")))
     unknown = []

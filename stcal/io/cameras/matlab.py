@@ -58,10 +58,8 @@ def is_mat(content: bytes) -> bool:
 def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignLens:
     """Return a camera of a ``.mat`` file; ``choice`` : name of the variable if there are several cameras.
 
-    Raises
-    ------
-    InputError
-        The file is of version 7.3 (HDF5), has objects in place of structures, no camera, or several and no choice.
+    Raises InputError: the file is of version 7.3 (HDF5), has objects in place of structures, no camera, or several and
+    no choice.
     """
     if content.startswith(HEADS[1]):
         raise InputError("E-CAMERA-UNREADABLE", f"camera file {source}: of MATLAB 7.3 (HDF5); save it with '-v7'")
@@ -89,10 +87,7 @@ def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignL
 def from_structure(values: Mapping, source: str) -> CameraModel | ForeignLens:
     """Return the camera of ``toStruct(cameraParameters)`` or ``toStruct(cameraIntrinsics)``, as a structure or as JSON.
 
-    Raises
-    ------
-    InputError
-        The lens is a fisheye lens, or a field is missing.
+    Raises InputError: the lens is a fisheye lens, or a field is missing.
     """
     unread = {key: _plain_value(value) for key, value in values.items() if key not in TAKEN}
     require_known(unread, source, HARMLESS)
@@ -240,10 +235,7 @@ def is_zhang(rows: list[list[str]]) -> bool:
 def from_zhang(rows: list[list[str]], source: str) -> CameraModel | ForeignLens:
     """Return the camera of α, c, β, u0, v0, then k1, k2; poses are ignored (Zhang 2000; the file of his page).
 
-    Raises
-    ------
-    InputError
-        A word is no number.
+    Raises InputError: a word is no number.
     """
     try:
         (fx, skew, fy, cx, cy), (k1, k2) = ([float(word) for word in row] for row in rows[:2])

@@ -68,10 +68,7 @@ class CameraModel:
     def require_inside(self, width: int, height: int, image: str) -> None:
         """Refuse an image without the principal point: a file that states no size may belong to another camera.
 
-        Raises
-        ------
-        InputError
-            The camera file and the image do not belong together.
+        Raises InputError: the camera file and the image do not belong together.
         """
         x, y = self.centre
         if not (0 < x < width and 0 < y < height):
@@ -191,10 +188,7 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path)
 def camera_from_colmap(colmap_model: str, width: float, height: float, params, source: str | Path) -> CameraModel:
     """Return the camera of COLMAP's ``params`` (in its order and pixel origin); ``source`` : their file, for messages.
 
-    Raises
-    ------
-    InputError
-        The camera model is not supported, the number of parameters is wrong, or values are impossible.
+    Raises InputError: the camera model is not supported, the number of parameters is wrong, or values are impossible.
     """
     if colmap_model not in COLMAP_LAYOUT:
         known = ", ".join(COLMAP_LAYOUT)
@@ -227,16 +221,11 @@ def camera_from_opencv(
 
     Parameters
     ----------
-    lens : sequence of 4 float
-        fx, fy, cx, cy, px, with OpenCV's pixel origin.
-    given : (k,) array
-        k1, k2, p1, p2, k3 …; for an equidistant camera k1 to k4, or with ``tangential`` k1, k2, p1, p2, k3, k4.
-    fisheye, tangential : bool
-        Equidistant projection; and whether ``given`` has p1, p2.
-    width, height : float
-        Image size, px; 0 if the file states none.
-    path : str or Path
-        Camera file, for messages.
+    lens : fx, fy, cx, cy, px, with OpenCV's pixel origin
+    given : (k,) k1, k2, p1, p2, k3 …; for an equidistant camera k1 to k4, or with ``tangential`` k1, k2, p1, p2, k3, k4
+    fisheye, tangential : equidistant projection; and whether ``given`` has p1, p2
+    width, height : image size, px; 0 if the file states none
+    path : camera file, for messages
 
     Raises
     ------

@@ -53,15 +53,9 @@ def is_photograph(path: str | Path) -> bool:
 def camera_of_photograph(path: str | Path) -> Photograph:
     """Return the camera that a photograph's EXIF describes.
 
-    Parameters
-    ----------
-    path : str or Path
-        JPEG, TIFF or PNG file.
+    ``path`` : JPEG, TIFF or PNG file.
 
-    Raises
-    ------
-    InputError
-        The file is unreadable, or states no focal length.
+    Raises InputError: the file is unreadable, or states no focal length.
     """
     try:
         data = read_bytes(path, IMAGE_BYTES)

@@ -45,17 +45,10 @@ def camera_chosen(name: str) -> Iterator[None]:
 def read_camera(path: str | Path, name: str = "") -> CameraModel:
     """Read a camera file of any supported kind, which is recognised by the content.
 
-    Parameters
-    ----------
-    path : str or Path
-        COLMAP, OpenCV, ROS, ROS-Industrial, Kalibr, mrcal or Metashape (``data_layout.md``).
-    name : str
-        Name of the camera in a file of several.
+    ``path`` : COLMAP, OpenCV, ROS, ROS-Industrial, Kalibr, mrcal or Metashape (``data_layout.md``); ``name`` : name of
+    the camera in a file of several.
 
-    Raises
-    ------
-    InputError
-        The file is missing or malformed, holds more than one camera, or a lens of an unsupported model.
+    Raises InputError: the file is missing or malformed, holds more than one camera, or a lens of an unsupported model.
     """
     lens = read_lens(path, name)
     if isinstance(lens, CameraModel):
@@ -107,10 +100,7 @@ def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None =
 def sized_camera(model: CameraModel | ForeignLens, path: str | Path, size: tuple[int, int] | None) -> Camera:
     """Return the camera of a file; ``size`` is taken where the file states none.
 
-    Raises
-    ------
-    InputError
-        No size is known.
+    Raises InputError: no size is known.
     """
     width, height = size or (0, 0)
     if not (model.width or width) or not (model.height or height):

@@ -41,10 +41,7 @@ def shallow(values: dict):
 def cameras_of(values: dict) -> dict[str, dict]:
     """Return the cameras of a file by name, each with the keys that all share; a single one may have no name.
 
-    Raises
-    ------
-    ValueError
-        A lens of Meshroom, or of Basalt, is not read, or lacks a number.
+    Raises ValueError: a lens of Meshroom, or of Basalt, is not read, or lacks a number.
     """
     if isinstance(values.get("value0"), dict):  # of cereal, which Basalt writes with
         return cameras_of(values["value0"])
@@ -129,10 +126,7 @@ MESHROOM = {
 def _of_meshroom(stated: dict) -> dict:
     """Return an entry of ``intrinsics`` with lengths in px: Meshroom's are in mm, its centre is an offset or absolute.
 
-    Raises
-    ------
-    ValueError
-        The lens is another one, or a number is missing.
+    Raises ValueError: the lens is another one, or a number is missing.
     """
     kind = plain(stated.get("distortionType", stated.get("type", "")))
     kind = plain(stated.get("type", "")) if kind == "none" and "distortionType" in stated else kind

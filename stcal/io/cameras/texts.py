@@ -20,10 +20,8 @@ TAB = 4
 def values_of(text: str) -> dict:
     """Return the keys and values of a text in JSON, XML, TOML, INI, or YAML, or of a matrix alone.
 
-    Raises
-    ------
-    ValueError, yaml.YAMLError, ElementTree.ParseError
-        The text is none of these, or holds several documents that differ.
+    Raises ValueError, yaml.YAMLError, ElementTree.ParseError: the text is none of these, or holds several documents
+    that differ.
     """
     if text.lstrip().startswith("<"):
         return _xml_values(ElementTree.fromstring(text))
@@ -52,10 +50,7 @@ def values_of(text: str) -> dict:
 def values_of_archive(content: bytes) -> dict:
     """Return the arrays of a file of ``numpy.savez`` as lists; pickled objects are not opened, as they may be programs.
 
-    Raises
-    ------
-    ValueError
-        The content is no such archive.
+    Raises ValueError: the content is no such archive.
     """
     values = {}
     try:

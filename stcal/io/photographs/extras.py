@@ -44,10 +44,7 @@ def is_heic(data: bytes) -> bool:
 def require_heic(name: str) -> ModuleType:
     """Return the package that reads HEIC.
 
-    Raises
-    ------
-    InputError
-        It is not installed; the message begins with ``name``.
+    Raises InputError: it is not installed; the message begins with ``name``.
     """
     if find_spec("pillow_heif") is None:
         raise InputError("E-IMAGE-EXTRA", f"{name}: {reason_unread('.heic')}")
@@ -59,10 +56,7 @@ def require_heic(name: str) -> ModuleType:
 def heic_grey(data: bytes, name: str) -> np.ndarray:
     """Return the grey pixels of a HEIC photograph as they are stored, without the turn that its container states.
 
-    Raises
-    ------
-    InputError
-        The package is missing, or the data are damaged or mirrored.
+    Raises InputError: the package is missing, or the data are damaged or mirrored.
     """
     package = require_heic(name)
     try:
@@ -101,10 +95,7 @@ def is_dng(data: bytes) -> bool:
 def raw_grey(data: bytes, name: str) -> np.ndarray:
     """Return the grey pixels of a raw photograph, uint16, proportional to the light, without turn or correction.
 
-    Raises
-    ------
-    InputError
-        The package is missing, or cannot read the file.
+    Raises InputError: the package is missing, or cannot read the file.
     """
     if find_spec("rawpy") is None:
         raise InputError("E-IMAGE-EXTRA", f"{name}: {reason_unread('.dng')}")

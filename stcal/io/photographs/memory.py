@@ -14,16 +14,11 @@ from stcal.io.images import ImageFile, ImageFiles, grey_of, name_fault, without_
 def files_of_arrays(images: Mapping[str, Sequence[np.ndarray]], exclude: Sequence[str] = ()) -> ImageFiles:
     """Return images in memory as files that carry their content, named ``12/0.png``, ``12/1.png`` … by group.
 
-    Parameters
-    ----------
-    images : grey or RGB arrays of 8 or 16 bit, by name of the group
-    exclude : names of images that are not used
+    ``images`` : grey or RGB arrays of 8 or 16 bit, by name of the group; ``exclude`` : names of images that are not
+    used.
 
-    Raises
-    ------
-    InputError
-        No image, an array that is none, or a name that leads out of a folder; and as for
-        :func:`stcal.io.images.chosen_images`.
+    Raises InputError: no image, an array that is none, or a name that leads out of a folder; and as for
+    :func:`stcal.io.images.chosen_images`.
     """
     named = [(group, f"{group}/{k}.png", image) for group, arrays in images.items() for k, image in enumerate(arrays)]
     if not named:

@@ -18,10 +18,7 @@ TRIED_PX = 1024
 def demosaiced(mosaic: np.ndarray, pattern: str, name: str) -> np.ndarray:
     """Return the grey image of a mosaic; ``pattern`` : one of :data:`PATTERNS`.
 
-    Raises
-    ------
-    InputError
-        The pattern is unknown, or the image has colours already.
+    Raises InputError: the pattern is unknown, or the image has colours already.
     """
     word = pattern.upper()
     if word not in PATTERNS:

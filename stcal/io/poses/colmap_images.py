@@ -27,10 +27,7 @@ class ImageLine:
 def image_lines(text: str, where: str) -> list[ImageLine]:
     """Return the images of ``images.txt``, also of one from which empty lines were removed.
 
-    Raises
-    ------
-    InputError
-        A line is neither an image's nor a list of points; the message names it.
+    Raises InputError: a line is neither an image's nor a list of points; the message names it.
     """
     images: list[ImageLine] = []
     pending: tuple[int, list[float], str] | None = None  # an image whose second line is to come

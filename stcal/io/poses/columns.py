@@ -79,10 +79,7 @@ def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) 
 
     ``rotation`` : name of the convention, from ``--rotation``, for angles whose columns leave it open.
 
-    Raises
-    ------
-    InputError
-        Only some columns of a rotation exist, values are no rotation, or the convention must be given.
+    Raises InputError: only some columns of a rotation exist, values are no rotation, or the convention must be given.
     """
     places, where = places_of(table), table.where
     if f"{prefix}qw" in table or f"{prefix}qx" in table:
@@ -212,10 +209,7 @@ def read_mapped(path: str | Path, columns: str | Path, what: str, quaternions: O
     ``columns`` : the map (TOML; form: ``data_layout.md``); ``quaternions`` : see
     :func:`~stcal.io.table.read_table`.
 
-    Raises
-    ------
-    InputError
-        The file is unreadable, a column is missing, or a row has another length.
+    Raises InputError: the file is unreadable, a column is missing, or a row has another length.
     """
     form, where = load_toml(columns, _ColumnsFile, WHAT, "give its path"), f"{what} {path}"
     try:

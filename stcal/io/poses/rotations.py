@@ -70,10 +70,7 @@ class Convention:
 def convention_of(name: str) -> Convention:
     """Return the convention of a name that the user gives, such as ``kuka-abc``, ``ZYX``, ``zyx-rad``, ``rotvec-deg``.
 
-    Raises
-    ------
-    InputError
-        The name is unknown.
+    Raises InputError: the name is unknown.
     """
     if name in ALIASES:
         return Convention(*ALIASES[name])
@@ -92,10 +89,7 @@ def convention_of(name: str) -> Convention:
 def said_convention(rotation: str | None, what: str, where: str, count: int = 3) -> Convention:
     """Return the convention of the option ``--rotation``; ``what`` : names of the columns, or their description.
 
-    Raises
-    ------
-    InputError
-        The option is not given, or its convention has another number of values.
+    Raises InputError: the option is not given, or its convention has another number of values.
     """
     if rotation is None:
         likely = LIKELY["quaternions"] if count == len("wxyz") else LIKELY.get(what, "kuka-abc, ur-rotvec, xyz or ZYX")
@@ -117,10 +111,7 @@ def rotations(
 
     ``by_axis`` : True if the columns are named by the axes x, y, z and not in the order of the rotations.
 
-    Raises
-    ------
-    InputError
-        Values are not finite, or their unit is ambiguous.
+    Raises InputError: values are not finite, or their unit is ambiguous.
     """
     require_finite(values, places, where)
     unit, guessed = convention.unit, False
@@ -157,10 +148,7 @@ def turned_values(
 def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
     """Return matrices (m, 3, 3) projected onto rotations, since files state few digits.
 
-    Raises
-    ------
-    InputError
-        A matrix is no rotation; the message names it, the deviation, and its likely cause.
+    Raises InputError: a matrix is no rotation; the message names it, the deviation, and its likely cause.
     """
     require_finite(rotation, places, where)
     u, size, vt = np.linalg.svd(rotation)
@@ -185,10 +173,7 @@ def proper(rotation: np.ndarray, places: Sequence[str], where: str) -> np.ndarra
 def of_quaternions(wxyz: np.ndarray, places: Sequence[str], where: str) -> np.ndarray:
     """Return the rotations (m, 3, 3) of quaternions (m, 4), w first.
 
-    Raises
-    ------
-    InputError
-        A quaternion is not of unit length.
+    Raises InputError: a quaternion is not of unit length.
     """
     require_finite(wxyz, places, where)
     require_unit(wxyz, places.__getitem__, where, "correct it")

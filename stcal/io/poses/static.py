@@ -116,10 +116,7 @@ def read_ros2_commands(text: str) -> list[Static]:
 def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
     """Return a launch file of ROS 1, as MoveIt's calibration plugin writes it.
 
-    Raises
-    ------
-    InputError
-        A name has white space, at which ``roslaunch`` would split it.
+    Raises InputError: a name has white space, at which ``roslaunch`` would split it.
     """
     lines = ["<launch>", *(f"  <!-- {line} -->" for line in said)]
     for static in statics:

@@ -125,10 +125,7 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
     The board is the datum and exact. A factor on the σ of the board's measured points, and additional σ of the tags'
     corners, are estimated from residuals and redundancy (variance components: Förstner 1979).
 
-    Raises
-    ------
-    ConvergenceError
-        The iteration does not converge.
+    Raises ConvergenceError: the iteration does not converge.
     """
     corners = start.reshape(-1, 2).copy()
     poses = Poses.of([image.pose for image in images])

@@ -78,10 +78,7 @@ CAPTURED = "capture.json"
 def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
     """Returns ``count`` exposure times from ``shortest`` to ``longest`` in a geometric series, in their unit.
 
-    Raises
-    ------
-    InputError
-        Times are not positive or not in order, or ``count`` does not fit them.
+    Raises InputError: times are not positive or not in order, or ``count`` does not fit them.
     """
     if not (0 < shortest <= longest < np.inf) or count < 1 or (count == 1 and shortest < longest):
         raise InputError(
@@ -193,10 +190,7 @@ class Settings:
 def scene_folder(out: Path, scene: str) -> Path:
     """Returns the path of a new folder for a scene.
 
-    Raises
-    ------
-    InputError
-        The name is invalid, or the scene exists.
+    Raises InputError: the name is invalid, or the scene exists.
     """
     folder = out / checked_name(scene, "scene")
     if folder.exists():
@@ -215,16 +209,11 @@ def capture(
 
     Parameters
     ----------
-    source
-        The camera.
-    exposures
-        Exposures in the unit of the camera's driver, from :func:`~stcal.locate.data.exposures.exposure_times`.
-    folder
-        Folder of the scene. It is created and written only after all images are taken.
-    settings
-        Gain and settle time.
-    taken
-        Called with the row of each image.
+    source : the camera
+    exposures : exposures in the unit of the camera's driver, from :func:`~stcal.locate.data.exposures.exposure_times`
+    folder : folder of the scene. It is created and written only after all images are taken.
+    settings : gain and settle time
+    taken : called with the row of each image
 
     Returns
     -------

@@ -302,8 +302,8 @@ def locate(
             names = ", ".join(str(layout.tags[row][1]) for row in sorted(outliers))
             raise DegenerateError(
                 "E-LOCATE-CONTRADICTS",
-                f"{where}: {len(outliers)} of {len(seen)} tags contradict the others ({names}); check that layout and "
-                "camera file belong to the images",
+                f"{where}: {len(outliers)} of {len(seen)} tags contradict the others ({names}); check that layout "
+                "and camera file belong to the images",
             )
         problem = all_corners.select((4 * keep[:, None] + np.arange(4)).ravel())
         start = minima.poses[[0]]
@@ -315,32 +315,36 @@ def locate(
     return pose
 
 
-def problem_of(seen: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None = None) -> PlanarProblem:
+def problem_of(
+    detected: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None = None
+) -> PlanarProblem:
     """Returns the corners with their full noise model."""
-    rows = (8 * seen.rows[:, None] + np.arange(8)).ravel()
-    pixels = seen.corners_px.reshape(-1, 2)
+    rows = (8 * detected.rows[:, None] + np.arange(8)).ravel()
+    pixels = detected.corners_px.reshape(-1, 2)
     ideal = camera.normalised_from_pixel(pixels)
     px_by_seen = camera.distort_jacobian(ideal)[1] * camera.focal[:, None]
     seen_by_px = np.linalg.inv(px_by_seen)
-    common = np.concatenate([_by_edges(seen, seen_by_px), _by_tag(len(seen), seen_by_px)], axis=2)
-    common_covariance = np.diag(np.append(seen.edge_sigma_px**2, np.full(2 * len(seen), layout.tag_sigma_px**2)))
+    common = np.concatenate([_by_edges(detected, seen_by_px), _by_tag(len(detected), seen_by_px)], axis=2)
+    common_covariance = np.diag(
+        np.append(detected.edge_sigma_px**2, np.full(2 * len(detected), layout.tag_sigma_px**2))
+    )
     if prior is not None:
         by_camera = seen_by_px @ (camera.parameter_jacobian(ideal) @ intrinsic_basis(prior.colmap_model))
         common = np.concatenate([common, by_camera], axis=2)
         common_covariance = np.asarray(block_diag(common_covariance, prior.covariance))
     of_tags = block_diagonal(seen_by_px.reshape(-1, 4, 2, 2))
-    noise = block_diagonal(of_tags @ seen.covariance_px2 @ np.swapaxes(of_tags, 1, 2))
-    xy = layout.corners_mm[seen.rows].reshape(-1, 2)
+    noise = block_diagonal(of_tags @ detected.covariance_px2 @ np.swapaxes(of_tags, 1, 2))
+    xy = layout.corners_mm[detected.rows].reshape(-1, 2)
     return PlanarProblem(
         xy, ideal, noise, px_by_seen, layout.covariance_mm2[np.ix_(rows, rows)], common, common_covariance
     )
 
 
-def _by_edges(seen: SeenTags, back: np.ndarray) -> np.ndarray:
+def _by_edges(detected: SeenTags, back: np.ndarray) -> np.ndarray:
     """Returns the derivative (4k, 2, k) of the corners by the shift of each tag's edges, px."""
-    k = len(seen)
+    k = len(detected)
     jacobian = np.zeros((k, 4, 2, k))
-    jacobian[np.arange(k), :, :, np.arange(k)] = corners_by_edges(seen.corners_px)
+    jacobian[np.arange(k), :, :, np.arange(k)] = corners_by_edges(detected.corners_px)
     return back @ jacobian.reshape(4 * k, 2, k)
 
 

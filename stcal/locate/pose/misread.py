@@ -31,33 +31,28 @@ PLACES_MIRRORED = "Y pointed down (the layout has it upwards: change the signs o
 
 
 def likely_mistake(
-    seen: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None, pose: ObjPose | None
+    detected: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None, pose: ObjPose | None
 ) -> str | None:
     """Returns the mistake in a layout without which all tags would fit; None where there is no such mistake.
 
     Parameters
     ----------
-    seen : SeenTags
-        Corners of the layout's tags, px.
-    layout : TargetLayout
-        The layout as it is.
-    camera : Camera
-        The camera at the size of the image.
-    prior : CameraPrior or None
-        Covariance of the intrinsics.
-    pose : ObjPose or None
-        The pose by the layout as it is; None if none was found.
+    seen : corners of the layout's tags, px
+    layout : the layout as it is
+    camera : the camera at the size of the image
+    prior : covariance of the intrinsics
+    pose : the pose by the layout as it is; None if none was found
     """
-    if len(seen) < LEAST_TAGS:
+    if len(detected) < LEAST_TAGS:
         return None
-    side = np.linalg.norm(seen.corners_px - np.roll(seen.corners_px, 1, axis=1), axis=2).mean()
+    side = np.linalg.norm(detected.corners_px - np.roll(detected.corners_px, 1, axis=1), axis=2).mean()
     allowed = FITS * float(side)
     if pose is not None:
-        allowed = min(allowed, _misfit_px(seen, layout, camera, pose) / BETTER)
+        allowed = min(allowed, _misfit_px(detected, layout, camera, pose) / BETTER)
     fitting = []
     for reason, variant in _variants(layout):
         try:
-            misfit = _misfit_px(seen, variant, camera, locate(seen, variant, camera, prior))
+            misfit = _misfit_px(detected, variant, camera, locate(detected, variant, camera, prior))
         except StcalError:  # this layout does not fit either
             continue
         if misfit < allowed:
@@ -66,13 +61,13 @@ def likely_mistake(
     return next((reason for misfit, reason in fitting if misfit <= ALIKE * best), None)
 
 
-def _misfit_px(seen: SeenTags, layout: TargetLayout, camera: Camera, pose: ObjPose) -> float:
+def _misfit_px(detected: SeenTags, layout: TargetLayout, camera: Camera, pose: ObjPose) -> float:
     """Returns the RMS distance of all corners, those left out by the pose too, from where the layout has them."""
-    corners = layout.corners_mm[seen.rows].reshape(-1, 2)
+    corners = layout.corners_mm[detected.rows].reshape(-1, 2)
     xyz_camera = pose.camera_from_obj @ np.column_stack([corners, np.zeros(len(corners))])
     if xyz_camera[:, 2].min() <= 0 or pose.foreshortening <= 0:
         return np.inf
-    off = seen.corners_px.reshape(-1, 2) - camera.project(xyz_camera)
+    off = detected.corners_px.reshape(-1, 2) - camera.project(xyz_camera)
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 

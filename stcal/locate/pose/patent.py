@@ -63,20 +63,13 @@ class PatentExposure:
 
     Parameters
     ----------
-    exposure : int
-        Index of the exposure.
-    tags : int
-        Number of the layout's tags in it.
-    area_px2 : float or None
-        Area that the triangles of the tags span; None if other exposures show more tags.
-    candidate : bool
-        Whether its poses were compared with those of other exposures.
-    poses : (Rigid, Rigid) or None
-        T_a and T_b, the one with the smaller error first; None if it is no candidate, or has no pose.
-    errors_px : (float, float) or None
-        RMS errors of both poses.
-    det_j : float or None
-        Determinant of the homography's derivative at the normalised centre, 1/mm².
+    exposure : index of the exposure
+    tags : number of the layout's tags in it
+    area_px2 : area that the triangles of the tags span; None if other exposures show more tags
+    candidate : whether its poses were compared with those of other exposures
+    poses : (Rigid, Rigid) T_a and T_b, the one with the smaller error first; None if it is no candidate, or has no pose
+    errors_px : (float, float) RMS errors of both poses
+    det_j : determinant of the homography's derivative at the normalised centre, 1/mm²
     """
 
     exposure: int
@@ -176,10 +169,7 @@ def locate_as_patent(
 ) -> PatentPose:
     """Finds the exposure whose IPPE pose has the smallest reprojection error, and applies the gate (S5 to S9).
 
-    Raises
-    ------
-    DegenerateError
-        No exposure shows a tag, or no exposure gives a pose.
+    Raises DegenerateError: no exposure shows a tag, or no exposure gives a pose.
     """
     options = options or PatentOptions()
     rows = layout.rows()

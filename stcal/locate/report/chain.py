@@ -65,12 +65,9 @@ class GoalChain:
     source: str = "hand-eye file"
 
     def base_from_goal(self, scene: str, camera_from_obj: UncertainRigid) -> UncertainRigid:
-        """Returns the target's pose with the offset in the robot's base; its covariance holds the errors of all links.
+        """Returns the goal's pose in the robot's base. Its covariance holds the errors of all links of the chain.
 
-        Raises
-        ------
-        InputError
-            There is no robot pose of this scene.
+        Raises InputError: the robot has no pose for this scene.
         """
         chain = self.mount @ camera_from_obj @ UncertainRigid.exact(self.offset)
         if not self.moving:
@@ -99,10 +96,8 @@ def read_chain(
     ``quaternions`` : order of the robot's quaternions, ``xyzw`` if their columns hold x, y, z, w in this order.
     ``key`` : column of the robot's poses that names the scenes; ``columns`` : map of their columns.
 
-    Raises
-    ------
-    InputError
-        A file does not follow ``data_layout.md``, or robot poses are missing, or are given for a fixed camera.
+    Raises InputError: a file does not follow ``data_layout.md``, or robot poses are missing, or are given for a fixed
+    camera.
     """
     mounted = read_result(hand_eye, HandEyeRead, "hand-eye file", "give the file of stcal handeye")
     where = f"hand-eye file {hand_eye}"
@@ -130,10 +125,7 @@ def read_chain(
 def read_registered(registration: str | Path, offset: str | Path | None = None) -> GoalChain:
     """Reads the file of ``stcal register`` for points that a fixed camera (a) and the robot (b, its base) measured.
 
-    Raises
-    ------
-    InputError
-        A file does not follow ``data_layout.md``, or the registration is not rigid.
+    Raises InputError: a file does not follow ``data_layout.md``, or the registration is not rigid.
     """
     advice = "give the file of stcal register --out"
     read = read_result(registration, RegistrationRead, "registration file", advice)
@@ -198,10 +190,7 @@ def on_chain(chain: GoalChain, seen: Mapping[str, UncertainRigid]) -> tuple[str,
     A target that stands still while the flange turns reveals the convention. A single scene, a flange that stands still
     too, or a target that moves reveal nothing.
 
-    Raises
-    ------
-    InputError
-        The target would stand still in another unit or convention only; the message says which.
+    Raises InputError: the target would stand still in another unit or convention only; the message says which.
     """
     scenes = [scene for scene in seen if scene in chain.flange]
     if chain.moving and len(scenes) > 1:

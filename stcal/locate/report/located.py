@@ -115,30 +115,30 @@ class LocatedFile(ResultFile):
         return cls(format="stcal located 1", unit="mm", layout=layout.name, scenes=scenes)
 
 
-def _scene(each: Located, layout: TargetLayout, chain: GoalChain | None) -> SceneRow:
-    verdict, merged, pose = each.verdict, each.merged, camera_from_obj(each)
+def _scene(located: Located, layout: TargetLayout, chain: GoalChain | None) -> SceneRow:
+    verdict, merged, pose = located.verdict, located.merged, camera_from_obj(located)
     content: dict[str, Any] = {
-        "scene": each.name,
+        "scene": located.name,
         "verdict": verdict.decision,
         "reasons": verdict.reasons,
-        "notes": each.notes,
+        "notes": located.notes,
         "checks": verdict.checks,
-        "exposures": [_exposure(own) for own in each.tags.exposures],
+        "exposures": [_exposure(own) for own in located.tags.exposures],
         "tags": [layout.tags[row][1] for row in merged.seen.rows] if merged else [],
         "differing_share": None if merged is None else merged.share,
         "shifts": [_shift(own) for own in merged.shifts] if merged else [],
         "camera_from_obj": pose,
     }
-    if each.patent is not None:
+    if located.patent is not None:
         content |= {
-            "twin": each.patent.second,
-            "errors_px": each.patent.errors_px,
-            "patent": _patent(each, each.patent),
+            "twin": located.patent.second,
+            "errors_px": located.patent.errors_px,
+            "patent": _patent(located, located.patent),
         }
-    if each.pose is not None:
-        content |= _fit(each.pose, layout)
-    if chain and pose is not None and not chain.without_pose([each.name]):
-        goal = chain.base_from_goal(each.name, uncertain(each))
+    if located.pose is not None:
+        content |= _fit(located.pose, layout)
+    if chain and pose is not None and not chain.without_pose([located.name]):
+        goal = chain.base_from_goal(located.name, uncertain(located))
         content |= {"base_from_goal": goal.rigid, "base_covariance": goal.covariance}
     return SceneRow.model_validate(content)
 
@@ -148,8 +148,8 @@ def _exposure(own: Exposure | Unreadable) -> ExposureRow:
     return ExposureRow(image=own.name, tags=len(own.tags) if read else None, trouble=None if read else own.trouble)
 
 
-def _patent(each: Located, patent: PatentPose) -> PatentRow:
-    names = [exposure.name for exposure in each.tags.readable()]
+def _patent(located: Located, patent: PatentPose) -> PatentRow:
+    names = [exposure.name for exposure in located.tags.readable()]
     rows = []
     for exposure_result in patent.exposures:
         first, second = exposure_result.poses or (None, None)

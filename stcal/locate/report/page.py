@@ -26,18 +26,20 @@ from stcal.report.text import NONE, number
 BASE = "base_from_goal_"
 
 
-def _patent_blocks(each: Located) -> list[Block]:
+def _patent_blocks(located: Located) -> list[Block]:
     """Returns a table with a row per exposure: its result by the rules of the patent."""
     rows: list[list[str]] = []
-    if each.patent is None:
+    if located.patent is None:
         return []
-    for name, result in zip((e.name for e in each.tags.readable()), each.patent.exposures, strict=True):
-        state = "kept" if result.exposure == each.patent.exposure else "candidate" if result.candidate else "left out"
+    for name, result in zip((e.name for e in located.tags.readable()), located.patent.exposures, strict=True):
+        state = (
+            "kept" if result.exposure == located.patent.exposure else "candidate" if result.candidate else "left out"
+        )
         errors = result.errors_px or (None, None)
         det_j = NONE if result.det_j is None else f"{result.det_j:.3g}"
         rows.append([name, state, str(result.tags), number(result.area_px2, 0), *(number(e, 3) for e in errors), det_j])
     return [
-        "both poses are one, no ratio" if each.patent.same else "",
+        "both poses are one, no ratio" if located.patent.same else "",
         page_only(
             "By the published rules: exposures with most tags, of these the ones of more than S_dis of the largest "
             "area; of these the pose of the smallest error"
@@ -47,21 +49,21 @@ def _patent_blocks(each: Located) -> list[Block]:
     ]
 
 
-def camera_from_obj(each: Located) -> Rigid | None:
+def camera_from_obj(located: Located) -> Rigid | None:
     """Returns camera_from_obj by the method that was asked for, or None."""
-    if each.patent is not None:
-        return each.patent.camera_from_obj
-    return None if each.pose is None else each.pose.camera_from_obj
+    if located.patent is not None:
+        return located.patent.camera_from_obj
+    return None if located.pose is None else located.pose.camera_from_obj
 
 
-def uncertain(each: Located) -> UncertainRigid:
+def uncertain(located: Located) -> UncertainRigid:
     """Returns camera_from_obj with its covariance, which is zero for the patent's method."""
-    if each.pose is None:
-        pose = camera_from_obj(each)
+    if located.pose is None:
+        pose = camera_from_obj(located)
         if pose is None:
-            raise InputError("E-LOCATED-NO-POSE", f"{each.name}: no pose; {each.verdict.decision}")
+            raise InputError("E-LOCATED-NO-POSE", f"{located.name}: no pose; {located.verdict.decision}")
         return UncertainRigid.exact(pose)
-    return UncertainRigid(each.pose.camera_from_obj, each.pose.covariance)
+    return UncertainRigid(located.pose.camera_from_obj, located.pose.covariance)
 
 
 def accepted(results: Sequence[Located]) -> list[Located]:
@@ -112,9 +114,10 @@ def run_report(
     blocks: list[Block] = [Table(heads, _overview(results), css="text")]
     if chain and accepted(results):
         blocks += [page_only("Where the robot has to go"), Table(goal_heads, _in_base(results, chain))]
+    count = f"{len(results)} scene{'s' * (len(results) != 1)}, {len(accepted(results))} accepted"
     return Document(
         f"Tags located: {layout.name}",
-        f"target {layout.name}, {len(layout.tags)} tags: {len(results)} scenes, {len(accepted(results))} accepted",
+        f"target {layout.name}, {len(layout.tags)} tags: {count}",
         [
             Section("Scenes", blocks, terminal=True),
             *(
@@ -155,10 +158,10 @@ def _in_base(results: Sequence[Located], chain: GoalChain) -> list[list[str]]:
     return rows
 
 
-def _scene(each: Located, files: SceneFiles, layout: TargetLayout, model: CameraModel) -> list[Block]:
+def _scene(located: Located, files: SceneFiles, layout: TargetLayout, model: CameraModel) -> list[Block]:
     """Returns verdict, checks and pictures of a scene."""
     by_name = {file.name: file for file in files.files}
-    shown = each.tags.readable()
+    shown = located.tags.readable()
     best = best_exposure(shown, layout)
     checks = [
         [
@@ -167,7 +170,7 @@ def _scene(each: Located, files: SceneFiles, layout: TargetLayout, model: Camera
             f"≥ {check.at_least:.4g}" if check.at_least is not None else f"≤ {check.at_most:.4g}",
             "yes" if check.passed else Verdict("no"),
         ]
-        for check in each.verdict.checks
+        for check in located.verdict.checks
     ]
     several = shown if len(shown) > 1 else []
 
@@ -175,12 +178,12 @@ def _scene(each: Located, files: SceneFiles, layout: TargetLayout, model: Camera
         return macro("tag_photo", lambda: _picture(exposure, by_name[exposure.name], of, layout, model, width_px))
 
     return [
-        " – ".join((each.verdict.decision, *each.verdict.reasons)),
-        Notes(each.notes),
+        " – ".join((located.verdict.decision, *located.verdict.reasons)),
+        Notes(located.notes),
         Table(["<check", "value", "limit", "<kept"], checks),
-        *_patent_blocks(each),
-        photo(best, each, WIDE_PX) if best else None,
-        columns(*([photo(exposure, None, SMALL_PX)] for exposure in several), css="columns small"),
+        *_patent_blocks(located),
+        photo(best, located, WIDE_PX) if best else None,
+        columns(*([photo(exposure, None, SMALL_PX)] for exposure in several), css="columns thumbs"),
     ]
 
 
@@ -201,18 +204,23 @@ def best_exposure(exposures: Sequence[Exposure], layout: TargetLayout) -> Exposu
 
 
 def _picture(
-    exposure: Exposure, file: ImageFile, each: Located | None, layout: TargetLayout, model: CameraModel, width_px: int
+    exposure: Exposure,
+    file: ImageFile,
+    located: Located | None,
+    layout: TargetLayout,
+    model: CameraModel,
+    width_px: int,
 ) -> dict:
-    """Returns the image with the outlines of its tags; with axes of {obj} and names of tags if ``each`` is given."""
+    """Returns the image with the outlines of its tags; with axes of {obj} and names of tags if ``located`` is given."""
     grey = grey_8bit(decode(file.read(), file.name))
     width, height = exposure.size
     rows = layout.rows()
     tags = []
     for tag, corners in zip(exposure.tags.tags, exposure.tags.corners_px, strict=True):
         points = " ".join(f"{x:.2f},{y:.2f}" for x, y in corners)
-        name = "" if each is None else str(tag[1])
+        name = "" if located is None else str(tag[1])
         tags.append((points, COLOURS[2] if tag in rows else COLOURS[1], name, *corners.mean(0)))
-    pose = None if each is None else camera_from_obj(each)
+    pose = None if located is None else camera_from_obj(located)
     count = sum(tag in rows for tag in exposure.tags.tags)
     return {
         "shown_px": width_px,

@@ -20,14 +20,9 @@ WIDE = 8.0
 class Covariance:
     """Covariance of a transform's parameters.
 
-    Parameters
-    ----------
-    matrix : (p, p) array
-        Parameters as of :func:`~stcal.register.core.models.unit_covariance`.
-    scaled : bool
-        Whether it is derived from the residuals; False if it is derived from the given σ.
-    redundancy : float
-        Degrees of freedom of the σ that it is derived from; infinite if this σ was given.
+    ``matrix`` : (p, p) parameters as of :func:`~stcal.register.core.models.unit_covariance`; ``scaled`` : whether it is
+    derived from the residuals; False if it is derived from the given σ; ``redundancy`` : degrees of freedom of the σ
+    that it is derived from; infinite if this σ was given.
     """
 
     matrix: Array
@@ -56,13 +51,10 @@ def sigma_within(square_sum: float, model: Model, count: int, threshold: float) 
 
     Parameters
     ----------
-    square_sum : float
-        Square sum of the residuals of the points used, mm².
-    model : Model
-    count : int
-        Number of points used.
-    threshold : float
-        Threshold at which residuals were cut off, mm; infinite if none was.
+    square_sum : square sum of the residuals of the points used, mm²
+    model : model
+    count : number of points used
+    threshold : threshold at which residuals were cut off, mm; infinite if none was
 
     Returns
     -------
@@ -89,19 +81,8 @@ def covariance_of(inliers: Problem, b_from_a: Transform, sigma: float, threshold
     A given σ is kept unless χ² contradicts it. Cutting off at c σ increases the variance of the estimate by the factor
     χ²₃(c²)/χ²₅(c²), as for an M-estimator with hard rejection.
 
-    Parameters
-    ----------
-    inliers : Problem
-        Points that the transform is fitted to.
-    b_from_a : Transform
-    sigma : float
-        Estimated σ, mm of a point of mean σ.
-    threshold : float
-        Threshold at which residuals were cut off, mm; infinite if none was.
-
-    Returns
-    -------
-    Covariance
+    ``inliers`` : points that the transform is fitted to; ``b_from_a`` : transform; ``sigma`` : estimated σ, mm of a
+    point of mean σ; ``threshold`` : threshold at which residuals were cut off, mm; infinite if none was.
     """
     model, noise = inliers.model, inliers.noise
     redundancy = float(inliers.redundancy)

@@ -77,15 +77,11 @@ class Liu2017Result:
 
     Parameters
     ----------
-    b_from_a : Affine
-    sample : (N,) int array
-        Rows of the best sample.
-    inliers : (n,) bool array
-        Points within the limit, including those of the sample.
-    acceptable : int
-        Number of acceptable samples.
-    shares : (tries,) array
-        Share of inliers outside each sample, NaN if the sample was screened out.
+    b_from_a : affine
+    sample : (N,) rows of the best sample
+    inliers : (n,) points within the limit, including those of the sample
+    acceptable : number of acceptable samples
+    shares : (tries,) share of inliers outside each sample, NaN if the sample was screened out
     """
 
     b_from_a: Affine
@@ -100,14 +96,7 @@ def affine_least_squares(xyz_a: np.ndarray, xyz_b: np.ndarray) -> Affine:
 
     Coplanar points leave it undetermined off their plane, where it may be wrong by metres.
 
-    Parameters
-    ----------
-    xyz_a, xyz_b : (n, 3) arrays
-        mm; row i of both is the same point.
-
-    Returns
-    -------
-    Affine
+    ``xyz_a``, ``xyz_b`` : (n, 3) mm; row i of both is the same point.
     """
     design = np.column_stack([xyz_a, np.ones(len(xyz_a))])
     solution = np.linalg.lstsq(design, np.asarray(xyz_b, float), rcond=None)[0]

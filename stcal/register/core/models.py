@@ -26,14 +26,8 @@ CHUNK = 100_000
 class Model:
     """A model of a transform.
 
-    Parameters
-    ----------
-    name : str
-        ``rigid``, ``similarity`` or ``affine``.
-    parameters : int
-        Number of parameters.
-    sample : int
-        Least number of point pairs that determines them.
+    ``name`` : ``rigid``, ``similarity`` or ``affine``; ``parameters`` : number of parameters; ``sample`` : least number
+    of point pairs that determines them.
     """
 
     name: str
@@ -67,24 +61,11 @@ def fit(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray, precision: np.ndarra
 
     The solution is in closed form for isotropic noise. With inverse covariances a descent starts from there.
 
-    Parameters
-    ----------
-    model : Model
-    xyz_a, xyz_b : (n, 3) arrays
-        mm; row i of both is the same point.
-    precision : (n,) or (n, 3, 3) array, optional
-        Weights, or inverse covariances in frame b.
+    ``model`` : model; ``xyz_a``, ``xyz_b`` : (n, 3) mm; row i of both is the same point; ``precision`` : (n,) weights,
+    or inverse covariances in frame b.
 
-    Returns
-    -------
-    Rigid, Similarity or Affine
-
-    Raises
-    ------
-    DegenerateError
-        If there are too few points, collinear ones, or coplanar ones for the affine model.
-    ConvergenceError
-        If no minimum is reached.
+    Raises DegenerateError if there are too few points, collinear ones, or coplanar ones for the affine model. Raises
+    ConvergenceError: if no minimum is reached.
     """
     weights = precision
     if precision is not None and precision.ndim == 3:
@@ -123,19 +104,8 @@ def unit_covariance(
     Parameters of a left perturbation in frame b: rotation vector (rad) and translation (mm), R' = exp(w) R and
     t' = t + dt; then for a similarity its relative scale, s' = s (1 + ds). Affine: rows of the 3×4 matrix.
 
-    Parameters
-    ----------
-    model : Model
-    transform : Rigid, Similarity or Affine
-        b_from_a.
-    xyz_a : (n, 3) array
-        Points that were fitted, mm.
-    precision : (n,) or (n, 3, 3) array, optional
-        Precision as in :func:`fit`.
-
-    Returns
-    -------
-    (p, p) array
+    ``model`` : model; ``transform`` : b_from_a; ``xyz_a`` : (n, 3) points that were fitted, mm; ``precision`` : (n,)
+    precision as in :func:`fit`.
     """
     origin, normal = _normal(model, transform, xyz_a, precision)
     to_origin = _to_origin(model, transform, origin)
@@ -154,12 +124,9 @@ def leverages(
 
     Parameters
     ----------
-    model, transform, precision :
-        As in :func:`unit_covariance`.
-    xyz_a : (n, 3) array
-        All points, mm.
-    used : (n,) bool array
-        Mask of the points that were fitted.
+    model, transform, precision : : as in :func:`unit_covariance`
+    xyz_a : (n, 3) all points, mm
+    used : (n,) mask of the points that were fitted
 
     Returns
     -------
@@ -192,9 +159,8 @@ def hypotheses(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[np.n
 
     Parameters
     ----------
-    model : Model
-    xyz_a, xyz_b : (s, m, 3) arrays
-        m points of each of s samples, mm.
+    model : model
+    xyz_a, xyz_b : (s, m, 3) m points of each of s samples, mm
 
     Returns
     -------

@@ -159,12 +159,8 @@ class PointNoise:
     Inverse covariances are scaled so that a point of mean σ (the RMS of all σ) has σ = 1: whitened residuals are
     millimetres of such a point.
 
-    Parameters
-    ----------
-    precision : (n,) or (n, 3, 3) array, or None
-        Inverse variances or covariances at mean σ 1, frame b; None if all noise is equal and isotropic.
-    sigma_mm : float or None
-        Mean σ if it was given in mm.
+    ``precision`` : (n,) inverse variances or covariances at mean σ 1, frame b; None if all noise is equal and
+    isotropic; ``sigma_mm`` : mean σ if it was given in mm.
     """
 
     precision: np.ndarray | None = None
@@ -179,12 +175,7 @@ class PointNoise:
 class Problem:
     """Point pairs and a model. They are neither copied nor checked, as subsets are taken in inner loops.
 
-    Parameters
-    ----------
-    model : Model
-    xyz_a, xyz_b : (n, 3) arrays
-        mm; row i of both is the same point.
-    noise : PointNoise
+    ``model`` : model; ``xyz_a``, ``xyz_b`` : (n, 3) mm; row i of both is the same point; ``noise`` : PointNoise.
     """
 
     model: Model
@@ -228,23 +219,10 @@ class Problem:
 def noise_of(n: int, weights: np.ndarray | None, covariances: np.ndarray | None) -> PointNoise:
     """Returns the noise that weights or covariances state.
 
-    Parameters
-    ----------
-    n : int
-        Number of point pairs.
-    weights : (n,) array, optional
-        Weights, proportional to 1/σ².
-    covariances : (n, 3, 3) or (n,) array, optional
-        Covariances, or variances per axis, of b − b_from_a a in frame b, mm².
+    ``n`` : number of point pairs; ``weights`` : (n,) weights, proportional to 1/σ²; ``covariances`` : (n, 3, 3)
+    covariances, or variances per axis, of b − b_from_a a in frame b, mm².
 
-    Returns
-    -------
-    PointNoise
-
-    Raises
-    ------
-    InputError
-        If both are given, a shape is wrong, or weights or covariances are not positive.
+    Raises InputError if both are given, a shape is wrong, or weights or covariances are not positive.
     """
     if weights is not None and covariances is not None:
         raise InputError("E-REGISTER-WEIGHTS", "registration: weights and covariances given; give only one of them")

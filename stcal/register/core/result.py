@@ -14,10 +14,7 @@ from stcal.register.core.models import Transform
 class ErrorFigures:
     """Summary of the lengths |b − b_from_a a| of points' errors; NaN if there are no points.
 
-    Parameters
-    ----------
-    points : int
-    mean_mm, rms_mm, max_mm : float
+    ``points`` : int; ``mean_mm``, ``rms_mm``, ``max_mm`` : float.
     """
 
     points: int
@@ -178,18 +175,12 @@ def held_out(
 
     Parameters
     ----------
-    fit_rows : callable
-        Fit to given rows, b_from_a. A fold whose fit fails is left out of the summary.
-    xyz_a, xyz_b : (n, 3) arrays
-        mm; row i of both is the same point.
-    inliers : (n,) bool array
-        Inliers of the fit to all points.
-    folds : int
-        Number of parts to leave out, one at a time.
-    least : int
-        Least number of points of a fit.
-    seed : int
-        Seed of the division into parts.
+    fit_rows : fit to given rows, b_from_a. A fold whose fit fails is left out of the summary.
+    xyz_a, xyz_b : (n, 3) mm; row i of both is the same point
+    inliers : (n,) inliers of the fit to all points
+    folds : number of parts to leave out, one at a time
+    least : least number of points of a fit
+    seed : seed of the division into parts
 
     Returns
     -------

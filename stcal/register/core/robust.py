@@ -50,15 +50,11 @@ class Fitted:
 
     Parameters
     ----------
-    transform : Rigid, Similarity or Affine
-        b_from_a.
+    transform : b_from_a
     inliers : (n,) bool array
-    sigma : float
-        σ per axis, mm of a point of mean σ.
-    threshold : float
-        Largest distance of inliers, mm of a point of mean σ; infinite if no residual was cut off.
-    samples : int
-        Number of random samples; 0 if none or all possible ones were tried.
+    sigma : σ per axis, mm of a point of mean σ
+    threshold : largest distance of inliers, mm of a point of mean σ; infinite if no residual was cut off
+    samples : number of random samples; 0 if none or all possible ones were tried
     """
 
     transform: Transform
@@ -71,24 +67,11 @@ class Fitted:
 def robust_fit(problem: Problem, threshold: float | None = None, seed: int = 0) -> Fitted:
     """Returns the transform with its inliers and σ.
 
-    Parameters
-    ----------
-    problem : Problem
-    threshold : float, optional
-        Largest distance of inliers, mm of a point of mean σ; estimated if not given.
-    seed : int
-        Seed of the random samples.
+    ``problem`` : problem; ``threshold`` : largest distance of inliers, mm of a point of mean σ; estimated if not given;
+    ``seed`` : seed of the random samples.
 
-    Returns
-    -------
-    Fitted
-
-    Raises
-    ------
-    DegenerateError
-        If too few points agree, or no more than could agree by chance.
-    ConvergenceError
-        If a fit with covariances did not converge.
+    Raises DegenerateError if too few points agree, or no more than could agree by chance. Raises ConvergenceError: if
+    a fit with covariances did not converge.
     """
     rng = np.random.default_rng(seed)
     count = len(problem)
@@ -155,11 +138,9 @@ def settled(problem: Problem, inliers: np.ndarray, threshold: float | None, samp
 
     Parameters
     ----------
-    problem : Problem
-    inliers : (n,) bool array
-        First set of inliers.
-    threshold, samples :
-        As in :func:`robust_fit` and :class:`Fitted`.
+    problem : problem
+    inliers : (n,) first set of inliers
+    threshold, samples : : as in :func:`robust_fit` and :class:`Fitted`
 
     Returns
     -------
@@ -223,9 +204,8 @@ def deletion_squares(problem: Problem, transform: Transform, used: np.ndarray) -
 
     Parameters
     ----------
-    problem : Problem
-    transform : Rigid, Similarity or Affine
-        Fit to the points used.
+    problem : problem
+    transform : fit to the points used
     used : (n,) bool array
 
     Returns
@@ -283,11 +263,9 @@ def alternative_fit(problem: Problem, fitted: Fitted, seed: int) -> Fitted | Non
 
     Parameters
     ----------
-    problem : Problem
-    fitted : Fitted
-        Transform of the inliers.
-    seed : int
-        Seed as in :func:`robust_fit`.
+    problem : problem
+    fitted : transform of the inliers
+    seed : seed as in :func:`robust_fit`
 
     Returns
     -------

@@ -54,13 +54,8 @@ Score = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 class Consensus:
     """A set of points that agree on a transform.
 
-    Parameters
-    ----------
-    inliers : (n,) bool array
-    value : float
-        Score, less is better.
-    samples : int
-        Number of samples; 0 if all possible ones were tried.
+    ``inliers`` : (n,) bool array; ``value`` : score, less is better; ``samples`` : number of samples; 0 if all possible
+    ones were tried.
     """
 
     inliers: np.ndarray
@@ -127,9 +122,8 @@ def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensu
 
     Parameters
     ----------
-    problem : Problem
-    score : Score
-        Score as in :func:`by_scale`, :func:`by_share` and :func:`by_threshold`.
+    problem : problem
+    score : score as in :func:`by_scale`, :func:`by_share` and :func:`by_threshold`
     rng : numpy.random.Generator
 
     Returns

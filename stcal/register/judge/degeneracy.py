@@ -31,10 +31,7 @@ def spreads(xyz: np.ndarray) -> np.ndarray:
 def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
     """Refuses points that do not determine the model at their σ.
 
-    Raises
-    ------
-    DegenerateError
-        If they lie along a line, or in a plane for the affine model.
+    Raises DegenerateError: the points lie along a line, or in a plane for the affine model.
     """
     n, spread = len(xyz_a), spreads(xyz_a)
     needed = WIDER_THAN * sigma_mm
@@ -73,10 +70,7 @@ def check_supports(model: Model, xyz_a: np.ndarray, inliers: np.ndarray, sigma_m
     """Refuses a set with outliers in which a single point determines a turn, as any wrong point would have fitted
     there.
 
-    Raises
-    ------
-    DegenerateError
-        If the others would be refused by :func:`check_extent` without that point.
+    Raises DegenerateError if the others would be refused by :func:`check_extent` without that point.
     """
     rows = np.flatnonzero(inliers)
     alone = single_supports(model, xyz_a[rows], sigma_mm)

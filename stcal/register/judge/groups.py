@@ -29,12 +29,8 @@ TOGETHER = 0.01
 class Groups:
     """Two groups of points with a transform each.
 
-    Parameters
-    ----------
-    transforms : two Rigid, Similarity or Affine
-        Transforms of the larger group and of the other one.
-    in_space : bool
-        Whether the place determines the group, which indicates a bent frame and not two motions.
+    ``transforms`` : transforms of the larger group and of the other one; ``in_space`` : whether the place determines
+    the group, which indicates a bent frame and not two motions.
     """
 
     transforms: tuple[Transform, Transform]
@@ -172,16 +168,8 @@ NARROWEST = 0.01
 class Shifted:
     """Points of which some are shifted relative to the others.
 
-    Parameters
-    ----------
-    rows : (m,) int array
-        Indices of the smaller group.
-    count : int
-        Number of all points.
-    by_mm : (3,) array
-        Shift of the smaller group relative to the others, frame b.
-    together : bool
-        Whether the smaller group lies together in space.
+    ``rows`` : (m,) indices of the smaller group; ``count`` : number of all points; ``by_mm`` : (3,) shift of the
+    smaller group relative to the others, frame b; ``together`` : whether the smaller group lies together in space.
     """
 
     rows: np.ndarray
@@ -199,10 +187,8 @@ def shifted_rows(problem: Problem, transform: Transform) -> Shifted | None:
 
     Parameters
     ----------
-    problem : Problem
-        Points that agree on one transform.
-    transform : Transform
-        Fit to these points.
+    problem : points that agree on one transform
+    transform : fit to these points
 
     Returns
     -------

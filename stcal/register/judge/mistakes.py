@@ -40,10 +40,8 @@ LOOKED_AT = 10_000
 def check_units(xyz_a: np.ndarray, xyz_b: np.ndarray, seed: int) -> None:
     """Refuses frames whose distances differ by the ratio of two units.
 
-    Raises
-    ------
-    InputError
-        If the median ratio of distances between the same two points in b and a is the ratio of two units.
+    Raises InputError if the median ratio of distances between the same two points in b and a is the ratio of two
+    units.
     """
     rng = np.random.default_rng([seed, 3])
     i, j = rng.integers(len(xyz_a), size=(2, PAIRS))
@@ -77,11 +75,8 @@ def mirrored_ratio(xyz_a: np.ndarray, xyz_b: np.ndarray) -> tuple[float, np.ndar
 def check_mirrored(model: Model, xyz_a: np.ndarray, xyz_b: np.ndarray) -> None:
     """Refuses points (n, 3) that a reflection explains far better than any rotation.
 
-    Raises
-    ------
-    InputError
-        If they are. The message names the axis to change, if one change of sign or exchange makes the frames nearly
-        parallel.
+    Raises InputError if they are. The message names the axis to change, if one change of sign or exchange makes the
+    frames nearly parallel.
     """
     if model.name == "affine" or len(xyz_a) <= model.sample:
         return
@@ -170,10 +165,8 @@ def wider(problem: Problem, transform: Transform) -> Wider | None:
 
     Parameters
     ----------
-    problem : Problem
-        Points that agree on one transform.
-    transform : Transform
-        Fit to these points.
+    problem : points that agree on one transform
+    transform : fit to these points
 
     Returns
     -------

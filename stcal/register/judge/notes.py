@@ -34,21 +34,16 @@ class Subject:
 
     Parameters
     ----------
-    problem : Problem
+    problem : problem
     method : str
-    fitted : Fitted
-    alternative : Alternative or None
-    ambiguous : bool
-        Whether the alternative is about as good.
-    other : Wider or None
-        A wider model that explains the points.
-    shifted : Shifted or None
-        Inliers that are shifted together.
-    covariance : Covariance
-    factor : float or None
-        Ratio of the residuals to the given σ; None if none was given.
-    lines : sequence of int, optional
-        Lines of the file that name the points.
+    fitted : fitted
+    alternative : alternative or None
+    ambiguous : whether the alternative is about as good
+    other : a wider model that explains the points
+    shifted : inliers that are shifted together
+    covariance : covariance
+    factor : ratio of the residuals to the given σ; None if none was given
+    lines : lines of the file that name the points
     """
 
     problem: Problem

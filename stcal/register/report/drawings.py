@@ -20,11 +20,11 @@ RASTER = 41
 MARGIN = 0.25
 
 
-def space_figure(found: Findings):
+def space_figure(findings: Findings):
     """Returns three views of the points in frame b with their residuals, enlarged."""
-    result = found.registration
-    rows = _shown(found)
-    place = result.b_from_a @ found.xyz_a[rows]
+    result = findings.registration
+    rows = _shown(findings)
+    place = result.b_from_a @ findings.xyz_a[rows]
     residual, inlier = result.residuals[rows], result.inliers[rows]
     side = float(np.ptp(place, axis=0).max()) or 1.0
     typical = max(result.inlier_errors.rms_mm, 1e-12)
@@ -38,9 +38,8 @@ def space_figure(found: Findings):
     beyond = beyond[np.argsort(-length[beyond], kind="stable")]
     reach = np.abs(np.concatenate([place, place + arrow]) - middle).max(0) * 1.06 + 0.01 * side
     figure = new_figure(10.2, 3.7)
-    width = 0.27
     for k, (i, j) in enumerate(VIEWS):
-        axes = figure.add_axes((0.055 + k * 0.33, 0.14, width, 0.82))
+        axes = figure.add_axes((0.075 + k * 0.325, 0.14, 0.255, 0.82))
         for kind, colour in ((True, COLOURS[0]), (False, COLOURS[1])):
             own = inlier == kind
             if own.any():
@@ -69,15 +68,15 @@ def space_figure(found: Findings):
     return figure
 
 
-def has_field_figure(found: Findings, field: Field) -> bool:
+def has_field_figure(findings: Findings, field: Field) -> bool:
     """Returns whether the points have a width in all directions, so that planes through their middle show something."""
-    width = np.ptp(found.xyz_a[field.rows], axis=0)
+    width = np.ptp(findings.xyz_a[field.rows], axis=0)
     return bool(width.min() >= 1e-3 * width.max())
 
 
-def field_figure(found: Findings, field: Field):
+def field_figure(findings: Findings, field: Field):
     """Returns planes through the middle of the points with the expected error."""
-    own = found.xyz_a[field.rows]
+    own = findings.xyz_a[field.rows]
     low, high = own.min(0), own.max(0)
     middle, reach = (low + high) / 2, (high - low) / 2 * (1 + 2 * MARGIN)
     planes = []
@@ -94,7 +93,7 @@ def field_figure(found: Findings, field: Field):
     levels = np.arange(np.ceil(most / step * (1 - 1e-9)) + 1) * step
     figure, shown = new_figure(10.2, 3.5), []
     for k, ((i, j), (u, v, size)) in enumerate(zip(VIEWS, planes, strict=True)):
-        axes = figure.add_axes((0.055 + k * 0.298, 0.15, 0.24, 0.8))
+        axes = figure.add_axes((0.075 + k * 0.29, 0.15, 0.225, 0.8))
         shown.append(axes.contourf(u, v, size, levels=levels, cmap="YlOrRd"))
         axes.contour(u, v, size, levels=levels[1:-1:2], colors=INK, linewidths=0.4, alpha=0.5)
         third = 3 - i - j
@@ -110,12 +109,12 @@ def field_figure(found: Findings, field: Field):
     return figure
 
 
-def errors_figure(found: Findings, reach: Cubes):
+def errors_figure(findings: Findings, reach: Cubes):
     """Returns a figure of the residuals' lengths against the side of the cube about the middle that a point lies on."""
-    result = found.registration
-    rows = _shown(found)
-    side = 2 * np.abs(found.xyz_a[rows] - reach.middle).max(1)
-    length, inlier = found.length_mm[rows], result.inliers[rows]
+    result = findings.registration
+    rows = _shown(findings)
+    side = 2 * np.abs(findings.xyz_a[rows] - reach.middle).max(1)
+    length, inlier = findings.length_mm[rows], result.inliers[rows]
     figure = new_figure(9, 2.6)
     axes = figure.add_axes((0.07, 0.2, 0.92, 0.66))
     top = 1.25 * result.inlier_errors.max_mm
@@ -139,9 +138,9 @@ def errors_figure(found: Findings, reach: Cubes):
     return figure
 
 
-def _shown(found: Findings) -> np.ndarray:
+def _shown(findings: Findings) -> np.ndarray:
     """Returns all rows; of many, the outliers (a part of very many) and as many others as can be distinguished."""
-    result = found.registration
+    result = findings.registration
     if len(result) <= MOST_ARROWS:
         return np.arange(len(result))
     bad, good = result.outliers[: MOST_ARROWS // 3], np.flatnonzero(result.inliers)

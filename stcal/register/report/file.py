@@ -201,9 +201,9 @@ class RegistrationFile(ResultFile):
     )
 
     @classmethod
-    def of(cls, found: Findings) -> "RegistrationFile":
+    def of(cls, findings: Findings) -> "RegistrationFile":
         """Returns the file of a registration."""
-        result, lines = found.registration, found.lines
+        result, lines = findings.registration, findings.lines
         names = NAMES[len(result.covariance)]
         same = ("model", "method", "covariance", "sigma_mm", "sigma_factor", "scaled", "threshold_mm", "ambiguous")
         same += ("notes", "seed", "samples", "residuals")
@@ -211,7 +211,7 @@ class RegistrationFile(ResultFile):
             {name: getattr(result, name) for name in same}
             | {
                 "format": "stcal registration 1",
-                "pairs": found.where,
+                "pairs": findings.where,
                 "b_from_a": matrix_of(result.b_from_a),
                 "covariance_of": names,
                 "units": {
@@ -226,9 +226,9 @@ class RegistrationFile(ResultFile):
                 "alternative": result.alternative and _alternative(result.alternative, lines),
                 "lines": lines,
                 "inliers": result.inliers.tolist(),
-                "outliers": _outliers(found),
-                "field": found.field and _field(found.field, found),
-                "cubes": found.cubes and _cubes(found.cubes),
+                "outliers": _outliers(findings),
+                "field": findings.field and _field(findings.field, findings),
+                "cubes": findings.cubes and _cubes(findings.cubes),
             }
         )
 
@@ -261,18 +261,18 @@ def _alternative(other: Alternative, lines: Sequence[int]) -> OtherTransform:
     )
 
 
-def _outliers(found: Findings) -> list[WrongPairRow]:
+def _outliers(findings: Findings) -> list[WrongPairRow]:
     """Returns the rows of outliers without validation: residuals are finite, and there may be many thousands."""
-    rows = found.registration.outliers
-    residuals, lengths = found.registration.residuals[rows], found.length_mm[rows].tolist()
+    rows = findings.registration.outliers
+    residuals, lengths = findings.registration.residuals[rows], findings.length_mm[rows].tolist()
     return [
-        WrongPairRow.model_construct(line=found.lines[row], residual_mm=residual, length_mm=length)
+        WrongPairRow.model_construct(line=findings.lines[row], residual_mm=residual, length_mm=length)
         for row, residual, length in zip(rows.tolist(), residuals, lengths, strict=True)
     ]
 
 
-def _field(field: ResidualField, found: Findings) -> FieldPart:
-    grid = grid_of(found.xyz_a[field.rows])
+def _field(field: ResidualField, findings: Findings) -> FieldPart:
+    grid = grid_of(findings.xyz_a[field.rows])
     error, covariance = field.at(grid)
     plain, corrected = (ErrorFigures.of(lengths) for lengths in (field.plain_mm, field.corrected_mm))
     return FieldPart(
@@ -282,7 +282,7 @@ def _field(field: ResidualField, found: Findings) -> FieldPart:
         size_mm=field.size_mm,
         noise_mm=field.noise_mm,
         points=len(field.rows),
-        taken_back_lines=[found.lines[i] for i in field.taken_back],
+        taken_back_lines=[findings.lines[i] for i in field.taken_back],
         left_out=LeftOutErrors(
             transform=MeanRmsMax.model_validate(plain),
             transform_and_field=MeanRmsMax.model_validate(corrected),
@@ -309,11 +309,11 @@ def _cubes(cubes: Cubes) -> CubesPart:
     )
 
 
-def require_registration_written(path: str | Path, found: Findings) -> None:
+def require_registration_written(path: str | Path, findings: Findings) -> None:
     """Read a written registration again, and require that it maps the points as was reported."""
 
     def again() -> np.ndarray:
         read = read_result(path, RegistrationFile, "registration file", "report this with its data")
-        return found.xyz_a @ read.b_from_a[:3, :3].T + read.b_from_a[:3, 3]
+        return findings.xyz_a @ read.b_from_a[:3, :3].T + read.b_from_a[:3, 3]
 
-    require_written(path, again, found.registration.b_from_a @ found.xyz_a, POSE_MM, "mm")
+    require_written(path, again, findings.registration.b_from_a @ findings.xyz_a, POSE_MM, "mm")

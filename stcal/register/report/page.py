@@ -71,35 +71,39 @@ def matrix_table(name: str, matrix: np.ndarray) -> Table:
     return Table([f"<{name}", "x axis", "y axis", "z axis", "origin, mm"], rows)
 
 
-def _heading(found: Findings) -> str:
-    result = found.registration
+def _heading(findings: Findings) -> str:
+    result = findings.registration
     count, agree = len(result), int(result.inliers.sum())
     cut = "" if result.threshold_mm is None else f", threshold {result.threshold_mm:.4g} mm"
     way = f"{result.model}, {result.method}{cut}"
-    return f"{found.where}: {count} point pairs, {way}: {agree} inliers, {count - agree} outliers"
+    return f"{findings.where}: {count} point pairs, {way}: {agree} inliers, {count - agree} outliers"
 
 
-def _parts_lines(found: Findings) -> list[str]:
+def _three(values: np.ndarray) -> str:
+    return ", ".join(f"{v:.3g}" for v in values)
+
+
+def _parts_lines(findings: Findings) -> list[str]:
     """Returns lines on σ of the transform, and on its scale or shear."""
-    result, lines = found.registration, []
+    result, lines = findings.registration, []
     sigma = np.sqrt(np.diag(result.covariance))
     if isinstance(result.b_from_a, Affine):
         scales = np.linalg.svd(result.b_from_a.linear, compute_uv=False)
         lines.append(f"scales {' '.join(f'{s:.6f}' for s in scales)}: a frame of the same unit has 1 1 1")
     else:
-        lines.append(f"σ of its rotation {' '.join(f'{v:.3g}' for v in 1e3 * np.degrees(sigma[:3]))} mdeg")
+        lines.append(f"σ of its rotation about x, y, z: {_three(1e3 * np.degrees(sigma[:3]))} mdeg")
     if isinstance(result.b_from_a, Similarity):
         lines.append(f"scale {result.b_from_a.scale:.8f} ± {sigma[6] * result.b_from_a.scale:.2g}")
-    for place, xyz in (("the middle of the inliers", found.middle()), ("a's origin", np.zeros(3))):
-        lines.append(f"σ it makes at {place}: {' '.join(f'{v:.3g}' for v in found.sigma_mm_at(xyz))} mm")
+    for place, xyz in (("the middle of the inliers", findings.middle()), ("a's origin", np.zeros(3))):
+        lines.append(f"σ of a transformed point at {place}, along x, y, z: {_three(findings.sigma_mm_at(xyz))} mm")
     redundancy = f", {result.redundancy:.0f} degrees of freedom" if np.isfinite(result.redundancy) else ""
     factor = "" if result.sigma_factor is None else f", {result.sigma_factor:.2f} of the σ given"
     return [*lines, f"σ of a coordinate {result.sigma_mm:.4g} mm{factor}{redundancy}"]
 
 
-def _error_cells(found: Findings) -> list[list[str]]:
+def _error_cells(findings: Findings) -> list[list[str]]:
     """Returns cells with name, points, mean, RMS, maximum."""
-    result, held = found.registration, found.registration.held_out
+    result, held = findings.registration, findings.registration.held_out
     rows = [_figures("residuals of the inliers", result.inlier_errors)]
     if held is not None:
         rows.append(_figures(f"held out ({held.folds} folds), inliers", held.of_inliers))
@@ -112,22 +116,22 @@ def _figures(name: str, errors: ErrorFigures) -> list[str]:
     return [name, str(errors.points), *(number(v, 4) for v in (errors.mean_mm, errors.rms_mm, errors.max_mm))]
 
 
-def _rows(found: Findings) -> Table:
+def _rows(findings: Findings) -> Table:
     """Returns the residuals of all rows; of many rows those of outliers, and the largest of inliers."""
-    result = found.registration
+    result = findings.registration
     if len(result) <= FEW_ROWS:
-        return _table_of(found, np.arange(len(result)))
+        return _table_of(findings, np.arange(len(result)))
     inliers = np.flatnonzero(result.inliers)
-    worst = inliers[np.argsort(-found.length_mm[inliers], kind="stable")][:WORST]
-    return _table_of(found, np.concatenate([worst, result.outliers]))
+    worst = inliers[np.argsort(-findings.length_mm[inliers], kind="stable")][:WORST]
+    return _table_of(findings, np.concatenate([worst, result.outliers]))
 
 
-def _table_of(found: Findings, rows: np.ndarray) -> Table:
-    result, length = found.registration, found.length_mm
+def _table_of(findings: Findings, rows: np.ndarray) -> Table:
+    result, length = findings.registration, findings.length_mm
     cells = []
     for row in rows.tolist():
         values = (number(float(v), 4) for v in (*result.residuals[row], length[row]))
-        cells.append([f"line {found.lines[row]}", "inlier" if result.inliers[row] else "OUTLIER", *values])
+        cells.append([f"line {findings.lines[row]}", "inlier" if result.inliers[row] else "OUTLIER", *values])
     return Table(["<residual, mm", "<", "x", "y", "z", "length"], cells)
 
 
@@ -136,11 +140,11 @@ UNRELATED = 0.1
 coarsest instruments reach a hundredth of their range."""
 
 
-def field_sentence(found: Findings, field: Field) -> str:
+def field_sentence(findings: Findings, field: Field) -> str:
     """Returns a sentence on whether residuals are more than noise."""
-    result = found.registration
+    result = findings.registration
     own = result.inliers
-    xyz_b = (result.b_from_a @ found.xyz_a + result.residuals)[own]
+    xyz_b = (result.b_from_a @ findings.xyz_a + result.residuals)[own]
     share = float(np.sqrt((result.residuals[own] ** 2).sum() / ((xyz_b - xyz_b.mean(0)) ** 2).sum()))
     if share > UNRELATED:
         return (
@@ -182,48 +186,48 @@ def holds(reach: Cubes) -> list[str]:
     return [text]
 
 
-def registration_report(found: Findings, more: Sequence[Section] = ()) -> Document:
+def registration_report(findings: Findings, more: Sequence[Section] = ()) -> Document:
     """Returns the report of ``register``. ``more`` : sections to insert before the rows."""
-    result = found.registration
+    result = findings.registration
     matrix = matrix_table("b_from_a", matrix_of(result.b_from_a))
-    errors = Table(["<lengths of errors, mm", "points", "mean", "RMS", "max"], _error_cells(found))
-    answer = [page_only(alarms(result.notes)), tiles(_headline(found)), matrix, *_parts_lines(found), errors]
+    errors = Table(["<lengths of errors, mm", "points", "mean", "RMS", "max"], _error_cells(findings))
+    answer = [page_only(alarms(result.notes)), tiles(_headline(findings)), matrix, *_parts_lines(findings), errors]
     outliers = len(result.outliers) > 0
     cut = "; arrows of outliers that would leave the picture end in a ring, their length in mm beside them"
     space = [
         legend({"inlier": COLOURS[0], **({"outlier": COLOURS[1]} if outliers else {})}),
         plot(
-            lambda: space_figure(found),
+            lambda: space_figure(findings),
             "residuals in three views",
             f"Points in frame b and their residuals b − b_from_a a, enlarged{cut if outliers else ''}",
         ),
     ]
-    rows, first = _rows(found), min(len(result), MOST_ROWS)
+    rows, first = _rows(findings), min(len(result), MOST_ROWS)
     what = "All rows" if first == len(result) else f"The first {first} of {len(result)} rows"
-    every = fold(what, _table_of(found, np.arange(first))) if len(result) > FEW_ROWS else None
+    every = fold(what, _table_of(findings, np.arange(first))) if len(result) > FEW_ROWS else None
     return Document(
         "Registration",
-        _heading(found),
+        _heading(findings),
         [
             Section("Result", answer, terminal=True),
             Section("Residuals in space", space),
-            Section("Where it holds", _where_it_holds(found), terminal=True),
+            Section("Where it holds", _where_it_holds(findings), terminal=True),
             *more,
             Section("Rows", ["" if outliers else "no outliers", rows, every], terminal=True),
         ],
     )
 
 
-def _where_it_holds(found: Findings) -> list[Block]:
+def _where_it_holds(findings: Findings) -> list[Block]:
     """Returns whether residuals are systematic, and errors in cubes about the middle of the points."""
-    field, reach = found.field, found.cubes
+    field, reach = findings.field, findings.cubes
     blocks: list[Block] = []
     if field is not None:
-        blocks.append(field_sentence(found, field))
-        if has_field_figure(found, field):
+        blocks.append(field_sentence(findings, field))
+        if has_field_figure(findings, field):
             blocks.append(
                 plot(
-                    lambda: field_figure(found, field),
+                    lambda: field_figure(findings, field),
                     "systematic error over the workspace",
                     "Systematic error to expect of the transform (RMS: of what the residuals show and of what they "
                     "leave open), in planes through the middle of the points, frame a. Dots: the points within an "
@@ -237,20 +241,20 @@ def _where_it_holds(found: Findings) -> list[Block]:
             "and tried on those of all; the points that it is fitted to are held out in turn. Nothing is assumed "
             "about where errors come from"
         )
-        place = plot(lambda: errors_figure(found, reach), "errors by place", "Lengths of the residuals by place")
+        place = plot(lambda: errors_figure(findings, reach), "errors by place", "Lengths of the residuals by place")
         blocks += [page_only(explained), *holds(reach), _cubes(reach), place]
     return blocks or [page_only("Too few points to tell")]
 
 
-def _headline(found: Findings) -> list[tuple[str, str, str]]:
+def _headline(findings: Findings) -> list[tuple[str, str, str]]:
     """Returns value, unit and meaning of each tile."""
-    result, errors = found.registration, found.registration.inlier_errors
+    result, errors = findings.registration, findings.registration.inlier_errors
     tiles = [(f"{result.inliers.sum()} / {len(result)}", "", "inliers of the point pairs")]
     tiles.append((f"{errors.rms_mm:.3g} mm", "", f"RMS residual of the inliers, at most {errors.max_mm:.3g} mm"))
     if result.held_out is not None:
         held = result.held_out.of_inliers
         tiles.append((f"{held.mean_mm:.3g} mm", "", f"mean error of inliers held out, at most {held.max_mm:.3g} mm"))
-    sigma = float(np.linalg.norm(found.sigma_mm_at(found.middle())))
+    sigma = float(np.linalg.norm(findings.sigma_mm_at(findings.middle())))
     tiles.append((f"{sigma:.2g} mm", "", "σ of the transform at the middle of the inliers, all axes together"))
     return tiles
 

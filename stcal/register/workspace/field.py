@@ -335,11 +335,9 @@ def cubes(
 
     Parameters
     ----------
-    registration : Registration
-    xyz_a, xyz_b, weights, covariances, folds :
-        As in :func:`stcal.register.register`.
-    taken_back : (m,) int array, optional
-        Indices of outliers that are included.
+    registration : registration
+    xyz_a, xyz_b, weights, covariances, folds : : as in :func:`stcal.register.register`
+    taken_back : (m,) indices of outliers that are included
 
     Returns
     -------

@@ -111,16 +111,11 @@ def fit_axis(points: np.ndarray, moved: np.ndarray, arcs: list[Arc], prismatic: 
 
     Parameters
     ----------
-    points : (m, 3) array
-        Positions of all rows, mm, with the joints before this one unwound.
-    moved : (m,) array
-        Kinematic values of this joint, rad or mm.
-    arcs : list of Arc
-        The arcs of this joint.
-    prismatic : bool
-        Whether the joint slides.
-    where : str
-        The joint, for messages.
+    points : (m, 3) positions of all rows, mm, with the joints before this one unwound
+    moved : (m,) kinematic values of this joint, rad or mm
+    arcs : the arcs of this joint
+    prismatic : whether the joint slides
+    where : the joint, for messages
 
     Raises
     ------
@@ -320,7 +315,7 @@ class _AxisFitting:
         return self.demean(np.moveaxis(values, 2, 0).reshape(k, -1)).reshape(k, 2, -1)
 
     def inverse(self) -> np.ndarray:
-        """Returns the matrix (p, k, 2) that makes the Gauss-Newton step from the residuals."""
+        """Returns the matrix (p, k, 2) by which residuals become the Gauss-Newton step."""
         jacobian = self.jacobian()
         k, _, p = jacobian.shape
         root = np.repeat(np.sqrt(self.weights), 2)
@@ -437,8 +432,8 @@ def _frame(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 def fit_axes(
     data: Measurements, robot: Robot, arcs: list[Arc], virtual: VirtualReflectors | None = None
 ) -> tuple[list[AxisFit], np.ndarray, np.ndarray, list[list[np.ndarray]]]:
-    """Returns the fits in order, each to points with the joints before unwound; the covariance of all; the points with
-    all joints unwound; and for each axis its derivatives by those before it.
+    """Returns the fits in order, their common covariance, the points with all joints unwound, and the derivatives of
+    each axis by the axes before it. Each axis is fitted to points with the joints before it unwound.
 
     The covariance counts a row once, however many sweeps it belongs to, and a pose once for all its reflectors.
     """

@@ -277,7 +277,7 @@ def axes_report(result: AxesResult, where: str) -> Document:
         for name, tool in result.robot.tools.items()
     ]
     axis_heads = ("joint", "arcs", "points", "span", "RMS mm", "mean mm", "length RMS mm", "direction µrad", "place mm")
-    pair_heads = ("joints", "angle °", "σ °", "distance mm", "σ mm", "a mm", "σ mm", "foot m", "σ m", "row")
+    pair_heads = ("joints", "angle °", "σ °", "distance mm", "σ mm", "a mm", "σ mm", "foot m", "σ m", "<row")
     return Document(
         f"Axes of {result.robot.name}",
         where,

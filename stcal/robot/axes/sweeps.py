@@ -41,10 +41,7 @@ def find_arcs(data: Measurements, robot: Robot, still_rad: float = STILL_RAD) ->
     arc; a row may belong to several. Positions a full turn apart are one position of the joint that turns. A joint that
     should stand still must not be a full turn away, where gears and backlash need not repeat.
 
-    Raises
-    ------
-    InputError
-        No positions, a joint that is never swept, or a reflector that does not move.
+    Raises InputError: no positions, a joint that is never swept, or a reflector that does not move.
     """
     if data.positions is None:
         raise InputError(
@@ -186,10 +183,7 @@ def ring(length_mm: float) -> np.ndarray:
     """Returns places (3, 3) at ``length_mm`` from the target's origin; an error of rotation is worth one of position
     there.
 
-    Raises
-    ------
-    InputError
-        A length out of range.
+    Raises InputError: a length out of range.
     """
     if not SHORTEST_MM <= length_mm <= LONGEST_MM:
         raise InputError(
@@ -201,10 +195,7 @@ def ring(length_mm: float) -> np.ndarray:
 def virtual_reflectors(data: Measurements, places: np.ndarray) -> VirtualReflectors:
     """Returns reflectors that each pose carries at ``places`` (k, 3) of its target, mm; k ≥ 3, not in line.
 
-    Raises
-    ------
-    InputError
-        The measurements have no orientations.
+    Raises InputError: the measurements have no orientations.
     """
     if data.rotations is None or data.positions is None:
         raise InputError(

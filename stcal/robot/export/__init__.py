@@ -36,10 +36,7 @@ class Exported:
 def require_form(form: str) -> None:
     """Refuses an unknown form.
 
-    Raises
-    ------
-    InputError
-        The form is unknown; the message names the known ones.
+    Raises InputError: the form is unknown; the message names the known ones.
     """
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
@@ -57,17 +54,13 @@ def exported(
 
     Parameters
     ----------
-    result : Compensated
-    robot : Robot
-        The robot whose joint values these are.
-    form : str
-        One of :data:`~stcal.robot.export.files.FORMS`.
-    path : Path
-        The file. Controllers have its name, without its ending, inside the file too.
-    wanted : {"joints", "poses"}
-        Joint values, or the poses that must be commanded to the controller, which knows the nominal robot.
-    pulses_per_deg : sequence of float, optional
-        Pulses per degree of each joint, for Yaskawa's joint values; without them its file has poses.
+    result : compensated
+    robot : the robot whose joint values these are
+    form : one of :data:`~stcal.robot.export.files.FORMS`
+    path : the file. Controllers have its name, without its ending, inside the file too.
+    wanted : {"joints", "poses"}: joint values, or the poses that must be commanded to the controller, which knows the
+        nominal robot
+    pulses_per_deg : pulses per degree of each joint, for Yaskawa's joint values; without them its file has poses
 
     Raises
     ------

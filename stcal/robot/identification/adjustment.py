@@ -53,35 +53,35 @@ class Weighting:
     factor: float = 1.0
     estimated: tuple[str, ...] = ()
 
-    def whiten(self, values: np.ndarray, seen: Observed) -> np.ndarray:
-        """Returns residuals (r, w) or derivatives (r, w, k) of ``seen`` in units of σ."""
+    def whiten(self, values: np.ndarray, measured: Observed) -> np.ndarray:
+        """Returns residuals (r, w) or derivatives (r, w, k) of ``measured`` in units of σ."""
         flat = values.ndim == 2
         values = values[..., None] if flat else values
         width = values.shape[1]
         if self.given and width > 1:
-            root = self._root(seen, width)
-            values = _decorrelated(np.linalg.solve(root, values), root, seen)
+            root = self._root(measured, width)
+            values = _decorrelated(np.linalg.solve(root, values), root, measured)
         else:
             values = values / self._sigma(width)[:, None]
         return values[..., 0] if flat else values
 
-    def pull(self, white: np.ndarray, seen: Observed) -> np.ndarray:
+    def pull(self, white: np.ndarray, measured: Observed) -> np.ndarray:
         """Returns half the derivative (r, w) by the residuals of the sum of squares of ``white`` (r, w), the output of
         :meth:`whiten`."""
         width = white.shape[1]
         if not (self.given and width > 1):
             return white / self._sigma(width)
-        root = self._root(seen, width)
-        white = _decorrelated(white[..., None], root, seen)
+        root = self._root(measured, width)
+        white = _decorrelated(white[..., None], root, measured)
         return np.linalg.solve(np.swapaxes(root, 1, 2), white)[..., 0]
 
     def _sigma(self, width: int) -> np.ndarray:
         """Returns σ (width,) of the coordinates."""
         return self.factor * np.array([self.sigma_rad] * 3 + [self.sigma_mm] * 3)[-width:]
 
-    def _root(self, seen: Observed, width: int) -> np.ndarray:
+    def _root(self, measured: Observed, width: int) -> np.ndarray:
         """Returns the roots (r, width, width) of the covariances that came with the measurements, times ``factor``."""
-        return self.factor * np.linalg.cholesky(seen.data.own_covariance()[:, -width:, -width:])
+        return self.factor * np.linalg.cholesky(measured.data.own_covariance()[:, -width:, -width:])
 
     def columns(self, width: int) -> dict[str, slice]:
         """Returns the columns among the ``width`` coordinates to which each σ belongs."""
@@ -99,16 +99,16 @@ class Weighting:
         return replace(self, sigma_mm=new["mm"], sigma_rad=new["rad"], factor=new["factor"])
 
 
-def _decorrelated(values: np.ndarray, root: np.ndarray, seen: Observed) -> np.ndarray:
+def _decorrelated(values: np.ndarray, root: np.ndarray, measured: Observed) -> np.ndarray:
     """Whitens values (r, w, k) for the errors that the observations have in common.
 
     All values have σ 1 apart from these errors. They are multiplied by the inverse root of their covariance 1 + F Fᵀ,
     where F is the common errors over ``root`` (r, w, w), rows stacked. What all observations may have in common counts
     less.
     """
-    if seen.data.common is None:
+    if measured.data.common is None:
         return values
-    common = np.linalg.solve(root, seen.data.common[:, -root.shape[1] :])
+    common = np.linalg.solve(root, measured.data.common[:, -root.shape[1] :])
     f = common.reshape(-1, common.shape[2])
     size, directions = np.linalg.eigh(f.T @ f)
     size, directions = size[size > 0], directions[:, size > 0]
@@ -180,7 +180,7 @@ class Solution:
 
 
 def solve(
-    state: State, seen: Observed, weighting: Weighting, robust: bool = True, held: Held | None = None
+    state: State, measured: Observed, weighting: Weighting, robust: bool = True, held: Held | None = None
 ) -> Solution:
     """Minimises the whitened residuals of the observations, from ``state``; ``held`` is linear about it.
 
@@ -191,24 +191,24 @@ def solve(
     ConvergenceError
         No minimum is reached.
     """
-    limit = huber_limit(seen.kind) if robust else np.inf
-    first = _linearised(state, seen, weighting, limit)[0]
+    limit = huber_limit(measured.kind) if robust else np.inf
+    first = _linearised(state, measured, weighting, limit)[0]
     held_normal, pull = np.zeros_like(first.normal), np.zeros(len(first.units))
     conditions, count = np.zeros_like(first.normal), 0
     if held is not None:
         held_normal, pull = held.normal(), held.pull()
         conditions, count = held.conditions(), int(held.fixed.sum())
     _, directions, determined = replace(first, conditions=conditions).spectrum()
-    prior = held_normal + _fixed(first, directions[:, : unseen(seen.kind)])
+    prior = held_normal + _fixed(first, directions[:, : unseen(measured.kind)])
     hold = held_normal + _fixed(first, directions[:, ~determined])  # along undetermined ones valleys bend, and lead far
 
     def kept(away: np.ndarray) -> NormalEquations:
         return NormalEquations(float(away @ (hold @ away + 2 * pull)), hold, hold @ away + pull)
 
     def linearise(at: _Away, bends: bool) -> NormalEquations:
-        fit, gradient = _linearised(at.state, seen, weighting, limit)
+        fit, gradient = _linearised(at.state, measured, weighting, limit)
         straight = NormalEquations(fit.cost, fit.normal, gradient) + kept(at.away)
-        curved = curvature_of(fit, seen, weighting) if bends else None
+        curved = curvature_of(fit, measured, weighting) if bends else None
         if curved is None:
             return straight
         return replace(straight, normal=straight.normal - Bent.of(straight.normal, curved).taken())
@@ -217,8 +217,10 @@ def solve(
         return minimise(
             begin,
             partial(linearise, bends=bends),
-            lambda at, step: _Away(moved(at.state, step, seen.kind), at.away + step),
-            cost=lambda at: _cost(residuals(at.state, seen), seen, weighting, limit) + float(kept(at.away).cost),
+            lambda at, step: _Away(moved(at.state, step, measured.kind), at.away + step),
+            cost=lambda at: (
+                _cost(residuals(at.state, measured), measured, weighting, limit) + float(kept(at.away).cost)
+            ),
             settled=SETTLED,
             least_gain=least_gain,
             max_steps=max_steps,
@@ -230,21 +232,21 @@ def solve(
         fit, accepted = descended(near, True, LEAST_ELASTIC, MAX_STEPS), ACCEPTED_ELASTIC
     else:
         fit, accepted = descended(begin, False, LEAST_GAIN, MAX_STEPS), ACCEPTED
-    fit.required(f"{seen.data.where}: identification", "check the robot file and the outliers", accepted)
-    solution = _linearised(fit.state.state, seen, weighting, limit)[0]
+    fit.required(f"{measured.data.where}: identification", "check the robot file and the outliers", accepted)
+    solution = _linearised(fit.state.state, measured, weighting, limit)[0]
     return replace(solution, prior=prior, conditions=conditions, count=count)
 
 
-def curvature_of(solution: Solution, seen: Observed, weighting: Weighting) -> np.ndarray | None:
+def curvature_of(solution: Solution, measured: Observed, weighting: Weighting) -> np.ndarray | None:
     """Returns what products of compliance and moment take from the normal matrix by second derivatives, (k, k).
 
     Without them, descents along the curved valleys of these products take hundreds of steps. None for rigid arms, and
     for distances, which are nonlinear by themselves.
     """
-    if not solution.state.elastic or seen.kind == "distance":
+    if not solution.state.elastic or measured.kind == "distance":
         return None
-    white = solution.weights[:, None] * weighting.whiten(solution.residuals, seen)
-    elastic = curvature(solution.state, seen, weighting.pull(white, seen))
+    white = solution.weights[:, None] * weighting.whiten(solution.residuals, measured)
+    elastic = curvature(solution.state, measured, weighting.pull(white, measured))
     k, count = len(solution.units), solution.state.elastic_count
     taken = np.zeros((k, k))
     place = slice(k - count, k - count + len(elastic))
@@ -312,16 +314,16 @@ def huber_limit(kind: Kind) -> float:
     return length_limit(WIDTH[kind], 1 - HUBER_LEVEL)
 
 
-def normal_rank(state: State, seen: Observed, weighting: Weighting) -> int:
+def normal_rank(state: State, measured: Observed, weighting: Weighting) -> int:
     """Returns how many parameters these observations determine, at the state where they would be exact."""
-    return _linearised(state, seen, weighting, np.inf)[0].rank()
+    return _linearised(state, measured, weighting, np.inf)[0].rank()
 
 
-def _linearised(state: State, seen: Observed, weighting: Weighting, limit: float) -> tuple[Solution, np.ndarray]:
+def _linearised(state: State, measured: Observed, weighting: Weighting, limit: float) -> tuple[Solution, np.ndarray]:
     """Returns the state with its normal matrix, and half the gradient (k,) of the cost."""
-    errors, derivative = linear(state, seen)
+    errors, derivative = linear(state, measured)
     units = parameter_units(derivative)
-    white, whitened = weighting.whiten(errors, seen), weighting.whiten(derivative, seen)
+    white, whitened = weighting.whiten(errors, measured), weighting.whiten(derivative, measured)
     weights = huber_weights(np.linalg.norm(white, axis=1), limit)
     flat = whitened.reshape(-1, whitened.shape[2])
     weighted = flat * np.repeat(weights, white.shape[1])[:, None]
@@ -341,5 +343,5 @@ def parameter_units(derivative: np.ndarray) -> np.ndarray:
     return np.where(moves > 1e-9, 1 / np.maximum(moves, 1e-9), 1.0)
 
 
-def _cost(found: np.ndarray, seen: Observed, weighting: Weighting, limit: float) -> float:
-    return float(huber_cost(np.linalg.norm(weighting.whiten(found, seen), axis=1), limit).sum())
+def _cost(found: np.ndarray, measured: Observed, weighting: Weighting, limit: float) -> float:
+    return float(huber_cost(np.linalg.norm(weighting.whiten(found, measured), axis=1), limit).sum())

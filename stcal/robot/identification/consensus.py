@@ -73,27 +73,21 @@ class _Problem:
         return ((self.slope @ inverse) * self.slope).sum(2)
 
 
-def agreeing(state: State, seen: Observed, weighting: Weighting) -> np.ndarray:
+def agreeing(state: State, measured: Observed, weighting: Weighting) -> np.ndarray:
     """Returns a mask (r,) of the observations that agree with a solution near ``state``.
 
     All agree if there are too few observations beyond those needed.
 
-    Parameters
-    ----------
-    state : State
-        Start of the search; steps from it are linear.
-    seen : Observed
-        r observations.
-    weighting : Weighting
-        σ of the observations, up to a common factor.
+    ``state`` : start of the search; steps from it are linear; ``measured`` : r observations; ``weighting`` : σ of the
+    observations, up to a common factor.
     """
-    good = every = np.ones(len(seen), bool)
+    good = every = np.ones(len(measured), bool)
     for step in range(ROUNDS):
-        errors, derivative = linear(state, seen)
+        errors, derivative = linear(state, measured)
         units = parameter_units(derivative)
         if step:
-            weighting = _reweighed(weighting, errors, seen)
-        problem = _Problem(weighting.whiten(errors, seen), weighting.whiten(derivative * units, seen))
+            weighting = _reweighed(weighting, errors, measured)
+        problem = _Problem(weighting.whiten(errors, measured), weighting.whiten(derivative * units, measured))
         r, w, k = problem.slope.shape
         half = (r + k // w + 1) // 2 + 1
         if half >= r:
@@ -102,16 +96,16 @@ def agreeing(state: State, seen: Observed, weighting: Weighting) -> np.ndarray:
         searched = step < SEARCHES
         begin = _trimmed(problem, half) if searched else good
         good = _tested(problem, begin, half if searched else None, list(weighting.columns(w).values()))
-        state = moved(state, units * problem.solved(good[None])[0], seen.kind)
+        state = moved(state, units * problem.solved(good[None])[0], measured.kind)
         if not searched and (good == before).all():
             break
     return good
 
 
-def _reweighed(weighting: Weighting, left: np.ndarray, seen: Observed) -> Weighting:
+def _reweighed(weighting: Weighting, left: np.ndarray, measured: Observed) -> Weighting:
     """Returns the weighting with σ from the medians of the residuals ``left`` (r, w), of positions and of
     orientations."""
-    white = weighting.whiten(left, seen)
+    white = weighting.whiten(left, measured)
     medians = {name: float(np.median(np.abs(white[:, at]))) for name, at in weighting.columns(white.shape[1]).items()}
     return weighting.with_values({name: weighting.value(name) * (value or 1.0) for name, value in medians.items()})
 

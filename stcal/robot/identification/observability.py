@@ -39,16 +39,11 @@ class ObservabilityIndices:
 
     Parameters
     ----------
-    o1 : float
-        (σ₁ … σ_L)^(1/L) / √count: the volume of the ellipsoid of uncertainty, D-optimality (Borm & Menq 1989, 1991).
-    o2 : float
-        σ_L / σ₁: inverse condition number (Driels & Pathre 1990).
-    o3 : float
-        σ_L: the combination of parameters that is seen worst, E-optimality (Nahvi, Hollerbach & Hayward 1994).
-    o4 : float
-        σ_L² / σ₁: noise amplification (Nahvi & Hollerbach 1996).
-    o5 : float
-        1 / (1/σ₁ + … + 1/σ_L): harmonic, near to A-optimality (Sun & Hollerbach 2008).
+    o1 : (σ₁ … σ_L)^(1/L) / √count: the volume of the ellipsoid of uncertainty, D-optimality (Borm & Menq 1989, 1991)
+    o2 : σ_L / σ₁: inverse condition number (Driels & Pathre 1990)
+    o3 : σ_L: the combination of parameters that is seen worst, E-optimality (Nahvi, Hollerbach & Hayward 1994)
+    o4 : σ_L² / σ₁: noise amplification (Nahvi & Hollerbach 1996)
+    o5 : 1 / (1/σ₁ + … + 1/σ_L): harmonic, near to A-optimality (Sun & Hollerbach 2008)
     """
 
     o1: float
@@ -62,10 +57,7 @@ class ObservabilityIndices:
         """Returns the indices by the singular values (L,) of the Jacobian of ``count`` poses; all are 0 if one value is
         0.
 
-        Raises
-        ------
-        InputError
-            No singular values, negative ones, or no poses.
+        Raises InputError: no singular values, negative ones, or no poses.
         """
         sigma = np.sort(np.asarray(singular_values, float).ravel())[::-1]
         if not len(sigma) or not np.isfinite(sigma).all() or sigma[-1] < 0 or count < 1:
@@ -106,10 +98,7 @@ def identification_jacobian(
     r is 6 (rotation over σ_rad, translation over σ_mm) or 3 (position over σ_mm), in the world's axes; the k parameters
     are those of :func:`~stcal.robot.identification.residuals.parameter_names`, rad and mm.
 
-    Parameters
-    ----------
-    q : (m, n) array
-        Joint values of the controller, rad or mm.
+    ``q`` : (m, n) joint values of the controller, rad or mm.
     """
     state = State(robot.chain(), {tool: robot.tool(tool)})
     derivative = tip_jacobian(state, q, (tool,) * len(q), observe)[1]

@@ -40,31 +40,30 @@ class Predicted:
     left_mm: float = 0.0
 
     def elsewhere(self) -> float:
-        """Returns σ over the ranges in units of σ at the measured rows (RMS)."""
+        """Returns σ over the joints' ranges as a multiple of σ at the measured rows (RMS)."""
         return _rms(self.ranges_mm) / max(_rms(self.here_mm), 1e-9)
 
 
-def predicted(state: State, robot: Robot, seen: Observed, covariance: np.ndarray) -> Predicted | None:
+def predicted(state: State, robot: Robot, measured: Observed, covariance: np.ndarray) -> Predicted | None:
     """Returns σ for the target of most rows; None for distances, which do not show where the whole arm is.
 
-    Parameters
-    ----------
-    state : State
-        The identified state.
-    robot : Robot
-        The robot with the joints' ranges.
-    seen : Observed
-        The observations.
-    covariance : (k, k) array
-        Covariance of the parameters, rad and mm.
+    ``state`` : the identified state; ``robot`` : the robot with the joints' ranges; ``measured`` : the observations;
+    ``covariance`` : (k, k) covariance of the parameters, rad and mm.
     """
-    if seen.kind == "distance":
+    if measured.kind == "distance":
         return None
-    names = list(dict.fromkeys(seen.data.targets))
-    target = max(names, key=seen.data.targets.count)
+    names = list(dict.fromkeys(measured.data.targets))
+    target = max(names, key=measured.data.targets.count)
 
-    here = _sigma(state, seen.data.q, seen.data.targets, seen.kind, covariance, seen.data.conditions)
-    ranges = _sigma(state, _over_ranges(robot, SAMPLES), (target,) * SAMPLES, seen.kind, covariance)
+    here = _sigma(
+        state,
+        measured.data.q,
+        measured.data.targets,
+        measured.kind,
+        covariance,
+        measured.data.conditions,
+    )
+    ranges = _sigma(state, _over_ranges(robot, SAMPLES), (target,) * SAMPLES, measured.kind, covariance)
     return Predicted(here, ranges, covariance)
 
 
@@ -86,16 +85,9 @@ def predicted_at(found: Predicted, state: State, kind: Kind, q: np.ndarray, targ
 
     It includes the effects that residuals go with, and is nan for tools that were not measured.
 
-    Parameters
-    ----------
-    found : Predicted
-        Prediction of the identification.
-    state, kind
-        The identified state, and the kind of observation that it was identified from.
-    q : (r, n) array
-        Joint values, rad and mm.
-    targets : (r,) sequence of str
-        The tool of each.
+    ``found`` : prediction of the identification; ``state``, ``kind`` : the identified state, and the kind of
+    observation that it was identified from; ``q`` : (r, n) joint values, rad and mm; ``targets`` : (r,) the tool of
+    each.
     """
     sigma, known = np.full(len(q), np.nan), np.array([name in state.tools for name in targets], bool)
     if known.any():
@@ -131,7 +123,12 @@ def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted
 
 
 def doubts(
-    found: Predicted | None, seen: Observed, units: np.ndarray, covariance: np.ndarray, names: list[str], tested: bool
+    found: Predicted | None,
+    measured: Observed,
+    units: np.ndarray,
+    covariance: np.ndarray,
+    names: list[str],
+    tested: bool,
 ) -> tuple[str, ...]:
     """Returns notes on rows that are few, or that cover a small part of the ranges.
 
@@ -139,8 +136,8 @@ def doubts(
     out.
     """
     notes = []
-    numbers = WIDTH[seen.kind] * len(seen)
-    count = f"{len(seen)} {seen.kind}s give {numbers} numbers for {len(names)} parameters"
+    numbers = WIDTH[measured.kind] * len(measured)
+    count = f"{len(measured)} {measured.kind}s give {numbers} numbers for {len(names)} parameters"
     if not tested:
         notes.append(
             f"{count}: none can be held out to test the result, and errors of the same rows say nothing; measure twice "

@@ -175,10 +175,7 @@ DIMENSIONS = ("a", "alpha", "d", "theta", "beta")
 def adjusted(text: str) -> Adjusted:
     """Returns the option for ``text``, names with commas between them; base and tool are always included.
 
-    Raises
-    ------
-    InputError
-        An unknown name.
+    Raises InputError: an unknown name.
     """
     words = {word.strip() for word in text.split(",")}
     if not words <= {"base", "tool", "zeros", "geometry", "all"}:
@@ -373,16 +370,12 @@ def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, 
 
     Parameters
     ----------
-    state : State
-        The identified state.
-    kind : {"pose", "position", "distance"}
-        Kind of the observations: positions tell no orientation of a tool, distances no base.
-    covariance : (k, k) array
-        Covariance of the parameters without elasticity.
-    units : (k,) array
-        Factors that make each parameter a movement of the tool of about 1 mm.
-    nominal : Robot
-        The robot whose file form is used.
+    state : the identified state
+    kind : {"pose", "position", "distance"}: kind of the observations: positions tell no orientation of a tool,
+        distances no base
+    covariance : (k, k) covariance of the parameters without elasticity
+    units : (k,) factors that make each parameter a movement of the tool of about 1 mm
+    nominal : the robot whose file form is used
     """
 
     def poses(at: State) -> Poses:

@@ -78,10 +78,7 @@ def tool_width(kind: Kind) -> int:
 def observed(data: Measurements, kind: Kind | None = None) -> Observed:
     """Returns the measurements as ``kind``, or as the richest kind that they hold.
 
-    Raises
-    ------
-    InputError
-        The measurements do not hold ``kind``.
+    Raises InputError: the measurements do not hold ``kind``.
     """
     richest = "distance" if data.distances is not None else "position" if data.rotations is None else "pose"
     kind = kind or richest
@@ -119,49 +116,49 @@ def tips_of(state: State, data: Measurements) -> Poses:
     return tips(state, data.q, data.targets, data.conditions)
 
 
-def residuals(state: State, seen: Observed) -> np.ndarray:
+def residuals(state: State, measured: Observed) -> np.ndarray:
     """Returns measured minus modelled values, (r, 6), (r, 3) or (r, 1): rad and mm in the axes of the row's station."""
-    return _beside(state, tips_of(state, seen.data), seen)
+    return _beside(state, tips_of(state, measured.data), measured)
 
 
-def jacobian(state: State, seen: Observed) -> np.ndarray:
+def jacobian(state: State, measured: Observed) -> np.ndarray:
     """Returns the derivative of the modelled values by :func:`parameter_names` and the elasticity, (r, 6 or 3 or 1,
     k)."""
-    return linear(state, seen)[1]
+    return linear(state, measured)[1]
 
 
-def linear(state: State, seen: Observed) -> tuple[np.ndarray, np.ndarray]:
+def linear(state: State, measured: Observed) -> tuple[np.ndarray, np.ndarray]:
     """Returns :func:`residuals` and :func:`jacobian`."""
-    tip, full = tip_jacobian(state, seen.data.q, seen.data.targets, seen.kind, seen.data.conditions)
+    tip, full = tip_jacobian(state, measured.data.q, measured.data.targets, measured.kind, measured.data.conditions)
     if len(state.stations) > 1:
-        full = _by_station(state, seen, tip, full)
-    return _beside(state, tip, seen), as_seen(state, seen, tip, full)
+        full = _by_station(state, measured, tip, full)
+    return _beside(state, tip, measured), as_seen(state, measured, tip, full)
 
 
-def curvature(state: State, seen: Observed, pull: np.ndarray) -> np.ndarray:
+def curvature(state: State, measured: Observed, pull: np.ndarray) -> np.ndarray:
     """Returns the second derivative (9 n, 9 n), by compliances and moments, of the sum of ``pull`` (r, 6 or 3) times
     the modelled values."""
-    tip, data = tips_of(state, seen.data), seen.data
-    moves = as_seen(state, seen, tip, np.broadcast_to(np.eye(6), (len(tip), 6, 6)))
+    tip, data = tips_of(state, measured.data), measured.data
+    moves = as_seen(state, measured, tip, np.broadcast_to(np.eye(6), (len(tip), 6, 6)))
     pulls = np.einsum("rw,rwk->rk", pull, moves)
     return elasticity_curvature(state.chain, data.q, tip, data.targets, pulls, data.conditions)
 
 
-def as_seen(state: State, seen: Observed, tip: Poses, moves: np.ndarray) -> np.ndarray:
+def as_seen(state: State, measured: Observed, tip: Poses, moves: np.ndarray) -> np.ndarray:
     """Returns the effect on observations, (r, 6 or 3 or 1, k), of motions ``moves`` (m, 6, k) of the tools at ``tip``.
 
     Motions are rad over mm in the world's axes; their effects are in the axes of the row's station.
     """
     if len(state.stations) > 1:
-        turn = _stations(state, seen.data.stations).rotation[:, None]
+        turn = _stations(state, measured.data.stations).rotation[:, None]
         moves = (turn @ moves.reshape(len(moves), 2, 3, -1)).reshape(moves.shape)
-    if seen.kind == "pose":
+    if measured.kind == "pose":
         return moves
-    if seen.kind == "position":
+    if measured.kind == "position":
         return moves[:, 3:]
-    apart = tip.translation[seen.first] - tip.translation[seen.second]
+    apart = tip.translation[measured.first] - tip.translation[measured.second]
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-12)[:, None]
-    return np.einsum("ri,rik->rk", unit, moves[seen.first, 3:] - moves[seen.second, 3:])[:, None]
+    return np.einsum("ri,rik->rk", unit, moves[measured.first, 3:] - moves[measured.second, 3:])[:, None]
 
 
 def _stations(state: State, names: Sequence[str]) -> Poses:
@@ -170,10 +167,10 @@ def _stations(state: State, names: Sequence[str]) -> Poses:
     return Poses.of(state.stations.values())[[place[name] for name in names]]
 
 
-def _by_station(state: State, seen: Observed, tip: Poses, full: np.ndarray) -> np.ndarray:
+def _by_station(state: State, measured: Observed, tip: Poses, full: np.ndarray) -> np.ndarray:
     """Returns the derivative with the columns of the stations filled in, as small motions of the world."""
-    full, names = full.copy(), np.array(seen.data.stations)
-    offset = len(parameter_names(state, seen.kind)) - 6 * (len(state.stations) - 1)
+    full, names = full.copy(), np.array(measured.data.stations)
+    offset = len(parameter_names(state, measured.kind)) - 6 * (len(state.stations) - 1)
     for s, name in enumerate(list(state.stations)[1:]):
         rows, place = names == name, offset + 6 * s
         full[rows, :3, place : place + 3] = np.eye(3)
@@ -182,16 +179,16 @@ def _by_station(state: State, seen: Observed, tip: Poses, full: np.ndarray) -> n
     return full
 
 
-def _beside(state: State, tip: Poses, seen: Observed) -> np.ndarray:
+def _beside(state: State, tip: Poses, measured: Observed) -> np.ndarray:
     """Returns measured minus modelled values for the poses ``tip`` (m,) of the tools."""
     if len(state.stations) > 1:
-        tip = _stations(state, seen.data.stations) @ tip
-    if seen.kind == "pose":
-        return seen.data.poses().difference(tip)
-    if seen.kind == "position":
-        return seen.data.points() - tip.translation
-    apart = tip.translation[seen.first] - tip.translation[seen.second]
-    return (seen.values - np.linalg.norm(apart, axis=1))[:, None]
+        tip = _stations(state, measured.data.stations) @ tip
+    if measured.kind == "pose":
+        return measured.data.poses().difference(tip)
+    if measured.kind == "position":
+        return measured.data.points() - tip.translation
+    apart = tip.translation[measured.first] - tip.translation[measured.second]
+    return (measured.values - np.linalg.norm(apart, axis=1))[:, None]
 
 
 def tip_jacobian(
@@ -237,10 +234,15 @@ def moved(state: State, step: np.ndarray, kind: Kind) -> State:
     return replace(state, chain=chain, tools=tools, stations=stations)
 
 
-def only_of(seen: Observed, keep: np.ndarray) -> Observed:
+def only_of(measured: Observed, keep: np.ndarray) -> Observed:
     """Returns the observations at the indices, or of the mask (r,), ``keep``."""
-    if seen.kind == "distance":
-        return replace(seen, first=seen.first[keep], second=seen.second[keep], values=seen.values[keep])
-    data = seen.data[keep]
+    if measured.kind == "distance":
+        return replace(
+            measured,
+            first=measured.first[keep],
+            second=measured.second[keep],
+            values=measured.values[keep],
+        )
+    data = measured.data[keep]
     rows = np.arange(len(data))
-    return replace(seen, data=data, first=rows, second=rows)
+    return replace(measured, data=data, first=rows, second=rows)

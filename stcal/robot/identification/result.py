@@ -265,10 +265,8 @@ def position_errors(found: np.ndarray) -> np.ndarray:
 def require_identified_written(path: Path | str, result: Identified) -> None:
     """Read a written robot file again, and require that it predicts the residuals that were reported.
 
-    Raises
-    ------
-    ConvergenceError
-        The file cannot be read again, or residuals of the measurements by it differ from those of the result.
+    Raises ConvergenceError: the file cannot be read again, or residuals of the measurements by it differ from those of
+    the result.
     """
 
     def again() -> np.ndarray:

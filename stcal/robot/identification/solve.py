@@ -175,22 +175,22 @@ def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None =
 
 
 def _modelled(
-    robot: Robot, first: State, seen: Observed, options: IdentifyOptions, rows: NominalRows
+    robot: Robot, first: State, measured: Observed, options: IdentifyOptions, rows: NominalRows
 ) -> tuple[Adjustment, HeldOutRows | None, Gain | None]:
     """Returns the adjustment by the requested model, or by the one that predicts better by more than chance; with its
     held-out errors, and the gain if both were tried."""
-    rigid = _adjusted(first, seen, options, rows)
+    rigid = _adjusted(first, measured, options, rows)
     if options.model == "rigid":
-        return rigid, _cross_validated(robot, seen, rigid, options), None
-    _undetermined(rigid.solution, parameter_names(first, seen.kind), seen, options.partial)
-    conditions = seen.data.conditions
+        return rigid, _cross_validated(robot, measured, rigid, options), None
+    _undetermined(rigid.solution, parameter_names(first, measured.kind), measured, options.partial)
+    conditions = measured.data.conditions
     state = bending(rigid.solution.state, robot, rigid.deviations.axis_rad, conditions)
-    carried, units = carries(state.chain, conditions), parameter_units(jacobian(state, seen))
+    carried, units = carries(state.chain, conditions), parameter_units(jacobian(state, measured))
     rows = NominalRows.about(state, units, robot, options.adjust, carried)
     good = rigid.solution.weights >= GROSS
     good |= good.mean() < MOSTLY_GOOD
-    elastic = _without_errors(state, seen, good, options, (rows, rigid.weighting, rigid.deviations))
-    held_out = [_cross_validated(robot, seen, each, options) for each in (rigid, elastic)]
+    elastic = _without_errors(state, measured, good, options, (rows, rigid.weighting, rigid.deviations))
+    held_out = [_cross_validated(robot, measured, each, options) for each in (rigid, elastic)]
     if held_out[0] is None or held_out[1] is None:
         return (elastic, None, None) if options.model == "elastic" else (rigid, None, None)
     gain = Gain.between(held_out[0], held_out[1])
@@ -219,53 +219,53 @@ def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
             )
 
 
-def _enough(seen: Observed, state: State, rows: NominalRows) -> None:
-    seeks = len(parameter_names(state, seen.kind)) - unseen(seen.kind) - int(rows.fixed.sum())
-    numbers = WIDTH[seen.kind] * len(seen)
+def _enough(measured: Observed, state: State, rows: NominalRows) -> None:
+    seeks = len(parameter_names(state, measured.kind)) - unseen(measured.kind) - int(rows.fixed.sum())
+    numbers = WIDTH[measured.kind] * len(measured)
     if numbers <= seeks:
-        needed = seeks // WIDTH[seen.kind] + 1
+        needed = seeks // WIDTH[measured.kind] + 1
         raise DegenerateError(
             "E-IDENTIFY-FEW",
-            f"{seen.data.where}: {len(seen)} {seen.kind}s give {numbers} numbers for {seeks} parameters; "
+            f"{measured.data.where}: {len(measured)} {measured.kind}s give {numbers} numbers for {seeks} parameters; "
             f"{needed} or more needed, better twice that",
         )
 
 
-def _weighting(state: State, seen: Observed, options: IdentifyOptions) -> Weighting:
+def _weighting(state: State, measured: Observed, options: IdentifyOptions) -> Weighting:
     """Returns the weighting at the start, and which σ are estimated from the residuals.
 
     Where σ of all coordinates are given, they are weights, times σ₀. Where one of two σ is given, it is taken as it is.
     The others start at the misfit, so that no observation is an outlier at the start.
     """
     sigma = {"mm": options.sigma_mm, "rad": options.sigma_rad}
-    needed = ("rad", "mm") if seen.kind == "pose" else ("mm",)
+    needed = ("rad", "mm") if measured.kind == "pose" else ("mm",)
     missing = tuple(name for name in needed if sigma[name] is None)
-    with_covariances = seen.data.covariance is not None and seen.kind != "distance" and missing == needed
+    with_covariances = measured.data.covariance is not None and measured.kind != "distance" and missing == needed
     estimated = ("factor",) if with_covariances or not missing else missing
     weighting = Weighting(
         options.sigma_mm or LEAST_MM, options.sigma_rad or LEAST_RAD, with_covariances, estimated=estimated
     )
-    white = weighting.whiten(residuals(state, seen), seen)
+    white = weighting.whiten(residuals(state, measured), measured)
     misfit = {name: float(np.median(np.abs(white[:, c]))) for name, c in weighting.columns(white.shape[1]).items()}
     return weighting.with_values({n: weighting.value(n) * max(misfit[n], 1.0) for n in estimated})
 
 
-def _with_all(robot: Robot, first: State, seen: Observed, options: IdentifyOptions) -> HeldOutRows | None:
+def _with_all(robot: Robot, first: State, measured: Observed, options: IdentifyOptions) -> HeldOutRows | None:
     """Returns the held-out errors of a rigid arm with all dimensions adjusted."""
     free = replace(robot, joints=tuple(replace(joint, fixed={}) for joint in robot.joints))
-    rows = NominalRows.about(first, parameter_units(jacobian(first, seen)), free)
-    return _cross_validated(robot, seen, _adjusted(first, seen, options, rows), options)
+    rows = NominalRows.about(first, parameter_units(jacobian(first, measured)), free)
+    return _cross_validated(robot, measured, _adjusted(first, measured, options, rows), options)
 
 
-def _adjusted(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> Adjustment:
+def _adjusted(state: State, measured: Observed, options: IdentifyOptions, rows: NominalRows) -> Adjustment:
     """Solves with the observations that agree, and estimates σ."""
-    good = np.ones(len(seen), bool)
+    good = np.ones(len(measured), bool)
     if options.robust:
-        good = agreeing(state, seen, _weighting(state, seen, options))
+        good = agreeing(state, measured, _weighting(state, measured, options))
         good |= good.mean() < MOSTLY_GOOD
-    consistent = seen if good.all() else only_of(seen, good)
+    consistent = measured if good.all() else only_of(measured, good)
     state, weighting = _by_medians(state, consistent, options, rows)
-    return _without_errors(state, seen, good, options, (rows, weighting, Deviations()))
+    return _without_errors(state, measured, good, options, (rows, weighting, Deviations()))
 
 
 Known = tuple[NominalRows, Weighting, Deviations]
@@ -274,7 +274,7 @@ Known = tuple[NominalRows, Weighting, Deviations]
 
 def _without_errors(
     state: State,
-    seen: Observed,
+    measured: Observed,
     good: np.ndarray,
     options: IdentifyOptions,
     known: Known,
@@ -286,11 +286,11 @@ def _without_errors(
     pull, but each outlier pulls as hard as the worst honest observation, and no covariance shows it.
     """
     for _ in range(OUTLIER_ROUNDS + 1):
-        adjustment = _settled(state, seen if good.all() else only_of(seen, good), options, known, rounds)
+        adjustment = _settled(state, measured if good.all() else only_of(measured, good), options, known, rounds)
         if not good.all():
-            errors = residuals(adjustment.solution.state, seen)
-            length = np.linalg.norm(adjustment.weighting.whiten(errors, seen), axis=1)
-            weights = huber_weights(length, huber_limit(seen.kind))
+            errors = residuals(adjustment.solution.state, measured)
+            length = np.linalg.norm(adjustment.weighting.whiten(errors, measured), axis=1)
+            weights = huber_weights(length, huber_limit(measured.kind))
             adjustment = replace(adjustment, solution=replace(adjustment.solution, residuals=errors, weights=weights))
         if not _errors_change(adjustment, good):
             return adjustment
@@ -307,24 +307,26 @@ def _errors_change(found: Adjustment, good: np.ndarray) -> bool:
     return bool((now != good).any() and now.mean() >= MOSTLY_GOOD)
 
 
-def _by_medians(state: State, seen: Observed, options: IdentifyOptions, rows: NominalRows) -> tuple[State, Weighting]:
+def _by_medians(
+    state: State, measured: Observed, options: IdentifyOptions, rows: NominalRows
+) -> tuple[State, Weighting]:
     """Returns the state, and σ by medians, which outliers do not move, iterated until they stay."""
-    weighting = _weighting(state, seen, options)
+    weighting = _weighting(state, measured, options)
     for _ in range(VARIANCE_ROUNDS):
-        state = solve(state, seen, weighting, options.robust, rows.held(state, Deviations(), seen.kind)).state
-        before, weighting = weighting, _weighting(state, seen, options)
+        state = solve(state, measured, weighting, options.robust, rows.held(state, Deviations(), measured.kind)).state
+        before, weighting = weighting, _weighting(state, measured, options)
         if all(weighting.value(n) > FALLS * before.value(n) for n in weighting.estimated):
             break
     return state, weighting
 
 
-def _settled(state: State, seen: Observed, options: IdentifyOptions, known: Known, rounds: int) -> Adjustment:
+def _settled(state: State, measured: Observed, options: IdentifyOptions, known: Known, rounds: int) -> Adjustment:
     """Solves and estimates σ in turns."""
     rows, weighting, deviations = known
     relaxation = Relaxation()
     for _ in range(rounds):
-        solution = solve(state, seen, weighting, options.robust, rows.held(state, deviations, seen.kind))
-        parts = components(solution, seen, weighting, options.robust, rows, deviations)
+        solution = solve(state, measured, weighting, options.robust, rows.held(state, deviations, measured.kind))
+        parts = components(solution, measured, weighting, options.robust, rows, deviations)
         best = parts.best()
         change = float(np.abs(best).max())
         if change < VARIANCE_SETTLED:
@@ -335,11 +337,11 @@ def _settled(state: State, seen: Observed, options: IdentifyOptions, known: Know
     return Adjustment(solution, weighting, deviations, rows, parts, (note,) if change > VARIANCE_UNSETTLED else ())
 
 
-def _undetermined(solution: Solution, names: list[str], seen: Observed, partial: bool) -> tuple[str, ...]:
+def _undetermined(solution: Solution, names: list[str], measured: Observed, partial: bool) -> tuple[str, ...]:
     """Returns the directions that the data leave open, named by their parameters, beyond those that distances never
     show."""
     _, directions, determined = solution.spectrum()
-    expected = unseen(seen.kind)
+    expected = unseen(measured.kind)
     if (~determined).sum() <= expected:
         return ()
     open_directions = directions_named(directions[:, ~determined][:, expected:], names)
@@ -347,7 +349,7 @@ def _undetermined(solution: Solution, names: list[str], seen: Observed, partial:
         first = ", ".join(open_directions[:4]) + (" …" if len(open_directions) > 4 else "")
         raise DegenerateError(
             "E-IDENTIFY-UNDETERMINED",
-            f"{seen.data.where}: the data determine {solution.rank()} of {len(names) - expected - solution.count} "
+            f"{measured.data.where}: the data determine {solution.rank()} of {len(names) - expected - solution.count} "
             "parameters, open are "
             f"{first}; measure more varied poses (`stcal robot design`), or keep the nominal values of these with "
             "--partial",
@@ -376,55 +378,59 @@ def _ranks(state: State, data: Measurements) -> dict[str, int]:
     return ranks
 
 
-def _observability(robot: Robot, adjusted: Adjustment, seen: Observed, rank: int) -> ObservabilityIndices:
+def _observability(robot: Robot, adjusted: Adjustment, measured: Observed, rank: int) -> ObservabilityIndices:
     state, weighting = adjusted.solution.state, adjusted.weighting
-    scale = parameter_scale(robot, seen.kind, state.tools)
-    rows = weighting.whiten(jacobian(state, seen)[:, :, : len(scale)], seen) * scale
-    if seen.frameless:  # remove what a motion of all points of a station can produce
+    scale = parameter_scale(robot, measured.kind, state.tools)
+    rows = weighting.whiten(jacobian(state, measured)[:, :, : len(scale)], measured) * scale
+    if measured.frameless:  # remove what a motion of all points of a station can produce
         blocks = []
-        for rows_of_station in seen.data.by_station().values():
-            lever = (seen.data.points() - seen.data.points()[rows_of_station].mean(0)) * rows_of_station[:, None]
+        for rows_of_station in measured.data.by_station().values():
+            lever = (measured.data.points() - measured.data.points()[rows_of_station].mean(0)) * rows_of_station[
+                :, None
+            ]
             shift = np.eye(3) * rows_of_station[:, None, None]
             blocks.append(np.concatenate([-skew(lever) / np.linalg.norm(lever), shift], axis=2))
         motions = np.concatenate(blocks, axis=2)
-        u, s, _ = np.linalg.svd(weighting.whiten(motions, seen).reshape(-1, motions.shape[2]), full_matrices=False)
+        u, s, _ = np.linalg.svd(weighting.whiten(motions, measured).reshape(-1, motions.shape[2]), full_matrices=False)
         u, flat = u[:, s > 1e-9 * s[0]], rows.reshape(-1, rows.shape[2])
         rows = (flat - u @ (u.T @ flat)).reshape(rows.shape)
     return ObservabilityIndices.of_jacobian(rows, rank)
 
 
-def _place(seen: Observed) -> int:
+def _place(measured: Observed) -> int:
     """Returns the number of directions in which positions that count by their distances can be moved together: 6 per
     station (5 for points on a line)."""
-    if not seen.frameless:
+    if not measured.frameless:
         return 0
     directions = 0
-    for rows in seen.data.by_station().values():
-        at = seen.data.points()[rows] - seen.data.points()[rows].mean(0)
+    for rows in measured.data.by_station().values():
+        at = measured.data.points()[rows] - measured.data.points()[rows].mean(0)
         directions += 3 + int(np.linalg.matrix_rank(skew(at).reshape(-1, 3), tol=STILL_MM))
     return directions
 
 
-def _covariance(adjusted: Adjustment, seen: Observed) -> np.ndarray:
+def _covariance(adjusted: Adjustment, measured: Observed) -> np.ndarray:
     """Returns the covariance (k, k) of the parameters; 0 along the directions that distances never show, which stay as
     they were."""
     covariance = adjusted.parts.covariance(np.zeros(len(adjusted.parts.least)))
-    if seen.kind != "distance":
+    if measured.kind != "distance":
         return covariance
     units = adjusted.solution.units
-    blind = adjusted.solution.spectrum()[1][:, : unseen(seen.kind)]
+    blind = adjusted.solution.spectrum()[1][:, : unseen(measured.kind)]
     blind = np.pad(blind, ((0, len(units) - len(blind)), (0, 0)))
     projector = (np.eye(len(units)) - blind @ blind.T) * units[:, None] / units
     return projector @ covariance @ projector.T
 
 
-def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: IdentifyOptions) -> HeldOutRows | None:
+def _cross_validated(
+    robot: Robot, measured: Observed, whole: Adjustment, options: IdentifyOptions
+) -> HeldOutRows | None:
     """Returns errors of rows that took no part in the parameters; None if the rows are too few.
 
     Where rows are few, held-out rows take no part in the σ and in the search for gross errors either. Descents start at
     the solution of all rows: the minimum is the same from everywhere, and near.
     """
-    rows = len(seen)
+    rows = len(measured)
     if min(options.folds, rows) < LEAST_FOLDS:
         return None
     repeats = options.repeats or (REPEATS if rows <= FEW_ROWS else 1)
@@ -435,30 +441,30 @@ def _cross_validated(robot: Robot, seen: Observed, whole: Adjustment, options: I
     for repeat in range(repeats):
         for test_rows in dealt(rows, options.folds, rng):
             train_rows = np.setdiff1d(np.arange(rows), test_rows)
-            train, test = only_of(seen, train_rows), only_of(seen, test_rows)
+            train, test = only_of(measured, train_rows), only_of(measured, test_rows)
             state = _of_targets(whole.solution.state, train)
-            seeks = len(parameter_names(state, seen.kind)) - unseen(seen.kind) - whole.solution.count
-            if WIDTH[seen.kind] * len(train) <= seeks:
+            seeks = len(parameter_names(state, measured.kind)) - unseen(measured.kind) - whole.solution.count
+            if WIDTH[measured.kind] * len(train) <= seeks:
                 return None
             if rows <= FEW_ROWS:
                 state = _without_errors(state, train, good[train_rows], options, begin, FOLD_ROUNDS).solution.state
             else:
-                held = whole.rows.held(state, whole.deviations, seen.kind)
+                held = whole.rows.held(state, whole.deviations, measured.kind)
                 state = solve(state, train, whole.weighting, options.robust, held).state
-            if seen.kind != "distance":
+            if measured.kind != "distance":
                 named = zip(test.data.targets, test.data.stations, strict=True)
                 known = np.array([target in state.tools and station in state.stations for target, station in named])
                 test, test_rows = only_of(test, known), test_rows[known]
             errors = residuals(state, test)
             position[repeat, test_rows] = position_errors(errors)
-            if seen.kind == "pose":
+            if measured.kind == "pose":
                 rotation[repeat, test_rows] = np.linalg.norm(errors[:, :3], axis=1)
     return HeldOutRows(min(options.folds, rows), position, rotation)
 
 
-def _of_targets(state: State, seen: Observed) -> State:
-    """Returns the state with the tools and stations that ``seen`` shows, and the first station."""
-    tools = {name: tool for name, tool in state.tools.items() if name in seen.data.targets}
+def _of_targets(state: State, measured: Observed) -> State:
+    """Returns the state with the tools and stations that ``measured`` shows, and the first station."""
+    tools = {name: tool for name, tool in state.tools.items() if name in measured.data.targets}
     first = next(iter(state.stations))
-    stations = {name: each for name, each in state.stations.items() if name in {first, *seen.data.stations}}
+    stations = {name: each for name, each in state.stations.items() if name in {first, *measured.data.stations}}
     return replace(state, tools=tools, stations=stations)

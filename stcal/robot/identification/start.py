@@ -54,21 +54,12 @@ reach."""
 def start(robot: Robot, data: Measurements, fit: Fit = BOTH) -> State:
     """Returns the nominal chain with its base in the instrument's frame, and the tools that fit the measurements best.
 
-    Parameters
-    ----------
-    robot : Robot
-        The robot. Its axes are taken as they are, and so are base and tools unless they are fitted.
-    data : Measurements
-        The measurements of the instrument.
-    fit : frozenset of {"base", "tool"}
-        What is fitted to the measurements; both if not given.
+    ``robot`` : the robot. Its axes are taken as they are, and so are base and tools unless they are fitted. ``data`` :
+    the measurements of the instrument; ``fit`` : frozenset of {"base", "tool"}: what is fitted to the measurements;
+    both if not given.
 
-    Raises
-    ------
-    InputError
-        The nominal robot does not fit the data; the message names a cause if its correction makes the robot fit.
-    DegenerateError
-        A target never moved, or only along a line.
+    Raises InputError: the nominal robot does not fit the data; the message names a cause if its correction makes the
+    robot fit. Raises DegenerateError: a target never moved, or only along a line.
     """
     if data.positions is not None and len(set(data.stations)) > 1:
         return _with_stations(robot, data)

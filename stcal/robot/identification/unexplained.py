@@ -34,21 +34,14 @@ class Finding:
 
     Parameters
     ----------
-    what : str
-        Name of the effect: "the angle of joint 3, once a turn".
-    effect_mm, effect_rad : float
-        Amplitude in the residuals of position and of orientation (0 if there are none) if the effect is periodic, else
-        RMS.
-    joint, turns : int
-        Number of the joint, and number of periods in one turn of it; 0 where there is none.
-    share : float
-        Share of the squared residuals (weighted as in the fit) that the effect explains.
-    p : float
-        Probability of such an effect by chance, times the number of tests.
-    line : int, optional
-        Line of the first row after a jump along the order of the rows; ``effect_mm`` and ``effect_rad`` are its size.
-    advice : str
-        What to do about it; empty for effects of the robot.
+    what : name of the effect: "the angle of joint 3, once a turn"
+    effect_mm, effect_rad : amplitude in the residuals of position and of orientation (0 if there are none) if the
+        effect is periodic, else RMS
+    joint, turns : number of the joint, and number of periods in one turn of it; 0 where there is none
+    share : share of the squared residuals (weighted as in the fit) that the effect explains
+    p : probability of such an effect by chance, times the number of tests
+    line : line of the first row after a jump along the order of the rows; ``effect_mm`` and ``effect_rad`` are its size
+    advice : what to do about it; empty for effects of the robot
     """
 
     what: str
@@ -73,7 +66,7 @@ class Finding:
 def left(
     state: State,
     world_from_base: Rigid,
-    seen: Observed,
+    measured: Observed,
     weighting: Weighting,
     explained: np.ndarray,
     weights: np.ndarray | None = None,
@@ -89,38 +82,32 @@ def left(
 
     Parameters
     ----------
-    state : State
-        Chain and tools, as fitted or given.
-    world_from_base : Rigid
-        Pose of the base, for up, the axes and the place.
-    seen : Observed
-        r observations.
-    weighting : Weighting
-        σ of the observations, up to a common factor.
-    explained : (r, w, k) array
-        Derivatives by the parameters that were fitted to these observations.
-    weights : (r,) array, optional
-        Weights of the observations; those below 0.5 are errors and left out.
+    state : chain and tools, as fitted or given
+    world_from_base : pose of the base, for up, the axes and the place
+    seen : r observations
+    weighting : σ of the observations, up to a common factor
+    explained : (r, w, k) derivatives by the parameters that were fitted to these observations
+    weights : (r,) weights of the observations; those below 0.5 are errors and left out
 
     Returns
     -------
     tuple of Finding, or None
         The strongest first, at most three; None if the observations are too few to tell.
     """
-    errors = residuals(state, seen)
-    candidates, order = _candidates(state, seen, world_from_base), _order(state, seen)
-    explained = np.concatenate([explained, _shared(state, seen)], axis=2)
+    errors = residuals(state, measured)
+    candidates, order = _candidates(state, measured, world_from_base), _order(state, measured)
+    explained = np.concatenate([explained, _shared(state, measured)], axis=2)
     good = np.ones(len(errors), bool) if weights is None else weights >= GROSS
     root = np.sqrt(np.ones(len(errors)) if weights is None else weights) * good
-    rest = _Rest.of(errors, explained, candidates, weighting, seen, root)
+    rest = _Rest.of(errors, explained, candidates, weighting, measured, root)
     findings: list[Finding] = []
     while len(findings) < MOST:
-        moved = _moved_meanwhile(order, errors, explained, weighting, seen, len(candidates) + len(order))
+        moved = _moved_meanwhile(order, errors, explained, weighting, measured, len(candidates) + len(order))
         found = rest.strongest(len(order))
         if moved is not None and (found is None or moved.log_p < found[0].log_p):
             findings.append(moved.finding)
             explained = np.concatenate([explained, moved.motions], axis=2)
-            rest = _Rest.of(errors, explained, candidates, weighting, seen, moved.good.astype(float))
+            rest = _Rest.of(errors, explained, candidates, weighting, measured, moved.good.astype(float))
         elif found is not None:
             findings.append(found[0].finding)
             explained = np.concatenate([explained, found[1].motions], axis=2)
@@ -163,13 +150,13 @@ class _Rest:
         explained: np.ndarray,
         candidates: list["_Candidate"],
         weighting: Weighting,
-        seen: Observed,
+        measured: Observed,
         root: np.ndarray,
     ) -> "_Rest":
         """Returns what is left of ``errors`` (r, w); ``root`` : (r,) roots of the weights, 0 for rows left out."""
 
         def white(values: np.ndarray) -> np.ndarray:
-            return (root[:, None, None] * weighting.whiten(values, seen)).reshape(errors.size, -1)
+            return (root[:, None, None] * weighting.whiten(values, measured)).reshape(errors.size, -1)
 
         good = root > 0
         fitted = _basis(_unit(white(explained)), SAME)
@@ -267,16 +254,16 @@ def _basis(values: np.ndarray, least: float) -> np.ndarray:
     return u[:, s > least]
 
 
-def _shared(state: State, seen: Observed) -> np.ndarray:
+def _shared(state: State, measured: Observed) -> np.ndarray:
     """Returns shifts (r, w, c) of positions from which several distances start. The error of such a position is in all
     of its distances, as if they went with place."""
-    starts = [row for row in np.unique(seen.second) if (seen.second == row).sum() >= SHARED]
-    if seen.kind != "distance" or not starts:
-        return np.zeros((len(seen), WIDTH[seen.kind], 0))
-    place = tips_of(state, seen.data).translation
-    away = place[seen.first] - place[seen.second]
+    starts = [row for row in np.unique(measured.second) if (measured.second == row).sum() >= SHARED]
+    if measured.kind != "distance" or not starts:
+        return np.zeros((len(measured), WIDTH[measured.kind], 0))
+    place = tips_of(state, measured.data).translation
+    away = place[measured.first] - place[measured.second]
     away /= np.maximum(np.linalg.norm(away, axis=1), 1e-12)[:, None]
-    return np.concatenate([away * (seen.second == row)[:, None] for row in starts], axis=1)[:, None]
+    return np.concatenate([away * (measured.second == row)[:, None] for row in starts], axis=1)[:, None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -293,31 +280,31 @@ class _Order:
 DRIFTS = "let the instrument warm up, and measure a fixed point now and then"
 
 
-def _order(state: State, seen: Observed) -> list[_Order]:
+def _order(state: State, measured: Observed) -> list[_Order]:
     """Returns what may move during the measurements; none for distances, which no frame enters."""
-    if seen.used == "distance":
+    if measured.used == "distance":
         return []
-    tip, data = tips_of(state, seen.data), seen.data
+    tip, data = tips_of(state, measured.data), measured.data
     frame = np.zeros((len(tip), 6, 6))
     frame[:, :3, :3] = frame[:, 3:, 3:] = np.eye(3)
     frame[:, 3:, :3] = -skew(tip.translation - tip.translation.mean(0))
     advice = "name these rows another station (column station), or measure again"
-    order = [_Order("the instrument or the robot's base elsewhere", 0, as_seen(state, seen, tip, frame), advice)]
+    order = [_Order("the instrument or the robot's base elsewhere", 0, as_seen(state, measured, tip, frame), advice)]
     for name in dict.fromkeys(data.targets):
         on_flange = np.zeros((len(tip), 6, 6))
         on_flange[:, :3, :3] = on_flange[:, 3:, 3:] = tip.rotation
         on_flange *= np.array([each == name for each in data.targets])[:, None, None]
-        on_flange = on_flange if seen.kind == "pose" else on_flange[..., 3:]
+        on_flange = on_flange if measured.kind == "pose" else on_flange[..., 3:]
         what = f"target {name} elsewhere on its flange" if name else "the target elsewhere on its flange"
         advice = "name these rows another target (column target), or measure again"
-        order.append(_Order(what, 0, as_seen(state, seen, tip, on_flange), advice))
+        order.append(_Order(what, 0, as_seen(state, measured, tip, on_flange), advice))
     turned, origins = joint_frames(state.chain, data.q, data.conditions)
     carries = state.chain.carries(data.targets)
     for i, (z, origin) in enumerate(zip(turned[..., 2], origins, strict=True)):
         turn, shift = (0 * z, z) if state.chain.prismatic[i] else (z, np.cross(z, tip.translation - origin))
         motions = np.hstack([turn, shift])[:, :, None] * carries[i, :, None, None]
         what, advice = f"the zero of joint {i + 1} another one", "look whether it slipped, and measure again"
-        order.append(_Order(what, i + 1, as_seen(state, seen, tip, motions), advice))
+        order.append(_Order(what, i + 1, as_seen(state, measured, tip, motions), advice))
     return order
 
 
@@ -331,11 +318,16 @@ class _Moved(_Found):
 
 
 def _moved_meanwhile(
-    order: list[_Order], errors: np.ndarray, explained: np.ndarray, weighting: Weighting, seen: Observed, tests: int
+    order: list[_Order],
+    errors: np.ndarray,
+    explained: np.ndarray,
+    weighting: Weighting,
+    measured: Observed,
+    tests: int,
 ) -> _Moved | None:
     """Returns the jump or the drift along the order of the rows; None if there is none beyond chance."""
-    white = weighting.whiten(errors, seen), weighting.whiten(explained, seen)
-    changes = changes_along(*white, [weighting.whiten(each.motions, seen) for each in order])
+    white = weighting.whiten(errors, measured), weighting.whiten(explained, measured)
+    changes = changes_along(*white, [weighting.whiten(each.motions, measured) for each in order])
     found = [(each, change) for each, change in zip(order, changes, strict=True) if change is not None]
     if not found:
         return None
@@ -344,7 +336,7 @@ def _moved_meanwhile(
     mm, rad = _size(moved, change)
     if log_p > np.log(LEVEL) or change.share < LEAST_SHARE or (mm < LEAST_MM and rad < LEAST_RAD):
         return None
-    lines = [int(seen.data.lines[row]) for row in seen.first]
+    lines = [int(measured.data.lines[row]) for row in measured.first]
     if change.kind == "drift":
         what, line, advice = f"the order of the rows, {moved.what} by and by", None, DRIFTS
     else:
@@ -357,11 +349,11 @@ def _moved_meanwhile(
     return _Moved(finding, log_p, change.moves[:, None, None] * moved.motions, change.good)
 
 
-def moved_meanwhile(state: State, seen: Observed, share: float = 0.0) -> Finding | None:
+def moved_meanwhile(state: State, measured: Observed, share: float = 0.0) -> Finding | None:
     """Returns the jump or the drift along the order of the rows beside all parameters of an arm, each row of the same
     σ; None if there is none beyond chance, or it explains no more than ``share`` of the squares."""
-    order, one = _order(state, seen), Weighting(1.0, 1.0)
-    found = _moved_meanwhile(order, residuals(state, seen), jacobian(state, seen), one, seen, len(order))
+    order, one = _order(state, measured), Weighting(1.0, 1.0)
+    found = _moved_meanwhile(order, residuals(state, measured), jacobian(state, measured), one, measured, len(order))
     return found.finding if found is not None and found.finding.share > share else None
 
 
@@ -374,8 +366,8 @@ def _size(moved: _Order, change: Change) -> tuple[float, float]:
     return float(np.sqrt((as_measured**2).mean())), turned
 
 
-def _candidates(state: State, seen: Observed, world_from_base: Rigid) -> list[_Candidate]:
-    chain, data = state.chain, seen.data
+def _candidates(state: State, measured: Observed, world_from_base: Rigid) -> list[_Candidate]:
+    chain, data = state.chain, measured.data
     tip = tips_of(state, data)
     turned, origins = joint_frames(chain, data.q, data.conditions)
     base, place = world_from_base.rotation, world_from_base.inverse() @ tip.translation
@@ -387,7 +379,7 @@ def _candidates(state: State, seen: Observed, world_from_base: Rigid) -> list[_C
     def add(what: str, motions: np.ndarray, joint: int = 0, turns: int = 0) -> None:
         if joint:
             motions = motions * carries[joint - 1, :, None, None]
-        candidates.append(_Candidate(what, joint, turns, as_seen(state, seen, tip, motions)))
+        candidates.append(_Candidate(what, joint, turns, as_seen(state, measured, tip, motions)))
 
     for i, (z, origin) in enumerate(zip(turned[..., 2], origins, strict=True)):
         joint, arm = i + 1, tip.translation - origin

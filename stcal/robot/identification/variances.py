@@ -100,14 +100,19 @@ def _rule(width: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def components(
-    solution: Solution, seen: Observed, weighting: Weighting, robust: bool, rows: NominalRows, deviations: Deviations
+    solution: Solution,
+    measured: Observed,
+    weighting: Weighting,
+    robust: bool,
+    rows: NominalRows,
+    deviations: Deviations,
 ) -> Components:
     """Returns the parts of an adjustment: those of the data whose σ is estimated, then the groups of the robot's
     dimensions."""
     units = solution.units
-    white = weighting.whiten(solution.residuals, seen)
-    derivative = weighting.whiten(jacobian(solution.state, seen), seen) * units
-    huber_share = _kept(seen.kind) if robust else 1.0
+    white = weighting.whiten(solution.residuals, measured)
+    derivative = weighting.whiten(jacobian(solution.state, measured), measured) * units
+    huber_share = _kept(measured.kind) if robust else 1.0
     honest = solution.weights >= GROSS
     honest |= honest.mean() < 0.5
     # σ scales the square of the residual cut off at Huber's limit, (w e)²; the rest of w e² does not depend on σ.
@@ -123,7 +128,7 @@ def components(
             fixed = fixed + _linear(white, derivative, columns, weight - scaled)
         else:
             fixed = fixed + _linear(white, derivative, columns, weight)
-    held, group = rows.held(solution.state, deviations, seen.kind), rows.groups
+    held, group = rows.held(solution.state, deviations, measured.kind), rows.groups
     e, j = held.value / held.sigma, held.jacobian * units / held.sigma[:, None]
     fixed = fixed + NormalEquations.of(e[group >= MOMENT], j[group >= MOMENT])
     for g, (sigma, expected) in enumerate(zip(astuple(deviations), astuple(Deviations()), strict=True)):
@@ -134,7 +139,7 @@ def components(
             parts.append((equations, in_group.sum(), np.log(expected / sigma), DOUBT, -far, far))
     equations_of_parts, *numbers = zip(*parts, strict=True)
     count, expected, doubt, least, most = (np.array(values, float) for values in numbers)
-    together, curved = NormalEquations.stacked(equations_of_parts), curvature_of(solution, seen, weighting)
+    together, curved = NormalEquations.stacked(equations_of_parts), curvature_of(solution, measured, weighting)
     if curved is not None:
         together, fixed = _bent(together, fixed, np.isfinite(doubt), curved * units[:, None] * units)
     return Components(Parts(together, count, fixed, expected, doubt), least, most, units)

@@ -23,17 +23,10 @@ MOST_KG = 1e4
 class Conditions:
     """Payload and approach directions of m joint vectors.
 
-    Parameters
-    ----------
-    payload_kg : (m,) array, optional
-        Mass at the flange; that of the robot file if not given.
-    approach : (m, n) array, optional
-        Direction in which each joint moved last: 1 upwards, −1 downwards, 0 unknown.
+    ``payload_kg`` : (m,) mass at the flange; that of the robot file if not given; ``approach`` : (m, n) direction in
+    which each joint moved last: 1 upwards, −1 downwards, 0 unknown.
 
-    Raises
-    ------
-    InputError
-        A mass that is not finite, below 0 or above ``MOST_KG``; a direction other than 1, −1 and 0.
+    Raises InputError: a mass that is not finite, below 0 or above ``MOST_KG``; a direction other than 1, −1 and 0.
     """
 
     payload_kg: np.ndarray | None = None
@@ -79,10 +72,7 @@ USUAL = Conditions()
 def loaded(payload_kg: ArrayLike | None, count: int) -> Conditions:
     """Returns conditions with one mass for all ``count`` joint vectors, or one mass for each.
 
-    Raises
-    ------
-    InputError
-        As :class:`Conditions`; or the number of masses is neither 1 nor ``count``.
+    Raises InputError: as :class:`Conditions`; or the number of masses is neither 1 nor ``count``.
     """
     if payload_kg is None:
         return USUAL
@@ -97,10 +87,8 @@ def read_conditions(table: Table, payload_kg: float | None = None, joints: int =
 
     The payload is column ``payload_kg``, or ``payload_kg`` for all rows.
 
-    Raises
-    ------
-    InputError
-        Both a column and an argument ``payload_kg``, or an invalid mass or direction; the message names the line.
+    Raises InputError: both a column and an argument ``payload_kg``, or an invalid mass or direction; the message names
+    the line.
     """
     return replace(_carried(table, payload_kg), approach=_approach(table, joints))
 
@@ -158,11 +146,8 @@ def oriented(table: Table, rotation: str | None = None) -> tuple[Poses | None, t
 
     ``rotation`` : convention of angles whose column names do not state it, as for ``--rotation``.
 
-    Raises
-    ------
-    InputError
-        The columns of a rotation are incomplete, ``rotation`` is given without such columns, or the convention is
-        missing or given although the columns state it.
+    Raises InputError: the columns of a rotation are incomplete, ``rotation`` is given without such columns, or the
+    convention is missing or given although the columns state it.
     """
     from stcal.io.poses.columns import read_rotations
 

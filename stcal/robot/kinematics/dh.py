@@ -236,21 +236,11 @@ def require_convention(where: str, targets: Sequence[str], flange: np.ndarray, s
 
     Orientations that do not fit in any convention are accepted.
 
-    Parameters
-    ----------
-    where : str
-        Name of the file, for messages.
-    targets : sequence of str
-        (m,) names of the targets seen or commanded.
-    flange : (m, 3, 3) array
-        Rotations of the flange according to the robot model.
-    seen : (m, 3, 3) array
-        Rotations of the targets as read from the file.
+    ``where`` : name of the file, for messages; ``targets`` : (m,) names of the targets seen or commanded; ``flange`` :
+    (m, 3, 3) rotations of the flange according to the robot model; ``seen`` : (m, 3, 3) rotations of the targets as
+    read from the file.
 
-    Raises
-    ------
-    InputError
-        Only another convention fits; the message names it.
+    Raises InputError: only another convention fits; the message names it.
     """
     own = turned_rad(targets, flange, seen)
     if own < TURNED_RAD:

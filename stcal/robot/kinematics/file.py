@@ -317,10 +317,7 @@ def require_robot_written(path: str | Path, robot: Robot, chain: Chain | None = 
 
     ``chain`` : axes as identified; those of ``robot`` if None.
 
-    Raises
-    ------
-    ConvergenceError
-        The file cannot be read again, or an axis or a pose of a tool differs.
+    Raises ConvergenceError: the file cannot be read again, or an axis or a pose of a tool differs.
     """
     q = fixed_values(len(robot.rows))
 

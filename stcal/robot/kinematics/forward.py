@@ -81,10 +81,7 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
 def flange_poses(chain: Chain, q: np.ndarray, conditions: Conditions = USUAL) -> Poses:
     """Returns world_from_flange of joint vectors (m, n).
 
-    Raises
-    ------
-    InputError
-        The joints are a tree, which has no one flange.
+    Raises InputError: the joints are a tree, which has no one flange.
     """
     rotation, translation = np.empty((len(q), 3, 3)), np.empty((len(q), 3))
     path = chain.path()

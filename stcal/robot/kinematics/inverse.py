@@ -194,17 +194,12 @@ LIMIT, UNREACHABLE = "limit", "unreachable"
 class Inverse:
     """Joint vectors found for m poses.
 
-    Parameters
-    ----------
-    q : (m, n) array
-        Values of the controller, rad or mm, always within the limits; where the pose is not reached, those that come
-        nearest of all that were tried.
-    status : (m,) tuple of str
-        ``reached``; ``singular``: reached, where joints can move without moving the tool or a branch ends, so that the
-        values are not the only ones; ``orientation``: position reached, orientation as near as fewer than six joints
-        come; ``limit``: only joint vectors beyond the limits reach it; ``unreachable``: none was found that does.
-    error_mm, error_rad : (m,) array
-        What remains, of position and orientation.
+    ``q`` : (m, n) values of the controller, rad or mm, always within the limits; where the pose is not reached, those
+    that come nearest of all that were tried; ``status`` : (m,) ``reached``; ``singular``: reached, where joints can
+    move without moving the tool or a branch ends, so that the values are not the only ones; ``orientation``: position
+    reached, orientation as near as fewer than six joints come; ``limit``: only joint vectors beyond the limits reach
+    it; ``unreachable``: none was found that does; ``error_mm``, ``error_rad`` : (m,) what remains, of position and
+    orientation.
     """
 
     q: np.ndarray

@@ -117,20 +117,13 @@ class Measurements:
 
         Parameters
         ----------
-        q : (m, n) array
-            Values of the controller, rad or mm.
-        positions : (m, 3) array, optional
-            Of the target in the instrument's frame, mm.
-        rotations : (m, 3, 3) array, optional
-            instrument_from_target, where poses were measured.
-        poses : Poses, optional
-            instrument_from_target, in place of positions and rotations.
-        covariance : (m, 6, 6) array, optional
-            Of the poses, rad and mm, left perturbation.
-        targets : sequence of str, optional
-            (m,) names of the targets seen; the robot's only one if not given.
-        where : str
-            Source of the data, for messages.
+        q : (m, n) values of the controller, rad or mm
+        positions : (m, 3) of the target in the instrument's frame, mm
+        rotations : (m, 3, 3) instrument_from_target, where poses were measured
+        poses : instrument_from_target, in place of positions and rotations
+        covariance : (m, 6, 6) of the poses, rad and mm, left perturbation
+        targets : (m,) names of the targets seen; the robot's only one if not given
+        where : source of the data, for messages
 
         Raises
         ------

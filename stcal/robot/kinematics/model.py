@@ -112,25 +112,19 @@ class Elasticity:
 
     Parameters
     ----------
-    compliance : (n, 2) array
-        rad/(N m): about the joint's axis, and across it.
-    moment : (n, 3) array
-        N m: weight of the link times the vector from the joint to its centre of mass, what follows being put at the
-        next joint; in the frame of the joint that has moved. Of compliance and moment, poses show the products alone.
-    periodic : (n, 4) array
-        rad: of sin q, cos q, sin 2q, cos 2q of revolute joints.
-    gravity : (3,) array
-        Its direction, of length 1: in the base of a robot, in the first joint's frame of a :class:`Chain`.
-    hysteresis : (n,) array
-        rad: what revolute joints are turned farther by that came from below, and less by that came from above.
-    pivot : (n, 3) array
-        Place about which each link turns when it gives way, mm, in its joint's frame: on the joint's axis for a
-        revolute joint. The origin of that frame if not given; always so of a :class:`Chain`.
-    payload_kg : float
-        Mass that is carried where nothing else is said of joint vectors.
-    payload_centre : (3,) array
-        Its centre, mm: in the flange's frame of a robot, in that of the joint that carries it, as it has moved, of a
-        :class:`Chain`.
+    compliance : (n, 2) rad/(N m): about the joint's axis, and across it
+    moment : (n, 3) N m: weight of the link times the vector from the joint to its centre of mass, what follows being
+        put at the next joint; in the frame of the joint that has moved. Of compliance and moment, poses show the
+        products alone.
+    periodic : (n, 4) rad: of sin q, cos q, sin 2q, cos 2q of revolute joints
+    gravity : (3,) its direction, of length 1: in the base of a robot, in the first joint's frame of a :class:`Chain`
+    hysteresis : (n,) rad: what revolute joints are turned farther by that came from below, and less by that came from
+        above
+    pivot : (n, 3) place about which each link turns when it gives way, mm, in its joint's frame: on the joint's axis
+        for a revolute joint. The origin of that frame if not given; always so of a :class:`Chain`.
+    payload_kg : mass that is carried where nothing else is said of joint vectors
+    payload_centre : (3,) its centre, mm: in the flange's frame of a robot, in that of the joint that carries it, as it
+        has moved, of a :class:`Chain`
 
     Raises
     ------
@@ -171,19 +165,11 @@ class Elasticity:
 class Tree:
     """Which joint carries which, of a robot with several arms on one trunk.
 
-    Parameters
-    ----------
-    mounts : mapping of int to (int, Rigid)
-        By the joint, from 0, that begins a branch: the joint that carries it (−1: the base), and where the branch's
-        first row begins in the frame that the carrier's row ends in, mm. Every other joint is carried by the one
-        before it.
-    carriers : mapping of str to int
-        By tool the joint, from 0, that carries it; the last one where a tool is not named.
+    ``mounts`` : by the joint, from 0, that begins a branch: the joint that carries it (−1: the base), and where the
+    branch's first row begins in the frame that the carrier's row ends in, mm. Every other joint is carried by the one
+    before it. ``carriers`` : by tool the joint, from 0, that carries it; the last one where a tool is not named.
 
-    Raises
-    ------
-    InputError
-        A branch that is carried by a joint that does not come before it.
+    Raises InputError: a branch that is carried by a joint that does not come before it.
     """
 
     mounts: Mapping[int, tuple[int, Rigid]]
@@ -301,16 +287,11 @@ class Robot:
 
         Parameters
         ----------
-        table : (n, 4) or (n, 5) array
-            a (mm), α (rad), d (mm), θ (rad) of each joint, from the base; and Hayati's β (rad).
-        convention : {"standard", "modified"}
-            Of all rows; see :class:`DHRow`.
-        limits : (n, 2) array, optional
-            Lowest and highest value of each joint, rad or mm; unlimited if not given.
-        types : sequence of {"revolute", "prismatic"}, optional
-            One for each joint; all revolute if not given.
-        name : str
-            For messages and reports.
+        table : (n, 4) a (mm), α (rad), d (mm), θ (rad) of each joint, from the base; and Hayati's β (rad)
+        convention : {"standard", "modified"}: of all rows; see :class:`DHRow`
+        limits : (n, 2) lowest and highest value of each joint, rad or mm; unlimited if not given
+        types : sequence of {"revolute", "prismatic"}, optional: one for each joint; all revolute if not given
+        name : for messages and reports
 
         Raises
         ------
@@ -352,10 +333,7 @@ class Robot:
     def loaded(self, payload_kg: float) -> "Robot":
         """The robot with another mass at its flange, kg, which a rigid one gives no way to.
 
-        Raises
-        ------
-        InputError
-            A mass below 0, or beyond all that arms carry.
+        Raises InputError: a mass below 0, or beyond all that arms carry.
         """
         loaded(payload_kg, 1)
         if self.elasticity is None:
@@ -489,10 +467,7 @@ class Chain:
     def path(self) -> tuple[int, ...]:
         """The joints from the world to the flange.
 
-        Raises
-        ------
-        InputError
-            A tree, which has no one flange.
+        Raises InputError: a tree, which has no one flange.
         """
         if self.grown is None:
             return tuple(range(len(self)))

@@ -76,10 +76,7 @@ def robot_of_kinematics(content: Mapping, where: str, convention: Convention) ->
     three as turns about fixed axes. The upper arm of every such file has a pitch of zero in the first reading alone.
     The base is that of the controller; ROS's base_link is turned by half a turn about Z.
 
-    Raises
-    ------
-    InputError
-        A link is missing, or its values are no numbers.
+    Raises InputError: a link is missing, or its values are no numbers.
     """
     links = validated(content, _File, where).kinematics
     chains = []
@@ -107,10 +104,8 @@ def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Conv
     The axes of upper arm, forearm and wrist are nearly parallel, so that the controller's rows have lengths of many
     metres that cancel. The same axes are written as rows with Hayati's angle.
 
-    Raises
-    ------
-    InputError
-        There is no nominal arm, it is no arm of six joints in the standard convention, or a list has not six numbers.
+    Raises InputError: there is no nominal arm, it is no arm of six joints in the standard convention, or a list has not
+    six numbers.
     """
     lists = {match["key"]: match["values"] for match in _LIST.finditer(text)}
     deltas = np.column_stack([_six(lists, f"delta_{name}", where) for name in DELTAS])

@@ -121,10 +121,7 @@ def _fixed(root: ElementTree.Element, parent: str, child: str, pose: Rigid) -> N
 def require_urdf_written(path: str | Path, robot: Robot) -> None:
     """Read a written URDF again, and require that it leads every tool where the robot does.
 
-    Raises
-    ------
-    ConvergenceError
-        The file cannot be read again, or the poses of a tool differ.
+    Raises ConvergenceError: the file cannot be read again, or the poses of a tool differ.
     """
     q = fixed_values(len(robot.rows))
 

@@ -34,6 +34,8 @@ from stcal.robot.use.targets import (
     robots_apart,
 )
 
+LEAST_SHOWN_MM = 1e-6
+"""Error below which its size says nothing."""
 ISOLATED = 6
 """Largest number of joints with isolated solutions, of which another one is another configuration."""
 
@@ -50,27 +52,29 @@ class Stayed:
     beyond: dict[int, str]
 
 
-def stayed(robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, found: Inverse, rows: np.ndarray) -> Stayed:
-    """Checks solutions ``found`` near to ``near`` (m, n) for changes of configuration, by solving ``rows`` without
+def stayed(
+    robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, inverse: Inverse, rows: np.ndarray
+) -> Stayed:
+    """Checks solutions ``inverse`` near to ``near`` (m, n) for changes of configuration, by solving ``rows`` without
     limits.
 
     A row whose nearest solution of all is beyond the limits gets the status ``limit`` and joint values at the limit.
     """
     if not len(rows) or len(robot.rows) > ISOLATED:
-        return Stayed(found, {})
+        return Stayed(inverse, {})
     some = targets[rows]
     free = joints_of(_between(robot, np.tile([-np.inf, np.inf], (len(robot.rows), 1))), some, poses[rows], near[rows])
-    q, status = found.q.copy(), list(found.status)
-    error_mm, error_rad = found.error_mm.copy(), found.error_rad.copy()
+    q, status = inverse.q.copy(), list(inverse.status)
+    error_mm, error_rad = inverse.error_mm.copy(), inverse.error_rad.copy()
     beyond = {}
     for k, i in enumerate(rows.tolist()):
         if not free.usable[k]:
             continue
         said = _beyond(robot, free.q[k])
-        if not said or (found.usable[i] and np.abs(free.q[k] - found.q[i]).max() <= SAME_BRANCH):
+        if not said or (inverse.usable[i] and np.abs(free.q[k] - inverse.q[i]).max() <= SAME_BRANCH):
             continue
         beyond[i] = said
-        if found.usable[i]:
+        if inverse.usable[i]:
             least, most = np.minimum(near[i], free.q[k]), np.maximum(near[i], free.q[k])
             limits = np.column_stack([least, most]).clip(*robot.limits().T[:, :, None])
             at = joints_of(_between(robot, limits), targets[rows[[k]]], poses[[i]], near[[i]])
@@ -291,12 +295,12 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
 
 
 def _stayed(
-    robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, found: Inverse, known: np.ndarray
+    robot: Robot, targets: Targets, poses: Poses, near: np.ndarray, inverse: Inverse, known: np.ndarray
 ) -> Stayed:
     """Removes changes of configuration in the rows whose commanding joint values ``near`` (m, n) are ``known``."""
-    away = (np.abs(found.q - near)[:, ~robot.prismatic] > FAR_RAD).any(axis=1)
-    rows = np.flatnonzero(known & (away | np.array([status == LIMIT for status in found.status])))
-    return stayed(robot, targets, poses, near, found, rows)
+    away = (np.abs(inverse.q - near)[:, ~robot.prismatic] > FAR_RAD).any(axis=1)
+    rows = np.flatnonzero(known & (away | np.array([status == LIMIT for status in inverse.status])))
+    return stayed(robot, targets, poses, near, inverse, rows)
 
 
 def _built(robot: Robot) -> list[tuple[str, int]]:
@@ -399,8 +403,8 @@ def compensation_file(result: Compensated, robot: Robot) -> CompensationFile:
     columns = joint_columns(robot)
     unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
 
-    def joints(found: Inverse, i: int) -> dict | None:
-        return dict(zip(columns, (found.q[i] * unit).tolist(), strict=True)) if found.usable[i] else None
+    def joints(inverse: Inverse, i: int) -> dict | None:
+        return dict(zip(columns, (inverse.q[i] * unit).tolist(), strict=True)) if inverse.usable[i] else None
 
     rows, mass = [], result.targets.conditions.payload_kg
     quaternions = result.poses.quaternions()
@@ -444,9 +448,9 @@ def compensated_summary(result: Compensated) -> list[str]:
     lines = [f"{good} of {m} poses reached by the identified robot"]
     both = result.compared()
     if both.any():
-        before = result.before_mm[both]
+        before, after = result.before_mm[both], max(result.found.error_mm[both].max(), LEAST_SHOWN_MM)
         lines.append(
             f"Position error of the nominal joint values, by the identified robot: mean {before.mean():.4f}, "
-            f"max {before.max():.4f} mm; taken away by compensation, down to {result.found.error_mm[both].max():.1g} mm"
+            f"max {before.max():.4f} mm; after compensation {after:.1g} mm or less"
         )
     return lines

@@ -49,18 +49,13 @@ class PoseDesign:
 
     Parameters
     ----------
-    q : (count, n) array
-        Joint vectors, in order of choice: the first ones alone are a good set too.
-    poses : Poses
-        base_from_tool there.
-    parameters, seen : int
-        Parameters, and how many of them (in combination) the candidates show; the indices are of these.
+    q : (count, n) joint vectors, in order of choice: the first ones alone are a good set too
+    poses : base_from_tool there
+    parameters, seen : parameters, and how many of them (in combination) the candidates show; the indices are of these
     chosen : ObservabilityIndices
-    random : tuple of ObservabilityIndices
-        Of random sets of the same size.
-    sigma_mm, random_sigma_mm : float
-        σ of the position that the identified robot will predict, RMS per axis over random poses; of the chosen set, and
-        median of the random ones.
+    random : of random sets of the same size
+    sigma_mm, random_sigma_mm : σ of the position that the identified robot will predict, RMS per axis over random
+        poses; of the chosen set, and median of the random ones
     exchanges : int
     """
 
@@ -321,7 +316,7 @@ def design_csv(result: PoseDesign, robot: Robot) -> str:
 
 
 def require_design_written(path: str | Path, result: PoseDesign, robot: Robot, tool: str = "") -> None:
-    """Read a written table of poses again, and require them, and that its joint values lead the robot to them."""
+    """Read a written table again, and require the same poses, and joint values that lead the robot to them."""
     require_pose_table_written(path, {"nominal_": result.poses})
 
     def again() -> np.ndarray:

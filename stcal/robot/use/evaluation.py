@@ -67,20 +67,13 @@ class Evaluated:
 
     Parameters
     ----------
-    robot : Robot
-        With base and tools as fitted.
-    state : State
-        Its chain and tools.
-    residuals : (r, 3) or (r, 1) array
-        Measured minus modelled position in the base's axes, or distance; mm.
-    rotation_rad : (r,) array
-        Errors of orientations; empty if none were measured.
-    placed : tuple of Placed
-        Base and tools.
-    left : tuple of Finding or None
-        What the residuals go with; None where rows are too few to tell.
-    beyond : tuple of Finding or None
-        The same of what would be left by all parameters of the kinematics fitted to these rows.
+    robot : with base and tools as fitted
+    state : its chain and tools
+    residuals : (r, 3) measured minus modelled position in the base's axes, or distance; mm
+    rotation_rad : (r,) errors of orientations; empty if none were measured
+    placed : base and tools
+    left : what the residuals go with; None where rows are too few to tell
+    beyond : the same of what would be left by all parameters of the kinematics fitted to these rows
     """
 
     robot: Robot
@@ -121,16 +114,11 @@ class Evaluation:
 
     Parameters
     ----------
-    refit : str
-        What was fitted of each robot: base, tool, both or nothing.
-    seen : Observed
-        The r observations: positions or distances.
-    robots : tuple of Evaluated
-        In the order given.
-    wrong : (r,) array of bool
-        Rows that no robot explains: wrong, or something that all models lack; nothing was fitted to them.
-    differences : tuple of Difference
-        The robot of least mean error against each other one, in order of their means.
+    refit : what was fitted of each robot: base, tool, both or nothing
+    seen : the r observations: positions or distances
+    robots : in the order given
+    wrong : (r,) rows that no robot explains: wrong, or something that all models lack; nothing was fitted to them
+    differences : the robot of least mean error against each other one, in order of their means
     """
 
     refit: Refit
@@ -154,12 +142,10 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
 
     Parameters
     ----------
-    robots : mapping of str to Robot
-        By the names that they are to have; mm, rad.
-    data : Measurements
-        Joint values with what was measured there, in the instrument's frame.
-    refit : {"none", "base", "tool", "base-tool"}
-        What is fitted by least squares with each robot's own axes; the rest is as its file has it.
+    robots : by the names that they are to have; mm, rad
+    data : joint values with what was measured there, in the instrument's frame
+    refit : {"none", "base", "tool", "base-tool"}: what is fitted by least squares with each robot's own axes; the rest
+        is as its file has it
 
     Returns
     -------
@@ -190,59 +176,59 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
     return Evaluation(refit, seen, found, wrong, _differences(found, ~wrong))
 
 
-def _parameters(seen: Observed, fit: Fit) -> int:
-    base = 6 if "base" in fit and seen.kind != "distance" else 0
-    return base + (3 * len(set(seen.data.targets)) if "tool" in fit else 0)
+def _parameters(measured: Observed, fit: Fit) -> int:
+    base = 6 if "base" in fit and measured.kind != "distance" else 0
+    return base + (3 * len(set(measured.data.targets)) if "tool" in fit else 0)
 
 
-def _enough(seen: Observed, fit: Fit) -> None:
-    numbers, seeks = WIDTH[seen.kind] * len(seen), _parameters(seen, fit)
+def _enough(measured: Observed, fit: Fit) -> None:
+    numbers, seeks = WIDTH[measured.kind] * len(measured), _parameters(measured, fit)
     if numbers <= seeks:
         raise DegenerateError(
             "E-IDENTIFY-FEW",
-            f"{seen.data.where}: {len(seen)} {seen.kind}s give {numbers} numbers for {seeks} parameters of "
-            f"{' and '.join(sorted(fit))}; {seeks // WIDTH[seen.kind] + 1} or more needed, or fit less (--refit)",
+            f"{measured.data.where}: {len(measured)} {measured.kind}s give {numbers} numbers for {seeks} parameters of "
+            f"{' and '.join(sorted(fit))}; {seeks // WIDTH[measured.kind] + 1} or more needed, or fit less (--refit)",
         )
 
 
-def _fitted(robots: list[Robot], data: Measurements, seen: Observed, fit: Fit) -> tuple[list[State], np.ndarray]:
+def _fitted(robots: list[Robot], data: Measurements, measured: Observed, fit: Fit) -> tuple[list[State], np.ndarray]:
     """Returns the states of all robots, and the mask (r,) of rows that no robot explains.
 
     Such rows are left out of the fit. Distances are all used, as they refer to one another.
     """
-    wrong = np.zeros(len(seen), bool)
-    freedom = WIDTH[seen.kind] * len(seen) - _parameters(seen, fit)
+    wrong = np.zeros(len(measured), bool)
+    freedom = WIDTH[measured.kind] * len(measured) - _parameters(measured, fit)
     for _ in range(ROUNDS):
-        kept = data if seen.kind == "distance" else data[~wrong]
+        kept = data if measured.kind == "distance" else data[~wrong]
         states = [start(robot, kept, fit) for robot in robots]
-        errors = np.array([position_errors(residuals(state, seen)) for state in states])
-        share = freedom / WIDTH[seen.kind] / len(seen)
-        sigma = min(robust_sigma(each[~wrong], WIDTH[seen.kind], share) for each in errors)
-        limit = SURELY * sigma * length_limit(WIDTH[seen.kind], FALSE_ALARM / len(seen))
+        errors = np.array([position_errors(residuals(state, measured)) for state in states])
+        share = freedom / WIDTH[measured.kind] / len(measured)
+        sigma = min(robust_sigma(each[~wrong], WIDTH[measured.kind], share) for each in errors)
+        limit = SURELY * sigma * length_limit(WIDTH[measured.kind], FALSE_ALARM / len(measured))
         now = errors.min(0) > max(limit, LEAST_MM)
-        if freedom < LEAST_FREEDOM or (now == wrong).all() or set(_targets(seen, ~now)) < set(_targets(seen)):
+        if freedom < LEAST_FREEDOM or (now == wrong).all() or set(_targets(measured, ~now)) < set(_targets(measured)):
             break
         wrong = now
     return states, wrong
 
 
-def _targets(seen: Observed, among: np.ndarray | slice = slice(None)) -> list[str]:
-    return np.array(seen.data.targets, object)[seen.first[among]].tolist()
+def _targets(measured: Observed, among: np.ndarray | slice = slice(None)) -> list[str]:
+    return np.array(measured.data.targets, object)[measured.first[among]].tolist()
 
 
-def _evaluated(robot: Robot, state: State, seen: Observed, fit: Fit, wrong: np.ndarray) -> Evaluated:
+def _evaluated(robot: Robot, state: State, measured: Observed, fit: Fit, wrong: np.ndarray) -> Evaluated:
     base = state.chain.gap(0) @ replace(robot, world_from_base=Rigid()).chain().gap(0).inverse()
-    found = residuals(state, seen)
+    found = residuals(state, measured)
     rotation = np.zeros(0)
-    if seen.data.rotations is not None:
-        whole = observed(seen.data, "pose")
+    if measured.data.rotations is not None:
+        whole = observed(measured.data, "pose")
         rotation = np.linalg.norm(residuals(state, whole)[:, :3], axis=1)
-    good = only_of(seen, np.flatnonzero(~wrong))
+    good = only_of(measured, np.flatnonzero(~wrong))
     fitted = _derivatives(state, base, good, fit)
     one, full = Weighting(1.0, 1.0), jacobian(state, good)
     seeks = np.concatenate([fitted, full], axis=2)
     in_base = found @ base.rotation if found.shape[1] == 3 else found
-    placed = _placed(state, base, residuals(state, good), fitted, fit, seen.kind != "distance")
+    placed = _placed(state, base, residuals(state, good), fitted, fit, measured.kind != "distance")
     return Evaluated(
         replace(robot, world_from_base=base, tools=state.tools),
         state,
@@ -254,18 +240,18 @@ def _evaluated(robot: Robot, state: State, seen: Observed, fit: Fit, wrong: np.n
     )
 
 
-def _derivatives(state: State, base: Rigid, seen: Observed, fit: Fit) -> np.ndarray:
-    """Returns the derivatives (r, w, k) by the base, turns about its origin over shifts, and by the tools' points."""
-    parts = [np.zeros((len(seen), WIDTH[seen.kind], 0))]
-    tip = tips_of(state, seen.data)
-    if "base" in fit and seen.kind != "distance":
+def _derivatives(state: State, base: Rigid, measured: Observed, fit: Fit) -> np.ndarray:
+    """Returns the derivatives (r, w, k) by the base (rotation about its origin, translation) and the tools' points."""
+    parts = [np.zeros((len(measured), WIDTH[measured.kind], 0))]
+    tip = tips_of(state, measured.data)
+    if "base" in fit and measured.kind != "distance":
         moves = np.zeros((len(tip), 6, 6))
         moves[:, :3, :3] = moves[:, 3:, 3:] = np.eye(3)
         moves[:, 3:, :3] = -skew(tip.translation - base.translation)
-        parts.append(as_seen(state, seen, tip, moves))
+        parts.append(as_seen(state, measured, tip, moves))
     if "tool" in fit:
-        own = [name.startswith("tool") for name in parameter_names(state, seen.kind)]
-        parts.append(jacobian(state, seen)[:, :, own])
+        own = [name.startswith("tool") for name in parameter_names(state, measured.kind)]
+        parts.append(jacobian(state, measured)[:, :, own])
     return np.concatenate(parts, axis=2)
 
 

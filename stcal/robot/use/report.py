@@ -116,7 +116,7 @@ def compensation_report(result: Compensated, robot: Robot) -> Document:
             Section(
                 "Result", [*compensated_summary(result), before if result.compared().any() else None], terminal=True
             ),
-            Section("Poses to look at", [bullets([*result.targets.notes, *result.notes()][:MOST_NOTES])]),
+            Section("To know", [bullets([*result.targets.notes, *result.notes()][:MOST_NOTES])]),
             Section("Joint values", [Table(heads, _joint_rows(result, robot))], terminal=True),
         ],
     )
@@ -143,8 +143,8 @@ def _joint_rows(result: Compensated, robot: Robot) -> list[list[str]]:
     unit = np.where(robot.prismatic, 1.0, np.degrees(1.0))
     n, named = len(robot.prismatic), any(result.targets.tools)
 
-    def values(found: Inverse, i: int) -> list[str]:
-        return [number(v, 5) for v in found.q[i] * unit] if found.usable[i] else [NONE] * n
+    def values(inverse: Inverse, i: int) -> list[str]:
+        return [number(v, 5) for v in inverse.q[i] * unit] if inverse.usable[i] else [NONE] * n
 
     rows = []
     for i in range(len(result)):

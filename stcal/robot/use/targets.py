@@ -68,21 +68,11 @@ class Targets:
     ) -> "Targets":
         """Returns targets in memory.
 
-        Parameters
-        ----------
-        poses : Poses
-            m poses base_from_tool, mm.
-        q : (m, n) array, optional
-            Joint values near to which the solutions are wanted, rad or mm.
-        tools : sequence of str, optional
-            (m,) names of the robot's tools; the only one if not given.
-        where : str
-            Source of the poses, for messages.
+        ``poses`` : m poses base_from_tool, mm; ``q`` : (m, n) joint values near to which the solutions are wanted, rad
+        or mm; ``tools`` : (m,) names of the robot's tools; the only one if not given; ``where`` : source of the poses,
+        for messages.
 
-        Raises
-        ------
-        InputError
-            Other numbers of joint values or tools.
+        Raises InputError: other numbers of joint values or tools.
         """
         m, values = len(poses), None if q is None else np.asarray(q, float)
         names = tuple(tools) or ("",) * m
@@ -242,15 +232,12 @@ INVERSE = "poses were inverse (base seen from the tool); give the tool in the ba
 
 
 def robots_apart(identified: Robot, nominal: Robot) -> str:
-    """Returns a doubt whether two files are of one robot; empty if they may be.
+    """Returns a note if two files may be of different robots; an empty text otherwise.
 
-    Their flanges are compared over the joints' ranges; arms are made to a thousandth of their reach, and files of one
-    arm state the same base and flange, whichever tool they have.
+    Their flanges are compared over the joints' ranges. Arms are made to a thousandth of their reach, and all files of
+    one arm state the same base and flange, whatever the tool.
 
-    Raises
-    ------
-    InputError
-        They cannot be.
+    Raises InputError: the files cannot be of one robot.
     """
     ends = [""] if identified.tree is None else list(identified.tree.carriers)
     identified, nominal = (replace(each, tools=dict.fromkeys(ends, Rigid())) for each in (identified, nominal))
@@ -284,17 +271,10 @@ def robots_apart(identified: Robot, nominal: Robot) -> str:
 def on_targets(robot: Robot, targets: Targets) -> tuple[bool, tuple[str, ...]]:
     """Returns whether joint values beside the poses confirm them, and doubts about the poses.
 
-    Parameters
-    ----------
-    robot : Robot
-        That commands them.
-    targets : Targets
-        m poses base_from_tool, with or without joint values.
+    ``robot`` : that commands them; ``targets`` : m poses base_from_tool, with or without joint values.
 
-    Raises
-    ------
-    InputError
-        Joint values lead to the poses in another unit or convention, or order of rows; the message says which.
+    Raises InputError: joint values lead to the poses in another unit or convention, or order of rows; the message says
+    which.
     """
     if targets.poses is None:
         return True, ()
@@ -409,10 +389,10 @@ def _base_mm(robot: Robot) -> float:
     return float(np.linalg.norm(replace(robot, world_from_base=Rigid()).chain().translation[0]))
 
 
-def out_of_reach(robot: Robot, targets: Targets, found: Inverse) -> tuple[str, ...]:
+def out_of_reach(robot: Robot, targets: Targets, inverse: Inverse) -> tuple[str, ...]:
     """Returns a note if many poses are out of reach, and all of them would be within in another convention."""
-    lost = np.flatnonzero(~found.usable)
-    if targets.poses is None or len(lost) < max(LEAST, DOUBTED * len(found)):
+    lost = np.flatnonzero(~inverse.usable)
+    if targets.poses is None or len(lost) < max(LEAST, DOUBTED * len(inverse)):
         return ()
     some = lost[np.unique(np.linspace(0, len(lost) - 1, TRIED).astype(int))]
     poses = targets.poses[some]
@@ -421,10 +401,10 @@ def out_of_reach(robot: Robot, targets: Targets, found: Inverse) -> tuple[str, .
     for reason, meant in guesses.items():
         # Most guesses fail at once: a pose out of reach takes a third of a second.
         if all(
-            joints_of(robot, targets[some[[i]]], meant[[i]], found.q[some[[i]]]).usable[0] for i in range(len(some))
+            joints_of(robot, targets[some[[i]]], meant[[i]], inverse.q[some[[i]]]).usable[0] for i in range(len(some))
         ):
             return (
-                f"{len(lost)} of {len(found)} poses are out of reach; {len(some)} of {len(some)} of these that were "
+                f"{len(lost)} of {len(inverse)} poses are out of reach; {len(some)} of {len(some)} of these that were "
                 f"tried would be within if {reason}",
             )
     return ()

@@ -90,10 +90,10 @@ class SetResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verification:
-    """Sets over the poses that all of them have.
+    """Distance errors of several sets of measurements, over the poses that all sets have.
 
     ``poses`` : names, the first being the one that distances start from; ``sets`` : in order of the file; ``missing`` :
-    by set the poses that it lacks, which are left out of all; ``notes`` : on columns that were not read.
+    by set, the poses that it lacks; they are left out of all sets; ``notes`` : on columns that were not read.
     """
 
     where: str

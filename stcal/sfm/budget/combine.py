@@ -112,17 +112,10 @@ class Budget:
 def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
     """Returns the budget of a finished run.
 
-    Parameters
-    ----------
-    run : SavedRun
-        The run. It must be solved jointly, since a chain states no covariance.
-    statement : Statement, optional
-        Stated sizes, temperatures and fields. If None, those that ``board.toml`` states.
+    ``run`` : the run. It must be solved jointly, since a chain states no covariance. ``statement`` : stated sizes,
+    temperatures and fields. If None, those that ``board.toml`` states.
 
-    Raises
-    ------
-    InputError
-        If the run was solved otherwise, or its folder lacks files.
+    Raises InputError if the run was solved otherwise, or its folder lacks files.
     """
     if run.faces.solve != "joint" or not run.faces.eccentricity:
         raise InputError(

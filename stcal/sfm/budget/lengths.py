@@ -82,10 +82,7 @@ def against_stated(budget: Budget, path: Path, columns: Path | None = None) -> L
     uncertainty of the lengths. Without ``sigma_mm`` they are taken as exact. ``columns`` : map of the columns, see
     :func:`~stcal.io.poses.columns.read_mapped`.
 
-    Raises
-    ------
-    InputError
-        If the file is not a table of lengths, a circle is not in the run, or a length or σ is invalid.
+    Raises InputError if the file is not a table of lengths, a circle is not in the run, or a length or σ is invalid.
     """
     table = table_of(path, columns, WHAT)
     ends = list(zip(table.text("from"), table.text("to"), strict=True))
@@ -121,10 +118,7 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     The lengths are the longest distances of every two faces, and within each face, between circles that both runs have.
     ``boards`` : the boards of the two runs.
 
-    Raises
-    ------
-    InputError
-        If the runs have no two circles of the target in common.
+    Raises InputError if the runs have no two circles of the target in common.
     """
     common = [label for label in budget.joint.labels if label in set(other.joint.labels)]
     rows, other_rows = (_places(calibration.joint, common) for calibration in (budget, other))

@@ -58,19 +58,10 @@ class Statement:
 def statement_of(own: StatedSize, path: Path | None = None, given: Sequence[str] = ()) -> Statement:
     """Returns the statement of a run. The file overrides ``board.toml``, and NAME=VALUE overrides fields of the file.
 
-    Parameters
-    ----------
-    own : StatedSize
-        Sizes that the run's ``board.toml`` states.
-    path : Path, optional
-        File of ``--statement``.
-    given : sequence of str
-        Fields of ``--field``, NAME=VALUE.
+    ``own`` : sizes that the run's ``board.toml`` states; ``path`` : file of ``--statement``; ``given`` : fields of
+    ``--field``, NAME=VALUE.
 
-    Raises
-    ------
-    InputError
-        If the file is not a statement, or a field has no ``=`` or is given twice.
+    Raises InputError if the file is not a statement, or a field has no ``=`` or is given twice.
     """
     file = load_toml(path, StatementFile, "statement", "give a TOML file") if path else StatementFile()
     sizes, origin = {}, {}

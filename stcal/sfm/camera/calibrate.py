@@ -180,10 +180,7 @@ def _of_one_round(
 def require_model(colmap_model: str) -> None:
     """Checks that a lens model is supported.
 
-    Raises
-    ------
-    InputError
-        It is not. The message lists the supported models.
+    Raises InputError: it is not. The message lists the supported models.
     """
     if colmap_model not in COLMAP_MODELS:
         raise InputError(
@@ -272,12 +269,7 @@ def _without_board(detection: DetectionResult, views: Sequence[ImageObservations
 def require_views(views: Sequence[ImageObservations], files: Sequence[ImageFile], skipped: Sequence[Skipped]) -> None:
     """Checks that there are enough views of the board.
 
-    Raises
-    ------
-    DetectionError
-        There are none.
-    DegenerateError
-        There are fewer than three.
+    Raises DetectionError: there are none. Raises DegenerateError: there are fewer than three.
     """
     if len(views) >= MIN_VIEWS:
         return
@@ -299,10 +291,7 @@ def require_views(views: Sequence[ImageObservations], files: Sequence[ImageFile]
 def require_determined(result: Intrinsics, views: Sequence[ImageObservations]) -> None:
     """Checks that the views determine the focal length and that the lens model fits them.
 
-    Raises
-    ------
-    DegenerateError
-        One of them is not so.
+    Raises DegenerateError: one of them is not so.
     """
     relative = float((result.sigma()[0] / result.camera.focal[0]).max())
     if relative > MAX_FOCAL_SIGMA:

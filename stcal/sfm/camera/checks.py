@@ -1,8 +1,7 @@
 """Checks of calibrated intrinsics: σ of projections, halves of the views, cross-validation of lens models."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -14,7 +13,7 @@ from stcal.errors import ConvergenceError, DegenerateError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis, parameter_names
 from stcal.labels import Label
-from stcal.parallel import run_parallel
+from stcal.parallel import run_in_order
 from stcal.sfm.adjust.refine import eccentricity_px, moved_poses
 from stcal.sfm.camera.intrinsics import (
     Intrinsics,
@@ -83,10 +82,7 @@ def projection_jacobian(camera: Camera, colmap_model: str) -> np.ndarray:
 
     The part that a rotation of the camera can absorb is removed.
 
-    Raises
-    ------
-    DegenerateError
-        The distortion folds the image over.
+    Raises DegenerateError: the distortion folds the image over.
     """
     try:
         ideal = camera.normalised_from_pixel(image_grid(camera))
@@ -219,10 +215,7 @@ def held_out(
 
     The places of the dots are those estimated from the other views of the folder, or design places if there are none.
 
-    Raises
-    ------
-    StcalError
-        A calibration without some of the views fails.
+    Raises StcalError: a calibration without some of the views fails.
     """
     folds = min(folds, len(views))
     if len(views) - -(-len(views) // folds) < MIN_TRAINING:
@@ -244,24 +237,14 @@ def choose_model(
 ) -> tuple[str, tuple[Candidate, ...]]:
     """Returns the simplest lens model that predicts held-out views as well as the best one, and all candidates.
 
-    Parameters
-    ----------
-    views : sequence of ImageObservations
-        Dots of the board, found with about the right camera.
-    board : BoardDesign
-    known : Intrinsics
-        Intrinsics of any model that fits; start of all models of the same projection.
-    workers : int, optional
-        Number of processes; one per core if None.
+    ``views`` : dots of the board, found with about the right camera; ``board`` : BoardDesign; ``known`` : intrinsics of
+    any model that fits; start of all models of the same projection; ``workers`` : number of processes; one per core if
+    None.
 
-    Raises
-    ------
-    StcalError
-        No model can be calibrated with four fifths of the views.
+    Raises StcalError: no model can be calibrated with four fifths of the views.
     """
-    fitted = dict(
-        zip(CANDIDATES, _all(_fitted, [(views, board, known.camera, m) for m in CANDIDATES], workers), strict=True)
-    )
+    starts = [(views, board, known.camera, model) for model in CANDIDATES]
+    fitted = dict(zip(CANDIDATES, run_in_order(_fitted, starts, workers), strict=True))
     factors = {m: entry.factors.centres for m, entry in fitted.items() if isinstance(entry, Intrinsics)}
     why = {m: str(entry) for m, entry in fitted.items() if isinstance(entry, StcalError)}
     least = min(factors, key=factors.__getitem__, default="")
@@ -270,7 +253,7 @@ def choose_model(
             why[model] = f"residuals {factor / factors[least]:.3g} times those of {least}"
     jobs = {m: (views, board, entry) for m, entry in fitted.items() if isinstance(entry, Intrinsics) and m not in why}
     fared: dict[str, HeldOut] = {}
-    for model, outcome in zip(jobs, _all(_tried, list(jobs.values()), workers), strict=True):
+    for model, outcome in zip(jobs, run_in_order(_tried, list(jobs.values()), workers), strict=True):
         if isinstance(outcome, HeldOut):
             fared[model] = outcome
         else:
@@ -301,11 +284,6 @@ def _row(model: str, outcome: HeldOut | None, squares: dict[str, np.ndarray], be
     apart = squares[model] - squares[best]
     sigma = float(apart.std(ddof=1) / np.sqrt(len(apart)))
     return Candidate(model, count, outcome.rms_px(), float(apart.mean()), sigma)
-
-
-def _all(function: Callable[..., T], jobs: list[tuple], workers: int | None) -> list[T]:
-    """Returns the results in the order of the jobs."""
-    return [result for _, result in sorted(run_parallel(function, jobs, workers), key=itemgetter(0))]
 
 
 def _fitted(views, board: BoardDesign, known: Camera, model: str) -> Intrinsics | StcalError:

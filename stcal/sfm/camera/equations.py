@@ -387,10 +387,7 @@ class Normal:
 def minimum(state: State, setting: Setting) -> State:
     """Returns the state of least cost. Only the kept unknowns are damped; dots and poses are optimal for each step.
 
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
+    Raises ConvergenceError: no minimum is reached.
     """
     solution = minimise(
         state,

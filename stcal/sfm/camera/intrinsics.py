@@ -83,10 +83,7 @@ def _best_of_several(observations: Sequence[ImageObservations], board: BoardDesi
 def start_pose(image: ImageObservations, board: BoardDesign, camera: Camera) -> Rigid:
     """Returns camera_from_board of one view.
 
-    Raises
-    ------
-    DegenerateError
-        The dots do not determine the pose.
+    Raises DegenerateError: the dots do not determine the pose.
     """
     pose = camera_from_plane(_homography(image, board, camera))
     return refine_planar_pose(pose, board.places_mm(image.labels)[:, :2], camera.normalised_from_pixel(image.centre_px))
@@ -252,19 +249,12 @@ def adjust_intrinsics(
 ) -> Intrinsics:
     """Adjusts the intrinsics from ``start``.
 
-    Parameters
-    ----------
-    views : at least three views, with dots of the board only
-    camera_of_view : camera of each view, for a comparison of cameras 0, 1, … on the same boards
-    factors : known factors of σ; estimated if None
-    held : if True, intrinsics stay at ``start``, only poses and boards are adjusted, and ``covariance`` is (0, 0)
+    ``views`` : at least three views, with dots of the board only; ``camera_of_view`` : camera of each view, for a
+    comparison of cameras 0, 1, … on the same boards; ``factors`` : known factors of σ; estimated if None; ``held`` : if
+    True, intrinsics stay at ``start``, only poses and boards are adjusted, and ``covariance`` is (0, 0).
 
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
-    DegenerateError
-        The dots of a view do not determine its pose.
+    Raises ConvergenceError: no minimum is reached. Raises DegenerateError: the dots of a view do not determine its
+    pose.
     """
     basis = intrinsic_basis(colmap_model)[:, : 0 if held else None]
     state = _start_state(views, camera_of_view or [0] * len(views), board, start)
@@ -315,10 +305,7 @@ def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board:
     """Returns the intrinsics from some of the views of ``result``: by steps from the solution of all, with its weights,
     and the factors of σ by one step of their own.
 
-    Raises
-    ------
-    ConvergenceError, DegenerateError
-        As :func:`adjust_intrinsics`, which solves where the steps do not settle.
+    Raises ConvergenceError, DegenerateError: as :func:`adjust_intrinsics`, which solves where the steps do not settle.
     """
     state, setting = _solution(result)
     last = _stepped(state.only({view.name for view in views}), setting)
@@ -330,10 +317,7 @@ def of_some_views(result: Intrinsics, views: Sequence[ImageObservations], board:
 def of_two_halves(result: Intrinsics, views: Sequence[ImageObservations], board: BoardDesign) -> Intrinsics:
     """Returns the intrinsics of two cameras, of which each took every second view of the same boards.
 
-    Raises
-    ------
-    ConvergenceError, DegenerateError
-        As :func:`of_some_views`.
+    Raises ConvergenceError, DegenerateError: as :func:`of_some_views`.
     """
     state, setting = _solution(result)
     half = [i % 2 for i in range(len(views))]
@@ -384,15 +368,10 @@ class Adjusted:
 def adjusted(state: State, setting: Setting, board: BoardDesign, known: SigmaFactors | None = None) -> Adjusted:
     """Alternates minimisation and estimation of σ and eccentricity until these converge.
 
-    Parameters
-    ----------
-    state, setting : start; the models of the state have the detected centres' σ
-    known : factors of σ; estimated if None
+    ``state``, ``setting`` : start; the models of the state have the detected centres' σ; ``known`` : factors of σ;
+    estimated if None.
 
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
+    Raises ConvergenceError: no minimum is reached.
     """
     detected_covariance, factors = [m.covariance_px2 for m in state.models], known or SigmaFactors()
     last: Normal | None = None

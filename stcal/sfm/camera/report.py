@@ -66,8 +66,8 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
                 [
                     alarms(summary.warnings),
                     Table(["<parameter", "value, px", "σ"], parameters),
-                    "cx, cy count from the centre of the top-left pixel; the camera file is COLMAP's, counts from that "
-                    f"pixel's corner and has them {COLMAP_PIXEL_ORIGIN:g} px larger",
+                    "the principal point counts from the centre of the top-left pixel; the camera file, as COLMAP's, "
+                    f"counts from that pixel's corner, so that cx, cy are {COLMAP_PIXEL_ORIGIN:g} px larger there",
                     sigma,
                     held_out,
                     *_split_half(result),
@@ -99,7 +99,7 @@ def calibration_report(result: CameraCalibration, summary: CalibrationFile, wher
                 [
                     "Means over cells of the image. Arrows that are alike in neighbouring cells are what the lens "
                     "model leaves",
-                    plot(lambda: residual_map(result), "Mean residuals, measured minus projected"),
+                    plots(plot(lambda: residual_map(result), "Mean residuals, measured minus projected", css="")),
                 ],
             ),
             Section(

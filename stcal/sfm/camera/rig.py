@@ -87,19 +87,11 @@ def gathered(
 ) -> Together:
     """Returns the poses of the cameras on the rig from views of the same instants.
 
-    Parameters
-    ----------
-    names, cameras : cameras of the rig
-    sightings : views of all cameras, at most one of each camera and instant
-    board : board with its grid
-    unique : whether the board's points are identified uniquely
+    ``names``, ``cameras`` : cameras of the rig; ``sightings`` : views of all cameras, at most one of each camera and
+    instant; ``board`` : board with its grid; ``unique`` : whether the board's points are identified uniquely.
 
-    Raises
-    ------
-    InputError
-        Two images have the same camera and instant.
-    DegenerateError
-        A camera shares no instant with the others, or its instants do not determine how its board is numbered.
+    Raises InputError: two images have the same camera and instant. Raises DegenerateError: a camera shares no instant
+    with the others, or its instants do not determine how its board is numbered.
     """
     turns = symmetries(board, unique)
     by_instant = _by_instant(names, sightings)
@@ -262,12 +254,9 @@ def calibrate_rig(cameras: Mapping[str, CameraCalibration], board: BoardDesign, 
 
     Parameters
     ----------
-    cameras : mapping
-        Calibrations of the single cameras by name. Views of one instant have the same name except for the suffix.
-    board : BoardDesign
-        Board that all cameras saw.
-    unique : bool
-        Whether the board's points are identified uniquely, as on a ChArUco board.
+    cameras : calibrations of the single cameras by name. Views of one instant have the same name except for the suffix.
+    board : board that all cameras saw
+    unique : whether the board's points are identified uniquely, as on a ChArUco board
 
     Returns
     -------
@@ -300,10 +289,7 @@ def _sightings(k: int, camera: CameraCalibration) -> list[Sighting]:
 def adjust_rig(alone: tuple[CameraCalibration, ...], together: Together, board: BoardDesign) -> Adjusted:
     """Adjusts all unknowns, starting from the calibrations of the single cameras and with their σ of centres.
 
-    Raises
-    ------
-    ConvergenceError
-        No minimum is reached.
+    Raises ConvergenceError: no minimum is reached.
     """
     cameras = tuple(each.intrinsics.camera for each in alone)
     models = [each.intrinsics.colmap_model for each in alone]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode
-from stcal.parallel import run_parallel
+from stcal.parallel import run_in_order
 from stcal.sfm.data.model import MIN_POINTS, ImageObservations, MetricModel
 from stcal.sfm.data.patterns import Pattern, ideal_border, in_view, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -38,11 +39,8 @@ def missing_circles(
 ) -> dict[str, list[Expected]]:
     """Returns, by image of one group, the planes with circles that should be visible but have no label.
 
-    Parameters
-    ----------
-    model : the model of the group, target frame, mm
-    circles : centres of the target's circles, (3,) by label, target frame, mm; centres of the model take precedence
-    observations : observations by image
+    ``model`` : the model of the group, target frame, mm; ``circles`` : centres of the target's circles, (3,) by label,
+    target frame, mm; centres of the model take precedence; ``observations`` : observations by image.
     """
     xyz = circles | dict(zip(model.labels, model.xyz_model, strict=True))
     patterns = patterns_of(target, board).values()
@@ -87,15 +85,10 @@ def diagnose(
 ) -> Diagnosis:
     """Finds what a run left out, and why.
 
-    Parameters
-    ----------
-    images : the folder of photographs, if it has moved since the run
-    progress : called with (stage, done, total)
+    ``images`` : the folder of photographs, if it has moved since the run; ``progress`` : called with (stage, done,
+    total).
 
-    Raises
-    ------
-    InputError
-        If the run is damaged or of another version, or the folder of photographs does not exist.
+    Raises InputError if the run is damaged or of another version, or the folder of photographs does not exist.
     """
     if images is not None and not images.is_dir():
         raise InputError(
@@ -110,7 +103,7 @@ def diagnose(
     except (KeyError, TypeError) as error:
         raise InputError("E-RUN-VERSION", f"run {run.folder}: of another version ({error}); run it again") from error
     jobs = _jobs(run, images or run.images, models, circles)
-    examined = _side_by_side(_examine, [(job,) for job in jobs], "examine", workers, progress)
+    examined = run_in_order(_examine, [(job,) for job in jobs], workers, progress and partial(progress, "examine"))
     options = _try_options(run, jobs, examined, workers, progress)
     for job, (verdicts, problem) in zip(jobs, examined, strict=True):
         findings += _findings(job, verdicts, problem, options.get(job.name, {}))
@@ -118,16 +111,6 @@ def diagnose(
     findings = [_with_options(finding, options, shown) for finding in findings]
     observed = sum(len(model.image_index) for model in models)
     return Diagnosis(files, len(run.observations), len(mapped), observed, in_order(findings))
-
-
-def _side_by_side(function: Callable, jobs: list[tuple], stage: str, workers, progress) -> list:
-    """Runs the jobs in parallel and returns their results in the order of the jobs."""
-    results = [None] * len(jobs)
-    for done, (i, result) in enumerate(run_parallel(function, jobs, workers), start=1):
-        results[i] = result
-        if progress:
-            progress(stage, done, len(jobs))
-    return results
 
 
 def _files(run: SavedRun) -> list[Finding]:
@@ -319,7 +302,7 @@ def _try_options(run: SavedRun, jobs, examined, workers, progress) -> dict[str, 
         useful = [trial for trial in all_trials if trial.gate in gates]
         if useful and not problem:
             attempts.append((job, useful))
-    results = _side_by_side(_try, attempts, "try options", workers, progress)
+    results = run_in_order(_try, attempts, workers, progress and partial(progress, "try options"))
     return {job.name: labels for (job, _), labels in zip(attempts, results, strict=True)}
 
 

@@ -90,10 +90,8 @@ def trace_outlines(
 ) -> list[OutlineEnd]:
     """Returns where the outlines of n circles end.
 
-    Parameters
-    ----------
-    image : 8-bit grey
-    centre, shape : (n, 2), (n, 2, 2) predicted ellipses that detection did not find, px
+    ``image`` : 8-bit grey; ``centre``, ``shape`` : (n, 2), (n, 2, 2) predicted ellipses that detection did not find,
+    px.
     """
     threshold, grey_range = contrast_threshold(image, options)
     grey_range = max(grey_range, 1.0)

@@ -63,10 +63,7 @@ class Finding:
     None if there is no number; ``remedy`` : what to do with the scene; ``options`` : options each of which lets it in,
     as tried on the image, the gentlest first.
 
-    Raises
-    ------
-    TypeError
-        If a field from a damaged report has another type.
+    Raises TypeError if a field from a damaged report has another type.
     """
 
     image: str

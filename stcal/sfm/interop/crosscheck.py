@@ -92,13 +92,9 @@ def crosscheck(
 ) -> Crosscheck:
     """Maps the run's database with the native program and returns the comparison, ``crosscheck`` of ``report.json``.
 
-    Raises
-    ------
-    InputError
-        If there is no native program or no schema of its version is known, it cannot list a name, or the database is
-        not the run's.
-    MappingError
-        If the native program fails, hangs, makes no model of a group, or makes a model of another database.
+    Raises InputError if there is no native program or no schema of its version is known, it cannot list a name, or the
+    database is not the run's. Raises MappingError if the native program fails, hangs, makes no model of a group, or
+    makes a model of another database.
     """
     progress = progress or (lambda *_: None)
     native = find_colmap(colmap)

@@ -42,17 +42,10 @@ def damaged(path: Path, sign: str) -> InputError:
 def require_whole(database: Path, copy: sqlite3.Connection) -> None:
     """Checks every name, blob and reference of a database against the schema.
 
-    Parameters
-    ----------
-    database : Path
-        Path of the database, for messages.
-    copy : sqlite3.Connection
-        Copy of its content, in the schema of our own database.
+    ``database`` : path of the database, for messages; ``copy`` : copy of its content, in the schema of our own
+    database.
 
-    Raises
-    ------
-    InputError
-        If a row is damaged; the message names the first one.
+    Raises InputError if a row is damaged; the message names the first one.
     """
     for fault in _faults(copy):
         raise damaged(database, fault)
@@ -132,17 +125,10 @@ def _told(blob: object) -> str:
 def require_of_run(database: Path, copy: sqlite3.Connection, run: SavedRun) -> None:
     """Checks that the database holds the run's camera, images, centres, and the matches of their labels.
 
-    Parameters
-    ----------
-    database, copy :
-        As in :func:`require_whole`, which must have accepted the database.
-    run : SavedRun
-        Run with the camera and the labelled, corrected centres.
+    ``database``, ``copy :`` : as in :func:`require_whole`, which must have accepted the database; ``run`` : run with
+    the camera and the labelled, corrected centres.
 
-    Raises
-    ------
-    InputError
-        If it differs from the run's files; the message names the first difference.
+    Raises InputError if it differs from the run's files; the message names the first difference.
     """
     _require_camera(database, copy, run)
     ids = image_ids(run.observations)
@@ -233,19 +219,12 @@ def export_database(database: Path, out: Path, schema: str, run: SavedRun | None
     name and reference in it must be valid; if ``run`` is given, the content must be what the run has labelled. ``out``
     is compared with the database and with the published schema before it appears. It appears complete or not at all.
 
-    Parameters
-    ----------
-    database : database of pycolmap 4.2 that no other program has open
-    schema : name of a schema of :mod:`stcal.sfm.interop.schema`
-    run : run to which the database belongs
+    ``database`` : database of pycolmap 4.2 that no other program has open; ``schema`` : name of a schema of
+    :mod:`stcal.sfm.interop.schema`; ``run`` : run to which the database belongs.
 
-    Raises
-    ------
-    InputError
-        If the schema is unknown; ``out`` exists or cannot be written; ``database`` is in use, damaged or of another
-        version; or it holds something that has no place in the schema.
-    StcalError
-        If the written copy differs from the database or the schema.
+    Raises InputError if the schema is unknown; ``out`` exists or cannot be written; ``database`` is in use, damaged or
+    of another version; or it holds something that has no place in the schema. Raises StcalError if the written copy
+    differs from the database or the schema.
     """
     database, out = Path(database), Path(out)
     wanted = find_schema(schema)

@@ -77,21 +77,11 @@ class View:
 def require_fit(path: Path, views: Mapping[str, View], camera: Camera, report: ReportOfModel) -> None:
     """Checks the residual of every keypoint and the pose of every camera against the report.
 
-    Parameters
-    ----------
-    path : Path
-        Path of the model, for messages.
-    views : mapping of str to View
-        Views by name of the image.
-    camera : Camera
-        Camera of the model.
-    report : ReportOfModel
-        Report of the model's run.
+    ``path`` : path of the model, for messages; ``views`` : views by name of the image; ``camera`` : camera of the
+    model; ``report`` : report of the model's run.
 
-    Raises
-    ------
-    InputError
-        If one deviates. The message names the point and image that exceed their limit most, and the deviation.
+    Raises InputError if one deviates. The message names the point and image that exceed their limit most, and the
+    deviation.
     """
     limits = {row.image: row for row in report.residuals_by_image}
     worst = (1.0, "")
@@ -188,15 +178,11 @@ def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
     without distortion, and the keypoints as this camera sees them. This is exact, but photographs have to be
     undistorted to match.
 
-    Parameters
-    ----------
-    out : new file or folder, or an empty folder for a format of :data:`FOLDERS`; missing parent folders are made
-    kind : a :data:`ModelFormat`
+    ``out`` : new file or folder, or an empty folder for a format of :data:`FOLDERS`; missing parent folders are made;
+    ``kind`` : a :data:`ModelFormat`.
 
-    Raises
-    ------
-    InputError
-        If it is no finished run, its model is damaged or changed, the format is unknown, or ``out`` exists.
+    Raises InputError if it is no finished run, its model is damaged or changed, the format is unknown, or ``out``
+    exists.
     """
     out = Path(out)
     if kind not in get_args(ModelFormat):

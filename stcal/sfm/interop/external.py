@@ -34,14 +34,8 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained =
 
     ``solve`` : ``chain`` for our stages, ``paper`` for those of Zhang & Wei (2017).
 
-    Raises
-    ------
-    InputError
-        If the models state different cameras.
-    ScaleError
-        If the board of a group is not in its model.
-    MappingError
-        If the reference face is in none of the models, or a face is not linked to it.
+    Raises InputError if the models state different cameras. Raises ScaleError: if the board of a group is not in its
+    model. Raises MappingError if the reference face is in none of the models, or a face is not linked to it.
     """
     models: dict[str, WorldModel] = {}
     notes = []

@@ -85,10 +85,7 @@ class _TwoViews:
 def run_gates(run: SavedRun, group: str | None = None) -> dict[str, list[PairGates]]:
     """Returns the gates of every ranked pair of a run or of one of its groups, by group, in the run's order.
 
-    Raises
-    ------
-    InputError
-        If there is no such group, or the report lacks its pairs.
+    Raises InputError if there is no such group, or the report lacks its pairs.
     """
     ranked = ranked_pairs(run)
     if group is not None and group not in ranked:
@@ -109,10 +106,7 @@ def run_gates(run: SavedRun, group: str | None = None) -> dict[str, list[PairGat
 def ranked_pairs(run: SavedRun) -> dict[str, list[PairScore]]:
     """Returns the pairs of a run by group, as the run ranked them, the chosen one first; without their poses.
 
-    Raises
-    ------
-    InputError
-        If the report has no ranked pairs.
+    Raises InputError if the report has no ranked pairs.
     """
     try:
         return {
@@ -145,9 +139,7 @@ def group_gates(
 ) -> list[PairGates]:
     """Returns the gates of ranked pairs of a group's images.
 
-    Parameters
-    ----------
-    group : all images that are mapped together, as the defaults ignore tracks of two views
+    ``group`` : all images that are mapped together, as the defaults ignore tracks of two views.
     """
     pycolmap.logging.minloglevel = LOG_ERRORS_ONLY
     native = colmap_camera(camera)

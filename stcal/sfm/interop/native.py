@@ -39,10 +39,7 @@ class NativeColmap:
 def find_colmap(path: Path | None = None) -> NativeColmap:
     """Returns the program at ``path``, or the one on the PATH.
 
-    Raises
-    ------
-    InputError
-        If there is none, it is not COLMAP, or it fails or hangs when asked for its version.
+    Raises InputError if there is none, it is not COLMAP, or it fails or hangs when asked for its version.
     """
     executable = shutil.which("colmap" if path is None else str(path))
     if executable is None:
@@ -65,10 +62,7 @@ def find_colmap(path: Path | None = None) -> NativeColmap:
 def require_listable(names: list[str]) -> None:
     """Refuses names that COLMAP's list of images would change, as its lines are stripped.
 
-    Raises
-    ------
-    InputError
-        If a name begins or ends with a space.
+    Raises InputError if a name begins or ends with a space.
     """
     for name in names:
         if name != name.strip(" "):
@@ -84,15 +78,10 @@ def map_natively(
 ) -> None:
     """Runs the mapper on the named images of a database and writes to ``folder/models``.
 
-    Parameters
-    ----------
-    folder : new folder; the mapper's output goes to ``mapper.log`` there
-    options : values by name without dashes; this version must have all of the names
+    ``folder`` : new folder; the mapper's output goes to ``mapper.log`` there; ``options`` : values by name without
+    dashes; this version must have all of the names.
 
-    Raises
-    ------
-    MappingError
-        If the program fails, or does not end in ``timeout_s`` seconds.
+    Raises MappingError if the program fails, or does not end in ``timeout_s`` seconds.
     """
     models, images = folder / "models", folder / "images"
     for subfolder in (models, images):

@@ -244,10 +244,7 @@ _SAME_TABLES = {"4.1": "4.0"}
 def find_schema(name: str) -> Schema:
     """Returns the schema of that name.
 
-    Raises
-    ------
-    InputError
-        If it is not the name of a schema.
+    Raises InputError if it is not the name of a schema.
     """
     if name not in SCHEMAS:
         raise InputError("E-OPTION-VALUE", f"schema {name}: unknown; give one of {', '.join(SCHEMAS)}")
@@ -258,10 +255,7 @@ def schema_of_version(version: str) -> str:
     """Returns the name of the schema that a COLMAP program of ``version`` (``3.8``, ``3.11.1``, ``4.0.3``) reads and
     writes.
 
-    Raises
-    ------
-    InputError
-        If the version is no release, older than 3.8, or newer than the newest schema here.
+    Raises InputError if the version is no release, older than 3.8, or newer than the newest schema here.
     """
     release = re.fullmatch(r"(\d+\.\d+)(\.\d+)?", version)
     minor = release[1] if release else version

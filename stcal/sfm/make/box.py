@@ -61,10 +61,7 @@ def sides_of(size_mm: tuple[float, float, float], names: tuple[str, ...] = NAMES
 def faces_of(text: str) -> tuple[str, ...]:
     """Parses ``front,right,top`` into the names of sides; all of them if the text is empty.
 
-    Raises
-    ------
-    InputError
-        If a name is unknown or occurs twice, or if no two of the sides are neighbours.
+    Raises InputError if a name is unknown or occurs twice, or if no two of the sides are neighbours.
     """
     names = tuple(name.strip() for name in text.split(",")) if text else NAMES
     for name in names:
@@ -84,10 +81,7 @@ def faces_of(text: str) -> tuple[str, ...]:
 def size_of(text: str) -> tuple[float, float, float]:
     """Parses ``W,H,D`` into width, height and depth in mm.
 
-    Raises
-    ------
-    InputError
-        If the text is not three lengths, or a length is outside 1 mm to 100 m.
+    Raises InputError if the text is not three lengths, or a length is outside 1 mm to 100 m.
     """
     try:
         width, height, depth = map(float, text.split(","))

@@ -57,10 +57,7 @@ class MakeOptions:
     def ideal_camera(self) -> Camera:
         """Returns the camera without its distortion, or a default camera if none is given.
 
-        Raises
-        ------
-        InputError
-            If the camera file states no image size.
+        Raises InputError if the camera file states no image size.
         """
         width, height = self.width, round(self.width * 2 / 3)
         focal = np.full(2, FOCAL_PER_WIDTH * width)
@@ -101,17 +98,10 @@ class Made:
 def make_target(options: MakeOptions, progress: Callable[[int, int], None] | None = None) -> Made:
     """Returns a board, and a pattern for each side of the box that is to have one.
 
-    Parameters
-    ----------
-    options : MakeOptions
-    progress : callable, optional
-        Called with (done, total), numbers of cases of hidden circles.
+    ``options`` : MakeOptions; ``progress`` : called with (done, total), numbers of cases of hidden circles.
 
-    Raises
-    ------
-    InputError
-        If circles are too small or too large for the camera, too few, or without room, or if a face is not identified
-        with some of its circles hidden.
+    Raises InputError if circles are too small or too large for the camera, too few, or without room, or if a face is
+    not identified with some of its circles hidden.
     """
     least = options.least_radius_mm()
     radius = options.radius_mm

@@ -48,10 +48,7 @@ def make_pattern(
 ) -> MadeTarget:
     """A face for each side, each named by its circles with any :data:`HIDDEN` of them hidden.
 
-    Raises
-    ------
-    InputError
-        Too few circles, or no room for them.
+    Raises InputError: too few circles, or no room for them.
     """
     if circles < LEAST_CIRCLES:
         raise InputError(

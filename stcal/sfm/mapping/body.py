@@ -129,10 +129,7 @@ def _lengths(xyz_camera: np.ndarray, corners: Corners, camera: Camera) -> np.nda
 def place_body(corners: Corners, camera: Camera) -> Body:
     """Returns start values of all poses for a given camera.
 
-    Raises
-    ------
-    MappingError
-        No two faces are ever seen together.
+    Raises MappingError: no two faces are ever seen together.
     """
     views = _Views.of(corners, camera)
     edges = _edges(views, len(corners.faces))

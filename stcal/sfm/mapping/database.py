@@ -68,10 +68,8 @@ def write_database(
 ) -> None:
     """Writes a new database atomically: the file appears complete or not at all.
 
-    Parameters
-    ----------
-    pairs : (n, 2) indices of the images to match, see :func:`stcal.sfm.mapping.pairs.image_graph`
-    keypoints_px : one (n, 2) array for each image, OpenCV pixel origin; by default the measured centres
+    ``pairs`` : (n, 2) indices of the images to match, see :func:`stcal.sfm.mapping.pairs.image_graph`; ``keypoints_px``
+    : one (n, 2) array for each image, OpenCV pixel origin; by default the measured centres.
     """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")

@@ -141,12 +141,8 @@ def map_group(
 
     The chosen pair seeds COLMAP. If COLMAP's checks reject it, the relative pose of the ranking is registered instead.
 
-    Raises
-    ------
-    MappingError
-        There is no model of two or more images.
-    InputError
-        There is no space for what COLMAP writes beside the database.
+    Raises MappingError: there is no model of two or more images. Raises InputError: there is no space for what COLMAP
+    writes beside the database.
     """
     names = [image.name for image in group if image.name in skeleton]
     try:

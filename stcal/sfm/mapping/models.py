@@ -87,10 +87,7 @@ def write_model(
 ) -> None:
     """Writes models that share one world as COLMAP's binary files.
 
-    Raises
-    ------
-    InputError
-        The files do not contain what was to be written.
+    Raises InputError: the files do not contain what was to be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_reconstruction(to_reconstruction(models, observations, ids, camera)[0], folder)
@@ -101,10 +98,7 @@ def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: Path, 
 
     COLMAP's writers do not report a full disk.
 
-    Raises
-    ------
-    InputError
-        The files do not contain what was to be written.
+    Raises InputError: the files do not contain what was to be written.
     """
     try:
         (reconstruction.write_text if text else reconstruction.write_binary)(str(folder))
@@ -161,10 +155,7 @@ class ReadModel:
 def find_models(folder: str | Path) -> list[Path]:
     """Returns the folders with a COLMAP model among this folder and its subfolders (the mapper writes 0, 1, …).
 
-    Raises
-    ------
-    InputError
-        No folder contains a model.
+    Raises InputError: no folder contains a model.
     """
     folder = Path(folder)
     models = []
@@ -185,11 +176,8 @@ def read_model(
 ) -> ReadModel:
     """Reads a model that is based on the keypoints of the run's database. (image, keypoint) determines the label.
 
-    Raises
-    ------
-    InputError
-        The model is damaged, has more than one camera, an image that is not in the run, or keypoints of another
-        database; or its poses and points do not fit the keypoints.
+    Raises InputError: the model is damaged, has more than one camera, an image that is not in the run, or keypoints of
+    another database; or its poses and points do not fit the keypoints.
     """
     reconstruction = open_model(path)
     cameras = list(reconstruction.cameras.values())
@@ -238,10 +226,7 @@ def read_model(
 def open_model(path: Path) -> pycolmap.Reconstruction:
     """Opens a model's files with COLMAP.
 
-    Raises
-    ------
-    InputError
-        A file is damaged or missing.
+    Raises InputError: a file is damaged or missing.
     """
     pycolmap.logging.minloglevel = LOG_NOTHING
     try:
@@ -364,10 +349,7 @@ def _require_whole(file: Path, skip: Callable[[_Walk], None]) -> None:
 def require_keypoints(path: Path, image: pycolmap.Image, labels: Sequence[str], corrected_px: np.ndarray) -> None:
     """Checks that the model uses the run's keypoints, as only then (image, keypoint) determines a label.
 
-    Raises
-    ------
-    InputError
-        The number of keypoints differs, or a keypoint is elsewhere.
+    Raises InputError: the number of keypoints differs, or a keypoint is elsewhere.
     """
     xy = from_colmap_px(np.array([point.xy for point in image.points2D]).reshape(-1, 2))
     if len(xy) != len(corrected_px):
@@ -404,10 +386,7 @@ def _require_fit(path: Path, model: GroupModel, camera: Camera) -> None:
 def pose_of_image(path: Path, image: pycolmap.Image) -> Rigid:
     """Returns camera_from_model of an image of the model.
 
-    Raises
-    ------
-    InputError
-        The quaternion is far from unit length, or the translation is not finite.
+    Raises InputError: the quaternion is far from unit length, or the translation is not finite.
     """
     pose = image.cam_from_world()
     length = math.hypot(*pose.rotation.quat)  # accepts any numbers without a warning

@@ -91,10 +91,7 @@ def rank_pairs(
 
     ``board`` : gives the relative pose of pairs with only the board in common, as a plane has two essential matrices.
 
-    Raises
-    ------
-    MappingError
-        No pair is usable: too few labels in common, or the camera did not move.
+    Raises MappingError: no pair is usable: too few labels in common, or the camera did not move.
     """
     scores = [_score(a, b, camera, options, board) for a, b in combinations(group, 2)]
     scores.sort(key=lambda s: (s.verdict != "usable", -round(s.median_angle_rad, 9), -s.shared, s.first, s.second))

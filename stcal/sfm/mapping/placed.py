@@ -62,10 +62,7 @@ def place_with_camera(
 
     Faces of circles may be among them: their design is near enough to begin with, and moves afterwards.
 
-    Raises
-    ------
-    MappingError
-        No two faces are ever seen together.
+    Raises MappingError: no two faces are ever seen together.
     """
     corners = Corners.of(observations, faces)
     none = np.zeros((16, 0))
@@ -80,10 +77,7 @@ def place_and_find_camera(
 
     The search begins at each of ``starts``, and at several focal lengths about the first; the least cost decides.
 
-    Raises
-    ------
-    MappingError
-        No two faces are ever seen together, or no focal length explains the images.
+    Raises MappingError: no two faces are ever seen together, or no focal length explains the images.
     """
     corners = Corners.of(observations, faces)
     side, first = max(starts[0].width, starts[0].height), starts[0]
@@ -143,10 +137,7 @@ def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: 
 
     Other images of the group, and other points, are added as far as these determine them.
 
-    Raises
-    ------
-    MappingError
-        Fewer than two images of the group are placed.
+    Raises MappingError: fewer than two images of the group are placed.
     """
     placed = [image for image in group if image.name in body.camera_from_body]
     if len(placed) < 2:

@@ -72,9 +72,8 @@ def covariance_of_likelihood(
     least : χ² of the pose
     covariance : (6, 6) of the linearised problem
     second : the second solution, or None
-    plane : target_from_plane of a face seen alone and without a second minimum, else None. The two minima may have
-        merged into a valley, of which the linearised problem sees one side. The mirror image matters if its excess in
-        χ² is below ``plausible``, it is some σ away, and it is far more probable than these σ say.
+    plane : merged into a valley, of which the linearised problem sees one side. The mirror image matters if its excess
+        in χ² is below ``plausible``, it is some σ away, and it is far more probable than these σ say.
     plausible : largest excess in χ² with which the mirror image is plausible
     """
     whiten = np.linalg.inv(np.linalg.cholesky(full))

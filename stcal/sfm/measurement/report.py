@@ -104,10 +104,7 @@ def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, 
 
     ``joints`` : further columns by image. Only images of this table are then written.
 
-    Raises
-    ------
-    InputError
-        If the table has no column ``image``, an image twice, or a column of the name of a measured one.
+    Raises InputError if the table has no column ``image``, an image twice, or a column of the name of a measured one.
     """
     header = [IMAGE, FACES, CIRCLES, STATUS, *POSE, *COVARIANCE, *QUALITY]
     common = common_columns(result.common.shape[2])
@@ -399,7 +396,7 @@ def _sigma(result: MeasureResult):
     place.scatter(rows, across, s=size**2, c="none", edgecolors=colours, lw=0.8)
     turn.scatter(rows, np.degrees(rotation), s=size**2, c=colours, lw=0)
     for axes, label in ((place, "σ position, µm"), (turn, "σ rotation, mdeg")):
-        axes.set_ylim(0, None)
+        axes.set_ylim(0, 1.06 * axes.get_ylim()[1])
         axes.yaxis.set_major_locator(locator())
         axes.set_xlim(0.4, len(rows) + 0.6)
         axes.xaxis.set_major_locator(locator())

@@ -58,16 +58,9 @@ NO_TOKEN, NOT_FOUND, NOT_ALLOWED, NO_LENGTH, TOO_LARGE, LONG_TARGET, MANY_FIELDS
 class ServeOptions:
     """Options of the HTTP service.
 
-    Parameters
-    ----------
-    host : str
-        Address to listen on; reachable from this machine only by default.
-    port : int
-        Port to listen on; any free one if 0.
-    max_megabytes : float
-        Largest size of an image file.
-    token : str
-        Word that each request must carry as ``Authorization: Bearer``; none is needed if empty.
+    ``host`` : address to listen on; reachable from this machine only by default; ``port`` : port to listen on; any free
+    one if 0; ``max_megabytes`` : largest size of an image file; ``token`` : word that each request must carry as
+    ``Authorization: Bearer``; none is needed if empty.
     """
 
     host: str = LOCALHOST

@@ -60,12 +60,7 @@ class MeasureService:
     Each image goes to the process with the fewest waiting images, together with the previous poses of its sequence.
     Images of a sequence are measured in the order in which they came.
 
-    Parameters
-    ----------
-    setting : Setting
-        Target and camera.
-    workers : int
-        Number of processes.
+    ``setting`` : target and camera; ``workers`` : number of processes.
     """
 
     def __init__(self, setting: Setting, workers: int):
@@ -92,14 +87,10 @@ class MeasureService:
 
         Parameters
         ----------
-        data : bytes
-            Content of an image file.
-        name : str
-            Name of the image, for the answer.
-        sequence : str
-            Name of the sequence whose next image it is; empty for a single image.
-        left : callable, optional
-            Returns whether the client has gone, so that an image that still waits need not be measured.
+        data : content of an image file
+        name : name of the image, for the answer
+        sequence : name of the sequence whose next image it is; empty for a single image
+        left : returns whether the client has gone, so that an image that still waits need not be measured
 
         Returns
         -------

@@ -35,12 +35,8 @@ class TargetCircles:
     ``normal`` : (c, 3) normal of the plane of each circle's face; ``target_from_plane`` : by face, with the origin of
     the plane at the mean of its circles; ``place`` : index by label.
 
-    Raises
-    ------
-    DegenerateError
-        If the circles of a face lie in line.
-    InputError
-        If an array has a wrong shape, a number is out of range, a label occurs twice, or a covariance is invalid.
+    Raises DegenerateError if the circles of a face lie in line. Raises InputError: if an array has a wrong shape, a
+    number is out of range, a label occurs twice, or a covariance is invalid.
     """
 
     labels: tuple[CircleLabel, ...]

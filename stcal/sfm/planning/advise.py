@@ -108,10 +108,7 @@ def known_of(run: SavedRun) -> Known:
 
     It is adjusted once more, which moves nothing, for the data that ``faces.json`` does not contain.
 
-    Raises
-    ------
-    InputError
-        The run's ``target_model`` is missing or damaged.
+    Raises InputError: the run's ``target_model`` is missing or damaged.
     """
     again = adjusted_run(run)
     joint = again.state.result()

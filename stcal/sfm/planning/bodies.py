@@ -37,12 +37,9 @@ def plan_body(options: PlanOptions, target: TargetDesign, nominal: dict[str, Rig
 
     Parameters
     ----------
-    options : PlanOptions
-        Images, distance, camera and noise. Without a camera it is found from the photographs, as ``run`` does.
-    target : TargetDesign
-        Design of the body, mm.
-    nominal : dict of Rigid
-        Pose of every face in one common frame, mm, by face id.
+    options : images, distance, camera and noise. Without a camera it is found from the photographs, as ``run`` does.
+    target : design of the body, mm
+    nominal : pose of every face in one common frame, mm, by face id
 
     Returns
     -------

@@ -22,10 +22,8 @@ def nominal_poses(target: TargetDesign, faces: Path | None) -> dict[str, Rigid]:
     """Returns the pose of every face in one frame. ``faces`` : a ``faces.json``, or None for the rough poses of the
     design.
 
-    Raises
-    ------
-    InputError
-        If a face has no rough pose and there is no ``faces.json``, or if that file is invalid or lacks a face.
+    Raises InputError if a face has no rough pose and there is no ``faces.json``, or if that file is invalid or lacks a
+    face.
     """
     if faces is None:
         rough = target.rough_poses()

@@ -132,10 +132,7 @@ class Plan:
 def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ...]:
     """Returns the pairs of face ids that a text like ``12,14`` or ``top-left,top-right`` names.
 
-    Raises
-    ------
-    InputError
-        If a name is not a pair of the target's faces.
+    Raises InputError if a name is not a pair of the target's faces.
     """
     pair_of_name = {group_name(pair): pair for pair in permutations([face.id for face in target.faces], 2)}
     names = [name.strip() for name in text.split(",")]
@@ -288,10 +285,7 @@ def _setup(scene: Scene, options: PlanOptions, board: BoardDesign) -> Setup:
 def _linked(reference: str, pairs: list[tuple[str, ...]]) -> set[str]:
     """Returns the faces of all groups, after a check that each is linked to the reference face.
 
-    Raises
-    ------
-    InputError
-        If a face is not linked to it.
+    Raises InputError if a face is not linked to it.
     """
     planned = {face for pair in pairs for face in pair}
     linked = {reference}

@@ -47,27 +47,17 @@ class FromPhotos:
 
     Parameters
     ----------
-    images : str
-        Folder of the photographs.
-    measured : MeasureResult
-        Poses of the target.
-    nominal : Robot
-        The arm as drawn.
-    data : Measurements
-        Poses with their joint values.
-    axes : AxesResult or None
-        Result of the axis method, where every joint is swept.
-    without_axes : str
-        Reason why there is no result of the axis method.
-    identified : Identified
-        Identification from all poses.
-    compensated : Compensated or None
-        Joint values for the targets, where there are any.
-    errors : dict of str to Figures
-        Position errors of the rows, mm: as drawn and by the axis method with base and tool fitted, identified, and of
-        rows held out.
-    notes : tuple of str
-        Notes on rows and photographs that have no partner, and on the input.
+    images : folder of the photographs
+    measured : poses of the target
+    nominal : the arm as drawn
+    data : poses with their joint values
+    axes : result of the axis method, where every joint is swept
+    without_axes : reason why there is no result of the axis method
+    identified : identification from all poses
+    compensated : joint values for the targets, where there are any
+    errors : position errors of the rows, mm: as drawn and by the axis method with base and tool fitted, identified, and
+        of rows held out
+    notes : notes on rows and photographs that have no partner, and on the input
     """
 
     images: str

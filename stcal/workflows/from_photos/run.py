@@ -57,20 +57,13 @@ def from_photos(
 
     Parameters
     ----------
-    images, camera, target, design, board, progress
-        As in :func:`stcal.sfm.measurement.images.measure`.
-    joints : path
-        Table of joint values with a column ``key`` that names the photograph of each row (CSV).
-    nominal : Robot
-        The arm as drawn, mm and rad; the model by which the controller commands it.
-    targets : path or Table, optional
-        Poses or joint values to compensate.
-    key : str
-        Name of the column of photographs.
-    measure_options, options
-        Options of measuring and of identifying; the defaults if None.
-    columns : path, optional
-        Map of the columns of ``joints``.
+    images, camera, target, design, board, progress : as in :func:`stcal.sfm.measurement.images.measure`
+    joints : table of joint values with a column ``key`` that names the photograph of each row (CSV)
+    nominal : the arm as drawn, mm and rad; the model by which the controller commands it
+    targets : poses or joint values to compensate
+    key : name of the column of photographs
+    measure_options, options : options of measuring and of identifying; the defaults if None
+    columns : map of the columns of ``joints``
 
     Returns
     -------
@@ -95,11 +88,8 @@ def read_joints(
 ) -> Table:
     """Returns joint values with the name of each row's photograph in the column ``image``, which replaces ``key``.
 
-    Raises
-    ------
-    InputError
-        No such column, no row of the photographs, one twice, poses beside the joint values, or other joints than the
-        robot's.
+    Raises InputError: no such column, no row of the photographs, one twice, poses beside the joint values, or other
+    joints than the robot's.
     """
     values, nowhere = table_of(path, columns, "joints"), np.zeros(len(photographs))
     files = Table(PHOTOGRAPHS, {key: list(photographs)} | dict.fromkeys(POSE, nowhere), range(len(photographs)))

@@ -71,10 +71,7 @@ def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[Rob
 
     Where the table has base_from_flange_… too, ``understood`` says how far these poses are off.
 
-    Raises
-    ------
-    InputError
-        Missing columns, values that are not numbers, or an image that has two rows.
+    Raises InputError: missing columns, values that are not numbers, or an image that has two rows.
     """
     table = read_table(path, "robot poses", quaternions)
     arm = Arm(robot, joint_values(table, robot))
@@ -105,18 +102,12 @@ def with_arm(
 
     Parameters
     ----------
-    outcome : Outcome
-        Calibration of the same poses, by the robot's file.
-    arm : Arm
-        The arm at the joint values of these poses.
-    options : HandEyeOptions
-        Options of the outcome.
-    prior : CameraPrior, optional
-        Prior of the intrinsics.
-    rows : (s, k) int array
-        Poses to hold out; none where empty.
-    workers, progress
-        As in :func:`stcal.handeye.cross_validate`.
+    outcome : calibration of the same poses, by the robot's file
+    arm : the arm at the joint values of these poses
+    options : options of the outcome
+    prior : prior of the intrinsics
+    rows : (s, k) poses to hold out; none where empty
+    workers, progress : as in :func:`stcal.handeye.cross_validate`
 
     Returns
     -------

@@ -66,7 +66,7 @@ def two_files(
     first: Path,
     second: Path,
     key: str,
-    said: Said,
+    statements: Said,
     quaternions: Order = "wxyz",
     timing: Timing = WITHOUT_OPTIONS,
     columns: tuple[Path | None, Path | None] = (None, None),
@@ -76,16 +76,13 @@ def two_files(
     The result is None for two tables of the package's own, which are joined as tables. ``columns`` : maps of the
     columns of both, where they are tables of other programs.
 
-    Raises
-    ------
-    InputError
-        As in :func:`~stcal.handeye.data.inputs.read_two`; or options were given that tables do not need.
+    Raises InputError: as in :func:`~stcal.handeye.data.inputs.read_two`; or options were given that tables do not need.
     """
-    told = read_two(first, second, said, key, quaternions, timing.tolerance_s, timing.offset, columns)
+    told = read_two(first, second, statements, key, quaternions, timing.tolerance_s, timing.offset, columns)
     if told is None:
         for path in (first, second):
             require_own(path, quaternions)
-        _require_unsaid(said, f"{first}, {second}")
+        _require_unsaid(statements, f"{first}, {second}")
     return told
 
 
@@ -98,25 +95,23 @@ def read_input(
     workers: int | None = None,
     progress: Progress = lambda *_: None,
     quaternions: Order = "wxyz",
-    said: Said = NOTHING_SAID,
+    statements: Said = NOTHING_SAID,
     timing: Timing = WITHOUT_OPTIONS,
     robot: Robot | None = None,
 ) -> HandEyeInput:
     """Returns pose pairs from their files, or from a folder of images with ``poses``, ``camera`` and ``board``.
 
-    ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``said`` : the
-    user's statements about what files do not state; ``timing`` : of poses by time; ``robot`` : the robot at whose joint
-    values, in ``poses``, the images were taken, if its parameters are to be solved for.
+    ``quaternions`` : ``xyzw`` where their columns hold x, y, z, w in the order in which they stand; ``statements`` :
+    the user's statements about what files do not state; ``timing`` : of poses by time; ``robot`` : the robot at whose
+    joint values, in ``poses``, the images were taken, if its parameters are to be solved for.
 
-    Raises
-    ------
-    InputError
-        A file is missing or not of the required form, one file too many was given, or no image shows the board.
+    Raises InputError: a file is missing or not of the required form, one file too many was given, or no image shows the
+    board.
     """
     if isinstance(source, Path) and source.is_dir():
         poses, camera, board = _all_three(source, poses, camera, board)
         if robot is None:
-            robot_poses = read_robot_poses(poses, quaternions, said)
+            robot_poses = read_robot_poses(poses, quaternions, statements)
             return _from_images(source, robot_poses, poses, camera, board, workers, progress, timing)
         _require_by_name(timing)
         robot_poses, arm = read_arm(poses, robot, quaternions)
@@ -130,12 +125,12 @@ def read_input(
     if isinstance(source, Table):
         return HandEyeInput(source.where, read_poses(source, quaternions))
     if isinstance(source, Told):
-        return _from_told(source, said)
-    told = read_pairs(source, said, quaternions=quaternions)
+        return _from_told(source, statements)
+    told = read_pairs(source, statements, quaternions=quaternions)
     if told is not None:
-        return _from_told(told, said)
+        return _from_told(told, statements)
     pairs = read_poses(source, quaternions)  # first: a table that is not understood is no table whose columns say all
-    _require_unsaid(said, str(source))
+    _require_unsaid(statements, str(source))
     return HandEyeInput(source.name, pairs)
 
 
@@ -185,32 +180,34 @@ def _require_timed(source: Source, timing: Timing) -> None:
         )
 
 
-def _require_unsaid(said: Said, where: str) -> None:
-    if said.options():
+def _require_unsaid(statements: Said, where: str) -> None:
+    if statements.options():
         raise InputError(
-            "E-OPTION-NEEDS", f"{where}: tables whose columns say all; leave {', '.join(said.options())} out"
+            "E-OPTION-NEEDS", f"{where}: tables whose columns say all; leave {', '.join(statements.options())} out"
         )
 
 
-def setup_of(said: Said, told: str | None, where: str) -> Setup:
+def setup_of(statements: Said, told: str | None, where: str) -> Setup:
     """Returns the setup that the user states, or that a file states, or eye-in-hand.
 
-    Raises
-    ------
-    InputError
-        The user and the file contradict each other.
+    Raises InputError: the user and the file contradict each other.
     """
-    if said.setup and told and said.setup != told:
+    if statements.setup and told and statements.setup != told:
         raise InputError(
-            "E-OPTION-CONTRADICTS", f"{where}: of a setup {told}, --setup {said.setup}; leave the option out"
+            "E-OPTION-CONTRADICTS", f"{where}: of a setup {told}, --setup {statements.setup}; leave the option out"
         )
-    name = said.setup or told or SETUPS[0]
+    name = statements.setup or told or SETUPS[0]
     return "eye-to-hand" if name == "eye-to-hand" else "eye-in-hand"
 
 
-def _from_told(told: Told, said: Said) -> HandEyeInput:
+def _from_told(told: Told, statements: Said) -> HandEyeInput:
     """Returns the input. Lengths of a model without a unit are brought to mm, approximately, by the robot's motions."""
-    setup, pairs, unit, understood = setup_of(said, told.setup, told.pairs.where), told.pairs, None, told.understood
+    setup, pairs, unit, understood = (
+        setup_of(statements, told.setup, told.pairs.where),
+        told.pairs,
+        None,
+        told.understood,
+    )
     if told.scaled:
         pairs, unit = _about_mm(pairs, setup)
         understood = (*understood, "the model has no unit: --with-scale is implied; give --length-unit if it is metric")
@@ -273,10 +270,7 @@ def photographed(
 ) -> Photographed:
     """Returns the corners of the board in all images that have a pose.
 
-    Raises
-    ------
-    InputError
-        No image shows the board, or no image has a pose.
+    Raises InputError: no image shows the board, or no image has a pose.
     """
     model = read_camera(camera)
     files, skipped = find_images(source)
@@ -385,23 +379,20 @@ def dry_run(
     camera: Path | None = None,
     board: Path | None = None,
     quaternions: Order = "wxyz",
-    said: Said = NOTHING_SAID,
+    statements: Said = NOTHING_SAID,
     timing: Timing = WITHOUT_OPTIONS,
     robot: Robot | None = None,
 ) -> list[str]:
     """Returns lines on how the inputs are understood, without looking for the board in images.
 
-    Raises
-    ------
-    InputError
-        For the reasons given in :func:`read_input`.
+    Raises InputError: for the reasons given in :func:`read_input`.
     """
     if isinstance(source, Path) and source.is_dir():
-        return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, said, timing, robot)
-    inputs = read_input(source, poses, camera, board, quaternions=quaternions, said=said, timing=timing)
+        return _dry_images(source, *_all_three(source, poses, camera, board), quaternions, statements, timing, robot)
+    inputs = read_input(source, poses, camera, board, quaternions=quaternions, statements=statements, timing=timing)
     lines = list(inputs.understood) if isinstance(source, Told) or inputs.understood else own_told(source, quaternions)
-    setup = setup_of(said, inputs.setup, inputs.where)
-    origin = "as you say" if said.setup else "as the file says" if inputs.setup else "by default"
+    setup = setup_of(statements, inputs.setup, inputs.where)
+    origin = "as you say" if statements.setup else "as the file says" if inputs.setup else "by default"
     lines += [f"setup: {setup}, {origin}", f"pairs: {len(inputs.pairs)}"]
     if inputs.unit_mm is not None:
         lines.append(f"scale: a unit of the model is about {inputs.unit_mm:.6g} mm by the robot's motions")
@@ -415,27 +406,27 @@ def _dry_images(
     camera: Path,
     board: Path,
     quaternions: Order,
-    said: Said,
+    statements: Said,
     timing: Timing,
     arm: Robot | None,
 ) -> list[str]:
     """Returns the lines on a folder of images."""
     if arm is not None:
         _require_by_name(timing)
-    robot = read_robot_poses(poses, quaternions, said) if arm is None else read_arm(poses, arm, quaternions)[0]
+    robot = read_robot_poses(poses, quaternions, statements) if arm is None else read_arm(poses, arm, quaternions)[0]
     design, model = load_boards(board), read_camera(camera)
     files, skipped = find_images(source)
     at_images = robot_at_images(robot, [file.name for file in files], None if arm else timing)
     robot, every = at_images.robot, len(files)
     files = [file for file in files if file.name not in dict(at_images.left_out)]
     rows, missing, matching = _rows_of_images(robot, files, source)
-    setup = setup_of(said, None, source.name)
+    setup = setup_of(statements, None, source.name)
     kind = kind_of(design)
     lines = [
         *_robot_lines(robot, matching),
         f"camera: {camera.name}: {model.width} × {model.height} px, focal length {model.focal[0]:.6g} px",
         f"board: {board.name}: {kind}",
-        f"setup: {setup}, {'as you say' if said.setup else 'by default'}",
+        f"setup: {setup}, {'as you say' if statements.setup else 'by default'}",
         f"images: {len(rows)} of {every} with a pose of the robot; the board was not looked for",
         *spread_text(robot.base_from_flange[list(rows.values())], setup),
     ]
@@ -452,10 +443,7 @@ def without_flips(inputs: HandEyeInput, setup: Setup, options: HandEyeOptions) -
     """Returns the input with the second pose of a flat target, tilted the other way, for poses that agree with the
     others only so; and a sentence that names them.
 
-    Raises
-    ------
-    InputError
-        Images, which tell the poses by themselves.
+    Raises InputError: images, which tell the poses by themselves.
     """
     if inputs.views is not None:
         raise InputError(

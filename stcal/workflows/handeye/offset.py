@@ -42,12 +42,8 @@ def at_offset(
 
     Numberings of a symmetric board are put right.
 
-    Raises
-    ------
-    InputError
-        There are no times, or the robot has four axes.
-    StcalError
-        For the reasons given in :func:`~stcal.handeye.time_offset.estimate_offset`.
+    Raises InputError: there are no times, or the robot has four axes. Raises StcalError: for the reasons given in
+    :func:`~stcal.handeye.time_offset.estimate_offset`.
     """
     timed = given.timed
     if timed is None:

@@ -37,16 +37,11 @@ def plan_next(given: HandEyeInput, setup: Setup, count: int = 3, robot: Robot | 
 
     Parameters
     ----------
-    given : HandEyeInput
-        Poses taken so far.
-    setup : {"eye-in-hand", "eye-to-hand"}
-        What carries the camera.
-    count : int
-        Number of poses to plan.
-    robot : Robot, optional
-        Robot within whose joint limits the poses are to be, from its own base to its flange, no tool.
-    seed : int
-        Seed of the candidates.
+    given : poses taken so far
+    setup : {"eye-in-hand", "eye-to-hand"}: what carries the camera
+    count : number of poses to plan
+    robot : robot within whose joint limits the poses are to be, from its own base to its flange, no tool
+    seed : seed of the candidates
 
     Returns
     -------

@@ -43,19 +43,17 @@ def read_rig(
     workers: int | None = None,
     progress: Progress = lambda *_: None,
     quaternions: Order = "wxyz",
-    said: Said | None = None,
+    statements: Said | None = None,
     tolerance_s: float = TOLERANCE_S,
 ) -> RigInput:
     """Returns the board in all images of all cameras, with the robot's poses.
 
-    Raises
-    ------
-    InputError
-        The message says what is wrong with a file, and names the camera.
+    Raises InputError: the message says what is wrong with a file, and names the camera.
     """
     design, cameras = load_boards(files.board), []
     by_file = {
-        camera_files.poses: read_robot_poses(camera_files.poses, quaternions, said) for camera_files in files.cameras
+        camera_files.poses: read_robot_poses(camera_files.poses, quaternions, statements)
+        for camera_files in files.cameras
     }
     robots = [_of_camera(by_file[camera_files.poses], camera_files.images, files) for camera_files in files.cameras]
     for camera_files, robot in zip(files.cameras, robots, strict=True):
@@ -147,10 +145,8 @@ def calibrate_rig(
 ) -> RigOutcome:
     """Solve all cameras in one adjustment and each by itself, and compare both on held-out poses of the robot.
 
-    Raises
-    ------
-    StcalError
-        For the reasons given in :func:`stcal.handeye.handeye_rig`; the message also names what was left out before.
+    Raises StcalError: for the reasons given in :func:`stcal.handeye.handeye_rig`; the message also names what was left
+    out before.
     """
     validation = validation or Splits()
     options = RigOptions(refine=refine, with_scale=with_scale, symmetries=given.symmetries)

@@ -47,10 +47,7 @@ def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | No
 
     Poses stay as they are where ``timing`` is None, since joint values belong to images by name.
 
-    Raises
-    ------
-    InputError
-        There are no times where an option needs them, or no image lies within the stream.
+    Raises InputError: there are no times where an option needs them, or no image lies within the stream.
     """
     if timing is None:
         return AtImages(robot)

@@ -7,7 +7,7 @@ from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions, Noise, View, Views, handeye, pairs_of_views
 from stcal.handeye.data.pairs import Loop
-from stcal.handeye.methods.bundle import Bundle
+from stcal.handeye.methods.bundle import RigBundle, RigCorners
 from stcal.handeye.methods.reprojection import problem
 from stcal.io.cameras.model import camera_prior
 from tests.handeye.derivatives import assert_derivatives
@@ -59,8 +59,9 @@ def test_derivatives_of_the_corners(setup):
     loop = Loop.of(truth.pairs, setup)
     noise = Noise(1e-3, 0.5, corner_px=0.2, board_mm=0.1)
     flange = truth.pairs.base_from_flange
-    corners, _ = problem(loop, flange, truth.views, noise, prior(truth.views.camera, "FULL_OPENCV"), True)
-    state = Bundle(truth.mount_from_camera, truth.stand_from_board, flange, corners.xyz_board, truth.views.camera)
+    one, _ = problem(loop, flange, truth.views, noise, prior(truth.views.camera, "FULL_OPENCV"), True)
+    corners, cameras = RigCorners(("",), (one,)), (truth.views.camera,)
+    state = RigBundle((truth.mount_from_camera,), truth.stand_from_board, flange, one.xyz_board, cameras)
     assert list(corners.parts(state)) == [
         "corner_px",
         *(f"camera_{kind}" for kind in ("focal", "centre", "radial", "tangential")),

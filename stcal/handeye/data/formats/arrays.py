@@ -20,10 +20,7 @@ DAMAGED = (ValueError, TypeError, EOFError, OSError, MemoryError, OverflowError,
 def load_npy(data: bytes, where: str) -> np.ndarray:
     """Returns the array of an npy file.
 
-    Raises
-    ------
-    InputError
-        The file is damaged, or holds objects, which only a program could load.
+    Raises InputError: the file is damaged, or holds objects, which only a program could load.
     """
     stream = io.BytesIO(data)
     try:
@@ -52,10 +49,7 @@ def load_npy(data: bytes, where: str) -> np.ndarray:
 def load_npz(data: bytes, where: str) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Returns the arrays of an npz file by name, and the names of those that are not numbers.
 
-    Raises
-    ------
-    InputError
-        The file is damaged, or larger than any such file is when unpacked.
+    Raises InputError: the file is damaged, or larger than any such file is when unpacked.
     """
     arrays, others = {}, []
     try:

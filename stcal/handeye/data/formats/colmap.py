@@ -35,10 +35,7 @@ def is_text(text: str) -> bool:
 def read_text(text: str, where: str) -> Content:
     """Returns the poses in images.txt, which has two lines for each image; the second holds its points.
 
-    Raises
-    ------
-    InputError
-        A line does not have the form of the format.
+    Raises InputError: a line does not have the form of the format.
     """
     images = image_lines(text, where)
     places = [f"line {image.number}" for image in images]
@@ -48,10 +45,7 @@ def read_text(text: str, where: str) -> Content:
 def read_binary(path: Path, where: str) -> Content:
     """Returns the poses in images.bin.
 
-    Raises
-    ------
-    InputError
-        The file ends too early, or has bytes after its end.
+    Raises InputError: the file ends too early, or has bytes after its end.
     """
     try:
         data = read_bytes(path, MODEL_BYTES)

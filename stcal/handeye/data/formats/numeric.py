@@ -54,13 +54,10 @@ class Line:
     first: str
 
 
-def read_numbers(text: str, said: Said, where: str) -> Content | None:
+def read_numbers(text: str, statements: Said, where: str) -> Content | None:
     """Returns the poses in lines of numbers, each with or without a name before them; None for any other text.
 
-    Raises
-    ------
-    InputError
-        Lines of unequal length, 3×4 matrices, no rotations, or a convention that must be stated.
+    Raises InputError: lines of unequal length, 3×4 matrices, no rotations, or a convention that must be stated.
     """
     lines, comments = [], []
     for i, raw in enumerate(_with_points(text.splitlines()), 1):
@@ -104,17 +101,19 @@ def read_numbers(text: str, said: Said, where: str) -> Content | None:
         rotation, translation = of_matrices(values.reshape(-1, 4, 4), places, where)
         return Content("4×4 matrices, a row each", (Side(rotation, translation, places, MATRICES, names=names),))
     if width in PAIRS:
-        return _pairs(values, said, places, names, where)
-    rotation, words = turned_values(values[:, 3:], said.rotation, "the numbers after x, y, z", places, where)
+        return _pairs(values, statements, places, names, where)
+    rotation, words = turned_values(values[:, 3:], statements.rotation, "the numbers after x, y, z", places, where)
     return Content("rows of numbers", (Side(rotation, values[:, :3], places, words, names=names),))
 
 
-def _pairs(values: np.ndarray, said: Said, places: tuple[str, ...], names: tuple[str, ...], where: str) -> Content:
+def _pairs(
+    values: np.ndarray, statements: Said, places: tuple[str, ...], names: tuple[str, ...], where: str
+) -> Content:
     """Returns the poses of both sides in rows of numbers (m, 12) or (m, 14), the robot's first."""
     half, sides = values.shape[1] // 2, []
     for role, numbers in zip(ROLES, (values[:, :half], values[:, half:]), strict=True):
         what = f"the numbers after x, y, z of the {role}'s pose"
-        rotation, words = turned_values(numbers[:, 3:], said.of(role).rotation, what, places, where)
+        rotation, words = turned_values(numbers[:, 3:], statements.of(role).rotation, what, places, where)
         frames = Frames(FRAMES[role][0], "by default", False)
         sides.append(Side(rotation, numbers[:, :3], places, words, None, frames, names))
     return Content(f"rows of {half} + {half} numbers, the robot's pose first", tuple(sides))
@@ -132,10 +131,7 @@ def _without_counts(lines: list[Line], where: str) -> list[Line]:
     """Returns the lines without a first one that holds the number of poses alone; a number alone before each matrix is
     its name.
 
-    Raises
-    ------
-    InputError
-        There are not as many poses as the first line says.
+    Raises InputError: there are not as many poses as the first line says.
     """
     single = [i for i, line in enumerate(lines) if len(line.values) == 1 and not line.label]
     matrix_lines = 4
@@ -260,14 +256,11 @@ def todays(table: Table) -> bool:
     return any(table.has(f"{prefix}x", LENGTHS) and f"{prefix}qw" in table for prefix in prefixes)
 
 
-def read_columns(table: Table, key: str, said: Said) -> Content | None:
+def read_columns(table: Table, key: str, statements: Said) -> Content | None:
     """Returns the poses in the columns of a table; None where it has none.
 
-    Raises
-    ------
-    InputError
-        Some columns of a pose are missing, rotations are missing, one file holds several topics, or the convention must
-        be stated.
+    Raises InputError: some columns of a pose are missing, rotations are missing, one file holds several topics, or the
+    convention must be stated.
     """
     messages = _messages(table)
     if messages:
@@ -275,11 +268,11 @@ def read_columns(table: Table, key: str, said: Said) -> Content | None:
     names = _row_names(table, key)
     sides = []
     for frame in EVERY_FRAME:
-        side = _side(table, f"{frame}_", Frames(frame, f"by the columns {frame}_…"), names, said)
+        side = _side(table, f"{frame}_", Frames(frame, f"by the columns {frame}_…"), names, statements)
         if side is not None:
             sides.append(side)
     if not sides:
-        side = _side(table, "", None, names, said)
+        side = _side(table, "", None, names, statements)
         sides = [side] if side is not None else []
     if not sides:
         return None
@@ -380,13 +373,13 @@ def _of_messages(table: Table, messages: Sequence[_Message], names: tuple[str, .
     return Content("ROS bag export", tuple(sides))
 
 
-def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ...], said: Said) -> Side | None:
+def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ...], statements: Said) -> Side | None:
     """Returns the poses in the columns that begin with a prefix; None where place or rotation is missing."""
     place = _place(table, prefix)
     if place is None:
         return None
     at, unit = place
-    turned = read_rotations(table, prefix, said.rotation)
+    turned = read_rotations(table, prefix, statements.rotation)
     if turned is None:
         return None
     covariance = table.pose_covariances(prefix)

@@ -34,18 +34,15 @@ class NotToldError(InputError):
     """An error for a file whose format is not known here; another reader may know it."""
 
 
-def read_content(path: Path, said: Said, key: str = "image", quaternions: Order = "wxyz") -> Content | None:
+def read_content(path: Path, statements: Said, key: str = "image", quaternions: Order = "wxyz") -> Content | None:
     """Returns the content of a file, of a folder of files with a pose each, or of a COLMAP model. Returns None for the
     package's own tables, and for tables whose readers give better messages.
 
     ``key`` : the column that names rows, where there is one; ``quaternions`` as in :func:`~stcal.io.table.read_table`.
 
-    Raises
-    ------
-    InputError
-        The message says what is wrong with the file.
+    Raises InputError: the message says what is wrong with the file.
     """
-    content = _read(path, said, key, quaternions)
+    content = _read(path, statements, key, quaternions)
     if content is not None and quaternions != "wxyz" and not content.form.startswith(TABLE):
         raise InputError(
             "E-OPTION-NEEDS",
@@ -54,11 +51,11 @@ def read_content(path: Path, said: Said, key: str = "image", quaternions: Order 
     return content
 
 
-def _read(path: Path, said: Said, key: str, quaternions: Order) -> Content | None:
+def _read(path: Path, statements: Said, key: str, quaternions: Order) -> Content | None:
     where = str(path)
     if path.is_dir():
         model = colmap.model_file(path)
-        return read_content(model, said) if model is not None else _of_folder(path, said)
+        return read_content(model, statements) if model is not None else _of_folder(path, statements)
     try:
         if path.name == colmap.BINARY:
             return colmap.read_binary(path, where)
@@ -66,40 +63,42 @@ def _read(path: Path, said: Said, key: str, quaternions: Order) -> Content | Non
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{where}: {error.strerror or error}; check the path") from error
     if data.startswith(NPY):
-        return _required(read_tree(load_npy(data, where), "NumPy array", said, where), where)
+        return _required(read_tree(load_npy(data, where), "NumPy array", statements, where), where)
     if data.startswith(NPZ):
         arrays, others = load_npz(data, where)
-        content = read_tree(next(iter(arrays.values())) if len(arrays) == 1 else arrays, "NumPy arrays", said, where)
+        content = read_tree(
+            next(iter(arrays.values())) if len(arrays) == 1 else arrays, "NumPy arrays", statements, where
+        )
         if content is None:
-            content = read_tree(arrays, "NumPy arrays", said, where)
+            content = read_tree(arrays, "NumPy arrays", statements, where)
         return replace(_required(content, where), passed_over=(*_required(content, where).passed_over, *others))
     try:
         text = text_of(data)
     except UnicodeDecodeError:
         return None
-    return _of_text(text, path, said, key, quaternions)
+    return _of_text(text, path, statements, key, quaternions)
 
 
-def _of_text(text: str, path: Path, said: Said, key: str, quaternions: Order) -> Content | None:
+def _of_text(text: str, path: Path, statements: Said, key: str, quaternions: Order) -> Content | None:
     where = str(path)
     used = (line for line in text.splitlines() if line.strip() and not is_comment(line))
     first = next((line.strip() for line in used if not separator_stated(line)), "")
     if not first:
         return None
     if first[0] in "{[" and (content := _json(text)) is not None:
-        return _required(read_tree(content, "JSON", said, where), where)
+        return _required(read_tree(content, "JSON", statements, where), where)
     if colmap.is_text(text):
         return colmap.read_text(text, where)
-    content = read_numbers(text, said, where)
+    content = read_numbers(text, statements, where)
     if content is not None:
         return content
     if re.match(r"[^:\[{]*[,;\t]", _BRACKETED_UNIT.sub("", first)):
         table = read_table(path, "pose file", quaternions)
-        return None if todays(table) else read_columns(table, key, said)
+        return None if todays(table) else read_columns(table, key, statements)
     value = _yaml(text, where)
     if not isinstance(value, list | dict):
         return None
-    content = read_tree(value, "YAML", said, where)
+    content = read_tree(value, "YAML", statements, where)
     if content is None:
         raise NotToldError("E-POSES-NOT-FOUND", f"{where}: no poses found in it; {KNOWN} needed")
     return content
@@ -141,14 +140,14 @@ def _yaml(text: str, where: str):
     return documents[0] if len(documents) == 1 else documents
 
 
-def _of_folder(folder: Path, said: Said) -> Content | None:
+def _of_folder(folder: Path, statements: Said) -> Content | None:
     """Returns a pose from each file, named by the file; None for a folder without such files."""
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
     if not files:
         return None
     read = []
     for file in files:
-        content = read_content(file, said)
+        content = read_content(file, statements)
         if content is None or len(content.sides) != 1 or len(content.sides[0]) != 1:
             count = "no pose" if content is None else f"{sum(len(side) for side in content.sides)} poses"
             raise InputError(

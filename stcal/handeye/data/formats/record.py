@@ -52,22 +52,14 @@ class Side:
 
     Parameters
     ----------
-    rotation, translation : (m, 3, 3), (m, 3) arrays
-        Rotation and translation of each pose; lengths in ``unit``.
-    places : tuple of str
-        Place of each pose in its file: ``line 7``.
-    turned : str
-        How rotations are written, in words.
-    unit, frames
-        None where the file does not say.
-    names : tuple of str
-        Image or timestamp of each pose; empty where there are none.
-    trajectory : bool
-        Whether poses are those of a moving body in a world, as in files of trajectories.
-    scaled : bool
-        Whether the lengths have no unit at all, like those of a COLMAP model.
-    covariance : (m, 6, 6) array, optional
-        Covariances of the transforms of ``frames``, mm and rad.
+    rotation, translation : (m, 3, 3) rotation and translation of each pose; lengths in ``unit``
+    places : place of each pose in its file: ``line 7``
+    turned : how rotations are written, in words
+    unit, frames : None where the file does not say
+    names : image or timestamp of each pose; empty where there are none
+    trajectory : whether poses are those of a moving body in a world, as in files of trajectories
+    scaled : whether the lengths have no unit at all, like those of a COLMAP model
+    covariance : (m, 6, 6) covariances of the transforms of ``frames``, mm and rad
     """
 
     rotation: np.ndarray
@@ -134,10 +126,7 @@ class Said:
         """Returns the statements in the values of ``--rotation`` and ``--length-unit``, each for all poses or as
         ``robot=`` and ``camera=``, and of ``--poses-are``.
 
-        Raises
-        ------
-        InputError
-            A name is not known, or is given twice.
+        Raises InputError: a name is not known, or is given twice.
         """
         whole: dict[str, str] = {}
         by_role: list[tuple[Role, str, str]] = []
@@ -195,10 +184,7 @@ class Said:
 def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
     """Returns the rotations and translations of homogeneous matrices (m, 4, 4).
 
-    Raises
-    ------
-    InputError
-        A last row that is not 0 0 0 1, or a matrix whose upper left part is not a rotation.
+    Raises InputError: a last row that is not 0 0 0 1, or a matrix whose upper left part is not a rotation.
     """
     require_finite(matrices, places, where)
     bad = np.flatnonzero(np.abs(matrices[:, 3] - [0, 0, 0, 1]).max(axis=1) > 0)
@@ -215,10 +201,7 @@ def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tupl
 def require_each_once(names: Sequence[str], places: Sequence[str], where: str, kind: str = "") -> None:
     """Refuse a name that two poses have. ``kind`` says whether it names an image or a time stamp.
 
-    Raises
-    ------
-    InputError
-        A name occurs twice.
+    Raises InputError: a name occurs twice.
     """
     first: dict[str, str] = {}
     for name, place in zip(names, places, strict=True):

@@ -71,30 +71,27 @@ def _all_numbers(value: Any) -> bool:
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
-def one(value: Any, said: Said, place: str, where: str) -> One | None:
+def one(value: Any, statements: Said, place: str, where: str) -> One | None:
     """Returns the pose in a value; None where the value does not have the shape of one.
 
-    Raises
-    ------
-    InputError
-        The value has the shape of a pose, but is not valid; or its convention must be stated.
+    Raises InputError: the value has the shape of a pose, but is not valid; or its convention must be stated.
     """
     array = numbers(value)
     if array is not None:
-        return _of_array(array, said, place, where)
+        return _of_array(array, statements, place, where)
     if not isinstance(value, Mapping):
         return None
     if isinstance(value.get("FloatMatrix"), Mapping):
-        pose = one(value["FloatMatrix"].get("Data"), said, place, where)
+        pose = one(value["FloatMatrix"].get("Data"), statements, place, where)
         return pose and _named(pose, value, unit=ZIVID, form="Zivid pose file")
-    pose = _of_parts(value, said, place, where) or _of_scalars(value, place, where)
+    pose = _of_parts(value, statements, place, where) or _of_scalars(value, place, where)
     if pose is None:
         inside = [value[key] for key in WRAPPED if key in value]
         if not inside:  # OpenCV's FileStorage: one matrix under any name
             inside = [item for item in value.values() if isinstance(item, Mapping) and "rows" in item]
             inside = inside if len(inside) == 1 else []
         if len(inside) == 1:
-            pose = one(inside[0], said, place, where)
+            pose = one(inside[0], statements, place, where)
     return pose and _named(pose, value)
 
 
@@ -118,7 +115,7 @@ def name_in(value: Mapping) -> str:
     return str(stamp) if isinstance(stamp, int | float) and not isinstance(stamp, bool) else ""
 
 
-def _of_array(array: np.ndarray, said: Said, place: str, where: str) -> One | None:
+def _of_array(array: np.ndarray, statements: Said, place: str, where: str) -> One | None:
     if array.shape == (16,):
         array = array.reshape(4, 4)
     if array.shape in ((3, 4), (12,)):
@@ -128,12 +125,14 @@ def _of_array(array: np.ndarray, said: Said, place: str, where: str) -> One | No
         return One(rotation[0], translation[0], MATRICES)
     if array.shape in ((6,), (7,)):
         require_finite(array[None], (place,), where)
-        rotation, turned = turned_values(array[None, 3:], said.rotation, "the numbers after x, y, z", (place,), where)
+        rotation, turned = turned_values(
+            array[None, 3:], statements.rotation, "the numbers after x, y, z", (place,), where
+        )
         return One(rotation[0], array[:3], turned)
     return None
 
 
-def _of_parts(value: Mapping, said: Said, place: str, where: str) -> One | None:
+def _of_parts(value: Mapping, statements: Said, place: str, where: str) -> One | None:
     """Returns the pose from a translation and a rotation under two keys."""
     at = next((value[key] for key in PLACE_KEYS if key in value), None)
     turn_key = next((key for key in TURN_KEYS if key in value), None)
@@ -164,7 +163,7 @@ def _of_parts(value: Mapping, said: Said, place: str, where: str) -> One | None:
     if turn_key == "rvec":
         rotation, turned = rotations(values, Convention(ROTATION_VECTOR, "rad"), (place,), where)
     else:
-        rotation, turned = turned_values(values, said.rotation, turn_key, (place,), where)
+        rotation, turned = turned_values(values, statements.rotation, turn_key, (place,), where)
     return One(rotation[0], translation.ravel(), turned, unit, form)
 
 

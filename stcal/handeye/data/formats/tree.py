@@ -33,13 +33,10 @@ _CAMODOCAL = re.compile(r"T([12])_(\d+)")
 OPENCV = "OpenCV's hand-eye arrays"
 
 
-def read_tree(value: Any, form: str, said: Said, where: str) -> Content | None:
+def read_tree(value: Any, form: str, statements: Said, where: str) -> Content | None:
     """Returns the poses in plain values; None where there are none.
 
-    Raises
-    ------
-    InputError
-        A pose is not valid, there are more than two sides, or the convention must be stated.
+    Raises InputError: a pose is not valid, there are more than two sides, or the convention must be stated.
     """
     if isinstance(value, Mapping):
         if "parameters" in value and "transform" in value:
@@ -47,27 +44,27 @@ def read_tree(value: Any, form: str, said: Said, where: str) -> Content | None:
                 "E-POSES-NOT-FOUND",
                 f"{where}: the result of an easy_handeye calibration; give its samples, NAME.samples",
             )
-        if (content := easy_handeye(value, said, where)) is not None:
+        if (content := easy_handeye(value, statements, where)) is not None:
             return content
         if (content := camodocal(value, where)) is not None:
             return content
-        if (content := _of_keys(value, form, said, where)) is not None:
+        if (content := _of_keys(value, form, statements, where)) is not None:
             return content
-        if (single := one(value, said, "the pose", where)) is not None:
+        if (single := one(value, statements, "the pose", where)) is not None:
             return Content(single.form or form, (_side([single], ("the pose",), where),))
-        if (content := _by_name(value, form, said, where)) is not None:
+        if (content := _by_name(value, form, statements, where)) is not None:
             return content
         for key in HOLDERS:
             if isinstance(value.get(key), Mapping | list | np.ndarray):
-                content = read_tree(value[key], form, said, where)
+                content = read_tree(value[key], form, statements, where)
                 if content is not None:
                     others = tuple(str(unused_key) for unused_key in value if unused_key != key)
                     return Content(content.form, content.sides, content.setup, (*content.passed_over, *others))
         return None
-    return _of_list(value, form, said, where) if isinstance(value, list | np.ndarray) and len(value) else None
+    return _of_list(value, form, statements, where) if isinstance(value, list | np.ndarray) and len(value) else None
 
 
-def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
+def easy_handeye(value: Mapping, statements: Said, where: str) -> Content | None:
     """Returns the samples of easy_handeye, ROS 1 and 2. For a camera that stands still it writes the robot's poses
     inverted."""
     samples, parameters = value.get("samples", value), value.get("parameters")
@@ -92,7 +89,7 @@ def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
         setup = by_type.get(str(parameters.get("calibration_type", "")))
         if isinstance(parameters.get("eye_on_hand"), bool):
             setup = "eye-in-hand" if parameters["eye_on_hand"] else "eye-to-hand"
-    fixed = (setup or said.setup) == "eye-to-hand"
+    fixed = (setup or statements.setup) == "eye-to-hand"
     of_setup = "eye-to-hand" if fixed else "eye-in-hand"
     frames = (
         Frames(FRAMES["robot"][fixed], f"as easy_handeye writes it of {of_setup}", False),
@@ -100,7 +97,7 @@ def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
     )
     sides = []
     for entry, frames_of_side in zip(lists, frames, strict=True):
-        side = _listed(entry if isinstance(entry, list) else [], said, where, frames_of_side, "sample")
+        side = _listed(entry if isinstance(entry, list) else [], statements, where, frames_of_side, "sample")
         if side is None:
             raise InputError(
                 "E-POSES-NOT-FOUND", f"{where}: samples of easy_handeye without transforms; take samples, and save them"
@@ -112,10 +109,7 @@ def easy_handeye(value: Mapping, said: Said, where: str) -> Content | None:
 def camodocal(value: Mapping, where: str) -> Content | None:
     """Returns the pairs that handeye_calib_camodocal records: ``T1_0``, ``T2_0`` …, tip in base and tag in camera.
 
-    Raises
-    ------
-    InputError
-        A matrix is missing, is none, or ``frameCount`` is another number.
+    Raises InputError: a matrix is missing, is none, or ``frameCount`` is another number.
     """
     found = {key: match for key in value if (match := _CAMODOCAL.fullmatch(str(key)))}
     if "frameCount" not in value or not found:
@@ -139,7 +133,7 @@ def camodocal(value: Mapping, where: str) -> Content | None:
     return Content("pairs of handeye_calib_camodocal", tuple(sides))
 
 
-def _of_keys(value: Mapping, form: str, said: Said, where: str) -> Content | None:
+def _of_keys(value: Mapping, form: str, statements: Said, where: str) -> Content | None:
     """Returns stacks of poses, each side under keys that name it."""
     parts: dict[str, dict[str, Any]] = {}
     named: dict[str, Frames] = {}
@@ -151,7 +145,7 @@ def _of_keys(value: Mapping, form: str, said: Said, where: str) -> Content | Non
         frames = frames_of(key)
         role = role_of(key) if frames is None else frames.role
         shaped = isinstance(item, list | Mapping | np.ndarray)
-        if role is None or not shaped or (frames is None and _side_of(item, said, where, None) is None):
+        if role is None or not shaped or (frames is None and _side_of(item, statements, where, None) is None):
             others.append(str(key))
             continue
         frames = frames or Frames(FRAMES[role][0], "by default", False)
@@ -167,7 +161,7 @@ def _of_keys(value: Mapping, form: str, said: Said, where: str) -> Content | Non
         )
     sides = []
     for name, item in parts.items():
-        side = _of_parts(item, said, where, named[name])
+        side = _of_parts(item, statements, where, named[name])
         if side is None:
             keys = ", ".join(item)
             raise InputError(
@@ -182,10 +176,10 @@ def _of_keys(value: Mapping, form: str, said: Said, where: str) -> Content | Non
     return Content(OPENCV if opencv else form, _same_count(sides, where), None, tuple(others))
 
 
-def _of_parts(parts: dict[str, Any], said: Said, where: str, frames: Frames) -> Side | None:
+def _of_parts(parts: dict[str, Any], statements: Said, where: str, frames: Frames) -> Side | None:
     """Returns the poses under one key, or those of rotations and translations under two."""
     if len(parts) == 1:
-        return _side_of(next(iter(parts.values())), said, where, frames)
+        return _side_of(next(iter(parts.values())), statements, where, frames)
     if len(parts) != 2:
         raise InputError(
             "E-POSES-MIXED", f"{where}: {', '.join(parts)}: more than one set of the same poses; leave one in the file"
@@ -213,7 +207,7 @@ def _of_parts(parts: dict[str, Any], said: Said, where: str, frames: Frames) -> 
     if turn.shape[1] == 3 and keys[0].lower().startswith("r"):  # OpenCV takes rotation vectors in place of matrices
         rotation, words = rotations(turn, Convention(ROTATION_VECTOR, "rad"), places, where)
     else:
-        rotation, words = turned_values(turn, said.rotation, keys[0], places, where)
+        rotation, words = turned_values(turn, statements.rotation, keys[0], places, where)
     return Side(rotation, at, places, words, frames=frames)
 
 
@@ -222,39 +216,39 @@ def _flat(value: Any) -> Any:
     return value if array is None else array.ravel().tolist()
 
 
-def _by_name(value: Mapping, form: str, said: Said, where: str) -> Content | None:
+def _by_name(value: Mapping, form: str, statements: Said, where: str) -> Content | None:
     """Returns a pose for each name; the names are mostly those of images."""
     if not value or not all(isinstance(item, Mapping | list | np.ndarray) for item in value.values()):
         return None
     poses = []
     for key, item in value.items():
-        single = one(item, said, str(key), where)
+        single = one(item, statements, str(key), where)
         if single is None:
             return None
         poses.append(One(single.rotation, single.translation, single.turned, single.unit, single.form, str(key)))
     return Content(poses[0].form or form, (_side(poses, tuple(map(str, value)), where),))
 
 
-def _of_list(value: Any, form: str, said: Said, where: str) -> Content | None:
+def _of_list(value: Any, form: str, statements: Said, where: str) -> Content | None:
     if all(isinstance(item, Mapping) for item in value):
-        content = _of_pairs(value, form, said, where)
+        content = _of_pairs(value, form, statements, where)
         if content is not None:
             return content
-    side = _side_of(value, said, where, None)
+    side = _side_of(value, statements, where, None)
     if side is None:
         return None
-    singles = [one(item, said, "pose", where) for item in value[:1]] if isinstance(value, list) else []
+    singles = [one(item, statements, "pose", where) for item in value[:1]] if isinstance(value, list) else []
     return Content((singles[0].form if singles and singles[0] else "") or form, (side,))
 
 
-def _of_pairs(value: Sequence[Mapping], form: str, said: Said, where: str) -> Content | None:
+def _of_pairs(value: Sequence[Mapping], form: str, statements: Said, where: str) -> Content | None:
     """Returns the poses of a list whose entries hold the poses of both sides, or of one, under keys that name them."""
     sides: dict[Role, tuple[str, Frames]] = {}
     others = []
     for key, entry in value[0].items():
         frames = frames_of(key)
         role = role_of(key) if frames is None else frames.role
-        if role is None or one(entry, said, "pose 1", where) is None:
+        if role is None or one(entry, statements, "pose 1", where) is None:
             others.append(str(key))
             continue
         if role in sides:
@@ -275,7 +269,7 @@ def _of_pairs(value: Sequence[Mapping], form: str, said: Said, where: str) -> Co
                     "E-POSE-INCOMPLETE",
                     f"{where}: pose {i}: {key} is missing, which pose 1 has; add it, or take the pose out",
                 )
-        side = _listed([entry[key] for entry in value], said, where, frames, "pose")
+        side = _listed([entry[key] for entry in value], statements, where, frames, "pose")
         if side is None:
             raise InputError("E-POSE-VALUE", f"{where}: {key}: not a pose in every entry; correct it")
         read.append(_renamed(side, tuple(names), where) if named else side)
@@ -293,21 +287,21 @@ def _renamed(side: Side, names: tuple[str, ...], where: str) -> Side:
     return replace(side, names=names)
 
 
-def _side_of(value: Any, said: Said, where: str, frames: Frames | None) -> Side | None:
+def _side_of(value: Any, statements: Said, where: str, frames: Frames | None) -> Side | None:
     """Returns one side from a list, a stack or a mapping by name; None where it holds no poses."""
     if isinstance(value, Mapping):
-        single = one(value, said, "the pose", where)
+        single = one(value, statements, "the pose", where)
         if single is not None:
             return _side([single], ("the pose",), where, frames)
-        content = _by_name(value, "", said, where)
+        content = _by_name(value, "", statements, where)
         return content and replace(content.sides[0], frames=frames)
     if not isinstance(value, list | np.ndarray) or not len(value):
         return None
     if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
-        return _listed(value, said, where, frames, "pose")
+        return _listed(value, statements, where, frames, "pose")
     array = numbers(value)
     if array is None:
-        return _listed(value, said, where, frames, "pose") if isinstance(value, list) else None
+        return _listed(value, statements, where, frames, "pose") if isinstance(value, list) else None
     if array.ndim == 3 and array.shape[1:] == (3, 4):
         raise InputError(
             "E-MATRIX-ROWS", f"{where}: {len(array)} matrices 3×4, 4×4 needed; add the row 0 0 0 1 to each"
@@ -319,7 +313,7 @@ def _side_of(value: Any, said: Said, where: str, frames: Frames | None) -> Side 
     if array.ndim == 2 and array.shape[1] in (6, 7):
         places = tuple(f"pose {i}" for i in range(1, len(array) + 1))
         require_finite(array, places, where)
-        turned, words = turned_values(array[:, 3:], said.rotation, "the numbers after x, y, z", places, where)
+        turned, words = turned_values(array[:, 3:], statements.rotation, "the numbers after x, y, z", places, where)
         return Side(turned, array[:, :3], places, words, frames=frames)
     if array.ndim != 3 or array.shape[1:] != (4, 4):
         return None
@@ -328,12 +322,12 @@ def _side_of(value: Any, said: Said, where: str, frames: Frames | None) -> Side 
     return Side(rotation, translation, places, MATRICES, frames=frames)
 
 
-def _listed(values: Sequence, said: Said, where: str, frames: Frames | None, what: str) -> Side | None:
+def _listed(values: Sequence, statements: Said, where: str, frames: Frames | None, what: str) -> Side | None:
     """Returns poses one by one; None where the first value is not a pose."""
     places = tuple(f"{what} {i}" for i in range(1, len(values) + 1))
     poses = []
     for value, place in zip(values, places, strict=True):
-        single = one(value, said, place, where)
+        single = one(value, statements, place, where)
         if single is None and not poses:
             return None
         if single is None:

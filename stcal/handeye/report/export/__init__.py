@@ -87,10 +87,7 @@ FORMS = ROS_FORMS | {
 def require_form(form: str) -> None:
     """Checks the name of a format.
 
-    Raises
-    ------
-    InputError
-        The format is unknown; the message lists all formats.
+    Raises InputError: the format is unknown; the message lists all formats.
     """
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
@@ -106,19 +103,11 @@ def exported(
 ) -> str:
     """Returns the file's text, after reading it back and comparing the transform.
 
-    Parameters
-    ----------
-    form : str
-        One of :data:`FORMS`.
-    name : str
-        Name of the file without its ending; files of easy_handeye and of robot controllers hold it too.
-    parent, child, camera_frame
-        Frames for :data:`ROS_FORMS`; see :func:`~stcal.handeye.report.export.frames.tree`.
+    ``form`` : one of :data:`FORMS`; ``name`` : name of the file without its ending; files of easy_handeye and of robot
+    controllers hold it too; ``parent``, ``child``, ``camera_frame`` : frames for :data:`ROS_FORMS`; see
+    :func:`~stcal.handeye.report.export.frames.tree`.
 
-    Raises
-    ------
-    InputError
-        The format is unknown, or cannot hold the name of a frame.
+    Raises InputError: the format is unknown, or cannot hold the name of a frame.
     """
     require_form(form)
     transforms = tree(result, parent, child, camera_frame)

@@ -23,17 +23,11 @@ CameraFrame = Literal["optical", "link"]
 def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> list[Static]:
     """Returns the transforms that add the camera to a tree of frames, in which each frame has one parent.
 
-    Parameters
-    ----------
-    parent, child : str
-        Names of the frames. If empty: flange or base, and :data:`CAMERA_FRAME` or :data:`CAMERA_LINK`.
-    camera_frame : str
-        ``optical``: the camera's own frame; ``link``: the link, and the optical frame in it.
+    ``parent``, ``child`` : names of the frames. If empty: flange or base, and :data:`CAMERA_FRAME` or
+    :data:`CAMERA_LINK`. ``camera_frame`` : ``optical``: the camera's own frame; ``link``: the link, and the optical
+    frame in it.
 
-    Raises
-    ------
-    InputError
-        A name is invalid, or the names are not all different.
+    Raises InputError: a name is invalid, or the names are not all different.
     """
     mount, *names = frame_names(result.setup, parent, child, camera_frame)
     require_frame_names(mount, *names)
@@ -56,10 +50,7 @@ def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame
 def require_frame_names(*names: str) -> None:
     """Checks that names of frames are printable and all different; empty names stand for the defaults.
 
-    Raises
-    ------
-    InputError
-        A name has a control character, or occurs twice.
+    Raises InputError: a name has a control character, or occurs twice.
     """
     given = [name for name in names if name]
     for name in given:

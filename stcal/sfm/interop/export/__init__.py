@@ -66,21 +66,12 @@ class ExportedRun:
 def export_run(run: str | Path, path: str | Path, form: str = "", name: str = ROOT) -> ExportedRun:
     """Writes faces and circles to a new file, with σ, cameras and photographs if the form holds them.
 
-    Parameters
-    ----------
-    run : path
-        Folder of a finished run.
-    path : path
-        New file, whose suffix gives the form.
-    form : str
-        Form of :data:`FORMS`, in place of the one of the suffix.
-    name : str
-        Name of the target frame, and prefix of the other frames' names.
+    ``run`` : folder of a finished run; ``path`` : new file, whose suffix gives the form; ``form`` : form of
+    :data:`FORMS`, in place of the one of the suffix; ``name`` : name of the target frame, and prefix of the other
+    frames' names.
 
-    Raises
-    ------
-    InputError
-        If it is no finished run, the file exists, the form is unknown, a library is not installed, or the name is bad.
+    Raises InputError if it is no finished run, the file exists, the form is unknown, a library is not installed, or
+    the name is bad.
     """
     path = Path(path)
     form = form or form_of(path)
@@ -113,10 +104,7 @@ def export_run(run: str | Path, path: str | Path, form: str = "", name: str = RO
 def form_of(path: Path) -> str:
     """Returns the form for the suffix of a path.
 
-    Raises
-    ------
-    InputError
-        If no form has the suffix.
+    Raises InputError if no form has the suffix.
     """
     suffixes = {form.suffix: name for name, form in FORMS.items()}
     if path.suffix.lower() not in suffixes:

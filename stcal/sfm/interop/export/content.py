@@ -130,10 +130,8 @@ class Content:
 def content_of(run: SavedRun, root: str) -> Content:
     """Returns the content of a run. ``root`` : name of the target frame.
 
-    Raises
-    ------
-    InputError
-        If the name is invalid, two frames would have the same name, or the run's report is of another version.
+    Raises InputError if the name is invalid, two frames would have the same name, or the run's report is of another
+    version.
     """
     if not root.isprintable() or root.split() != [root]:
         raise InputError("E-FRAME-NAME", f"--name {root!r}: a word of visible characters without spaces needed")

@@ -81,10 +81,7 @@ def ply(content: Content) -> str:
 def dxf(content: Content) -> str:
     """Returns DXF R2010 in mm: a layer per face with a CIRCLE and a POINT for each circle, and a layer of labels.
 
-    Raises
-    ------
-    InputError
-        If ``stereo-target-calibration[cad]`` is not installed.
+    Raises InputError if ``stereo-target-calibration[cad]`` is not installed.
     """
     drawing = new_drawing()
     from ezdxf.colors import rgb2int

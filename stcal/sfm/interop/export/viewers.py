@@ -213,10 +213,7 @@ def write_rrd(content: Content, path: Path) -> list[str]:
 
     JPEG and PNG photographs are copied as they are. Each is a step of the time line ``photograph``.
 
-    Raises
-    ------
-    InputError
-        If ``stereo-target-calibration[rerun]`` is not installed.
+    Raises InputError if ``stereo-target-calibration[rerun]`` is not installed.
     """
     try:
         import rerun as rr

@@ -374,16 +374,16 @@ def test_a_table_that_is_not_understood_is_not_told_to_leave_options_out(tmp_pat
     path = written(tmp_path, f"{head}\n{between.join('123456')}\n", name)
     said = Said(rotation="ur-rotvec")
     with fails_with("E-TABLE-COLUMN-MISSING … base_from_flange_x_mm"):
-        read_input(path, said=said)
+        read_input(path, statements=said)
     with fails_with("E-POSES-NOT-FOUND … u … --columns"):
         two_files(path, path, "image", said)
     with fails_with("E-POSES-NOT-FOUND … u … --columns"):
-        read_robot_poses(path, said=said)
+        read_robot_poses(path, statements=said)
 
 
 def test_half_of_decimal_commas_is_no_list_of_numbers(tmp_path):
     with fails_with("E-TABLE-HEADER"):
-        read_input(written(tmp_path, "1.5;2,5;3,5;4,5;5,5;6,5\n" * 2), said=Said(rotation="ur-rotvec"))
+        read_input(written(tmp_path, "1.5;2,5;3,5;4,5;5,5;6,5\n" * 2), statements=Said(rotation="ur-rotvec"))
 
 
 def test_maps_of_columns(tmp_path):
@@ -398,5 +398,5 @@ def test_maps_of_columns(tmp_path):
     np.save(tmp_path / "camera.npy", GOOD)
     found = two_files(table, tmp_path / "camera.npy", "image", Said(), columns=(map_file, None))
     np.testing.assert_array_equal(found.pairs.base_from_flange.translation, GOOD[:, :3, 3])
-    robot = read_robot_poses(table, said=Said(columns=map_file))
+    robot = read_robot_poses(table, statements=Said(columns=map_file))
     np.testing.assert_array_equal(robot.base_from_flange.translation, GOOD[:, :3, 3])

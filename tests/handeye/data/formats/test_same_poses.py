@@ -23,9 +23,9 @@ def read(arguments, path=None):
         options[name].append(value)
     said = Said.of_options(options["--rotation"], options["--length-unit"], options["--poses-are"])
     if source is not None:
-        return read_input(Path(source), said=said)
+        return read_input(Path(source), statements=said)
     told = two_files(Path(options["--a"][0]), Path(options["--b"][0]), "image", said)
-    return read_input(told, said=said)
+    return read_input(told, statements=said)
 
 
 @pytest.mark.parametrize("name", FORMATS)
