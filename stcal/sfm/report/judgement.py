@@ -378,7 +378,7 @@ def _by_size(report: dict) -> _Cause | None:
     return _Cause(
         "Its size: nothing of known size is in view.",
         "Measure the distance of two points and state it with scale in target.toml, or photograph the board of dots "
-        "with it.",
+        "with it; if one is in view, give its file with --board.",
     )
 
 
