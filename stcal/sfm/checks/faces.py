@@ -61,7 +61,10 @@ class Again:
         whole = self.calibration.target
         start = replace(whole, reference_face=faces[0], target_from_face={f: whole.target_from_face[f] for f in faces})
         try:
-            return calibrated_target(joint, start, self.target, self.options.frame), joint
+            posed = calibrated_target(joint, start, self.target, self.options.frame)
+            for face in faces[1:]:
+                np.linalg.cholesky(posed.face_covariance[face])  # fails where rounding is all that determines it
+            return posed, joint
         except np.linalg.LinAlgError as error:
             raise _unfixed(joint.models) from error
 
