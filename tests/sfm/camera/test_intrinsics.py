@@ -239,7 +239,7 @@ def require_true_and_said(out, truth, printed, photographs):
     stated = out.read_text(encoding="utf-8").splitlines()[-1].split()
     assert stated[1] == "OPENCV"
     assert float(stated[6]) == pytest.approx(float(shown) + 0.5, abs=5.1e-5)  # four decimals are shown
-    assert "counts from that pixel's corner and has them 0.5 px larger" in printed
+    assert "counts from that pixel's corner, so that cx, cy are 0.5 px larger there" in printed
     camera = read_camera(out).calibrated(truth.width, truth.height)
     prior = camera_prior(camera)
     assert prior.colmap_model == "OPENCV"
