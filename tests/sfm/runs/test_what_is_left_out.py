@@ -113,7 +113,8 @@ def test_the_redundancy_of_a_free_network(scene, labels_only):
     assert smaller.circles == 1.0  # residuals do not deny what all views share
     kinds = SigmaFactors(0, 0.5, 4.0, 2.0, frozenset({"1"}))
     mixed = image_sigma_factors([with_sigma(m, kinds) for m in models], scene.camera, ["1"])
-    assert (mixed.printed, mixed.dots, mixed.of_target) == (1.0, factors.dots, mixed.circles)
+    assert (mixed.printed, mixed.of_target) == (1.0, mixed.circles)
+    assert mixed.dots == pytest.approx(factors.dots, rel=0.01)
     assert mixed.circles == pytest.approx(2.0, abs=0.25)
     kinds = SigmaFactors(0, 2.0, 4.0, 0.5, frozenset({"1"}))
     larger = image_sigma_factors([with_sigma(m, kinds) for m in models], scene.camera, ["1"])
