@@ -104,7 +104,7 @@ def calibrate_camera_by_corners(
     if gated.corners or gated.skipped:
         views, skipped = gated.views, (*skipped, *gated.skipped)
         require_views(views, files, skipped)
-        result = adjust_intrinsics(views, grid, result.camera, colmap_model)
+        result = replace(adjust_intrinsics(views, grid, result.camera, colmap_model), restarted=result.restarted)
     require_determined(result, views)
     calibration = judged(result, views, skipped, rounds, True, grid)
     return replace(calibration, warnings=(*calibration.warnings, *gated.warnings()))

@@ -139,6 +139,7 @@ def calibrate_camera(
             views, skipped, result = _of_one_round(
                 files, not_images, detection, board, camera, colmap_model, before is None
             )
+            result = replace(result, restarted=result.restarted or (before is not None and before.restarted))
             camera = result.camera
             settled = before is not None and _next_move(before, result) < SETTLED_SIGMAS
             if settled:
@@ -357,7 +358,13 @@ def _warnings(
     result: Intrinsics, projection: ProjectionSigma, split: SplitHalf | None, board: BoardDesign
 ) -> list[str]:
     """Returns warnings, and what the user should do about them."""
-    warnings = [
+    warnings = []
+    if result.restarted:
+        warnings.append(
+            "from the closed form no minimum was reached, only from the best focal length: other minima may exist, and "
+            "σ hold about this one alone; add views that fill the image and are tilted, or choose a simpler --model"
+        )
+    warnings += [
         f"no dots near the corner {corner}: they reach {100 * reach:.0f} %, {100 * MIN_REACH:.0f} % advised, "
         f"the distortion is extrapolated there, σ of a projection {sigma:.3f} px; add views with the board in it"
         for corner, reach, sigma in zip(CORNERS, projection.reach, projection.corner_sigma_px, strict=True)

@@ -182,7 +182,8 @@ class Intrinsics:
     ``covariance`` : (cq, cq) of the parameters of ``colmap_model``, camera by camera; ``models`` : views of one
     folder's board by one camera, mm, board frame; ``camera_of`` : camera of each model; ``huber`` : length of a
     normalised residual beyond which its weight decreases; ``settled`` : whether σ and eccentricities converged within
-    :data:`MAX_ROUNDS`; ``solution`` : state and setting from which solutions of some of the views start, None for the
+    :data:`MAX_ROUNDS`; ``restarted`` : whether the descent from the start did not end, and began again with the focal
+    length alone; ``solution`` : state and setting from which solutions of some of the views start, None for the
     intrinsics of a rig.
     """
 
@@ -195,6 +196,7 @@ class Intrinsics:
     huber: float
     redundancy: int
     settled: bool
+    restarted: bool = False
     solution: tuple[State, Setting] | None = None
 
     @property
@@ -267,14 +269,17 @@ def adjust_intrinsics(
         sigma_mm=board.sigma_mm,
         huber=np.inf,
     )
+    restarted = False
     try:
         adjustment = adjusted(state, setting, board, factors)
     except ConvergenceError:
         if held:
             raise
+        restarted = True
         # A focal length far off makes the rest of the lens wander: it comes first, alone.
         adjustment = adjusted(_with_focal_length(state, setting), setting, board, factors)
-    return _intrinsics(adjustment.last, colmap_model, adjustment.factors, adjustment.settled)
+    result = _intrinsics(adjustment.last, colmap_model, adjustment.factors, adjustment.settled)
+    return replace(result, restarted=restarted)
 
 
 def _intrinsics(last: Normal, colmap_model: str, factors: SigmaFactors, settled: bool) -> Intrinsics:
