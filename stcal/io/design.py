@@ -375,6 +375,7 @@ def target_toml(target: TargetDesign, printed: Callable[[FaceDesign], list[str]]
     lines = [
         "# A stereo target: faces with circles. Positions in mm, in any right-handed drawing frame of the face,",
         "# seen from outside with y up. Circle ids are free (no spaces, colons or commas), unique within a face.",
+        *(["# Faces of tags or boards: seen from outside X to the right, Y down."] if target.has_printed else []),
         f"name = {toml_string(target.name)}",
         f'polarity = "{target.polarity}"  # circles are "bright" or "dark" against what surrounds them',
         *stated_unusual(radius("", float(r)) for face in target.with_faces(False).faces for r in face.radius_mm),

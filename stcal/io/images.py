@@ -469,6 +469,8 @@ def require_grey(image: np.ndarray, size: tuple[int, int] | None, name: str = "i
 
     Raises InputError: the message begins with ``name``.
     """
+    if not isinstance(image, np.ndarray):
+        raise InputError("E-IMAGE-TYPE", f"{name}: {type(image).__name__}, no image; leave lost frames out")
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         remedy = "; of colours, give one: image[:, :, 1] is green" if image.ndim == 3 else ""
         raise InputError(

@@ -35,7 +35,10 @@ def with_code(text: str) -> Markup:
     return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else p for i, p in enumerate(parts))
 
 
-NEEDED = 'PDF: needs WeasyPrint, which is not installed; pip install "stereo-target-calibration[pdf]"'
+NEEDED = (
+    'PDF: needs WeasyPrint, which is not installed; pip install "stereo-target-calibration[pdf]", or in a clone '
+    '`source scripts/setup "[pdf]"`'
+)
 NO_PANGO = (
     "PDF: WeasyPrint does not find a library of the system ({reason}); install Pango, as with `apt-get install "
     "libpango-1.0-0 libpangoft2-1.0-0`"

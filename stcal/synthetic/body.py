@@ -21,6 +21,8 @@ from stcal.synthetic.dataset import TruthFile
 from stcal.synthetic.render import encode
 
 BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
+FINER = 4
+"""Pixels that are drawn for the side of one of a drawing: edges then lie where they belong to an eighth of a pixel."""
 DRAWING_PX = 2000
 """Longer side of the drawing of a face, px."""
 CIRCLE_CORNERS = 360
@@ -180,19 +182,21 @@ def drawing_of(face: FaceDesign, polarity: Polarity = "bright") -> Drawing:
     width, height = np.ceil((high - low) * px_mm).astype(int)
     ground, ink = (WHITE, BLACK) if dark else (BLACK, WHITE)
 
-    def filled(value: float, inside: float, parts: list[list[np.ndarray]]) -> np.ndarray:
-        picture = np.full((height, width), value, np.float32)
+    def covered(parts: list[list[np.ndarray]]) -> np.ndarray:
+        """Returns the share of each pixel that the parts cover, drawn finer and averaged."""
+        mask = np.zeros((FINER * height, FINER * width), np.uint8)
         for lines_mm in parts:
-            lines = [np.round(((line - low) * px_mm - 0.5) * 16).astype(np.int32) for line in lines_mm]
-            cv2.fillPoly(picture, lines, inside, lineType=cv2.LINE_8, shift=4)
-        return picture
+            lines = [np.round(((line - low) * FINER * px_mm - 0.5) * 16).astype(np.int32) for line in lines_mm]
+            cv2.fillPoly(mask, lines, 255, lineType=cv2.LINE_8, shift=4)
+        return cv2.resize(mask, (int(width), int(height)), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
 
     # A filled area takes all pixels that its outline touches: ink and ground are filled in turn, and averaged.
     whole = np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) + (
         np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     )
-    grey = (filled(ground, ink, areas) + filled(ink, ground, [[whole, *(line for area in areas for line in area)]])) / 2
-    solid = filled(0.0, 1.0, [[plate]])
+    outside = covered([[whole, *(line for area in areas for line in area)]])
+    grey = ground + (ink - ground) * (covered(areas) + 1 - outside) / 2
+    solid = covered([[plate]])
     return Drawing(grey, solid, px_mm, low)
 
 

@@ -26,6 +26,7 @@ from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, co
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera, place_with_camera
+from stcal.sfm.measurement.tracker import Tracker
 from stcal.sfm.planning.bodies import plan_body
 from stcal.sfm.planning.session import PlanOptions
 from stcal.sfm.report.compare import compare
@@ -271,6 +272,13 @@ def test_a_run_of_photographs_without_board_and_camera(tmp_path):
     assert not (tmp_path / "r/board.toml").exists()
     again = adjusted_run(load_run(tmp_path / "r")).state.result()
     assert again.sigma0 == pytest.approx(result.calibration.joint.sigma0, rel=1e-3)
+    tracker = Tracker(result.circles(), result.refined_camera)
+    for i, path in enumerate(sorted((tmp_path / "set/images").iterdir())[:3]):  # each is searched as a whole
+        pose = tracker.locate(np.asarray(Image.open(path)))
+        assert pose.status == "certain"
+        off = pose.camera_from_target @ scene.camera_from_target[i].inverse()
+        assert np.degrees(off.angle_rad()) < 0.5
+        assert np.linalg.norm(pose.camera_from_target.translation - scene.camera_from_target[i].translation) < 2
 
 
 def test_the_unit_of_a_body_of_unknown_size_is_kept_in_its_file(tmp_path):

@@ -221,5 +221,6 @@ def _live(setting: "Setting", source: int | str, listen, as_json: bool) -> None:
 
     view = LiveView()
     with pictures_of(source) as frames, show_live(MeasureService(setting, 1), ServeOptions(*listen), view) as server:
-        _say_place(server, f"showing {server.url}/ until Ctrl-C")
+        end = "it ends" if isinstance(source, str) else "Ctrl-C"
+        _say_place(server, f"showing {server.url}/ until {end}")
         say(f"ended after {follow(frames, tracker, view, tell)} pictures")

@@ -323,7 +323,7 @@ class _Connection:
 
     async def _stream(self) -> bool:
         """Sends the pictures of the view as they come, until the client goes away or the view ends."""
-        view, number = self.server.view, 0
+        view, number, boundary = self.server.view, 0, f"--{BOUNDARY}\r\n".encode()
         assert view is not None
         self._send(DONE, f"multipart/x-mixed-replace; boundary={BOUNDARY}", None, closing=True)
         while not (self.ended or self.writer.transport.is_closing()):
@@ -334,9 +334,11 @@ class _Connection:
                     break
                 await asyncio.sleep(LIVE_LOOK_S)
                 continue
-            number, size = picture.number, len(picture.jpeg)
-            head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {size}\r\n\r\n".encode()
-            self.writer.write(self.http.send(h11.Data(data=head + picture.jpeg + b"\r\n")) or b"")
+            head = f"Content-Type: image/jpeg\r\nContent-Length: {len(picture.jpeg)}\r\n\r\n".encode()
+            # The next boundary comes at once: browsers show a picture when they have seen its end.
+            part = (b"" if number else boundary) + head + picture.jpeg + b"\r\n" + boundary
+            number = picture.number
+            self.writer.write(self.http.send(h11.Data(data=part)) or b"")
             async with asyncio.timeout(PATIENCE_S):
                 await self.writer.drain()
             self._last = time.monotonic()

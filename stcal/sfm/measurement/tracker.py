@@ -52,15 +52,16 @@ class Tracker:
     from there is found in a reduced image. Every circle is then measured at its shifted place, with its whole rim, as
     in a single image. If too few are found, or the fit fails, the target is searched for in the whole image. Both ways
     measure the same circles. Their centres differ by a part of their σ, since the band of pixels lies about another
-    start. The previous pose affects a pose only by the choice between two solutions that fit equally well.
+    start. A target with printed faces is searched for in each whole image. The previous pose affects a pose only by
+    the choice between two solutions that fit equally well.
 
     Parameters
     ----------
     target : TargetCircles
         Calibrated target with its design: :meth:`stcal.sfm.RunResult.circles`, or :func:`stcal.sfm.read_target`.
     camera : Camera
-        Camera from :func:`stcal.load_camera`, or of the run. Its covariance, if any, is part of the poses'
-        covariances.
+        Camera from :func:`stcal.load_camera`, or of the run: ``result.refined_camera or result.camera``. Its
+        covariance, if any, is part of the poses' covariances.
     board : BoardDesign, optional
         A dot board that may be in view, so that its dots are not taken for circles of the target.
     pose : PoseOptions, optional
@@ -150,7 +151,7 @@ class Tracker:
     def observe(self, image: np.ndarray, name: str = "image") -> tuple[LabelledImage, TargetPose | StcalError]:
         """Returns the labelled circles of the next image, and its pose or the error; see :meth:`locate`."""
         camera = self._camera_of(image, name)
-        followed = self._follow(image, camera, name) if self.recent else None
+        followed = self._follow(image, camera, name) if self.recent and not self.design.has_printed else None
         self.searched = followed is None
         labelled, pose = followed or self._search(image, camera, name)
         if isinstance(pose, StcalError):

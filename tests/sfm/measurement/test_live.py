@@ -104,7 +104,7 @@ def test_places_of_the_view(service, setting, photograph):
         head, _, rest = pictures.partition(b"\r\n\r\n")
         assert head.startswith(f"--{boundary}\r\n".encode())
         assert view.newest is not None
-        assert rest.removesuffix(b"\r\n") == view.newest.jpeg
+        assert rest.removesuffix(f"\r\n--{boundary}\r\n".encode()) == view.newest.jpeg
         assert got(server, "/elsewhere?token=word")[0] == 404
 
 
