@@ -146,6 +146,12 @@ def _tag_body(path: Path, kind: TagBody, size: str, tags: "tuple[str, int]", pla
 
     target = tag_body(kind, size, *tags)
     noise, source = expected_noise(of_corners=True)
-    forecast = plan_body(replace(planned, noise=noise), target, target.rough_poses())
+    try:
+        forecast = plan_body(replace(planned, noise=noise), target, target.rough_poses())
+    except InputError as error:
+        if error.code != "E-PLAN-UNLINKED":
+            raise
+        save_body(path, target)
+        return f"{path}\nno forecast: {error}, --images {2 * planned.images} say"
     save_body(path, target)
     return f"{made_text(target, forecast.setup.camera, planned.distance_mm)}\n{path}\n\n{plan_text(forecast, source)}"

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, StcalError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, CameraPrior
-from stcal.io.cameras.read import camera_model
+from stcal.io.cameras.read import camera_model, read_camera
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import ImageFile, Skipped, find_images
 from stcal.parallel import Progress, counted, one_thread
@@ -23,7 +24,7 @@ from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import DetectedImage, copy_of, detect_files, load_image, sized_by
 from stcal.sfm.detect.labels import label_single, without_defocus
 from stcal.sfm.measurement.pose import PoseOptions, TargetPose, common_errors, measured_pose, resolved
-from stcal.sfm.measurement.target import TargetCircles
+from stcal.sfm.measurement.target import TargetCircles, read_target
 from stcal.sfm.measurement.tracker import Tracker
 
 
@@ -89,9 +90,9 @@ class MeasureResult:
 @one_thread()
 def measure(
     images: str | Path,
-    camera: Camera | CameraModel,
-    target: TargetCircles,
-    design: TargetDesign,
+    camera: Camera | CameraModel | str | Path,
+    target: TargetCircles | str | Path,
+    design: TargetDesign | str | Path,
     board: BoardDesign | None = None,
     options: MeasureOptions | None = None,
     progress: Progress | None = None,
@@ -105,13 +106,13 @@ def measure(
     ----------
     images : path
         Folder of photographs, with its subfolders.
-    camera : Camera
-        Camera from :func:`stcal.load_camera`, or of the run. Its covariance, if any, is part of the poses'
-        covariances.
-    target : TargetCircles
-        Circles of the target, target frame, mm; see :func:`read_target`.
-    design : TargetDesign
-        Design with radii and polarity, for detection and labels.
+    camera : Camera or path
+        Camera from :func:`stcal.load_camera`, its file, or of the run: ``result.refined_camera or result.camera``. Its
+        covariance, if any, is part of the poses' covariances.
+    target : TargetCircles or path
+        Circles of the target, target frame, mm; see :func:`read_target`; or the ``faces.json`` of a run.
+    design : TargetDesign or path
+        Design with radii and polarity, for detection and labels, or its ``target.toml``.
     board : BoardDesign, optional
         A dot board that may be in view, so that its dots are not taken for circles of the target.
     options : MeasureOptions, optional
@@ -132,7 +133,10 @@ def measure(
     DetectionError
         If no image shows a face.
     """
-    options, progress, camera = options or MeasureOptions(), progress or (lambda *_: None), camera_model(camera)
+    options, progress = options or MeasureOptions(), progress or (lambda *_: None)
+    design = load_body(design) if isinstance(design, str | Path) else design
+    target = read_target(target, design) if isinstance(target, str | Path) else target
+    camera = read_camera(camera) if isinstance(camera, str | Path) else camera_model(camera)
     files, unreadable = find_images(images)
     step = counted(progress, "detect", len(files))
     if options.sequence:

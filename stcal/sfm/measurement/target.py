@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from stcal.boards.target import load_body
 from stcal.design import TargetDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.align import align_rigid
@@ -92,15 +93,15 @@ class TargetCircles:
         return cls(labels, xyz, np.array([radius[label] for label in labels]), covariance, sigma_factor, notes, design)
 
 
-def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
+def read_target(path: str | Path, design: TargetDesign | str | Path) -> TargetCircles:
     """Reads a ``faces.json`` and checks that it belongs to this design.
 
     Parameters
     ----------
     path : path
         ``faces.json`` of a finished run.
-    design : TargetDesign
-        Design of the same target.
+    design : TargetDesign or path
+        Design of the same target, or its ``target.toml``.
 
     Returns
     -------
@@ -112,7 +113,7 @@ def read_target(path: str | Path, design: TargetDesign) -> TargetCircles:
     InputError
         If the file is no ``faces.json``, or belongs to another design.
     """
-    path = Path(path)
+    path, design = Path(path), load_body(design) if isinstance(design, str | Path) else design
     faces = read_result(path, FacesFile, "faces", "give RUN/faces.json, the faces.json of a run")
     try:
         labels = circle_labels(faces.circles)

@@ -365,9 +365,8 @@ def measured(small_run, small_dataset, tmp_path_factory):
     images = tmp_path_factory.mktemp("measured")
     (images / "12").mkdir()
     own_copy(small_dataset / "images/12/IMG_1000.jpg", images / "12")
-    target = read_target(small_run / "faces.json", reference_target())
-    camera = read_camera(small_dataset / "cameras.txt")
-    return measure(images, camera, target, reference_target(), options=MeasureOptions(workers=1))
+    files = small_dataset / "cameras.txt", small_run / "faces.json", small_dataset / "target.toml"
+    return measure(images, *files, options=MeasureOptions(workers=1))
 
 
 def mean_squared_error(result, truth: dict) -> float:
