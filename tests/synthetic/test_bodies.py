@@ -12,7 +12,9 @@ TIE_MM = 70.0
 
 @pytest.mark.parametrize("size_mm", [45.0, 60.0, TIE_MM])
 def test_the_border_of_a_tag_is_drawn_where_it_is(size_mm):
-    """Along the middle of the upper and of the left border, all ink: its middle and length to an eighth of a pixel."""
+    """Along the middle of the upper and of the left border, all ink: its middle and length to an eighth of a pixel.
+
+    An eighth is half of what is drawn, four to a pixel; points are rounded to a sixteenth of that, 0.008 px."""
     face = tag_cube(size_mm).faces[0]
     drawing = drawing_of(face)
     ink = (WHITE - drawing.grey) / (WHITE - BLACK)

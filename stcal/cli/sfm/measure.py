@@ -80,7 +80,10 @@ def measure(
     ] = 8765,
     max_megabytes: Annotated[float, "Accept image files up to this size with --serve.", Opt(min=0.01, max=2000)] = 64.0,
     token: Annotated[
-        str, "Answer with --serve only requests with `Authorization: Bearer` and this word.", Opt(envvar="STCAL_TOKEN")
+        str,
+        "Answer with --serve or --live only requests with `Authorization: Bearer` and this word; a browser gives it as "
+        "?token=.",
+        Opt(envvar="STCAL_TOKEN"),
     ] = "",
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
@@ -172,7 +175,9 @@ def _say_place(server: "MeasureServer", what: str) -> None:
         token = server.options.token
         who = "that knows the token" if token else f"that reaches {server.options.host}"
         remedy = "" if token else "; give a --token"
-        print_each("warning", [f"every machine {who} can send images; nothing is encrypted{remedy}"])
+        print_each(
+            "warning", [f"every machine {who} can send images and see what is shown; nothing is encrypted{remedy}"]
+        )
     say(what)
     sys.stdout.flush()
 

@@ -308,9 +308,7 @@ def image_sigma_factors(models: Sequence[GroupModel], camera: Camera, printed: I
 
     ``printed`` : ids of printed faces, whose corners have a factor of their own. It and the factor of ``circles`` are
     not below 1. σ of some centres hold what is uncertain of their corrections, and σ of printed corners what all
-    photographs share: neither is a residual, so that small residuals do not deny σ. On six simulated sets with depth of
-    field χ² of all circles was 1.18 ± 0.05 per degree of freedom without this limit and is 1.01 with it; on six without
-    depth of field 1.06 and 1.03 (``simulate``, ``scripts/studies/optics_study.py``).
+    photographs share: neither is a residual, so that small residuals do not deny σ.
     """
     start = SigmaFactors(1.0, 1.0, 1.0, 1.0, frozenset(printed))
     square, redundancy = np.zeros(3), np.zeros(3)
