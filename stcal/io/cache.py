@@ -10,6 +10,7 @@ import importlib.metadata
 import io
 import json
 import shutil
+import threading
 import warnings
 import zipfile
 import zlib
@@ -27,6 +28,10 @@ R = TypeVar("R")
 META, MADE_FROM, CHECKSUM = "meta", "made_from", "checksum"
 DAMAGE = (OSError, ValueError, LookupError, EOFError, TypeError, zipfile.BadZipFile, zlib.error, StcalError)
 """Exceptions of reading a file, or of rebuilding its result, if the file is truncated or of another form."""
+
+_parsing = threading.Lock()
+"""A lock for parsing heads of arrays: Python's parser counts its depth for all threads together, and can fail where
+several use it (https://github.com/python/cpython/issues/106905)."""
 
 
 @functools.cache
@@ -68,7 +73,8 @@ def kept(path: Path, make: Callable[[Mapping[str, np.ndarray], dict[str, Any]], 
         with np.load(io.BytesIO(read_bytes(path, TABLE_BYTES))) as stored:
             if sum(part.file_size for part in stored.zip.infolist()) > TABLE_BYTES:
                 raise ValueError("too large")
-            content = dict(stored)
+            with _parsing:
+                content = dict(stored)
         fault = "" if content.pop(CHECKSUM).tobytes() == _digest(content) else "edited"
         meta = json.loads(content[META].tobytes())
         if meta.pop(MADE_FROM) == path.stem and not fault:

@@ -1,9 +1,13 @@
 """What is kept is read back bit by bit; what is damaged, edited or another's counts as absent, with a note."""
 
+import ast
 import os
+import threading
+import time
 import tracemalloc
 import warnings
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -26,6 +30,27 @@ def test_kept_and_read_back(tmp_path):
     arrays, meta = kept(path, together)
     assert meta == META
     assert all(np.array_equal(arrays[name], ARRAYS[name]) for name in ARRAYS)
+
+
+def test_heads_of_arrays_are_parsed_by_one_thread_at_a_time(tmp_path, monkeypatch):
+    """NumPy parses them by ``ast``, which can fail in several threads."""
+    parse, busy, overlaps = ast.literal_eval, threading.Lock(), []
+
+    def slowly(text):
+        overlaps.append(not busy.acquire(blocking=False))
+        time.sleep(1e-3)
+        if not overlaps[-1]:
+            busy.release()
+        return parse(text)
+
+    path = tmp_path / "key.npz"
+    keep(path, ARRAYS, META)
+    monkeypatch.setattr(ast, "literal_eval", slowly)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: kept(path, together), range(8)))
+    assert None not in found
+    assert len(overlaps) == 8 * 4  # two arrays, the values, and the checksum
+    assert not any(overlaps)
 
 
 @pytest.mark.parametrize("end", [0, 10, 200, -1])
