@@ -169,3 +169,12 @@ def test_checks_of_ones_own_have_their_own_names():
         own_checks(Result(), [lambda _: check("camera")])
     with fails_with("E-CHECK-OWN … bool"):
         own_checks(Result(), [lambda _: True])
+
+
+def test_the_repr_of_a_large_result_is_a_line():
+    """A notebook prints it."""
+    pair = np.random.default_rng(0).uniform(-100, 100, (60, 3))
+    result = stcal.register.register(pair, pair + np.array([1.0, 2.0, 3.0]))
+    assert repr(result).startswith("Registration(")
+    assert len(repr(result)) < 1000
+    assert "\n" not in repr(result)

@@ -56,7 +56,9 @@ def known_dictionary(name: str) -> str:
     plain = plain if plain.startswith("DICT_") else f"DICT_{plain}"
     dictionaries = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
     if plain not in dictionaries:
-        alike = sorted(k for k in dictionaries if k[5:9] == plain[5:9]) or sorted(dictionaries)
+        size = re.search(r"\d+ ?[X×] ?\d+|\d\dH\d+", plain)
+        word = size[0].replace(" ", "").replace("×", "X") if size else plain[5:9]
+        alike = sorted(key for key in dictionaries if word in key) or sorted(dictionaries)
         raise ValueError(f"unknown dictionary; one of {', '.join(alike)} needed")
     return dictionaries[plain]
 

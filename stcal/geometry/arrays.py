@@ -1,5 +1,6 @@
 """Read-only arrays of a checked shape, for the fields of the package's frozen dataclasses."""
 
+from dataclasses import fields
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -10,6 +11,8 @@ from stcal.errors import InputError
 
 Shape = tuple[int | None, ...]
 
+LONGEST = 100
+"""Number of characters up to which the ``repr`` of a value stands in that of a result."""
 MYPY = False
 """True to mypy, by its name: it knows no descriptors in frozen dataclasses, so that fields are arrays to it."""
 
@@ -28,6 +31,26 @@ if TYPE_CHECKING and not MYPY:
 
 else:
     Array = np.ndarray  # pyright: ignore[reportAssignmentType]  # to mypy, and at run time
+
+
+class Brief:
+    """Base of results with many values, made with ``@dataclass(repr=False)``: their ``repr`` is one short line, with
+    plain values as they are and of all else how much there is of it."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        values = ((field.name, getattr(self, field.name)) for field in fields(self))  # type: ignore[arg-type]
+        return f"{type(self).__name__}({', '.join(f'{name}={_brief(value)}' for name, value in values)})"
+
+
+def _brief(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"<array {'×'.join(map(str, value.shape))}>" if value.size > 1 else str(value)
+    if isinstance(value, dict | list | tuple | set | frozenset):
+        return f"<{len(value)}>" if value else "<0>"
+    text = repr(value)
+    return text if len(text) <= LONGEST else f"<{type(value).__name__}>"
 
 
 @lru_cache

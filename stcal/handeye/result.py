@@ -5,15 +5,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.methods.reprojection import Reprojection
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HandEye:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class HandEye(Brief):
     """A hand-eye calibration from m pose pairs.
 
     Parameters

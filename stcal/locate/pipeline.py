@@ -10,6 +10,7 @@ import numpy as np
 from stcal.boards.design import TagLayout
 from stcal.boards.tags import other_dictionaries
 from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import Brief
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model
@@ -58,8 +59,8 @@ class LocateOptions:
             raise InputError("E-OPTION-RANGE", f"moved_px {self.moved_px:g}: a positive number needed")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Located:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Located(Brief):
     """Result of one scene.
 
     Parameters

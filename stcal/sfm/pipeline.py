@@ -2,7 +2,7 @@
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,15 +10,25 @@ import numpy as np
 
 from stcal.boards.design import CornerBoard
 from stcal.boards.file import run_board_of as board_of
-from stcal.boards.target import body_of
+from stcal.boards.tags import find_tags, other_dictionaries
+from stcal.boards.target import body_of, tags_on
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference, with_drawn_size
-from stcal.errors import InputError, StcalError
+from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, camera_prior, model_of, refinable
 from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.cameras.read import camera_model
 from stcal.io.files import save
-from stcal.io.images import TOP_GROUP, ImageFile, ImageFiles, chosen_images, mosaic_of, require_common_size
+from stcal.io.images import (
+    TOP_GROUP,
+    ImageFile,
+    ImageFiles,
+    chosen_images,
+    decode,
+    grey_of,
+    mosaic_of,
+    require_common_size,
+)
 from stcal.io.photographs.memory import files_of_arrays
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, counted, kept_processes, one_thread
@@ -48,6 +58,13 @@ from stcal.sfm.runs.transaction import MarkerFile, RunFolder, run_folder
 IN_MEMORY = "images in memory"
 """What a run's folder states as the folder of its images where there is none."""
 PHOTOGRAPHS = "the photographs"
+LOOKED_AT = 5
+"""Number of images in which other tags are looked for."""
+FOUND_BY_DOTS = "no --camera: found by the dots of the board, f {:.0f} px"
+ASSUMED = (
+    "no --camera, and no board of dots that tells one: a lens without distortion is assumed, and centres are good "
+    "for a look, not for measuring"
+)
 """Where a camera that was found is from, for messages."""
 Images = str | Path | Mapping[str, Sequence[np.ndarray]]
 """A folder of images, or grey or RGB arrays by the name of their group."""
@@ -222,6 +239,8 @@ def _with_found_camera(
     printed = target.with_faces(printed=True)
     guesses = guessed_cameras(files[0])
     detection, labelled = _labelled(files, model_of(guesses[0], PHOTOGRAPHS), folder, printed, None, options, progress)
+    if unseen := why_unseen(files[0], labelled, target):
+        raise DetectionError("E-TARGET-UNSEEN", unseen)
     observations = [image.observations for image in labelled]
     found = place_and_find_camera(observations, printed.faces, guesses).camera
     model = model_of(found, PHOTOGRAPHS)
@@ -282,10 +301,23 @@ def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
     return [Camera.of(start_camera(width, height, LENS), LENS)]
 
 
-def assumed_camera(files: Sequence[ImageFile]) -> CameraModel:
-    """Returns the camera with which images are detected for a look where none is given. It moves no corner of a printed
-    face, and the centres of circles a little."""
-    return model_of(guessed_cameras(files)[0], PHOTOGRAPHS)
+def _camera_for_a_look(
+    files: ImageFiles,
+    folder: RunFolder,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: RunOptions,
+    progress: Progress,
+) -> tuple[CameraModel, bool]:
+    """Returns the camera with which images are detected where none is given, and whether the dots of the board told it.
+
+    Where they do not, it is one of medium focal length without distortion: it moves no corner of a printed face and the
+    centres of circles a little, but far from the middle of a wide image faces may lose their names.
+    """
+    if board is not None and board.rows:
+        with suppress(DetectionError, DegenerateError):
+            return _camera_of_dots(files, None, folder, target, board, options, progress), True
+    return model_of(guessed_cameras(files[0])[0], PHOTOGRAPHS), False
 
 
 def _require_for_printed(options: RunOptions) -> None:
@@ -454,17 +486,49 @@ def unlinked_notes(body: PlacedBody) -> list[str]:
 
 def detect(
     files: ImageFiles,
-    camera: CameraModel,
+    camera: CameraModel | None,
     folder: RunFolder,
     target: TargetDesign,
     board: BoardDesign | None,
     options: RunOptions,
     progress: Progress,
-) -> tuple[DetectionResult, list[LabelledImage]]:
-    """Detects and labels the images, and writes ``detections.csv`` and overlays into a claimed folder."""
+) -> tuple[DetectionResult, list[LabelledImage], list[str]]:
+    """Detects and labels the images, and writes ``detections.csv`` and overlays into a claimed folder.
+
+    ``camera`` : None to find one by the dots of the board, or to assume one; the notes of the result say which.
+    """
+    notes = []
+    if camera is None:
+        camera, told = _camera_for_a_look(files, folder, target, board, options, progress)
+        if target.with_faces(printed=False).faces:
+            notes.append(FOUND_BY_DOTS.format(camera.focal[0]) if told else ASSUMED)
     detection, labelled = labelled_images(files, camera, folder, target, board, options, progress)
+    if unseen := why_unseen(files[0], labelled, target):
+        notes.append(unseen)
     with overlays_beside(detection, labelled, target, folder, progress):
-        return detection, labelled
+        return detection, labelled, notes
+
+
+def why_unseen(files: Sequence[ImageFile], labelled: Sequence[LabelledImage], target: TargetDesign) -> str:
+    """Returns why no image shows a corner of the target's printed faces; empty if one does, or there are no such faces.
+
+    Tags of other dictionaries are looked for in the first images.
+    """
+    faces = [face for face in target.faces if face.printed is not None]
+    ids = {face.id for face in faces}
+    if not faces or any(ids.intersection(image.observations.face_ids()) for image in labelled):
+        return ""
+    reason = f"no face of the target is seen in {len(labelled)} images"
+    known = sorted({dictionary for face in faces for dictionary, _ in tags_on(face.printed)})
+    for file in files[:LOOKED_AT] if known else ():
+        grey = grey_of(decode(file.read(), file.name), file.name)
+        if read := find_tags(grey, known).tags:
+            names = ", ".join(str(tag) for _, tag in read[:5])
+            return f"{reason}, and {file.name} shows tags {names} of its dictionaries; correct the ids in target.toml"
+        if others := other_dictionaries(grey, known):
+            name, count = others[0]
+            return f"{reason}, and {file.name} shows {count} tags of {name}; correct the dictionary in target.toml"
+    return f"{reason}; look at overlays (`stcal-sfm detect`), and check dictionary, ids and the exposure"
 
 
 def labelled_images(

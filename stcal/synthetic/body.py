@@ -17,7 +17,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.parallel import run_parallel
-from stcal.synthetic.dataset import TruthFile
+from stcal.synthetic.dataset import FIRST_IMAGE, TruthFile
 from stcal.synthetic.render import encode
 
 BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
@@ -247,13 +247,20 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> n
     return np.clip(np.rint(255 * noisy), 0, 255).astype(np.uint8)
 
 
-def body_truth(scene: BodyScene) -> TruthFile:
-    """Returns the truth of a body."""
+def _image_name(image: int, image_format: str) -> str:
+    """Returns the name of a photograph: ``IMG_1000.jpg``."""
+    return f"IMG_{FIRST_IMAGE + image}.{image_format}"
+
+
+def body_truth(scene: BodyScene, image_format: str = "jpg") -> TruthFile:
+    """Returns the truth of a body, with the pose of each photograph."""
+    poses = {_image_name(i, image_format): pose.matrix() for i, pose in enumerate(scene.camera_from_target)}
     return TruthFile(
         unit="mm",
         reference_face=scene.target.faces[0].id,
         target_from_face={face: pose.matrix() for face, pose in scene.target_from_face.items()},  # type: ignore
         circles=scene.circles_target(),  # type: ignore[arg-type]
+        camera_from_target=poses,  # type: ignore[arg-type]
     )
 
 
@@ -281,14 +288,16 @@ def write_body(
         (folder / "images").mkdir(parents=True, exist_ok=True)
         write_cameras_txt(folder / "cameras.txt", scene.camera)
         (folder / "target.toml").write_text(body_toml(scene.target), encoding="utf-8")
-        (folder / "truth.json").write_text(json.dumps(body_truth(scene).content()) + "\n", encoding="utf-8")
+        (folder / "truth.json").write_text(
+            json.dumps(body_truth(scene, image_format).content()) + "\n", encoding="utf-8"
+        )
     except OSError as error:
         raise InputError(
             "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
         ) from error
     drawings = {face.id: drawing_of(face, scene.target.polarity) for face in scene.target.faces}
     count = len(scene.camera_from_target)
-    paths = [folder / "images" / f"IMG_{1000 + i}.{image_format}" for i in range(count)]
+    paths = [folder / "images" / _image_name(i, image_format) for i in range(count)]
     jobs = [(path, scene, i, drawings, jpeg_quality) for i, path in enumerate(paths)]
     for done, _ in enumerate(run_parallel(_write_image, jobs, workers), 1):
         if progress:

@@ -69,6 +69,9 @@ class TruthFile(ResultFile):
     target_from_face: dict[ByFace, Pose] = Field(description="three-point frame of each face")
     circles: dict[ByLabel, Vector3] = Field(description="`face:circle` → centre, target frame, mm")
     groups: dict[ByGroup, TrueGroup] | None = Field(None, description="by folder of `images`")
+    camera_from_target: dict[ByImage, Pose] | None = Field(
+        default=None, description="of the photographs of a body that is held, by file below `images`"
+    )
     optics: TrueOptics | None = Field(default=None, description="of simulated sets with a thin lens or rims")
 
     @classmethod

@@ -55,6 +55,8 @@ class SceneOptions:
         RMS length and angle of the deviations of true face poses from nominal ones.
     margin_mm : float
         How far plates without ``outline_mm`` reach beyond the rims of their circles.
+    one_board : bool
+        Whether all groups show the same board, whose dots err alike; otherwise each has a board of its own.
     """
 
     seed: int = 0
@@ -71,6 +73,7 @@ class SceneOptions:
     face_shift_mm: float = 0.5
     face_turn_deg: float = 0.5
     margin_mm: float = FACE_MARGIN_MM
+    one_board: bool = False
 
     def __post_init__(self):
         for name in ("width", "height", "images_per_group", "distance_mm", "spread_deg"):
@@ -195,9 +198,10 @@ def make_scene(
     target_from_face, circles = _made_target(target, nominal, options, rng)
     _check_convex(target, target_from_face, options.margin_mm)
     camera = _made_camera(options, rng)
+    common = board.sigma_mm * rng.standard_normal((len(board.labels()), 3)) if options.one_board else None
     groups = {}
     for pair in options.groups or _default_groups(target, target_from_face):
-        group = _made_group(pair, target, board, camera, target_from_face, circles, options, rng)
+        group = _made_group(pair, target, board, camera, target_from_face, circles, options, common, rng)
         if group.name in groups:
             raise InputError("E-SCENE-GROUP", f"scene: group {group.name} occurs twice; give different pairs")
         groups[group.name] = group
@@ -272,7 +276,8 @@ def _default_groups(target: TargetDesign, target_from_face: dict[str, Rigid]) ->
     return visible_pairs
 
 
-def _made_group(pair, target, board, camera, target_from_face, circles, options, rng) -> Group:
+def _made_group(pair, target, board, camera, target_from_face, circles, options, errors, rng) -> Group:
+    """Returns a group; ``errors`` : of the places of the board's dots, mm, drawn here if None."""
     name = group_name(pair)
     labels = [target.face(face).labels() for face in pair]
     normals = [target_from_face[face].rotation[:, 2] for face in pair]
@@ -290,7 +295,8 @@ def _made_group(pair, target, board, camera, target_from_face, circles, options,
     target_from_board, views = place_group(
         shape, camera, options.images_per_group, options.distance_mm, np.radians(options.spread_deg), rng
     )
-    dots_target = target_from_board @ (dots + board.sigma_mm * rng.standard_normal(dots.shape))
+    errors = board.sigma_mm * rng.standard_normal(dots.shape) if errors is None else errors
+    dots_target = target_from_board @ (dots + errors)
     return Group(name, tuple(pair), axes, target_from_board, dots_target, tuple(views))
 
 

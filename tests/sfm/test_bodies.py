@@ -1,5 +1,6 @@
 """Bodies whose faces are boards or tags: no dot board and no camera file are needed."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,7 +35,7 @@ from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
 from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
 from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
-from tests.outcome import fails_with
+from tests.outcome import COMPUTATION, assert_error, fails_with
 
 CUBE = Path(__file__).parents[3] / "shared/data/real/pycamset_cube"
 SIGMA_PX = 0.1
@@ -256,6 +257,17 @@ def test_widths_that_are_none_are_refused():
         tag_body("cube", "60", "4X4_50", 47)
 
 
+def test_tags_of_other_dictionaries_or_ids_are_named(tmp_path, stcal_sfm):
+    scene = make_body_scene(tag_cube(60.0), body_camera(640), BodyOptions(images=2, distance_mm=300))
+    write_body(tmp_path / "set", scene)
+    other = tag_cube(60.0, "DICT_5X5_100")
+    target, out = written(tmp_path, body_toml(other)), tmp_path / "run"
+    words = ("run", tmp_path / "set/images", "--target", target, "--out", out)
+    assert_error(stcal_sfm(*words), COMPUTATION, "E-TARGET-UNSEEN", "DICT_APRILTAG_36H11", "correct the dictionary")
+    written(tmp_path, body_toml(tag_cube(60.0, first_id=100)))
+    assert_error(stcal_sfm(*words), COMPUTATION, "E-TARGET-UNSEEN", "tags ", "correct the ids")
+
+
 @pytest.mark.slow
 def test_a_run_of_photographs_without_board_and_camera(tmp_path):
     scene = make_body_scene(tag_cube(60), body_camera(640), BodyOptions(images=14, distance_mm=300, seed=2))
@@ -269,6 +281,10 @@ def test_a_run_of_photographs_without_board_and_camera(tmp_path):
     assert 0.3 < np.sqrt(np.mean(np.square(normalised))) < 2  # about 1 of five faces that share their camera
     summary = load_run(tmp_path / "r").report["summary"]
     assert (summary["scale_from"], summary["camera_given"]) == (["faces"], False)
+    own = next(check for check in result.checks if check.key == "camera")
+    assert own.verdict == "not possible"  # there is no camera file to compare with
+    truth = json.loads((tmp_path / "set/truth.json").read_text())["camera_from_target"]
+    assert np.array_equal(truth["IMG_1003.jpg"], scene.camera_from_target[3].matrix())
     assert not (tmp_path / "r/board.toml").exists()
     again = adjusted_run(load_run(tmp_path / "r")).state.result()
     assert again.sigma0 == pytest.approx(result.calibration.joint.sigma0, rel=1e-3)

@@ -250,3 +250,14 @@ def test_versions_for_reports_of_faults(command, monkeypatch):
     again = command("--versions")[1]
     assert "native colmap  not found" in again
     assert "OpenCV         does not load: No module named 'no_such_module'" in again
+
+
+@pytest.mark.slow
+def test_without_a_camera_the_board_tells_it(stcal_sfm, small_dataset, small_run, tmp_path):
+    """The lens is that of the file within what eight views of a board tell: as many circles have names."""
+    designs = ("--target", small_dataset / "target.toml", "--board", small_dataset / "board.toml")
+    code, told, _ = stcal_sfm("detect", small_dataset / "images", *designs, "--out", tmp_path / "look")
+    assert code == 0
+    assert "note: no --camera: found by the dots of the board, f " in told
+    with_camera = (small_run / "detections.csv").read_text().splitlines()
+    assert len((tmp_path / "look/detections.csv").read_text().splitlines()) == len(with_camera)

@@ -115,6 +115,15 @@ def test_same_seed_same_scene_and_other_seed_another(scene):
     assert not np.allclose(other.camera.centre, scene.camera.centre)
 
 
+@pytest.mark.parametrize("one_board", [True, False])
+def test_groups_show_one_board_or_each_its_own(one_board):
+    """Distances of the dots tell boards apart, wherever they stand."""
+    scene = make_scene(replace(OPTIONS, one_board=one_board))
+    first, second = (g.board_circles_target for g in list(scene.groups.values())[:2])
+    lengths = [np.linalg.norm(dots - dots[0], axis=1) for dots in (first, second)]
+    assert np.allclose(*lengths, atol=1e-9, rtol=0) == one_board
+
+
 @pytest.mark.parametrize(
     ("distortion", "tolerance_px"),
     # Without distortion the 720-gon's centroid is the ellipse's centre. With it the lens bends the rim, which a

@@ -170,9 +170,7 @@ def detect(
             "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
         )
     files = chosen_images(images, options.exclude)
-    model = pipeline.assumed_camera(files[0]) if camera is None else read_camera(camera)
-    if camera is None and target_design.with_faces(printed=False).faces:
-        print_each("note", ["no --camera: a lens is assumed, and centres are good for a look, not for measuring"])
+    model = None if camera is None else read_camera(camera)
     inputs = {"images": images, "--camera": camera, "--target": target, "--board": board}
     with (
         shared.designs_told(target, board),
@@ -180,7 +178,9 @@ def detect(
         run_folder(out, MarkerFile.of(images, None), inputs) as folder,
         StageProgress() as progress,
     ):
-        detection, labelled = pipeline.detect(files, model, folder, target_design, board_design, options, progress)
+        found = pipeline.detect(files, model, folder, target_design, board_design, options, progress)
+    detection, labelled, notes = found
+    print_each("note", notes)
     say(detection_text(detection, labelled))
     say(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
 

@@ -83,6 +83,9 @@ def simulate(
         "together if none.",
     ] = None,
     camera: Annotated[Path | None, "Render with the camera of this file, in place of --width."] = None,
+    one_board: Annotated[
+        bool, "Photograph one board with all groups, as `plan` assumes, not another of its kind with each."
+    ] = False,
     second_design: Annotated[bool, "Use three faces, dark on white, and another board."] = False,
     png: Annotated[bool, "Write PNG in place of JPEG."] = False,
     sixteen_bit: Annotated[bool, "Write 16-bit PNG.", Opt("--16-bit")] = False,
@@ -106,11 +109,17 @@ def simulate(
         spread_deg=spread,
         images_per_group=images,
         margin_mm=margin,
+        one_board=one_board,
     )
     kind = "png" if png or sixteen_bit else "jpg"
     if target is not None and (body := body_of(target)).with_faces(printed=True).faces:
         others = {"--groups": groups, "--fisheye": fisheye, "--f-number": f_number, "--rim-mm": rim, "--board": board}
-        others |= {"--second-design": second_design, "--clutter": clutter, "--16-bit": sixteen_bit}
+        others |= {
+            "--second-design": second_design,
+            "--one-board": one_board,
+            "--clutter": clutter,
+            "--16-bit": sixteen_bit,
+        }
         if unfit := [name for name, value in others.items() if value]:
             raise InputError(
                 "E-OPTION-CONFLICT",

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from stcal.errors import DegenerateError, InputError, StcalError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import Loop, Setup
 from stcal.handeye.data.rig import RigPoses
@@ -28,8 +28,8 @@ POSE = 6
 """Number of parameters of a pose."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Rig:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Rig(Brief):
     """Poses of c cameras of one robot, from one adjustment of all their corners.
 
     Parameters

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.cross_validation import dealt, held_out_errors
-from stcal.geometry.arrays import Array, freeze
+from stcal.geometry.arrays import Array, Brief, freeze
 from stcal.register.core.models import Transform
 
 
@@ -80,8 +80,8 @@ class Alternative:
         freeze(self, "rows", (None,), "rows", int)
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Registration:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Registration(Brief):
     """The transform between two instruments' frames.
 
     Parameters

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, freeze, require_choices
+from stcal.geometry.arrays import Array, Brief, freeze, require_choices
 from stcal.io.files import require_written
 from stcal.robot.identification.adjustment import (
     Solution,
@@ -142,8 +142,8 @@ class Adjustment:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Identified:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Identified(Brief):
     """The identified robot, and how far to trust it; r observations, k parameters, n joints.
 
     Parameters

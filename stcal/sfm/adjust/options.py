@@ -8,6 +8,8 @@ from stcal.geometry.arrays import require_choices
 from stcal.io.toml import LEAST
 from stcal.sfm.adjust.faces import FrameKind
 
+FLATNESS_MM = 0.02
+"""σ of the circles off the plane of their face where none is stated."""
 MOST_FLATNESS_MM = 1e6
 Solve = Literal["joint", "chain", "paper"]
 
@@ -35,7 +37,7 @@ class AdjustOptions:
     solve: Solve = "joint"
     frame: FrameKind = "plane"
     eccentricity: bool = True
-    flatness_mm: float | None = 0.02
+    flatness_mm: float | None = FLATNESS_MM
     refine_camera: bool = False
 
     def __post_init__(self):

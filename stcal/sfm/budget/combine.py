@@ -138,6 +138,7 @@ def budget_of_run(run: SavedRun, statement: Statement | None = None) -> Budget:
         rows,
         run.faces.reference_face,
         rim,
+        run.report["summary"].get("camera_given", True),
     )
 
 
@@ -161,12 +162,13 @@ def budget(
     statement: Statement,
     reference_face: str,
     more: tuple[Source, ...] = (),
+    camera_given: bool = True,
 ) -> Budget:
     """Returns the budget of an adjustment. Arguments are as in :func:`stcal.sfm.budget.sources.sources_of`.
 
     ``more`` : further rows.
     """
-    sources = sources_of(found, camera, board, flatness_mm, refined, statement) + more
+    sources = sources_of(found, camera, board, flatness_mm, refined, statement, camera_given) + more
     if own.circles_designed.shape[2]:
         sources += (_placed(own),)
     rng = np.random.default_rng(0)

@@ -1,7 +1,7 @@
 """Form of the JSON file of ``budget``, which its page and PDF show too."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Literal
 
@@ -9,12 +9,13 @@ import numpy as np
 from pydantic import Field
 
 import stcal
+from stcal.geometry.rigid import Rigid
 from stcal.io.files import RUN_MARKER
 from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.report.text import join
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row
 from stcal.sfm.budget.lengths import LengthTest
-from stcal.sfm.budget.sources import Source
+from stcal.sfm.budget.sources import Source, reference_temperature_c
 from stcal.sfm.report.judgement import invalidated
 from stcal.sfm.runs.saved import SavedRun
 from stcal.sfm.runs.verify import VerifyFile
@@ -62,6 +63,8 @@ class Uncertainty(Part):
 
 
 class FaceUncertainty(Part):
+    position_mm: list[float]
+    rotation_vector_deg: list[float]
     position_um: Uncertainty
     position_xyz_um: list[float]
     rotation_mdeg: Uncertainty
@@ -139,6 +142,11 @@ class BudgetFile(ResultFile):
         description="`instrument`, `operator`, `date`, `traceability` and others, as given; empty where not"
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
+    use: str = Field(description='the run\'s own answer to "May I use it?"; empty where an older run has none')
+    reference_temperature_c: float = Field(
+        description="of the target: the temperature for which corrected lengths and positions hold, 20 °C (ISO 1) "
+        "unless stated otherwise"
+    )
     coverage_factor: float = Field(description="k of the expanded uncertainties")
     sigma0: float = Field(
         description="residuals of the adjustment over the σ of all observations, 1 where they are smaller; scales these"
@@ -159,7 +167,9 @@ class BudgetFile(ResultFile):
         description="by which lengths of the run are to be enlarged for the stated expansion; the run did not apply it"
     )
     faces: dict[ByName, FaceUncertainty] = Field(
-        description="against the reference face: `position_um` (root of the summed variances of x, y, z) and "
+        description="against the reference face: `position_mm`, x, y, z of the face's origin in the target frame, with "
+        "`correction_ppm`, and `rotation_vector_deg` of the run; `position_um` (root of the summed variances of x, y, "
+        "z) and "
         "`rotation_mdeg` likewise, each with `contributions` by key of the source, `sensitivities` (contribution over "
         "`sigma` of the source), combined `standard` and `expanded` uncertainty, `coverage` of the latter by "
         "simulation, and effective `degrees_of_freedom`, null for infinitely many; combined standard "
@@ -201,6 +211,8 @@ def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, A
         },
         "fields": stated.fields,
         "reference_face": budget.reference_face,
+        "use": (run.report.get("judgement") or {}).get("use", ""),
+        "reference_temperature_c": reference_temperature_c(stated.target),
         "coverage_factor": COVERAGE_FACTOR,
         "sigma0": budget.joint.sigma_scale,
         "redundancy": budget.joint.redundancy,
@@ -216,7 +228,7 @@ def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, A
             if value is not None
         ],
         "correction_ppm": PPM * budget.correction,
-        "faces": {} if is_refused(run) else _faces(budget),
+        "faces": {} if is_refused(run) else _faces(budget, run.faces.poses()),
         "distances": [] if is_refused(run) else [_distance(row, budget) for row in budget.of_kind("distance")],
         "notes": notes_of(budget, verified, run),
     }
@@ -226,12 +238,14 @@ def _source(source: Source) -> SourceRow:
     return SourceRow(**{key: getattr(source, key) for key in SourceRow.model_fields})
 
 
-def _faces(budget: Budget) -> dict[str, dict]:
+def _faces(budget: Budget, target_from_face: Mapping[str, Rigid]) -> dict[str, dict]:
     rotations = {row.measurand.name: row for row in budget.of_kind("rotation")}
     faces = {}
     for row in budget.of_kind("position"):
-        rotation = rotations[row.measurand.name]
+        rotation, pose = rotations[row.measurand.name], target_from_face[row.measurand.name]
         faces[row.measurand.name] = {
+            "position_mm": (pose.translation * (1 + budget.correction)).tolist(),
+            "rotation_vector_deg": pose.as_scipy().as_rotvec(degrees=True).tolist(),
             "position_um": _uncertainty(row, budget, MICRO),
             "position_xyz_um": (MICRO * np.sqrt(np.diag(row.covariance))).tolist(),
             "rotation_mdeg": _uncertainty(rotation, budget, MILLIDEGREES),

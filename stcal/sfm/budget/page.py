@@ -24,9 +24,13 @@ from stcal.sfm.budget.file import BudgetFile, LengthTestPart, SourceRow, Uncerta
 def verdict_of(test: LengthTestPart) -> str:
     """Returns the verdict of a length test in words."""
     count = len(test.lengths)
+    largest = f"largest |E_n| {number(max(abs(e) for e in _known(test)), 2)}"
+    if not test.beyond:
+        return f"agrees: all {count} lengths within U, {largest}"
+    word = "differs" if not test.agrees else "may agree"
     return (
-        f"{'agrees' if test.agrees else 'differs'}: {test.beyond} of {count} lengths beyond U, by chance 1 in 22 is; "
-        f"largest |E_n| {number(max(abs(e) for e in _known(test)), 2)}, up to {test.limit:.2f} for {count}"
+        f"{word}: {test.beyond} of {count} lengths beyond U, where 1 in 22 is by chance; {largest}, which reaches "
+        f"{test.limit:.2f} by chance in one of 22 tests of {count}"
     )
 
 
@@ -39,8 +43,11 @@ def name_of(circles: Sequence[str]) -> str:
     return "–".join(circles)
 
 
+SIGNED = ("date", "name", "signature")
+"""Lines that are left empty for whoever signs a certificate."""
 LEAST_SHARE = 1e-3
 """Least share of a variance that is drawn."""
+MANY = 1e6
 ROUNDING = 1e-6
 """Ratio to u below which a contribution is rounding error alone."""
 
@@ -57,6 +64,15 @@ def budget_report(file: BudgetFile) -> Document:
     lengths = [
         [name_of(e.circles), *(number(v, 4) for v in (e.length_mm, e.corrected_mm)), number(e.distance_um.expanded, 2)]
         for e in file.distances
+    ]
+    k = file.coverage_factor
+    positions = [
+        [face, *(number(v, 4) for v in e.position_mm), *(number(k * v, 2) for v in e.position_xyz_um)]
+        for face, e in faces.items()
+    ]
+    rotations = [
+        [face, *(number(v, 4) for v in e.rotation_vector_deg), *(number(k * v, 2) for v in e.rotation_xyz_mdeg)]
+        for face, e in faces.items()
     ]
     inputs = [
         [each.title, NONE if each.sigma is None else f"{each.sigma:.3g} {each.unit}", *_origin(each)]
@@ -87,6 +103,10 @@ def budget_report(file: BudgetFile) -> Document:
                         "x, y and z"
                     ),
                     Notes(file.notes),
+                    *([f"May the run be used? {file.use}"] if file.use else []),
+                    f"Lengths and positions hold at {file.reference_temperature_c:g} °C{_corrected(file)}",
+                    Table(_heads("position of face", "mm", "µm"), positions),
+                    Table(_heads("rotation vector of face", "°", "mdeg"), rotations),
                     Table(["<distance of circles", "in the run, mm", "corrected, mm", "U, µm"], lengths),
                     *(
                         _shares(file, [(name, u) for _, columns in kinds for name, u in columns.items()])
@@ -130,11 +150,24 @@ def budget_report(file: BudgetFile) -> Document:
                     Table(["<Of", "<"], hashes, css="text facts"),
                 ],
             ),
+            Section("Signature", [Table(["<", "<"], [[name, ""] for name in SIGNED], css="text facts")]),
         ],
         banner=[
             Table(["<Field", "<"], [[name, value or NONE] for name, value in file.fields.items()], css="text facts")
         ],
     )
+
+
+def _heads(of: str, unit: str, unit_of_u: str) -> list[str]:
+    """Returns the heads of a table of vectors and of their expanded uncertainties."""
+    return [f"<{of}", *(f"{axis}, {unit}" for axis in "xyz"), *(f"U of {axis}, {unit_of_u}" for axis in "xyz")]
+
+
+def _corrected(file: BudgetFile) -> str:
+    """Returns what the temperatures that were stated did to the lengths, for the end of a sentence."""
+    if file.correction_ppm:
+        return f", with a correction of {file.correction_ppm:+.1f} ppm for the stated expansion"
+    return ", as far as board and target were at it: no expansion that changes them is stated"
 
 
 def _origin(each: SourceRow) -> tuple[str, str, str]:
@@ -198,11 +231,16 @@ def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Tab
         ("coverage of U, simulated, %", [number(100 * u.coverage, 1) for u in columns.values()]),
         (
             "effective degrees of freedom",
-            ["∞" if u.degrees_of_freedom is None else f"{u.degrees_of_freedom:.0f}" for u in columns.values()],
+            [_freedom(u.degrees_of_freedom) for u in columns.values()],
         ),
     ):
         rows.append([name, "", *values])
     return Table(heads, rows)
+
+
+def _freedom(degrees: float | None) -> str:
+    """Returns degrees of freedom; beyond a million they are as good as infinitely many."""
+    return "∞" if degrees is None or degrees > MANY else f"{degrees:.0f}"
 
 
 def _slope(of: Uncertainty, source: SourceRow) -> float:

@@ -14,6 +14,7 @@ from stcal.geometry.arrays import frozen
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.io.design import BoardSizeEntry, SizeEntry
 from stcal.io.toml import Strict, load_toml
+from stcal.sfm.adjust.options import FLATNESS_MM
 from stcal.sfm.adjust.uncertainty import (
     BOARD,
     CIRCLES,
@@ -130,12 +131,13 @@ def sources_of(
     flatness_mm: float | None,
     refined: bool,
     statement: Statement,
+    camera_given: bool = True,
 ) -> tuple[Source, ...]:
     """Returns all rows of the budget, also of inputs of which nothing is known, so that the reader sees what is left
     out.
 
     ``camera`` : the camera as given to the run, with the covariance that its file states; ``refined`` : True if its
-    intrinsics were adjusted.
+    intrinsics were adjusted; ``camera_given`` : False if the photographs alone told it.
     """
     zero = np.zeros_like(found.joint.covariance_mm2)
     common = found.joint.board_common
@@ -156,7 +158,7 @@ def sources_of(
     rows += _own_size(found, board)
     if not corners or found.covariance_mm2[FLATNESS].any():
         rows.append(_flatness(found, flatness_mm))
-    rows.append(_intrinsics(found, camera, refined))
+    rows.append(_intrinsics(found, camera, refined, camera_given))
     if board.rows:
         rows.append(_scale(found.by_scale, zero, statement))
     grown = found.joint.xyz_model - found.joint.xyz_model.mean(0)
@@ -198,10 +200,15 @@ def _flatness(found: Contributions, flatness_mm: float | None) -> Source:
         words = "--flatness off: faces need not be flat"
     sigma = None if flatness_mm is None else 1e3 * flatness_mm * found.joint.sigma_scale
     origin: Origin = "not stated" if flatness_mm is None else "stated"
+    if flatness_mm == FLATNESS_MM:
+        origin, words = "assumed", f"the default of {words}"
     return Source("flatness", "flatness of faces", "B", origin, words, sigma, "µm", found.covariance_mm2[FLATNESS])
 
 
-def _intrinsics(found: Contributions, camera: Camera, refined: bool) -> Source:
+def _intrinsics(found: Contributions, camera: Camera, refined: bool, camera_given: bool) -> Source:
+    if not camera_given:
+        words = "found from these photographs, without a camera file; adjusted with all else"
+        return _camera_row("estimated", words, found.covariance_mm2[INTRINSICS], "A")
     stated = camera.covariance is not None
     origin: Origin = "stated" if stated else "assumed" if refined else "not stated"
     if refined:
@@ -214,8 +221,8 @@ def _intrinsics(found: Contributions, camera: Camera, refined: bool) -> Source:
     return _camera_row(origin, "fixed; σ of the camera file", effect @ camera.covariance @ effect.T)
 
 
-def _camera_row(origin: Origin, words: str, covariance: np.ndarray) -> Source:
-    return Source("intrinsics", "intrinsics", "B", origin, words, None, "", covariance)
+def _camera_row(origin: Origin, words: str, covariance: np.ndarray, evaluation: Literal["A", "B"] = "B") -> Source:
+    return Source("intrinsics", "intrinsics", evaluation, origin, words, None, "", covariance)
 
 
 def _scale(by_scale: np.ndarray, none: np.ndarray, statement: Statement) -> Source:
@@ -248,10 +255,12 @@ def _temperature(what: str, stated: StatedSize, effect: np.ndarray, statement: S
 
 def warmer_k(stated: StatedSize) -> float | None:
     """Returns the temperature in the photographs minus the reference temperature, or None if it is not stated."""
-    if stated.temperature_c is None:
-        return None
-    reference = stated.reference_temperature_c
-    return stated.temperature_c - (REFERENCE_C if reference is None else reference)
+    return None if stated.temperature_c is None else stated.temperature_c - reference_temperature_c(stated)
+
+
+def reference_temperature_c(stated: StatedSize) -> float:
+    """Returns the temperature for which a body's size is wanted: the one that is stated, or 20 °C."""
+    return REFERENCE_C if stated.reference_temperature_c is None else stated.reference_temperature_c
 
 
 def correction(statement: Statement) -> float:

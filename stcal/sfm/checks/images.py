@@ -16,7 +16,7 @@ from stcal.labels import CircleLabel, Label
 from stcal.sfm.adjust.calibration import Calibration
 from stcal.sfm.adjust.network import Network, solve_score
 from stcal.sfm.checks.culprits import Guilt, culprits, culprits_by_score
-from stcal.sfm.checks.verdict import SHOWN, SUSPICIOUS, Check, Measured, Trial, judge, without_image
+from stcal.sfm.checks.verdict import SHOWN, SUSPICIOUS, Check, Measured, Trial, impossible, judge, without_image
 from stcal.sfm.data.model import ImageObservations, Outlier
 
 MIN_CIRCLES = 3
@@ -35,7 +35,11 @@ FIELD_FLOOR_PX = 0.002
 
 
 def camera_check(
-    networks: Sequence[Network], camera: Camera, calibration: Calibration, prior: CameraPrior | None
+    networks: Sequence[Network],
+    camera: Camera,
+    calibration: Calibration,
+    prior: CameraPrior | None,
+    given: bool = True,
 ) -> Check:
     """Tests whether the intrinsics are those of the images.
 
@@ -43,9 +47,12 @@ def camera_check(
     (score test). If they were refined, their distance from the given ones is tested against the stated σ.
 
     ``prior`` : prior of the intrinsics if they were refined. The stated σ of a camera file does not excuse intrinsics
-    that were held fixed, as the σ of the faces do not include it.
+    that were held fixed, as the σ of the faces do not include it. ``given`` : False if the photographs alone told the
+    camera, so that there is nothing to test.
     """
     key, title = "camera", "Intrinsics against the images"
+    if not given:
+        return impossible(key, title, "no camera file: the intrinsics were found from these photographs", "")
     remedy = (
         "the camera file does not belong to these images (other focus, zoom, lens or size), or is too coarse: run with "
         "--refine-camera, or calibrate the camera anew"

@@ -61,7 +61,8 @@ class Evidence:
 
     ``models`` : adjusted models of the single groups, without unit; ``outliers`` : observations left out of the models;
     ``images`` : all observations; ``camera`` : as given; ``prior`` : of the intrinsics if they were refined;
-    ``blur_px`` : blur of the edges by image, may be empty; ``rim`` : whether rims are estimated for the result.
+    ``blur_px`` : blur of the edges by image, may be empty; ``rim`` : whether rims are estimated for the result;
+    ``camera_given`` : whether there is a camera file, or the photographs alone told the camera.
     """
 
     models: tuple[WorldModel, ...]
@@ -75,6 +76,7 @@ class Evidence:
     prior: CameraPrior | None
     blur_px: dict[str, float]
     rim: bool = False
+    camera_given: bool = True
 
     def radius_mm(self) -> dict[Label, float]:
         """Returns the radii of all circles and dots, without the corners of printed faces."""
@@ -128,7 +130,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
     rims, sigma_mm, allowed = _rims(evidence)
     radii = measure_radii(networks, evidence.images, evidence.radius_mm(), camera, _allowed_mm(evidence, rims))
     makers: tuple[Callable[[], Check | Iterable[Check]], ...] = (
-        lambda: camera_check(networks, evidence.camera, calibration, evidence.prior),
+        lambda: camera_check(networks, evidence.camera, calibration, evidence.prior, evidence.camera_given),
         lambda: field_check(networks, camera),
         lambda: sigma_check(networks, calibration.sigma_factors.all),
         *_joint_checks(evidence, networks),

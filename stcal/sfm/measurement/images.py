@@ -11,7 +11,7 @@ import numpy as np
 from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, StcalError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model, read_camera
@@ -64,8 +64,8 @@ class MeasuredImage:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasureResult:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class MeasureResult(Brief):
     """Result of :func:`measure`.
 
     ``images`` : those with a pose, in order of name; ``left_out`` : the others, with reasons; ``notes`` : what the

@@ -9,7 +9,7 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.arrays import require_choices
 from stcal.sfm.adjust.faces import FrameKind
-from stcal.sfm.adjust.options import AdjustOptions, Solve
+from stcal.sfm.adjust.options import FLATNESS_MM, AdjustOptions, Solve
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import GraphKind, PairOptions
 
@@ -74,7 +74,7 @@ class RunOptions:
     pairs: PairOptions = field(default_factory=PairOptions)
     ellipses: EllipseOptions = field(default_factory=EllipseOptions)
     workers: int | None = None
-    flatness_mm: float | None = 0.02
+    flatness_mm: float | None = FLATNESS_MM
     refine_camera: bool = False
     rim: bool = False
     board_only: bool = False

@@ -14,7 +14,7 @@ from stcal.boards.file import load_run_board
 from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign, scale_reference
 from stcal.errors import InputError, StcalError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior, camera_prior
@@ -42,8 +42,8 @@ ReportPart = TypeVar("ReportPart", bound=Part)
 COVARIANCE = ("var_x_px2", "cov_xy_px2", "var_y_px2")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SavedRun:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class SavedRun(Brief):
     """Content of a run's folder.
 
     ``images`` : the folder of photographs as given to the run; ``observations`` : of all images, in the database's

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stcal.design import StatedSize
 from stcal.io.design import board_toml, load_board
@@ -160,6 +161,11 @@ def test_command(stcal_sfm, small_run, tmp_path):
     own = first["distance_um"]
     assert own["sensitivities"]["board_pitch"] == pytest.approx(1e-3 * first["length_mm"], rel=2e-3)
     assert own["expanded"] == pytest.approx(2 * own["standard"])
+    pose = np.array(json.loads((small_run / "faces.json").read_text())["target_from_face"]["5"])
+    assert file["faces"]["5"]["position_mm"] == pytest.approx(pose[:3, 3] * (1 - 14e-6), abs=1e-9)
+    turn = Rotation.from_rotvec(file["faces"]["5"]["rotation_vector_deg"], degrees=True)
+    assert np.allclose(turn.as_matrix(), pose[:3, :3], atol=1e-9)
+    assert (file["reference_temperature_c"], file["use"][:4]) == (20.0, "Yes,")
     row = next(line for line in text.splitlines() if line.startswith("combined standard uncertainty u"))
     assert row.split()[-1] == f"{file['faces']['5']['position_um']['standard']:.2f}"
 

@@ -25,7 +25,9 @@ def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
     assert row is not None
     assert re.findall(r"<td>([\d.]+)</td>", row[1]) == combined
     assert "by +40.0 ppm" in html
-    assert "agrees: 0 of 10 lengths beyond U" in html
+    assert "Lengths and positions hold at 20 °C, with a correction of +40.0 ppm" in html
+    assert text.index("position of face") < text.index("distance of circles")
+    assert "agrees: all 10 lengths within U" in html
     assert re.search(r"SHA-256 of faces.json</th><td[^>]*>[0-9a-f]{64}<", html)
     assert not re.search(r'(?:src|href)="(?!data:|#)', html)
     assert (tmp_path / "budget.pdf").read_bytes() == b"%PDF-<!DOCTYPE html>"
