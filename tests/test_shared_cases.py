@@ -146,6 +146,7 @@ def test_bundles_of_apriltag_ros(call, shared_case, tmp_path):
         np.testing.assert_allclose(np.array(scene["camera_from_obj"])[:3, 3], place, atol=0.5)
 
 
+@pytest.mark.slow
 def test_tags_half_a_turn_off_are_told(call):
     words = "locate run tags --layout {} --camera cam.txt --out {{tmp}}/o.csv --overwrite"
     code, out, _ = call("rotated_tags", words.format("tags0.toml"))

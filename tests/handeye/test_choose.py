@@ -134,6 +134,7 @@ def test_a_closed_form_is_taken_where_it_predicts_better():
     assert found.result.covariance is not None
 
 
+@pytest.mark.slow
 def test_steps_from_the_solution_of_all_are_solutions_of_the_others():
     """Without three of fourteen poses: within a tenth of σ of what these eleven give by themselves."""
     truth = simulated_views(np.random.default_rng(2), 14, "eye-in-hand", ROBOT, 0.1)

@@ -223,6 +223,7 @@ def test_an_even_number_of_shifted_rows_is_numbered_up_to_its_symmetry(tmp_path)
     assert min(errors) < CORNER_PX < 20 < max(errors)
 
 
+@pytest.mark.slow
 def test_several_boards_are_one(tmp_path):
     """A ChArUco board and an AprilGrid at an angle, in one frame: points of both, with the normals of their planes."""
     own, sheet, first = charuco()

@@ -284,6 +284,7 @@ def test_a_fit_turns_the_camera_where_that_helps():
 REGION = np.array([[200.0, 100], [1000, 150], [1100, 800], [640, 700], [150, 850]])
 
 
+@pytest.mark.slow
 def test_a_lens_is_fitted_where_it_was_determined():
     lens, _, turn = turned_lens([1.0, 2.0, 0.0], REGION)  # beyond the region it is 3000 px off
     pixels = np.random.default_rng(0).uniform([0, 0], [WIDTH, HEIGHT], (500, 2))

@@ -73,6 +73,7 @@ def test_a_camera_of_a_pair_is_chosen_by_name(tmp_path):
     assert read_camera(path, "stereoParams.CameraParameters2").distortion[0] == 0.1
 
 
+@pytest.mark.slow
 def test_skewed_axes_are_fitted(tmp_path):
     matrix = np.array(STRUCTURE["IntrinsicMatrix"])
     matrix[1, 0] = 3.0
@@ -139,6 +140,7 @@ def test_zhangs_numbers(tmp_path):
     np.testing.assert_allclose(model.sized(640, 480).project(RAYS), wanted, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_zhangs_skew_is_fitted(tmp_path):
     (tmp_path / "camera.txt").write_text(ZHANG.replace("832.5 0 ", "832.5 0.204494 "))
     lens = read_lens(tmp_path / "camera.txt")

@@ -88,6 +88,7 @@ def measure(
 ) -> None:
     """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
     ellipses = shared.ellipse_options(min_diameter, max_diameter)
+    target = _design_beside(faces) if target is None else target
     if serve or live:
         mode = "--live" if live else "--serve"
         alone = {"--serve": serve and live, "--report": report, "--joints": joints, "--columns": columns}
@@ -150,6 +151,17 @@ def measure(
     write_if(report, document.page, "report")
     failed = [image.name for image in result.images if fit_verdict(image.pose) == "failed"]
     shared.require_passed(strict, [f"χ² of {name}" for name in failed], report)
+
+
+def _design_beside(faces: Path) -> Path | None:
+    """Returns the target.toml that a run wrote beside its faces.json, if there is one, and says that it is used."""
+    from stcal.io.files import RUN_MARKER, TARGET
+
+    own = faces.parent / TARGET
+    if not ((faces.parent / RUN_MARKER).is_file() and own.is_file()):
+        return None
+    print_each("note", [f"no --target: {own}, which the run wrote beside {faces.name}"])
+    return own
 
 
 def _setting(camera, faces, target, board, sigma_factor, ellipses) -> "Setting":

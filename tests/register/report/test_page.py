@@ -176,6 +176,7 @@ def test_thousands_of_outliers_are_told_in_few_lines_and_labels(monkeypatch):
     assert len(asked) < 5
 
 
+@pytest.mark.slow
 def test_the_field_and_the_page_keep_blas_to_one_thread(monkeypatch):
     """As `register` does: small matrices, on which threads wait for each other."""
     held = []

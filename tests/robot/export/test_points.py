@@ -178,6 +178,7 @@ def test_prismatic_joints(tmp_path):
         exported(result, SCARA, "yaskawa", path, pulses_per_deg=(1, 1, 1, 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("wanted", ["joints", "poses"])
 def test_a_file_that_differs_is_not_written(case, form, wanted, monkeypatch):

@@ -42,6 +42,7 @@ def test_wrong_rows_over_many_draws(case):
     assert sum(good for *_, good in found) <= 1  # 4.03 σ of 1200 rows: of honest ones 1 in 10⁹ has half weight
 
 
+@pytest.mark.slow
 def test_without_the_search_wrong_rows_would_do_harm():
     """The test above can fail: Huber's weights alone follow ten wrong rows of forty."""
     _, data, bad = study.simulated(of("position | 40 | 25% | 1–50"), 0)

@@ -128,6 +128,7 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
+@pytest.mark.slow
 def test_sigma_elsewhere_hold_what_a_rigid_model_leaves():
     """By the covariance alone 0.1 mm; the arm errs by twice that."""
     true, data = drawn(100, 0)

@@ -132,6 +132,7 @@ def test_several_rows_that_are_far_off_are_named():
         start(mh80(), data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mistaken", "named"),
     [(with_zero, "theta of joint 4 … +90°"), (with_rows_exchanged, "rows 2 and 3 were exchanged")],

@@ -105,6 +105,7 @@ def test_covariances_and_common_errors_are_known(data):
     assert read.notes == ()
 
 
+@pytest.mark.slow
 def test_notes_reach_terminal_and_json(data, stcal_robot):
     robot, out = ("--robot", data.folder / "robot.toml"), data.folder / "out.json"
     angles = "orientation: w_deg, p_deg, r_deg as Euler angles xyz (about fixed axes), degrees"

@@ -123,6 +123,7 @@ def test_mistakes_in_a_file_are_named(tmp_path, text, message):
     assert message in str(error.value)
 
 
+@pytest.mark.slow
 def test_joint_values_reach_a_pose_of_a_bent_arm():
     robot = bent()
     wanted = forward(robot, vectors(robot))

@@ -70,6 +70,7 @@ def test_forward_is_the_product_of_the_rows(seed, joints, convention):
         assert np.abs(found[k].matrix() - pose @ robot.tools[""].matrix()).max() < 1e-9  # mm of metres: rounding
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 8), st.sampled_from(["standard", "modified"]))
 def test_jacobian_is_that_of_differences(seed, joints, convention):

@@ -137,6 +137,7 @@ def test_nearest_of_all_branches_and_turns():
         np.testing.assert_allclose(inverse(robot, pose, near).q[0], expected, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_nearest_where_two_branches_almost_meet():
     """Elbow nearly stretched: both elbow branches are within 0.1 rad of every reference, and a step leads to either."""
     free = replace(mh80(), joints=(Joint(),) * 6)

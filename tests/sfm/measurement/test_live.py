@@ -56,6 +56,7 @@ def got(server, place: str) -> tuple[int, str, bytes]:
     return found
 
 
+@pytest.mark.slow
 def test_each_picture_has_its_pose_or_the_reason_why_not(setting, photograph):
     view, pictures = LiveView(), []
     assert follow([photograph, np.zeros_like(photograph), photograph], tracker_of(setting), view, pictures.append) == 3
@@ -70,6 +71,7 @@ def test_each_picture_has_its_pose_or_the_reason_why_not(setting, photograph):
     assert json.loads(view.json())["picture"] == 3
 
 
+@pytest.mark.slow
 def test_faces_and_centres_are_drawn_where_they_are(setting, photograph):
     tracker = tracker_of(setting)
     labelled, pose = tracker.observe(photograph)
@@ -88,6 +90,7 @@ def test_pictures_of_another_size_end_it(setting, photograph):
         follow([photograph[::2, ::2]], tracker_of(setting), LiveView())
 
 
+@pytest.mark.slow
 def test_places_of_the_view(service, setting, photograph):
     view = LiveView()
     with show_live(service, ServeOptions(port=0, token="word"), view) as server:

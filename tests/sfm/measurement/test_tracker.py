@@ -107,6 +107,7 @@ def test_a_hidden_face_is_missed_by_name(film, frames, target, model):
     assert any(note.startswith(f"face {face}: {face}:1 and 9 more should be in view") for note in tracker.notes)
 
 
+@pytest.mark.slow
 def test_an_image_without_the_target_is_an_error_and_the_next_is_searched(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     tracker.locate(frames[0])
@@ -127,6 +128,7 @@ def test_the_common_shift_is_found(film, frames, target, model):
     assert not common_shift(np.zeros_like(frames[0]), predicted).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "image", [np.zeros((864, 1296, 3), np.uint8), np.zeros((864, 1296)), np.zeros((10, 10), np.uint8)]
 )
