@@ -234,7 +234,7 @@ def _distance(entry: _ScaleFile, faces: Sequence[FaceDesign], where: str) -> Kno
             raise InputError(
                 "E-TARGET-SCALE",
                 f"{where}: scale from {entry.first} to {entry.second}: no point {name} on the target; points are "
-                f"{faces[0].labels()[0]}, …",
+                f"{', '.join(map(str, faces[0].labels()[:4]))}, …",
             )
     if entry.first == entry.second:
         raise InputError("E-TARGET-SCALE", f"{where}: scale from {entry.first} to itself; two points needed")

@@ -72,7 +72,9 @@ def design(
         "Draw the smaller circles with this radius; one that suits box and camera if not given.",
         Opt("--radius-mm", min=0.01, max=1e4),
     ] = None,
-    distance: Annotated[float, "Place the camera at this distance.", Opt("--distance-mm", min=50, max=1e5)] = 1000.0,
+    distance: Annotated[
+        float, "Place the camera at this distance.", Opt("--distance-mm --distance", min=50, max=1e5)
+    ] = 1000.0,
     width: Annotated[
         int, "Take images of this width, px; 3:2 images of a 24 mm lens.", Opt(min=320, max=100_000)
     ] = 5184,

@@ -44,7 +44,9 @@ def simulate(
     folder: Annotated[Path, "Write the data set to this new folder.", Arg()],
     width: Annotated[int, "Render images of this width, px; 3:2 images.", Opt(min=320, max=50_000)] = 2592,
     images: Annotated[int, "Render this many images in each group.", Opt(min=2, max=500)] = 6,
-    distance: Annotated[float, "Place the camera at this distance, mm.", Opt(min=200, max=1e5)] = 1000.0,
+    distance: Annotated[
+        float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=200, max=1e5)
+    ] = 1000.0,
     spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
     fisheye: Annotated[
         float | None,

@@ -259,8 +259,10 @@ def _shares(file: BudgetFile, measurands: list[tuple[str, Uncertainty]]) -> list
     colours = {row.key: COLOURS[i % len(COLOURS)] for i, row in enumerate(drawn)}
 
     def draw():
-        figure = new_figure(9.0, 0.6 + 0.24 * len(measurands))
+        height = 0.6 + 0.24 * len(measurands)
+        figure = new_figure(9.0, height)
         axes = figure.subplots()
+        figure.subplots_adjust(top=1 - 0.05 / height, bottom=0.5 / height)
         so_far, place = np.zeros(len(measurands)), np.arange(len(measurands))[::-1]
         for row in drawn:
             axes.barh(place, 100 * shares[row.key], left=100 * so_far, height=0.7, color=colours[row.key])

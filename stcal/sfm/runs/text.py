@@ -8,7 +8,7 @@ import numpy as np
 from stcal.design import faces_of_known_shape, known_distances
 from stcal.geometry.camera import Camera
 from stcal.io.files import REFINED_CAMERA
-from stcal.io.images import Skipped
+from stcal.io.images import TOP_GROUP, Skipped
 from stcal.labels import DotLabel
 from stcal.report.text import text_table, wrapped
 from stcal.sfm.adjust.scale import Scale
@@ -200,8 +200,9 @@ def _group(solution: GroupSolution, scale: Scale) -> Iterator[str]:
     of_scale = {"board": "board", "faces": "printed faces", "distances": "known distances", "drawing": "drawing"}[
         scale.source
     ]
+    name = "all images together" if solution.model.group == TOP_GROUP else f"group {solution.model.group}"
     yield (
-        f"group {solution.model.group}: {len(solution.model.images)} images, {len(solution.model.labels)} circles, "
+        f"{name}: {len(solution.model.images)} images, {len(solution.model.labels)} circles, "
         f"initial pair {Path(pair.first).name} – {Path(pair.second).name} at "
         f"{np.degrees(pair.median_angle_rad):.0f}°, {of_scale} {1e3 * scale.rms_mm():.1f} µm RMS"
     )

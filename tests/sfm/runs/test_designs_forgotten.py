@@ -59,10 +59,16 @@ def test_measure_and_calibrate_camera_name_what_they_assumed(stcal_sfm, small_se
     assert "the reference target" in out
     assert "1 of 1 images show the board" in err
     assert "pitch 30 mm (no --board)" in err
-    measured = "measure", small.images, "--camera", small.camera, "--faces", small_run / "faces.json", *one
-    code, out, err = stcal_sfm(*measured, "--out", tmp_path / "poses.csv")
+    faces = tmp_path / "faces.json"
+    faces.write_bytes((small_run / "faces.json").read_bytes())  # without the target.toml beside it
+    measured = "measure", small.images, "--camera", small.camera, *one, "--out", tmp_path / "poses.csv", "--faces"
+    code, out, err = stcal_sfm(*measured, faces)
     assert code == 0
     assert TARGET_ASSUMED in out
+    code, out, err = stcal_sfm(*measured, small_run / "faces.json")
+    assert code == 0
+    assert "no --target: " in out
+    assert TARGET_ASSUMED not in out
     assert "reference board" not in out
 
 

@@ -66,7 +66,7 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
     coarse = RunOptions(workers=1, solve="chain", ellipses=EllipseOptions(min_diameter_px=9.0)).settled(target)
     own, camera = RunFolder(small.out, small.out / "unfinished", small.out / "cache"), folder / "cameras.txt"
     files = find_images(folder / "images")
-    detection, _ = detect(files, read_camera(camera), own, target, board, coarse, lambda *_: None)
+    detection, _, _ = detect(files, read_camera(camera), own, target, board, coarse, lambda *_: None)
     assert not any(image.reused for image in detection.images)
 
 
