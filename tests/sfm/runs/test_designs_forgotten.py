@@ -65,7 +65,7 @@ def test_measure_and_calibrate_camera_name_what_they_assumed(stcal_sfm, small_se
     code, out, err = stcal_sfm(*measured, faces)
     assert code == 0
     assert TARGET_ASSUMED in out
-    code, out, err = stcal_sfm(*measured, small_run / "faces.json")
+    code, out, err = stcal_sfm(*measured, small_run / "faces.json", "--overwrite")
     assert code == 0
     assert "no --target: " in out
     assert TARGET_ASSUMED not in out
