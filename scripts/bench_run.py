@@ -247,7 +247,7 @@ def timed_calibration(out: Path) -> float:
     models = [m for g in run.groups() for m in read_model(out / "models" / g, run.observations, ids, px).groups]
     prior = camera_prior(run.camera)
     start = time.perf_counter()
-    calibrate(models, run.camera, run.target, run.board, run.options.adjustment(run.target), prior)
+    calibrate(models, run.camera, run.target_design, run.board_design, run.options.adjustment(run.target_design), prior)
     return time.perf_counter() - start
 
 

@@ -76,4 +76,4 @@ def test_faces_beside_asymmetric_circles_are_right(tmp_path):
         if face_id != comparison["reference_face"]:
             assert row["normalised_error"] < 2.0, face_id
             assert row["translation_um"] < 40, face_id
-    assert load_run(tmp_path / "run").board.labels() == CIRCLES.lattice().labels()
+    assert load_run(tmp_path / "run").board_design.labels() == CIRCLES.lattice().labels()

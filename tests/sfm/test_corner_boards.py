@@ -204,4 +204,4 @@ def test_faces_beside_a_board_of_corners_are_right(tmp_path, kind):
     for row in errors:
         assert row["normalised_error"] < 2.0
         assert row["translation_um"] < 15
-    assert load_run(tmp_path / "run").board.labels() == scene.board.labels()
+    assert load_run(tmp_path / "run").board_design.labels() == scene.board.labels()

@@ -49,7 +49,7 @@ def budget(
     if columns is not None and check_lengths is None:
         raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of lengths; give it with --check-lengths")
     saved = load_run(run)
-    stated = statement_of(saved.board.stated, statement, field or ())
+    stated = statement_of(saved.board_design.stated, statement, field or ())
     if pdf:
         _require_pdf(page, run)
     if lengths_statement is not None and lengths is None:
@@ -62,9 +62,11 @@ def budget(
         tests.append(against_stated(computed, check_lengths, columns))
     if lengths is not None:
         second = load_run(lengths)
-        statement_of_second = statement_of(second.board.stated, lengths_statement or statement)
+        statement_of_second = statement_of(second.board_design.stated, lengths_statement or statement)
         tests.append(
-            against_run(computed, budget_of_run(second, statement_of_second), lengths, (saved.board, second.board))
+            against_run(
+                computed, budget_of_run(second, statement_of_second), lengths, (saved.board_design, second.board_design)
+            )
         )
     file = BudgetFile.of(computed, saved, verify(run), tests)
     document = budget_report(file)

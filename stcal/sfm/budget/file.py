@@ -203,7 +203,7 @@ def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, A
         "run": {
             "folder": str(run.folder),
             "images": str(run.images),
-            "target": run.target.name,
+            "target": run.target_design.name,
             "version": verified.version,
             "sha256": run.sha256.get(RUN_MARKER, ""),
             "faces_sha256": run.sha256.get("faces.json", ""),

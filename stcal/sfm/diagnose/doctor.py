@@ -170,7 +170,7 @@ def _faces(run: SavedRun) -> list[Finding]:
     """Returns findings on faces that no image helps to place, and the run's notes."""
     findings = []
     for face_id in run.report["summary"]["faces_not_seen"]:
-        labels = tuple(run.target.face(face_id).labels())
+        labels = tuple(run.target_design.face(face_id).labels())
         views = sum(bool(set(labels) & set(image.labels)) for image in run.observations)
         findings.append(Finding("", labels, "views", views, MIN_VIEWS, "images", advice("views")))
     notes = [*run.report["notes"], *_depth_of_field(run)]
@@ -186,7 +186,7 @@ def _unread(run: SavedRun, models: Sequence[MetricModel]) -> list[Finding]:
     poses, size = run.faces.poses(), np.array([run.camera.width, run.camera.height])
     seen = {image.name: {str(label).partition(":")[0] for label in image.labels} for image in run.observations}
     findings = []
-    for face in run.target.with_faces(printed=True).faces:
+    for face in run.target_design.with_faces(printed=True).faces:
         if face.id not in poses:
             continue
         for name, pose in (
@@ -252,14 +252,14 @@ class _Job:
 def _jobs(run: SavedRun, images: Path, models: Sequence[MetricModel], circles: dict[str, np.ndarray]) -> list[_Job]:
     """Returns jobs for mapped images that lack visible circles, and for images without a pose. Groups without a model
     have no jobs."""
-    target = run.target.with_faces(printed=False)
-    settings = run.camera, target, run.board, run.options.ellipses
-    if not (target.faces or run.board.rows):
+    target = run.target_design.with_faces(printed=False)
+    settings = run.camera, target, run.board_design, run.options.ellipses
+    if not (target.faces or run.board_design.rows):
         return []  # corners are not circles, and no option for circles lets them in
     observations = {image.name: image for image in run.observations}
     jobs = []
     for model in models:
-        missing = missing_circles(model, circles, observations, run.camera, target, run.board)
+        missing = missing_circles(model, circles, observations, run.camera, target, run.board_design)
         jobs += [_Job(images / name, name, *settings, planes, frozenset()) for name, planes in missing.items()]
         jobs += [
             _Job(images / name, name, *settings, [], frozenset(model.labels))

@@ -121,11 +121,11 @@ def crosscheck(
             pycolmap_models.append(_own(folder, work, names, pair, name, run, ids))
         progress("crosscheck", len(groups), len(groups))
         of_native, of_pycolmap = faces_from_models(native_models, run), faces_from_models(pycolmap_models, run)
-    options = run.options.adjustment(run.target)
-    readjusted = calibrate(adjusted, run.camera, run.target, run.board, options)
+    options = run.options.adjustment(run.target_design)
+    readjusted = calibrate(adjusted, run.camera, run.target_design, run.board_design, options)
     heights, rim_sigma_mm = run.rims_mm()
     if heights:
-        readjusted = on_luminous_surface(readjusted, heights, rim_sigma_mm, run.target, options.frame)
+        readjusted = on_luminous_surface(readjusted, heights, rim_sigma_mm, run.target_design, options.frame)
     return _comparison(run, native, schema, of_native, of_pycolmap, readjusted, tolerances)
 
 
@@ -188,7 +188,7 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
 
 def _adjusted(path: Path, group, ids, run: SavedRun):
     model = labelled_model(open_model(path), group, ids, run.camera)[0]
-    return refine(model, run.camera, run.target, run.board, run.options.eccentricity).model
+    return refine(model, run.camera, run.target_design, run.board_design, run.options.eccentricity).model
 
 
 def _own(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids):

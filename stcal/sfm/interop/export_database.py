@@ -172,7 +172,7 @@ def _require_matches(database: Path, copy: sqlite3.Connection, run: SavedRun, id
     images = {ids[image.name]: image for image in run.observations}
     all_pairs = kind_of_graph(len(run.observations), run.options.graph) == "all"
     wanted = (
-        {(i + 1, j + 1) for i, j in image_graph(run.observations, run.board, "all").pairs.tolist()}
+        {(i + 1, j + 1) for i, j in image_graph(run.observations, run.board_design, "all").pairs.tolist()}
         if all_pairs
         else set()
     )

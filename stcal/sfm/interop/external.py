@@ -26,7 +26,7 @@ def _options(run: SavedRun, solve: Chained) -> AdjustOptions:
     options = replace(run.options, solve=solve, refine_camera=False)
     if solve == "paper":
         options = replace(options, frame="three-point", eccentricity=False)
-    return options.adjustment(run.target)
+    return options.adjustment(run.target_design)
 
 
 def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained = "chain") -> Calibration:
@@ -72,7 +72,7 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained =
     options = _options(run, solve)
     models_in_order = [models[name] for name in run.groups() if name in models]
     try:
-        calibration = calibrate(models_in_order, read[0].camera, run.target, run.board, options)
+        calibration = calibrate(models_in_order, read[0].camera, run.target_design, run.board_design, options)
     except MappingError as error:
         raise MappingError(error.code, "; ".join([str(error), *notes])) from error
     return replace(calibration, notes=(*notes, *calibration.notes))
@@ -89,7 +89,7 @@ def calibrate_models(model: Path, run: SavedRun, solve: Chained = "chain") -> Ca
 def write_faces(path: Path, calibration: Calibration, run: SavedRun, solve: Chained = "chain") -> None:
     """Writes ``faces.json`` of chained models."""
     options = _options(run, solve)
-    faces = FacesFile.of(calibration.target, run.target, options, calibration.sigma_factors.of_target)
+    faces = FacesFile.of(calibration.target, run.target_design, options, calibration.sigma_factors.of_target)
     save(path, json_text(faces.content()))
     require_faces_written(path, calibration.target)
 

@@ -115,8 +115,8 @@ def known_of(run: SavedRun) -> Known:
     heights, rim_sigma_mm = run.rims_mm()
     rims = rim_covariance_mm2(joint, again.start.target_from_face, heights, rim_sigma_mm) if rim_sigma_mm else None
     setup = Setup(
-        target=run.target,
-        board=run.board,
+        target=run.target_design,
+        board=run.board_design,
         camera=joint.camera,
         start=again.start,
         frame=run.faces.frame,

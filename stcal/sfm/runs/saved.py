@@ -56,8 +56,8 @@ class SavedRun(Brief):
     images: Path
     options: RunOptions
     camera: Camera
-    target: TargetDesign
-    board: BoardDesign
+    target_design: TargetDesign
+    board_design: BoardDesign
     observations: tuple[ImageObservations, ...]
     corrected_px: tuple[np.ndarray, ...]
     faces: FacesFile
@@ -69,6 +69,28 @@ class SavedRun(Brief):
         """Path of COLMAP's database."""
         return self.folder / "database.db"
 
+    @property
+    def target(self) -> CalibratedTarget:
+        """The calibrated target, as of :class:`~stcal.sfm.runs.result.RunResult`, with the covariances of
+        ``faces.json``; poses of groups are not kept."""
+        faces = self.faces
+        labels = circle_labels(faces.circles)
+        covariance = dict(
+            zip(circle_labels(faces.circle_covariance_mm2), faces.circle_covariance_mm2.values(), strict=True)
+        )
+        joint = faces.circles_joint_covariance_mm2
+        return CalibratedTarget(
+            faces.reference_face,
+            faces.poses(),
+            dict(zip(labels, faces.circles.values(), strict=True)),
+            {},
+            dict(faces.target_from_face_covariance),
+            covariance,
+            {},
+            None if faces.scale_sigma_ppm is None else 1e-6 * faces.scale_sigma_ppm,
+            None if joint is None else joint.matrix(),
+        )
+
     def groups(self) -> dict[str, list[ImageObservations]]:
         """Returns the observations by group, in order."""
         return by_group(self.observations)
@@ -79,7 +101,7 @@ class SavedRun(Brief):
         overall = summary["sigma_factor"]
         circles, dots = (summary.get(f"{kind}_sigma_factor", overall) for kind in ("circle", "dot"))
         printed = summary.get("printed_sigma_factor") or circles
-        return SigmaFactors(overall, circles, dots, printed, self.target.printed_ids())
+        return SigmaFactors(overall, circles, dots, printed, self.target_design.printed_ids())
 
     def rims_mm(self) -> tuple[dict[CircleLabel, float], float]:
         """Returns the heights of the rims behind which the faces lie, by circle, and σ of all of them together, mm: 0
@@ -179,8 +201,8 @@ def load_run(folder: str | Path) -> SavedRun:
         images=images,
         options=options,
         camera=camera,
-        target=target,
-        board=board,
+        target_design=target,
+        board_design=board,
         observations=observations,
         corrected_px=corrected,
         faces=result,
@@ -288,5 +310,5 @@ def adjusted_run(run: SavedRun) -> AdjustedRun:
         {model.group: Rigid() for model in models},
     )
     prior = camera_prior(run.camera) if run.options.refine_camera else None
-    state = adjusted(models, run.board, run.camera, run.options.flatness_mm, prior, read.camera)
+    state = adjusted(models, run.board_design, run.camera, run.options.flatness_mm, prior, read.camera)
     return AdjustedRun(state, start, prior)

@@ -47,7 +47,7 @@ def plain(saved):
 def stated(saved, tmp_path):
     path = tmp_path / "lab.toml"
     path.write_text(STATEMENT)
-    return statement_of(saved.board.stated, path, ["date=2026-03-01"])
+    return statement_of(saved.board_design.stated, path, ["date=2026-03-01"])
 
 
 @pytest.mark.slow
@@ -125,7 +125,7 @@ def test_a_statement_goes_before_the_boards_own(saved, tmp_path):
 def test_a_board_file_keeps_what_is_stated(saved, tmp_path):
     size = StatedSize(12.0, 8.5, 0.5, 23.25, 0.5, 22.0)
     path = tmp_path / "board.toml"
-    path.write_text(board_toml(replace(saved.board, stated=size)))
+    path.write_text(board_toml(replace(saved.board_design, stated=size)))
     assert load_board(path).stated == size
 
 

@@ -76,7 +76,7 @@ def test_lengths_without_sigma_are_exact(budget, tmp_path):
 def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, budget, tmp_path):
     """U of the difference is √2 that of one run; a pitch that both share leaves it as it is, another board's does
     not."""
-    plain = against_run(budget, budget, saved.folder, (saved.board, saved.board))
+    plain = against_run(budget, budget, saved.folder, (saved.board_design, saved.board_design))
     assert plain.agrees
     assert "cannot be seen here" in plain.notes[0]
     longest = budget.of_kind("distance")[0]
@@ -85,10 +85,10 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, b
     assert plain.lengths[0].expanded_mm == pytest.approx(np.sqrt(2) * longest.expanded)
     path = tmp_path / "lab.toml"
     path.write_text(PITCH)
-    stated = budget_of_run(saved, statement_of(saved.board.stated, path))
-    same = against_run(stated, stated, saved.folder, (saved.board, saved.board))
+    stated = budget_of_run(saved, statement_of(saved.board_design.stated, path))
+    same = against_run(stated, stated, saved.folder, (saved.board_design, saved.board_design))
     assert same.lengths[0].expanded_mm == pytest.approx(plain.lengths[0].expanded_mm)
-    other = against_run(stated, stated, saved.folder, (saved.board, replace(saved.board, pitch_mm=20.0)))
+    other = against_run(stated, stated, saved.folder, (saved.board_design, replace(saved.board_design, pitch_mm=20.0)))
     pitch = 50e-6 * longest.measurand.length_mm
     wanted = np.hypot(plain.lengths[0].expanded_mm, 2 * np.sqrt(2) * pitch)
     assert other.lengths[0].expanded_mm == pytest.approx(wanted, rel=2e-3)

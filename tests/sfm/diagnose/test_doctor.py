@@ -140,7 +140,7 @@ def test_in_view_is_what_the_simulation_wants_found(small_run, small_dataset):
     circles = {label: np.array(xyz) for label, xyz in saved.faces.circles.items()}
     assert len(models) == 2
     for model in models:
-        expected = missing_circles(model, circles, blind, saved.camera, saved.target, saved.board)
+        expected = missing_circles(model, circles, blind, saved.camera, saved.target_design, saved.board_design)
         for name in model.images:
             seen = truth[model.group]["images"][name]["circles"]
             wanted = [label for label in seen if seen[label]["must_find"]]

@@ -235,7 +235,7 @@ def test_a_deleted_circle(saved, model, plain):
 @pytest.mark.parametrize("face_id", ["1", "2"])
 def test_a_deleted_frame_circle_stands_where_the_design_has_it(saved, model, plain, face_id):
     """The circles are 20 µm off the design, each: so is a frame that rests on the design in one of its three."""
-    circle = saved.target.face(face_id).x
+    circle = saved.target_design.face(face_id).x
     model.delete_point3D(model.point(f"{face_id}:{circle}"))
     found = calibrate_models(model.as_binary(), saved)
     assert found.target.target_from_face.keys() == plain.target.target_from_face.keys()
@@ -246,7 +246,7 @@ def test_a_deleted_frame_circle_stands_where_the_design_has_it(saved, model, pla
 
 
 def test_a_reference_face_of_too_few_circles_is_named(saved, model, stcal_sfm):
-    face = saved.target.face("1")
+    face = saved.target_design.face("1")
     for circle in [face.y, *[c for c in face.ids if c not in (face.origin, face.x, face.y)][:5]]:
         model.delete_point3D(model.point(f"1:{circle}"))
     model.delete_point3D(model.point(f"1:{face.origin}"))
@@ -269,7 +269,7 @@ def test_points_of_two_labels_merged(saved, model, plain):
 
 def test_a_split_track(saved, model, plain):
     """The one of the two points that more images see counts; the other one lies elsewhere."""
-    origin = saved.target.face("2").origin
+    origin = saved.target_design.face("2").origin
     point = model.point(f"2:{origin}")
     xyz = model.point3D(point).xyz
     first = next(where for i, where, _ in model.seen() if i == point)
@@ -362,7 +362,9 @@ def test_circles_that_are_one_point_in_all_groups(saved):
     groups = {group.group: group for group in read(path, saved).groups}
     place = {g: dict(zip(m.labels, m.xyz_model.tolist(), strict=True)) for g, m in groups.items()}
     shared = [label for label in place["12"] if label in place["14"]]
-    assert {label for label in shared if label.startswith("1:")} == {f"1:{c}" for c in saved.target.face("1").ids}
+    assert {label for label in shared if label.startswith("1:")} == {
+        f"1:{c}" for c in saved.target_design.face("1").ids
+    }
     for label in shared:
         same = place["12"][label] == place["14"][label]
         assert same != label.startswith("board:"), label
@@ -737,7 +739,7 @@ def test_nothing_is_overwritten(saved, stcal_sfm, tmp_path):
 
 
 def test_no_file_of_half_an_answer(saved, model, stcal_sfm, tmp_path):
-    for circle in saved.target.face("1").ids[:7]:
+    for circle in saved.target_design.face("1").ids[:7]:
         model.delete_point3D(model.point(f"1:{circle}"))
     outcome = stcal_sfm("faces", model.as_binary(), "--run", saved.folder, "--out", tmp_path / "f.json")
     assert outcome[0] == COMPUTATION

@@ -104,11 +104,15 @@ def test_camera_and_designs_are_the_same(written):
     result, saved = written
     assert saved.camera.same_as(result.camera)
     assert saved.camera.colmap_model == result.camera.colmap_model
-    assert saved.target.radius_of() == result.target_design.radius_of()
-    for found, known in zip(saved.target.faces, result.target_design.faces, strict=True):
+    assert saved.target_design.radius_of() == result.target_design.radius_of()
+    for found, known in zip(saved.target_design.faces, result.target_design.faces, strict=True):
         assert [getattr(found, n) for n in FRAME] == [getattr(known, n) for n in FRAME]
         assert np.allclose(found.xy_mm, known.xy_mm, rtol=0, atol=1e-9)  # written to nine digits
-    assert asdict(saved.board) == asdict(result.board_design)
+    assert asdict(saved.board_design) == asdict(result.board_design)
+    for face, pose in result.target.target_from_face.items():
+        np.testing.assert_allclose(saved.target.target_from_face[face].matrix(), pose.matrix(), atol=1e-12)
+    for label, covariance in result.target.circle_covariance.items():
+        np.testing.assert_allclose(saved.target.circle_covariance[label], covariance, rtol=1e-9)
 
 
 def test_options_answers_and_places_are_the_same(written):

@@ -111,7 +111,7 @@ class Content:
         """Returns lines for comments: the origin of the content, and σ of every face."""
         faces = self.run.faces
         lines = [
-            f"stcal {stcal.__version__}: target {self.run.target.name}, {len(self.faces)} faces, "
+            f"stcal {stcal.__version__}: target {self.run.target_design.name}, {len(self.faces)} faces, "
             f"{len(self.circles)} circles, {len(self.photographs)} photographs",
             f"frame {self.root}: that of face {faces.reference_face} ({faces.frame}); "
             f"{self.root}_FACE: of a face; {self.root}_FACE_CIRCLE: at a circle's centre, axes of its face",
@@ -171,7 +171,7 @@ def content_of(run: SavedRun, root: str) -> Content:
 
 def colours(run: SavedRun) -> dict[str, tuple[int, int, int]]:
     """Returns the colour of each face, by id."""
-    return {face.id: FACES_RGB[i % len(FACES_RGB)] for i, face in enumerate(run.target.faces)}
+    return {face.id: FACES_RGB[i % len(FACES_RGB)] for i, face in enumerate(run.target_design.faces)}
 
 
 def ellipsoid(circle: Circle, target_from_face: Rigid) -> tuple[np.ndarray, np.ndarray]:

@@ -55,7 +55,7 @@ def opencv(content: Content) -> str:
     It has a list of faces, each with its 4×4 pose, covariance, names of circles, centres (n, 3), radii and the
     covariances (n, 9) of the centres.
     """
-    lines = ["%YAML:1.0", "---", 'unit: "mm"', f"target: {_quoted(content.run.target.name)}"]
+    lines = ["%YAML:1.0", "---", 'unit: "mm"', f"target: {_quoted(content.run.target_design.name)}"]
     lines += [
         f"reference_face: {_quoted(content.run.faces.reference_face)}",
         f"said: {_list(content.said())}",
