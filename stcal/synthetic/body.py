@@ -21,8 +21,6 @@ from stcal.synthetic.dataset import TruthFile
 from stcal.synthetic.render import encode
 
 BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
-FINER = 4
-"""Pixels that are drawn for the side of one of a drawing: edges then lie where they belong to an eighth of a pixel."""
 DRAWING_PX = 2000
 """Longer side of the drawing of a face, px."""
 CIRCLE_CORNERS = 360
@@ -182,22 +180,43 @@ def drawing_of(face: FaceDesign, polarity: Polarity = "bright") -> Drawing:
     width, height = np.ceil((high - low) * px_mm).astype(int)
     ground, ink = (WHITE, BLACK) if dark else (BLACK, WHITE)
 
-    def covered(parts: list[list[np.ndarray]]) -> np.ndarray:
-        """Returns the share of each pixel that the parts cover, drawn finer and averaged."""
-        mask = np.zeros((FINER * height, FINER * width), np.uint8)
-        for lines_mm in parts:
-            lines = [np.round(((line - low) * FINER * px_mm - 0.5) * 16).astype(np.int32) for line in lines_mm]
-            cv2.fillPoly(mask, lines, 255, lineType=cv2.LINE_8, shift=4)
-        return cv2.resize(mask, (int(width), int(height)), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-
-    # A filled area takes all pixels that its outline touches: ink and ground are filled in turn, and averaged.
-    whole = np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) + (
-        np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    )
-    outside = covered([[whole, *(line for area in areas for line in area)]])
-    grey = ground + (ink - ground) * (covered(areas) + 1 - outside) / 2
-    solid = covered([[plate]])
+    size = int(height), int(width)
+    grey = ground + (ink - ground) * covered_share([[(line - low) * px_mm for line in area] for area in areas], size)
+    solid = covered_share([[(plate - low) * px_mm]], size)
     return Drawing(grey, solid, px_mm, low)
+
+
+def covered_share(areas: list[list[np.ndarray]], size: tuple[int, int]) -> np.ndarray:
+    """Returns the share of each pixel (height, width) of a picture that areas cover, exactly.
+
+    ``areas`` : lists of closed lines (k, 2), pixels from the picture's corner, of which the first one is the outline
+    and the others, in the other direction, are holes. Each piece of a line within one pixel adds what is between it and
+    the picture's right side.
+    """
+    height, width = size
+    added = np.zeros((height, width + 1))
+    for area in areas:
+        following = np.roll(area[0], -1, axis=0)
+        turn = np.sign((area[0][:, 0] * following[:, 1] - area[0][:, 1] * following[:, 0]).sum())
+        for line in area:
+            for start, end in zip(line, np.roll(line, -1, axis=0), strict=True):
+                cuts = [np.array([0.0, 1.0])]
+                for k in (0, 1):
+                    low, high = sorted((start[k], end[k]))
+                    if low < high:
+                        cuts.append((np.arange(np.ceil(low), np.floor(high) + 1) - start[k]) / (end[k] - start[k]))
+                at = np.sort(np.concatenate(cuts).clip(0, 1))[:, None]
+                points = start + at * (end - start)
+                rise = turn * np.diff(points[:, 1])
+                x, y = ((points[1:] + points[:-1]) / 2).T
+                row, x = np.floor(y).astype(int), x.clip(0, width)
+                column = np.floor(x).astype(int).clip(0, width - 1)
+                used = (row >= 0) & (row < height)
+                row, column, rise, part = row[used], column[used], rise[used], (x - column)[used]
+                np.add.at(added, (row, column), rise * (1 - part))
+                np.add.at(added, (row, column + 1), rise * part)
+    # A line that goes down leaves the area on its right side, where rows go down.
+    return (-added.cumsum(1)[:, :-1]).clip(0, 1).astype(np.float32)
 
 
 def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> np.ndarray:
