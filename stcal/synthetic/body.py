@@ -25,8 +25,9 @@ DRAWING_PX = 2000
 """Longer side of the drawing of a face, px."""
 CIRCLE_CORNERS = 360
 """Corners of the polygon that a circle is drawn as."""
-SAMPLES = 3
-"""Samples of a pixel, along each axis."""
+SAMPLES, LATTICE = 13, 8
+"""Samples of a pixel: a Fibonacci lattice, shifted at random from pixel to pixel. An edge along the pixel rows is then
+where it is, which a grid of points places in steps."""
 LIGHT = np.array([0.3, -0.5, -0.8])
 LEAST_FACES = 2
 TRIALS = 2000
@@ -220,12 +221,13 @@ def covered_share(areas: list[list[np.ndarray]], size: tuple[int, int]) -> np.nd
 
 
 def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> np.ndarray:
-    """Returns one photograph, 8 bit. Each sample of a pixel is the point at which its ray meets a face."""
+    """Returns one photograph, 8 bit. Each sample of a pixel is the point at which its ray meets a face.
+
+    Within a pixel, the lens is linear."""
     camera, pose, options = scene.camera, scene.camera_from_target[image], scene.options
-    step = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
-    u = (np.arange(camera.width)[:, None] + step).ravel()
-    v = (np.arange(camera.height)[:, None] + step).ravel()
-    total = np.full((len(v), len(u)), BACKGROUND, np.float32)
+    lattice = np.column_stack([np.arange(SAMPLES), LATTICE * np.arange(SAMPLES)]) / SAMPLES
+    moved = np.random.default_rng([options.seed, 2, image]).random((camera.height, camera.width, 2), np.float32)
+    total = np.full((SAMPLES, camera.height, camera.width), BACKGROUND, np.float32)
     for face in scene.target.faces:
         camera_from_face = pose @ scene.target_from_face[face.id]
         drawing = drawings[face.id]
@@ -241,24 +243,27 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> n
         low, high = np.maximum(low, 0), np.minimum(high, [camera.width, camera.height])
         if (high <= low).any():
             continue
-        columns, rows = slice(SAMPLES * low[0], SAMPLES * high[0]), slice(SAMPLES * low[1], SAMPLES * high[1])
-        grid = np.stack(np.meshgrid(u[columns], v[rows]), axis=-1)
-        ideal = camera.normalised_from_pixel(grid)
-        rays = np.concatenate([ideal, np.ones((*ideal.shape[:2], 1))], axis=2) @ camera_from_face.rotation
+        columns, rows = slice(low[0], high[0]), slice(low[1], high[1])
+        pixels = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), axis=-1)
+        ideal = camera.normalised_from_pixel(pixels)
+        along = [camera.normalised_from_pixel(pixels + step) - ideal for step in np.eye(2)]
         start = -camera_from_face.rotation.T @ camera_from_face.translation
-        depth = -start[2] / np.where(np.abs(rays[..., 2]) > 1e-9, rays[..., 2], 1e-9)
-        at = start[:2] + depth[..., None] * rays[..., :2]
-        place = ((at - drawing.origin) * drawing.px_mm - 0.5).astype(np.float32)
-        inside = ((at >= drawing.origin) & (at <= drawing.origin + extent)).all(2)
-        value, solid = (
-            cv2.remap(picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            for picture in (drawing.grey, drawing.solid)
-        )
-        inside &= solid > 0.5
         light = 0.75 + 0.25 * float(inward @ (LIGHT / np.linalg.norm(LIGHT)) * -1)
-        part = total[rows, columns]
-        part[inside] = light * value[inside]
-    grey = total.reshape(camera.height, SAMPLES, camera.width, SAMPLES).mean((1, 3))
+        for part, point in zip(total, lattice, strict=True):
+            offset = (point + moved[rows, columns]) % 1 - 0.5
+            ray = ideal + offset[..., :1] * along[0] + offset[..., 1:] * along[1]
+            rays = np.concatenate([ray, np.ones((*ray.shape[:2], 1))], axis=2) @ camera_from_face.rotation
+            depth = -start[2] / np.where(np.abs(rays[..., 2]) > 1e-9, rays[..., 2], 1e-9)
+            at = start[:2] + depth[..., None] * rays[..., :2]
+            place = ((at - drawing.origin) * drawing.px_mm - 0.5).astype(np.float32)
+            inside = ((at >= drawing.origin) & (at <= drawing.origin + extent)).all(2)
+            value, solid = (
+                cv2.remap(picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                for picture in (drawing.grey, drawing.solid)
+            )
+            inside &= solid > 0.5
+            part[rows, columns][inside] = light * value[inside]
+    grey = total.mean(0)
     if options.blur_px:
         grey = cv2.GaussianBlur(grey, (0, 0), options.blur_px)
     rng = np.random.default_rng([options.seed, 1, image])
