@@ -144,8 +144,8 @@ class _Frame:
     """Geometry of the edges, px.
 
     ``middle`` : (n, 4, 2) of each edge; ``along`` : (n, 4, 2) direction; ``normal`` : (n, 4, 2) outwards; ``length`` :
-    (n, 4); ``cell`` : (n, 4) width of a cell across; ``cells`` : (n, 4) number of cells along; ``reach`` : (n, 4) of the
-    profiles; ``place`` : (n, 4, POINTS) of the profiles from the middle.
+    (n, 4); ``cell`` : (n, 4) width of a cell across; ``cells`` : (n, 4) number of cells along; ``reach`` : (n, 4) of
+    the profiles; ``place`` : (n, 4, POINTS) of the profiles from the middle.
     """
 
     middle: np.ndarray
