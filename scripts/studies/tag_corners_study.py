@@ -8,6 +8,7 @@ and NEES: squared errors over the stated covariance, of 2; 1 where σ are true.
 
 import argparse
 
+import cv2
 import numpy as np
 
 from stcal.boards.dictionaries import cells_of
@@ -31,8 +32,6 @@ CELLS = (0.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0, 9.0, 14.0, 25.0)
 
 def corner_errors(target, distance_mm: float, options: dict, jpeg: bool) -> list[tuple]:
     """Returns for each tag found: width of a cell, cosine of its tilt, errors (4, 2), covariances, outward shift."""
-    import cv2
-
     scene = make_body_scene(target, body_camera(WIDTH), BodyOptions(distance_mm=distance_mm, **options))
     drawings = {face.id: drawing_of(face) for face in target.faces}
     boards = {face.id: face.printed for face in target.faces}
@@ -83,7 +82,8 @@ def main() -> None:
     parser.add_argument("--png", action="store_true", help="no JPEG")
     arguments = parser.parse_args()
     print(
-        "| blur, px | cell, px | tilt | corners | error, px RMS | robust | stated | shift of edges: mean | RMS | NEES | robust NEES |"
+        "| blur, px | cell, px | tilt | corners | error, px RMS | robust | stated | shift of edges: mean | RMS | "
+        "NEES | robust NEES |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for blur in arguments.blurs:
@@ -110,7 +110,8 @@ def main() -> None:
                 print(
                     f"| {blur} | {low} to {high} | {tilt} | {4 * own.sum()} | {np.sqrt((length**2).mean() / 2):.3f} | "
                     f"{robust_sigma(length, 2):.3f} | {stated:.3f} | {shift[own].mean():+.4f} | "
-                    f"{np.sqrt((shift[own] ** 2).mean()):.3f} | {square[own].mean():.2f} | {robust_sigma(np.sqrt(2 * square[own].ravel()), 2) ** 2:.2f} |",
+                    f"{np.sqrt((shift[own] ** 2).mean()):.3f} | {square[own].mean():.2f} | "
+                    f"{robust_sigma(np.sqrt(2 * square[own].ravel()), 2) ** 2:.2f} |",
                     flush=True,
                 )
 
