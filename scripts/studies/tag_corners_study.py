@@ -39,11 +39,12 @@ def corner_errors(target, distance_mm: float, options: dict, jpeg: bool) -> list
     for image in range(len(scene.camera_from_target)):
         grey = render_body(scene, image, drawings)
         if jpeg:
-            grey = cv2.imdecode(np.frombuffer(encode(grey, ".jpg", 95), np.uint8), cv2.IMREAD_GRAYSCALE)
+            decoded = cv2.imdecode(np.frombuffer(encode(grey, ".jpg", 95), np.uint8), cv2.IMREAD_GRAYSCALE)
+            grey = np.asarray(decoded)
         views, _ = find_on_faces(grey, "image", boards, scene.camera)
         for face in target.faces:
             view = views.get(face.id)
-            if view is None:
+            if view is None or view.covariance_px2 is None:
                 continue
             pose = scene.camera_from_target[image] @ scene.target_from_face[face.id]
             truth = scene.camera.project(pose @ view.xyz_board).reshape(-1, 4, 2)

@@ -21,7 +21,7 @@ def length_limit(coordinates: int, beyond: float) -> float:
 TAIL = 0.05
 """Share of the lengths beyond the quantile that tells how heavy the tail is: gross errors are fewer."""
 TAIL_SIGMAS, LEAST_FREEDOM, MOST_FREEDOM = 1.0, 2.0, 1e3
-"""Sampling errors of the quantiles by which a tail may be heavier; limits of the degrees of freedom."""
+"""Number of sampling errors of the quantiles that a tail is allowed; limits of the degrees of freedom."""
 
 
 def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
@@ -57,7 +57,7 @@ def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
     ends = float(np.log(LEAST_FREEDOM)), float(np.log(MOST_FREEDOM))
     signs = off(ends[0]) > 0, off(ends[1]) > 0
     logarithm = brentq(off, *ends) if signs == (True, False) else ends[int(signs[1])]
-    freedom = float(np.exp(logarithm))
+    freedom = float(np.exp(np.asarray(logarithm, float)))
     return max(quantile(beyond, freedom) * middle / quantile(0.5, freedom), length_limit(2, beyond))
 
 

@@ -20,7 +20,7 @@ from stcal.io.cameras.read import camera_model
 from stcal.io.files import save
 from stcal.io.images import TOP_GROUP, ImageFile, ImageFiles, chosen_images, mosaic_of, require_common_size
 from stcal.io.photographs.memory import files_of_arrays
-from stcal.io.video import AUTO, write_frames
+from stcal.io.photographs.video import AUTO, write_frames
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, counted, kept_processes, one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
@@ -132,7 +132,7 @@ def frames_in_run(video: str | Path, out: str | Path, every: str | int) -> Path:
     Raises
     ------
     InputError
-        The folder is not a run's; or as :func:`stcal.io.video.write_frames`.
+        The folder is not a run's; or as :func:`stcal.io.photographs.video.write_frames`.
     """
     require_ours(Path(out))
     folder = frames_folder(out)

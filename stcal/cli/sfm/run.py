@@ -76,8 +76,8 @@ def run(
     exclude: shared.Exclude = None,
     every: Annotated[
         str | None,
-        "Where IMAGES is a video, take the sharpest of so many frames, or, by auto, the default, of those between "
-        "which the view hardly changes.",
+        "Take of a video in place of IMAGES the sharpest of so many frames, or, by auto, the default, of those "
+        "between which the view hardly changes.",
         Opt(metavar="FRAMES"),
     ] = None,
     expect_faces: Annotated[
