@@ -15,6 +15,8 @@ POINTS = 32
 """Largest number of places along an edge that are used; at most one per pixel."""
 ALONG = (0.08, 0.92)
 """Range of an edge that is used, as shares of its length: near its ends the next edge's blur disturbs it."""
+LEAST_ALONG = 0.25
+"""Share of an edge to either side of its middle that is used, however wide the blur is."""
 END_PX = 2.0
 """Distance from an edge's ends from which on pixels are used, px."""
 CELLS_ACROSS = 0.8
@@ -142,8 +144,8 @@ class _Frame:
     """Geometry of the edges, px.
 
     ``middle`` : (n, 4, 2) of each edge; ``along`` : (n, 4, 2) direction; ``normal`` : (n, 4, 2) outwards; ``length`` :
-    (n, 4); ``cell`` : (n, 4) width of a cell across; ``reach`` : (n, 4) of the profiles; ``place`` : (n, 4, POINTS) of
-    the profiles from the middle.
+    (n, 4); ``cell`` : (n, 4) width of a cell across; ``cells`` : (n, 4) number of cells along; ``reach`` : (n, 4) of
+    the profiles; ``place`` : (n, 4, POINTS) of the profiles from the middle.
     """
 
     middle: np.ndarray
@@ -151,6 +153,7 @@ class _Frame:
     normal: np.ndarray
     length: np.ndarray
     cell: np.ndarray
+    cells: np.ndarray
     reach: np.ndarray
     place: np.ndarray
 
@@ -181,7 +184,8 @@ def _frame(corners: np.ndarray, cells: np.ndarray) -> _Frame:
     cell = np.minimum(np.abs(depth), length) / np.reshape(cells, (-1, 1))
     reach = np.clip(CELLS_ACROSS * cell, *REACH_PX)
     place = (np.linspace(*ALONG, POINTS) - 0.5) * length[..., None]
-    return _Frame(middle, along, normal, length, cell, reach, place)
+    number = np.broadcast_to(np.reshape(cells, (-1, 1)), length.shape)
+    return _Frame(middle, along, normal, length, cell, number, reach, place)
 
 
 def _profiles(grey: np.ndarray, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
@@ -272,16 +276,18 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Lines:
     m = len(pixels.level)
     normal, most = frame.normal.reshape(m, 2), frame.reach.ravel() ** 2
     weight, t, d = pixels.used.astype(float), pixels.along, pixels.across
-    relative = 2 * t / frame.length.reshape(m, 1, 1)
+    length = frame.length.reshape(m, 1, 1)
+    relative = 2 * t / length
     distance = residual = third = d
     design, inverse = np.zeros((*t.shape, 7)), np.zeros((m, 7, 7))
     value = np.zeros((m, 7))  # offset, slope, variance of the blur, dark and rise with their changes along the edge
     value[:, :2] = np.nan_to_num(np.stack([rough.offset, rough.slope], -1).reshape(m, 2))
     value[:, 2] = START_VARIANCE
     for k in range(STEPS + 1):
-        if k == STEPS - 1:  # the blur is known: the next cell's must not reach the pixels
-            clear = frame.cell.reshape(m, 1, 1) - BLURS * np.sqrt(value[:, 2] + PIXEL_VARIANCE)[:, None, None]
-            weight = weight * (distance >= -np.maximum(clear, LEAST_INSIDE_PX))
+        if k == STEPS - 1:  # the blur is known: the next cell's must not reach the pixels, nor the next edge's
+            blurs = BLURS * np.sqrt(value[:, 2] + PIXEL_VARIANCE)[:, None, None]
+            weight = weight * (distance >= -np.maximum(frame.cell.reshape(m, 1, 1) - blurs, LEAST_INSIDE_PX))
+            weight = weight * (np.abs(t) <= np.maximum(length / 2 - blurs, LEAST_ALONG * length))
         distance = d - value[:, :1, None] - value[:, 1:2, None] * t
         step, slope, widening, skew = integrated_step(distance, normal, value[:, 2])
         levels = np.stack([np.ones_like(t), relative, step, step * relative], axis=-1)
@@ -297,10 +303,38 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Lines:
             value[:, 2] = value[:, 2].clip(MIN_VARIANCE, most)
             value = np.where(np.isfinite(value), value, 0.0)
     covariance = _covariance(residual, design, third, distance, weight, inverse, shape := frame.length.shape)
+    shift, uncertain = _by_next_cells(frame, design, rise, distance, t, weight, inverse, value[:, 2])
+    covariance += uncertain.reshape(covariance.shape)
+    value[:, :2] -= shift
     line = np.moveaxis(value[:, :2].reshape(*shape, 2), 2, 0)
     settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
     offset, slope = np.where(settled, line, [rough.offset, rough.slope])
     return _Lines(offset, slope, np.where(settled[..., None, None], covariance, rough.covariance), rough.keep)
+
+
+def _by_next_cells(frame, design, rise, distance, t, weight, inverse, variance) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far the cells behind the border move offset and slope (m, 2) of edges in the mean, and (m, 2, 2) the
+    covariance of this shift.
+
+    What the blur brings from a white cell into the border is not in the model of one edge. A cell is white or black
+    with equal probability, and independent of others.
+    """
+    m, cells = len(design), frame.cells.reshape(-1)
+    blur = np.sqrt(variance + PIXEL_VARIANCE)[:, None, None]
+    brought = rise * ndtr(-(distance + frame.cell.reshape(m, 1, 1)) / blur)
+    number = np.floor((t / frame.length.reshape(m, 1, 1) + 0.5) * cells[:, None, None]).astype(int)
+    inner = weight * brought * ((number >= 1) & (number <= cells[:, None, None] - 2))
+    most = int(cells.max(initial=1))
+    row = (number.clip(0, most - 1) + most * np.arange(m)[:, None, None]).ravel()
+    pull = np.stack(
+        [
+            np.bincount(row, (inner * design[..., i]).ravel(), m * most).reshape(m, most)
+            for i in range(design.shape[-1])
+        ],
+        axis=-1,
+    )
+    moved = (pull @ inverse)[..., :2]
+    return moved.sum(1) / 2, np.swapaxes(moved, 1, 2) @ moved / 4
 
 
 BIN_PX = 0.25

@@ -6,31 +6,18 @@ from dataclasses import replace
 import numpy as np
 
 from stcal.boards.aprilgrid import find_aprilgrid
-from stcal.boards.cells import UNKNOWN_BITS
 from stcal.boards.charuco import find_charuco
 from stcal.boards.chessboard import find_chessboard, why_no_chessboard
 from stcal.boards.design import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
-from stcal.boards.dictionaries import cells_of
 from stcal.boards.edges import ALONG, POINTS
 from stcal.boards.tags import find_tags, view_of_tags
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
 from stcal.labels import BOARD
 
-FLOOR_PX = 0.05
-"""σ that the pixel raster and the tag's own cells leave to the corner of a tag, whatever its edges say. Of 100 drawn
-tags of 24 px the edges' σ was 0.035 px in the median, the error 2.3 times as large."""
-
 LEAST_COSINE = float(np.cos(np.radians(70)))
 """Cosine of the tilt beyond which the corners of a tag are left out, as its edges meet at sharp angles: drawn tags had
 errors of 0.06 px RMS up to 70°, and of 0.27 to 0.45 px, 1.8 px at most, beyond."""
-OVERLAP_CELL_PX, NARROW_CELL_PX, NARROW_PX = 3.0, 2.0, 0.5
-"""Width of a tag's cell below which the blur of its two edges overlaps (±2 σ of a usual 0.75 px), the width below which
-edges cannot be told from the cells behind them, and the σ of corners then. The σ grows in equal ratios between the two:
-drawn tags had errors of up to 0.6 px in cells of 2.5 to 3 px, and of 2 px below.
-
-Judged on other tags, 2776 corners of 26 px and of five dictionaries on a simulated dodecahedron in a hand, JPEG: errors
-of 0.14 to 0.24 px RMS in cells of 2.5 to 3 px, 0.30 to 0.37 px in 2 to 2.5, 0.45 to 0.68 px in 1.5 to 2."""
 
 
 def find_on_faces(
@@ -51,7 +38,7 @@ def find_on_faces(
         view, why = None, ""
         try:
             if isinstance(board, TagLayout):
-                view = _straightened(_floored(_not_oblique(view_of_tags(name, tags, board)), board), camera)
+                view = _straightened(_not_oblique(view_of_tags(name, tags, board)), camera)
             elif isinstance(board, CharucoDesign):
                 if any((board.dictionary, tag) in read for tag in board.tag_ids()):
                     view = find_charuco(image, name, board)
@@ -62,8 +49,7 @@ def find_on_faces(
                 why = "" if view else why_no_chessboard(image, board)
             elif isinstance(board, AprilGridDesign):
                 view, why = find_aprilgrid(image, name, board, camera)
-                view = _not_oblique(view)  # of the many tags of a board their own σ is right
-                view = _straightened(view if face == BOARD else _floored(view, board), camera)
+                view = _straightened(_not_oblique(view), camera)
         except StcalError as error:  # corners on a line, say
             why = f"left out, {error}"
         where = BOARD if face == BOARD else f"face {face}"
@@ -112,20 +98,3 @@ def shift_by_curves(corners_px: np.ndarray, camera: Camera) -> np.ndarray:
     normal = np.linalg.eigh(np.swapaxes(away, 2, 3) @ away)[1][..., 0]
     lines, offsets = (np.stack([np.roll(each, 1, axis=1), each], axis=2) for each in (normal, (normal * middle).sum(2)))
     return np.linalg.solve(lines, offsets[..., None])[..., 0] - corners_px
-
-
-def _floored(view: BoardView | None, board: TagLayout | AprilGridDesign) -> BoardView | None:
-    """Returns the view of tags with the σ that their corners have beside that of their edges."""
-    if view is None or view.covariance_px2 is None:
-        return view
-    layout = board.layout() if isinstance(board, AprilGridDesign) else board
-    border = (board.border_bits or UNKNOWN_BITS) if isinstance(board, AprilGridDesign) else 1
-    corners = view.xy_px.reshape(-1, 4, 2)
-    side = np.roll(corners, -1, axis=1) - corners
-    diagonal = corners[:, 2:] - corners[:, :2]
-    area = np.abs(diagonal[:, 0, 0] * diagonal[:, 1, 1] - diagonal[:, 0, 1] * diagonal[:, 1, 0]) / 2
-    width = area / np.linalg.norm(side, axis=2).max(1)
-    cells = np.array([cells_of(layout.tags[row][0], border) for row in view.ids[::4] // 4])
-    narrow = np.clip((OVERLAP_CELL_PX - width / cells) / (OVERLAP_CELL_PX - NARROW_CELL_PX), 0, 1)
-    variance = np.repeat(FLOOR_PX**2 * (NARROW_PX / FLOOR_PX) ** (2 * narrow), 4)
-    return replace(view, covariance_px2=view.covariance_px2 + variance[:, None, None] * np.eye(2))

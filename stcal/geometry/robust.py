@@ -5,6 +5,7 @@ of freedom.
 """
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import chdtri, fdtri
 
 HUBER = 3.0
@@ -15,6 +16,49 @@ loses hardly any weight."""
 def length_limit(coordinates: int, beyond: float) -> float:
     """Return the length that normal errors in this number of ``coordinates`` exceed with probability ``beyond``."""
     return float(np.sqrt(chdtri(coordinates, beyond)))
+
+
+TAIL = 0.05
+"""Share of the lengths beyond the quantile that tells how heavy the tail is: gross errors are fewer."""
+TAIL_SIGMAS, LEAST_FREEDOM, MOST_FREEDOM = 1.0, 2.0, 1e3
+"""Number of sampling errors of the quantiles that a tail is allowed; limits of the degrees of freedom."""
+
+
+def tailed_limit(length: np.ndarray, beyond: float, together: int = 1) -> float:
+    """Return the length that sound errors in two coordinates exceed with probability ``beyond``, from a sample.
+
+    Where σ are estimates, errors over σ have Student's distribution, and rare ones are longer than normal ones. Its
+    degrees of freedom are the fewest that the ratio of two quantiles of the sample admits. Both are far below gross
+    errors, which do not move them.
+
+    Parameters
+    ----------
+    length : (n,) array
+        Lengths of errors over their σ.
+    beyond : float
+        Probability.
+    together : int
+        Number of lengths that share an error, so that the sample tells as much as one of n / ``together``.
+    """
+
+    def quantile(exceeded: float, freedom: float) -> float:
+        return float(np.sqrt(freedom * np.expm1(-2 / freedom * np.log(exceeded))))
+
+    middle, high = np.quantile(length, [0.5, 1 - TAIL])
+    # Variances of logarithms of quantiles, of normal errors.
+    far, near = length_limit(2, TAIL) ** 2, length_limit(2, 0.5) ** 2
+    variance = ((1 - TAIL) / TAIL / far**2 + 1 / near**2 - 2 / far / near) * together / len(length)
+    ratio = high / max(middle, 1e-9) * np.exp(TAIL_SIGMAS * np.sqrt(variance))
+
+    def off(logarithm: float) -> float:
+        freedom = float(np.exp(logarithm))
+        return quantile(TAIL, freedom) / quantile(0.5, freedom) - ratio
+
+    ends = float(np.log(LEAST_FREEDOM)), float(np.log(MOST_FREEDOM))
+    signs = off(ends[0]) > 0, off(ends[1]) > 0
+    logarithm = brentq(off, *ends) if signs == (True, False) else ends[int(signs[1])]
+    freedom = float(np.exp(np.asarray(logarithm, float)))
+    return max(quantile(beyond, freedom) * middle / quantile(0.5, freedom), length_limit(2, beyond))
 
 
 def ratio_limit(beyond: float, freedom: float, redundancy: float) -> float:

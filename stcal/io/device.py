@@ -193,6 +193,30 @@ def pictures_of(source: int | str) -> Iterator[Iterator[np.ndarray]]:
         device.release()
 
 
+@contextmanager
+def frames_of(video: str | Path) -> Iterator[Iterator[np.ndarray]]:
+    """Open a video file, and return its frames, grey.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or has no frame.
+    """
+    device = _device(str(video))
+    try:
+        frames = _every(device)
+        first = next(frames, None) if device.isOpened() else None
+        if first is None:
+            raise InputError(
+                "E-VIDEO-UNREADABLE",
+                f"video {video}: cannot be read as one, a folder of images or a video file needed; another program may "
+                "convert it, such as `ffmpeg -i VIDEO clip.mp4`",
+            )
+        yield chain([first], frames)
+    finally:
+        device.release()
+
+
 def _device(source: int | str) -> cv2.VideoCapture:
     """Return the source, opened if it can be. The libraries' own words about it are kept back."""
     level, before = cv2.utils.logging.getLogLevel(), os.environ.get(FFMPEG_LEVEL)

@@ -30,6 +30,7 @@ from stcal.io.images import (
     require_common_size,
 )
 from stcal.io.photographs.memory import files_of_arrays
+from stcal.io.photographs.video import AUTO, write_frames
 from stcal.labels import DotLabel
 from stcal.parallel import Progress, counted, kept_processes, one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
@@ -53,7 +54,7 @@ from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.solve import solve_body, solve_groups, ungrouped, unseen_board, usable_groups
-from stcal.sfm.runs.transaction import MarkerFile, RunFolder, run_folder
+from stcal.sfm.runs.transaction import MarkerFile, RunFolder, frames_folder, require_ours, run_folder
 
 IN_MEMORY = "images in memory"
 """What a run's folder states as the folder of its images where there is none."""
@@ -83,6 +84,7 @@ def run(
     progress: Progress | None = None,
     reload_s: int | None = None,
     checks: Sequence[OwnCheck] = (),
+    every: str | int | None = None,
 ) -> RunResult:
     """Calibrate a target from photographs.
 
@@ -90,7 +92,7 @@ def run(
     ----------
     images
         Folder with one folder of images for each group; or grey or RGB arrays of 8 or 16 bit by the name of their
-        group, which are named ``12/0.png``, ``12/1.png`` … in results.
+        group, which are named ``12/0.png``, ``12/1.png`` … in results; or a video file, which is one group.
     camera
         Camera from :func:`stcal.load_camera` or :meth:`stcal.Camera.from_opencv`, or a camera file; if None, it is
         found from the target's printed faces or the dots of the board, and adjusted with all else.
@@ -108,6 +110,9 @@ def run(
     checks
         Checks of one's own: functions of the result that return a :class:`stcal.sfm.Check`, such as
         :func:`stcal.sfm.judge` makes. They count in the answer and stand in the report like all others.
+    every
+        Of a video: the sharpest of so many frames is used; by ``auto``, also the value if None, the sharpest of those
+        between which the view hardly changes.
 
     Returns
     -------
@@ -122,16 +127,34 @@ def run(
     options = options or RunOptions()
     if camera is None:
         options = replace(options, refine_camera=True)
+    if out is None:
+        with tempfile.TemporaryDirectory(prefix="stcal-run-") as scratch:
+            result = run(images, camera, scratch, target, board, options, progress, reload_s, checks, every)
+            return replace(result, out=None)
+    if isinstance(images, str | Path) and Path(images).is_file():
+        images = frames_in_run(images, out, every or AUTO)
+    elif every is not None:
+        raise InputError("E-OPTION-VALUE", f"--every {every}: a video file in place of the images needed")
     with mosaic_of(options.bayer) if options.bayer else nullcontext():
         if isinstance(images, Mapping):
             files, place = files_of_arrays(images, options.exclude), IN_MEMORY
         else:
             files, place = chosen_images(images, options.exclude), images
-    if out is not None:
-        return run_on_files(files, place, camera, out, target, board, options, progress, reload_s, checks)
-    with tempfile.TemporaryDirectory(prefix="stcal-run-") as scratch:
-        result = run_on_files(files, place, camera, scratch, target, board, options, progress, reload_s, checks)
-        return replace(result, out=None)
+    return run_on_files(files, place, camera, out, target, board, options, progress, reload_s, checks)
+
+
+def frames_in_run(video: str | Path, out: str | Path, every: str | int) -> Path:
+    """Writes the chosen frames of a video below the folder of a run, and returns their folder.
+
+    Raises
+    ------
+    InputError
+        The folder is not a run's; or as :func:`stcal.io.photographs.video.write_frames`.
+    """
+    require_ours(Path(out))
+    folder = frames_folder(out)
+    write_frames(video, folder, every)
+    return folder
 
 
 @one_thread()

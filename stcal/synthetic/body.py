@@ -21,14 +21,13 @@ from stcal.synthetic.dataset import FIRST_IMAGE, TruthFile
 from stcal.synthetic.render import encode
 
 BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
-FINER = 4
-"""Pixels that are drawn for the side of one of a drawing: edges then lie where they belong to an eighth of a pixel."""
 DRAWING_PX = 2000
 """Longer side of the drawing of a face, px."""
 CIRCLE_CORNERS = 360
 """Corners of the polygon that a circle is drawn as."""
-SAMPLES = 3
-"""Samples of a pixel, along each axis."""
+SAMPLES, LATTICE = 13, 8
+"""Samples of a pixel: a Fibonacci lattice, shifted at random from pixel to pixel. An edge along the pixel rows is then
+where it is, which a grid of points places in steps."""
 LIGHT = np.array([0.3, -0.5, -0.8])
 LEAST_FACES = 2
 TRIALS = 2000
@@ -182,31 +181,53 @@ def drawing_of(face: FaceDesign, polarity: Polarity = "bright") -> Drawing:
     width, height = np.ceil((high - low) * px_mm).astype(int)
     ground, ink = (WHITE, BLACK) if dark else (BLACK, WHITE)
 
-    def covered(parts: list[list[np.ndarray]]) -> np.ndarray:
-        """Returns the share of each pixel that the parts cover, drawn finer and averaged."""
-        mask = np.zeros((FINER * height, FINER * width), np.uint8)
-        for lines_mm in parts:
-            lines = [np.round(((line - low) * FINER * px_mm - 0.5) * 16).astype(np.int32) for line in lines_mm]
-            cv2.fillPoly(mask, lines, 255, lineType=cv2.LINE_8, shift=4)
-        return cv2.resize(mask, (int(width), int(height)), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-
-    # A filled area takes all pixels that its outline touches: ink and ground are filled in turn, and averaged.
-    whole = np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) + (
-        np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    )
-    outside = covered([[whole, *(line for area in areas for line in area)]])
-    grey = ground + (ink - ground) * (covered(areas) + 1 - outside) / 2
-    solid = covered([[plate]])
+    size = int(height), int(width)
+    grey = ground + (ink - ground) * covered_share([[(line - low) * px_mm for line in area] for area in areas], size)
+    solid = covered_share([[(plate - low) * px_mm]], size)
     return Drawing(grey, solid, px_mm, low)
 
 
+def covered_share(areas: list[list[np.ndarray]], size: tuple[int, int]) -> np.ndarray:
+    """Returns the share of each pixel (height, width) of a picture that areas cover, exactly.
+
+    ``areas`` : lists of closed lines (k, 2), pixels from the picture's corner, of which the first one is the outline
+    and the others, in the other direction, are holes. Each piece of a line within one pixel adds what is between it and
+    the picture's right side.
+    """
+    height, width = size
+    added = np.zeros((height, width + 1))
+    for area in areas:
+        following = np.roll(area[0], -1, axis=0)
+        turn = np.sign((area[0][:, 0] * following[:, 1] - area[0][:, 1] * following[:, 0]).sum())
+        for line in area:
+            for start, end in zip(line, np.roll(line, -1, axis=0), strict=True):
+                cuts = [np.array([0.0, 1.0])]
+                for k in (0, 1):
+                    low, high = sorted((start[k], end[k]))
+                    if low < high:
+                        cuts.append((np.arange(np.ceil(low), np.floor(high) + 1) - start[k]) / (end[k] - start[k]))
+                at = np.sort(np.concatenate(cuts).clip(0, 1))[:, None]
+                points = start + at * (end - start)
+                rise = turn * np.diff(points[:, 1])
+                x, y = ((points[1:] + points[:-1]) / 2).T
+                row, x = np.floor(y).astype(int), x.clip(0, width)
+                column = np.floor(x).astype(int).clip(0, width - 1)
+                used = (row >= 0) & (row < height)
+                row, column, rise, part = row[used], column[used], rise[used], (x - column)[used]
+                np.add.at(added, (row, column), rise * (1 - part))
+                np.add.at(added, (row, column + 1), rise * part)
+    # A line that goes down leaves the area on its right side, where rows go down.
+    return (-added.cumsum(1)[:, :-1]).clip(0, 1).astype(np.float32)
+
+
 def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> np.ndarray:
-    """Returns one photograph, 8 bit. Each sample of a pixel is the point at which its ray meets a face."""
+    """Returns one photograph, 8 bit. Each sample of a pixel is the point at which its ray meets a face.
+
+    Within a pixel, the lens is linear."""
     camera, pose, options = scene.camera, scene.camera_from_target[image], scene.options
-    step = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
-    u = (np.arange(camera.width)[:, None] + step).ravel()
-    v = (np.arange(camera.height)[:, None] + step).ravel()
-    total = np.full((len(v), len(u)), BACKGROUND, np.float32)
+    lattice = np.column_stack([np.arange(SAMPLES), LATTICE * np.arange(SAMPLES)]) / SAMPLES
+    moved = np.random.default_rng([options.seed, 2, image]).random((camera.height, camera.width, 2), np.float32)
+    total = np.full((SAMPLES, camera.height, camera.width), BACKGROUND, np.float32)
     for face in scene.target.faces:
         camera_from_face = pose @ scene.target_from_face[face.id]
         drawing = drawings[face.id]
@@ -222,24 +243,27 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> n
         low, high = np.maximum(low, 0), np.minimum(high, [camera.width, camera.height])
         if (high <= low).any():
             continue
-        columns, rows = slice(SAMPLES * low[0], SAMPLES * high[0]), slice(SAMPLES * low[1], SAMPLES * high[1])
-        grid = np.stack(np.meshgrid(u[columns], v[rows]), axis=-1)
-        ideal = camera.normalised_from_pixel(grid)
-        rays = np.concatenate([ideal, np.ones((*ideal.shape[:2], 1))], axis=2) @ camera_from_face.rotation
+        columns, rows = slice(low[0], high[0]), slice(low[1], high[1])
+        pixels = np.stack(np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1])), axis=-1)
+        ideal = camera.normalised_from_pixel(pixels)
+        along = [camera.normalised_from_pixel(pixels + step) - ideal for step in np.eye(2)]
         start = -camera_from_face.rotation.T @ camera_from_face.translation
-        depth = -start[2] / np.where(np.abs(rays[..., 2]) > 1e-9, rays[..., 2], 1e-9)
-        at = start[:2] + depth[..., None] * rays[..., :2]
-        place = ((at - drawing.origin) * drawing.px_mm - 0.5).astype(np.float32)
-        inside = ((at >= drawing.origin) & (at <= drawing.origin + extent)).all(2)
-        value, solid = (
-            cv2.remap(picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            for picture in (drawing.grey, drawing.solid)
-        )
-        inside &= solid > 0.5
         light = 0.75 + 0.25 * float(inward @ (LIGHT / np.linalg.norm(LIGHT)) * -1)
-        part = total[rows, columns]
-        part[inside] = light * value[inside]
-    grey = total.reshape(camera.height, SAMPLES, camera.width, SAMPLES).mean((1, 3))
+        for part, point in zip(total, lattice, strict=True):
+            offset = (point + moved[rows, columns]) % 1 - 0.5
+            ray = ideal + offset[..., :1] * along[0] + offset[..., 1:] * along[1]
+            rays = np.concatenate([ray, np.ones((*ray.shape[:2], 1))], axis=2) @ camera_from_face.rotation
+            depth = -start[2] / np.where(np.abs(rays[..., 2]) > 1e-9, rays[..., 2], 1e-9)
+            at = start[:2] + depth[..., None] * rays[..., :2]
+            place = ((at - drawing.origin) * drawing.px_mm - 0.5).astype(np.float32)
+            inside = ((at >= drawing.origin) & (at <= drawing.origin + extent)).all(2)
+            value, solid = (
+                cv2.remap(picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                for picture in (drawing.grey, drawing.solid)
+            )
+            inside &= solid > 0.5
+            part[rows, columns][inside] = light * value[inside]
+    grey = total.mean(0)
     if options.blur_px:
         grey = cv2.GaussianBlur(grey, (0, 0), options.blur_px)
     rng = np.random.default_rng([options.seed, 1, image])

@@ -26,6 +26,8 @@ from stcal.sfm.adjust.scale import find_scale
 from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, contributions_of
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.detect.circles.candidates import EllipseOptions
+from stcal.sfm.detect.image import detect_image
 from stcal.sfm.mapping.placed import model_of_body, place_and_find_camera, place_with_camera
 from stcal.sfm.measurement.tracker import Tracker
 from stcal.sfm.planning.bodies import plan_body
@@ -33,7 +35,7 @@ from stcal.sfm.planning.session import PlanOptions
 from stcal.sfm.report.compare import compare
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.saved import adjusted_run, load_run
-from stcal.synthetic.body import BodyOptions, body_camera, make_body_scene, write_body
+from stcal.synthetic.body import BodyOptions, body_camera, drawing_of, make_body_scene, render_body, write_body
 from stcal.synthetic.designs import second_design, tag_body, tag_cube, tag_dodecahedron
 from tests.outcome import COMPUTATION, assert_error, fails_with
 
@@ -188,6 +190,29 @@ def test_corners_behind_a_finger_are_named_and_no_others():
     body = place_with_camera(images, scene.target.faces, scene.camera)
     assert [(each.image, each.label) for each in body.contradictions] == [("3.png", label) for label in hidden]
     assert all(each.residual_px > each.limit_px for each in body.contradictions)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+def test_of_photographs_of_tags_only_planted_corners_contradict(seed):
+    """One sound corner of the some 100 of a set may be named in a hundred sets."""
+    target, planted_px = tag_cube(45), 3.0
+    scene = make_body_scene(target, body_camera(900), BodyOptions(images=10, distance_mm=300, seed=seed))
+    drawings = {face.id: drawing_of(face) for face in target.faces}
+    images = []
+    for i in range(10):
+        found = detect_image(render_body(scene, i, drawings), scene.camera, target, None, EllipseOptions())
+        labels = tuple(label for each in found.printed for label in each.labels(target.face(each.face)))
+        rows = np.concatenate([each.rows for each in found.printed])
+        xy, covariance = found.centres.centre_px[rows], found.centres.covariance_px2[rows]
+        images.append(ImageObservations(f"{i}.png", ".", labels, xy, 0 * xy, 0 * covariance, covariance))
+    sound = place_with_camera(images, target.faces, scene.camera)
+    assert [(each.image, str(each.label), each.residual_px) for each in sound.contradictions] == []
+    moved = images[3].centre_px.copy()
+    moved[1] += [0.0, planted_px]
+    images[3] = replace(images[3], centre_px=moved)
+    spoiled = place_with_camera(images, target.faces, scene.camera)
+    assert [(each.image, each.label) for each in spoiled.contradictions] == [("3.png", images[3].labels[1])]
 
 
 def test_images_of_one_tag_beside_circles_are_placed():

@@ -12,9 +12,7 @@ TIE_MM = 70.0
 
 @pytest.mark.parametrize("size_mm", [45.0, 60.0, TIE_MM])
 def test_the_border_of_a_tag_is_drawn_where_it_is(size_mm):
-    """Along the middle of the upper and of the left border, all ink: its middle and length to an eighth of a pixel.
-
-    An eighth is half of what is drawn, four to a pixel; points are rounded to a sixteenth of that, 0.008 px."""
+    """Along the middle of the upper and of the left border, all ink: areas are exact, in single precision."""
     face = tag_cube(size_mm).faces[0]
     drawing = drawing_of(face)
     ink = (WHITE - drawing.grey) / (WHITE - BLACK)
@@ -24,6 +22,6 @@ def test_the_border_of_a_tag_is_drawn_where_it_is(size_mm):
         number = round(float((low[1 - axis] + cell / 2 - drawing.origin[1 - axis]) * drawing.px_mm - 0.5))
         line = lines[number].astype(float)
         middle = (line * (np.arange(len(line)) + 0.5)).sum() / line.sum() / drawing.px_mm + drawing.origin[axis]
-        most = 0.13 / drawing.px_mm
+        most = 1e-3 / drawing.px_mm
         assert middle == pytest.approx((low + high)[axis] / 2, abs=most)
         assert line.sum() / drawing.px_mm == pytest.approx((high - low)[axis], abs=2 * most)

@@ -74,6 +74,12 @@ def run(
         "not given.",
     ] = None,
     exclude: shared.Exclude = None,
+    every: Annotated[
+        str | None,
+        "Take of a video in place of IMAGES the sharpest of so many frames, or, by auto, the default, of those "
+        "between which the view hardly changes.",
+        Opt(metavar="FRAMES"),
+    ] = None,
     expect_faces: Annotated[
         str | None,
         "Answer no where one of these faces, such as 1,2, is not in the result; those that the groups are named "
@@ -118,7 +124,7 @@ def run(
         expect_faces=tuple(face.strip() for face in (expect_faces or "").split(",") if face.strip()),
     )
     with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as progress:
-        result = pipeline.run(images, camera, out, target, board, options, progress)
+        result = pipeline.run(images, camera, out, target, board, options, progress, every=every)
     if verbose():
         say("\n".join(found_lines(result.labelled)))
     say(run_text(result))

@@ -17,7 +17,7 @@ from stcal.geometry.least_squares import Normal, PoseStack, descend, minimise
 from stcal.geometry.normal_equations import blocks_of, reduce
 from stcal.geometry.plane import camera_from_plane, fit_homography, mirrored
 from stcal.geometry.rigid import Rigid, skew
-from stcal.geometry.robust import HUBER, huber_cost, huber_weights, length_limit, robust_sigma
+from stcal.geometry.robust import HUBER, huber_cost, huber_weights, robust_sigma, tailed_limit
 from stcal.labels import Label
 from stcal.sfm.data.model import MIN_POINTS, ImageObservations, Outlier
 
@@ -34,6 +34,8 @@ BETTER = 0.2
 """Share by which another pose of a face must fit its corners better."""
 BY_CHANCE = 0.01
 """Number of sound corners in a run that may be taken for gross errors."""
+SHARING = 2
+"""Number of corners that share the error of an edge."""
 PASSES, ROBUST_ROUNDS = 3, 3
 MAX_STEPS = 100
 FOCAL_STEPS = (0.6, 0.9, 1.4, 2.2, 3.5)
@@ -455,7 +457,8 @@ def contradictions(body: Body, corners: Corners) -> list[Outlier]:
 
     A finger over an edge moves two corners of a tag by a few tenths of a pixel, which free points follow: the four
     corners of a tag hardly control one another, the rigid body does. Lengths are compared with those of all corners,
-    and with those of the same corner in other images, as a print that is off its design is no gross error.
+    and with those of the same corner in other images, as a print that is off its design is no gross error. The limit
+    grows with the number of corners and with the tail that their lengths have.
     """
     printed = np.array([face.sigma_mm is not None for face in corners.faces])
     used = corners.select(body.used(corners) & printed[corners.face])
@@ -465,7 +468,7 @@ def contradictions(body: Body, corners: Corners) -> list[Outlier]:
     usual = np.full(len(length), max(robust_sigma(length, 2), 1e-3))
     for own in _members(np.column_stack([used.face, used.corner])):
         usual[own] = np.maximum(usual[own], robust_sigma(length[own], 2))
-    limit = length_limit(2, BY_CHANCE / len(length)) * usual
+    limit = tailed_limit(length / usual, BY_CHANCE / len(length), SHARING) * usual
     return [
         Outlier(
             used.images[used.image[k]],

@@ -132,7 +132,7 @@ def run_folder(out: str | Path, content: MarkerFile, inputs: Mapping[str, object
     out = Path(out)
     _require_short(out)
     folder = RunFolder(out, out / UNFINISHED, out / CACHE)
-    _require_ours(out)
+    require_ours(out)
     _require_no_inputs(out, inputs)
     with _locked(out):
         with _writable(out):
@@ -245,7 +245,13 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
 
 
-def _require_ours(out: Path) -> None:
+def frames_folder(out: str | Path) -> Path:
+    """Returns the folder of the frames of a video, in the folder of a run."""
+    return Path(out) / CACHE / "frames"
+
+
+def require_ours(out: Path) -> None:
+    """Raises an error if a folder is neither new, nor empty, nor of an earlier run."""
     if out.exists() and not out.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"output {out}: not a folder; give a new folder with --out")
     ours = (CACHE, UNFINISHED)  # left by a run that was killed while it claimed the folder
@@ -281,8 +287,10 @@ def _require_no_links(out: Path) -> None:
 
 def _require_no_inputs(out: Path, inputs: Mapping[str, object]) -> None:
     """Refuses inputs that lie where the run writes."""
-    place = real_place(out)
+    place, frames = real_place(out), real_place(frames_folder(out))
     for word, given in inputs.items():
+        if isinstance(given, str | Path) and real_place(given) == frames:
+            continue  # the run itself has put them there
         if isinstance(given, str | Path) and place in (own := real_place(given), *own.parents):
             raise InputError(
                 "E-OUTPUT-IS-INPUT",

@@ -87,7 +87,8 @@ def test_missing_folder(small_set, stcal_sfm):
 def test_a_file_in_place_of_the_folder(small_set, stcal_sfm):
     small = small_set()
     outcome = stcal_sfm("run", small.camera, "--camera", small.camera, "--out", small.out)
-    assert_error(outcome, INPUT, "E-IMAGES-FOLDER", str(small.camera), "not a folder")
+    assert_error(outcome, INPUT, "E-VIDEO-UNREADABLE", str(small.camera), "a folder of images")
+    assert not (small.out / "cache" / "frames").exists()
 
 
 def test_empty_folder(small_set, stcal_sfm):
