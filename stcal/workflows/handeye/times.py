@@ -61,7 +61,7 @@ def robot_at_images(robot: RobotPoses, names: Sequence[str], timing: Timing | No
         return AtImages(robot)
     if not timing.offset and all(time in samples for time in images.values()):
         rows = {name: samples.index(time) for name, time in images.items()}
-        if not len(images) < len(samples) == len(set(samples)):
+        if not 2 <= len(set(samples)) == len(samples):
             return AtImages(_of_rows(robot, rows))
         stream = Stream.of([time for time in samples if time is not None], robot.base_from_flange, robot.file)
         seconds = stream.after_origin(list(images.values())).tolist()
