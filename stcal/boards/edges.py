@@ -6,6 +6,16 @@ import cv2
 import numpy as np
 from scipy.special import ndtr
 
+from stcal.boards.area.grid_lines import OuterLines, told_by_lines
+from stcal.boards.area.step import (
+    PIXEL_VARIANCE,
+    PRIOR_PX,
+    Displacement,
+    displacement_variance,
+    integrated_step,
+    of_sampling,
+    solved,
+)
 from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.robust import median_length
 
@@ -42,8 +52,6 @@ MOST_MOVED_PX = 1.0
 """Largest distance of an edge from where its profiles have it; one that ends farther away stays with the profiles."""
 ROUNDING = 1 / 12
 """Variance of rounding to whole grey values."""
-PIXEL_VARIANCE = 1 / 12
-"""Variance of a square pixel about its centre, px²."""
 BLURS, LEAST_INSIDE_PX = 2.5, 1.0
 """Distance from the tag's inner cells, in σ of blur and pixel, from which on pixels are used, and the least width of
 the border's band that is used, px."""
@@ -58,37 +66,6 @@ MOST_LEFT = 0.15
 """Largest RMS residual of a window, as a share of the contrast; a window with a larger one shows something else."""
 WIDEST_BLUR = 0.4
 """Largest σ of the blur, in half sides of the window: a wider one leaves no area of one colour."""
-
-
-def integrated_step(distance: np.ndarray, normal: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the share of the bright side of an edge in pixels, and derivatives of this share.
-
-    The square pixel as the edge's normal sees it is a trapezoid, the convolution of two boxes. The wider one, and with
-    it an edge along the rows, is integrated exactly; the narrower one, like the blur, as a Gaussian of its variance.
-
-    Parameters
-    ----------
-    distance : (m, ...) array
-        Distances of the pixels' centres from the edges, positive on the bright side, px.
-    normal : (m, 2) array
-        Normals of the edges.
-    variance : (m,) array
-        Variances of the blur, px².
-
-    Returns
-    -------
-    tuple of (m, ...) arrays
-        The share; its derivatives by distance and by variance; its third derivative by distance.
-    """
-    narrow, wide = (side.reshape(-1, *(1,) * (distance.ndim - 1)) for side in np.sort(np.abs(normal), axis=1).T)
-    sigma = np.sqrt(variance.reshape(narrow.shape) + narrow**2 / 12)
-    first, last = ((distance + shift) / sigma for shift in (wide / 2, -wide / 2))
-    below = ndtr(first), ndtr(last)
-    density = tuple(np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi) for at in (first, last))
-    step = sigma * (first * below[0] + density[0] - last * below[1] - density[1])
-    widening = (density[0] - density[1]) / (2 * sigma)
-    skew = (last * density[1] - first * density[0]) / sigma**2
-    return step / wide, (below[0] - below[1]) / wide, widening / wide, skew / wide
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,11 +95,28 @@ def corners_from_edges(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray)
     offset, good = _profiles(grey, frame)
     with np.errstate(divide="ignore", invalid="ignore"):  # edges that are not visible
         rough = _fit(frame.place, offset, good)
-        lines = _by_area(grey, frame, rough)
-        meeting, covariance = _meet(frame, lines)
+        area = _by_area(grey, frame, rough)
+        meeting = _meet(frame, area.lines(rough, 0.0))[0]
+        variance = displacement_variance(area.told, *_told_by_lines(grey, meeting, np.reshape(cells, -1), area))
+        covariance = _meet(frame, area.lines(rough, variance))[1]
     seen = good.mean(2) >= MIN_SHARE
     seen &= np.isfinite(covariance.sum((1, 2)))[:, None] & (frame.length >= MIN_CELL_PX * np.reshape(cells, (-1, 1)))
     return EdgeCorners(meeting, covariance, seen.all(1))
+
+
+def _told_by_lines(grey: np.ndarray, corners: np.ndarray, cells: np.ndarray, area: "_Area") -> list[Displacement]:
+    """Return what the lines between the cells of tags say about sampling, for each number of cells."""
+    told, n = [], len(corners)
+    dark, rise = np.moveaxis(area.levels.reshape(n, 4, 2), 2, 0)
+    spread = np.where(area.settled, area.by_noise[:, 0, 0].reshape(n, 4), np.nan)
+    whole = np.isfinite(corners).all((1, 2)) & np.isfinite(spread).all(1)
+    for count in np.unique(cells[whole]).tolist():
+        rows = np.flatnonzero(whole & (cells == count))
+        blur, noise = (np.median(value.reshape(n, 4)[rows], axis=1) for value in (area.blur, area.noise))
+        levels = np.median(dark[rows], axis=1), np.median(rise[rows], axis=1)
+        sampling = area.by_sampling[:, 0].reshape(n, 4, 2)[rows]
+        told.append(told_by_lines(grey, OuterLines(corners[rows], blur, *levels, noise, spread[rows], sampling), count))
+    return told
 
 
 def corners_by_edges(corners: np.ndarray) -> np.ndarray:
@@ -233,12 +227,13 @@ def _fit(place: np.ndarray, offset: np.ndarray, good: np.ndarray) -> _Lines:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pixels:
     """Pixels about m edges: ``level`` (m, p, s) in p rows or columns, ``along`` and ``across`` (m, p, s) of their
-    centres from the edge's middle, px, ``used`` (m, p, s)."""
+    centres from the edge's middle, px, ``used`` (m, p, s); ``rise`` (m,) of ``across`` from one pixel to the next."""
 
     level: np.ndarray
     along: np.ndarray
     across: np.ndarray
     used: np.ndarray
+    rise: np.ndarray
 
 
 def _pixels(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Pixels:
@@ -267,10 +262,38 @@ def _pixels(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Pixels:
     used = keep[..., None] & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     used &= np.abs(d - offset[..., None] - slope[..., None] * t) <= reach
     used &= np.abs(t) <= np.minimum((0.5 - ALONG[0]) * length, length / 2 - END_PX)
-    return _Pixels(level, t, d, used)
+    return _Pixels(level, t, d, used, normal[each, 1 - major])
 
 
-def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Lines:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Area:
+    """Lines of m edges by area, with what their σ are made of.
+
+    ``offset``, ``slope`` : (n, 4), as in :class:`_Lines`; ``settled`` : (n, 4) False where the profiles' line is kept;
+    ``blur`` : (m,) variances, px²; ``levels`` : (m, 2) dark and rise; ``by_noise`` : (m, 2, 2) covariance of offset and
+    slope without sampling; ``by_sampling`` : (m, 2, 2) their derivatives by its two harmonics, in columns; ``told`` :
+    what the profiles along turned edges say of it.
+    """
+
+    offset: np.ndarray
+    slope: np.ndarray
+    settled: np.ndarray
+    blur: np.ndarray
+    levels: np.ndarray
+    noise: np.ndarray
+    by_noise: np.ndarray
+    by_sampling: np.ndarray
+    told: Displacement
+
+    def lines(self, rough: _Lines, variance: float) -> _Lines:
+        """Return the lines with their covariances, where sampling displaces them by ``variance``, px²."""
+        covariance = self.by_noise + variance * self.by_sampling @ np.swapaxes(self.by_sampling, 1, 2)
+        covariance = covariance.reshape(*self.offset.shape, 2, 2)
+        covariance = np.where(self.settled[..., None, None], covariance, rough.covariance)
+        return _Lines(self.offset, self.slope, covariance, rough.keep)
+
+
+def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Area:
     """Return the lines that split the pixels into dark and bright areas as the image has them."""
     pixels = _pixels(grey, frame, rough)
     m = len(pixels.level)
@@ -278,7 +301,7 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Lines:
     weight, t, d = pixels.used.astype(float), pixels.along, pixels.across
     length = frame.length.reshape(m, 1, 1)
     relative = 2 * t / length
-    distance = residual = third = d
+    distance = residual = d
     design, inverse = np.zeros((*t.shape, 7)), np.zeros((m, 7, 7))
     value = np.zeros((m, 7))  # offset, slope, variance of the blur, dark and rise with their changes along the edge
     value[:, :2] = np.nan_to_num(np.stack([rough.offset, rough.slope], -1).reshape(m, 2))
@@ -289,27 +312,32 @@ def _by_area(grey: np.ndarray, frame: _Frame, rough: _Lines) -> _Lines:
             weight = weight * (distance >= -np.maximum(frame.cell.reshape(m, 1, 1) - blurs, LEAST_INSIDE_PX))
             weight = weight * (np.abs(t) <= np.maximum(length / 2 - blurs, LEAST_ALONG * length))
         distance = d - value[:, :1, None] - value[:, 1:2, None] * t
-        step, slope, widening, skew = integrated_step(distance, normal, value[:, 2])
+        step, slope, widening = integrated_step(distance, normal, value[:, 2])
         levels = np.stack([np.ones_like(t), relative, step, step * relative], axis=-1)
         if not k:  # the levels follow linearly
             value[:, 3:] = solved(levels, weight, pixels.level)[0]
         rise = value[:, 5, None, None] + value[:, 6, None, None] * relative
         residual = pixels.level - np.einsum("mpsi,mi->mps", levels, value[:, 3:])
         design = np.concatenate([(rise * np.stack([-slope, -slope * t, widening])).transpose(1, 2, 3, 0), levels], -1)
-        third = rise * skew
         change, inverse = solved(design, weight, residual)
         if k < STEPS:
             value += change
             value[:, 2] = value[:, 2].clip(MIN_VARIANCE, most)
             value = np.where(np.isfinite(value), value, 0.0)
-    covariance = _covariance(residual, design, third, distance, weight, inverse, shape := frame.length.shape)
+    shape, good = frame.length.shape, np.isfinite(inverse).all((1, 2)) & (weight.sum((1, 2)) > 2 * design.shape[-1])
+    noise = _noise_of(residual, distance, weight)
+    factor = noise * _growth_of_tags(residual, design[..., 0], weight, noise, good, shape)
+    sampling = of_sampling(-distance / pixels.rise[:, None, None], design[..., 0])  # whole pixels do not count
+    pull = np.einsum("mps,mpsi,mpsk->mik", weight, design, sampling)
     shift, uncertain = _by_next_cells(frame, design, rise, distance, t, weight, inverse, value[:, 2])
-    covariance += uncertain.reshape(covariance.shape)
+    by_noise = np.where(good[:, None, None], factor[:, None, None] * inverse[:, :2, :2] + uncertain, np.nan)
     value[:, :2] -= shift
+    told = _told_along(residual, design, sampling, weight, factor, good)
     line = np.moveaxis(value[:, :2].reshape(*shape, 2), 2, 0)
     settled = (np.abs(line[0] - rough.offset) < MOST_MOVED_PX) & (value[:, 5] > 0).reshape(shape)
     offset, slope = np.where(settled, line, [rough.offset, rough.slope])
-    return _Lines(offset, slope, np.where(settled[..., None, None], covariance, rough.covariance), rough.keep)
+    levels = value[:, [3, 5]]
+    return _Area(offset, slope, settled, value[:, 2], levels, factor, by_noise, (inverse @ pull)[:, :2], told)
 
 
 def _by_next_cells(frame, design, rise, distance, t, weight, inverse, variance) -> tuple[np.ndarray, np.ndarray]:
@@ -338,66 +366,49 @@ def _by_next_cells(frame, design, rise, distance, t, weight, inverse, variance) 
 
 
 BIN_PX = 0.25
-"""Width of a class of distances from the edge: pixels in one class see the same part of its profile."""
-PRIOR_PX, PRIOR_EDGES = 0.005, 4
-"""σ of the displacements of an edge's profile before its image is seen, px, and the number of edges that it counts as.
-It is what six photographs of tags along the pixel rows showed beyond noise. Exact renderings show less, and σ are then
-too large, by up to a half."""
+"""Width of a class of distances from an edge of a crossing: pixels in one class see the same part of its profile."""
 
 
-def _covariance(residual, design, skew, distance, weight, inverse, shape) -> np.ndarray:
-    """Return the covariances (*shape, 2, 2) of offset and slope of edges, from the residuals of their pixels.
+def _told_along(residual, design, by_sampling, weight, noise, good) -> Displacement:
+    """Return what turned edges say: whether their profiles move with the phase."""
+    harmonic = np.stack(
+        [
+            part - (design @ solved(design, weight, part)[0][:, None, :, None])[..., 0]
+            for part in np.moveaxis(by_sampling, -1, 0)
+        ],
+        axis=-1,
+    )
+    pulled = np.einsum("mps,mpsi,mps->mi", weight, harmonic, residual)
+    gram = np.einsum("mps,mpsi,mpsj->mij", weight, harmonic, harmonic)
+    by_noise, by_displacement = noise * np.trace(gram, axis1=1, axis2=2), np.maximum((gram**2).sum((1, 2)), 1e-12)
+    square = ((pulled**2).sum(1) - by_noise) / by_displacement
+    return Displacement(np.where(good, square, np.nan), by_noise / by_displacement, np.full(len(square), 2.0))
 
-    Three errors are told apart. Noise of single pixels. Displacements of the edge from one of the profiles along it to
-    the next, as by its print, which all pixels of a profile share. And displacements of the profile itself that all
-    pixels at one distance from the edge share, as by rounding, compression, sampling, or a blur that is not Gaussian:
-    they do not average out where the edge lies along the pixel rows, since few distances occur there. They show in the
-    profile's asymmetry (``skew``, its third derivative), which no offset and no symmetric blur explains.
-    """
-    m, q = design.shape[0], design.shape[-1]
+
+def _noise_of(residual, distance, weight) -> np.ndarray:
+    """Return the variances (m,) of single pixels, from their scatter within classes of distances from the edge."""
+    m = len(residual)
     most = round(2 * REACH_PX[1] / BIN_PX)
     place = np.rint(distance / BIN_PX).clip(-most, most).astype(int) + most
     bins = 2 * most + 1
     row = (place + bins * np.arange(m)[:, None, None]).ravel()
+    count, total = (
+        np.bincount(row, (weight * value).ravel(), m * bins).reshape(m, bins)
+        for value in (np.ones_like(residual), residual)
+    )
+    within = (weight * residual**2).sum((1, 2)) - (total**2 / np.maximum(count, 1)).sum(1)
+    return np.maximum(within / np.maximum(count.sum(1) - (count > 0).sum(1), 1), ROUNDING)
 
-    def summed(value: np.ndarray) -> np.ndarray:
-        return np.bincount(row, (weight * value).ravel(), m * bins).reshape(m, bins)
 
-    count = summed(np.ones_like(residual))
-    within = (weight * residual**2).sum((1, 2)) - (summed(residual) ** 2 / np.maximum(count, 1)).sum(1)
-    noise = np.maximum(within / np.maximum(count.sum(1) - (count > 0).sum(1), 1), ROUNDING)
-    good = np.isfinite(inverse).all((1, 2)) & (count.sum(1) > 2 * q)
-    offset = design[..., 0]  # by a displacement of 1 px
-    pull = np.stack([summed(offset * design[..., i]) for i in range(q)], axis=-1)
-    # The skew that the parameters leave: what noise makes of it, and what displacements of 1 px make of it.
-    skew = skew - (design @ solved(design, weight, skew)[0][:, None, :, None])[..., 0]
-    by_noise = (weight * skew**2).sum((1, 2))
-    by_displacement = np.maximum((summed(skew * offset) ** 2).sum(1), 1e-12)
-    square = ((weight * skew * residual).sum((1, 2)) ** 2 - noise * by_noise) / by_displacement
-    certainty = good * (noise * by_noise / by_displacement + PRIOR_PX**2) ** -2
-    prior = PRIOR_EDGES * PRIOR_PX**-4
-    with np.errstate(invalid="ignore"):
-        displaced = (np.nansum(certainty * square) + prior * PRIOR_PX**2) / (np.nansum(certainty) + prior)
-    # Of the profiles: squares of their pulls at the offset, over what the noise of single pixels makes of them.
+def _growth_of_tags(residual, offset, weight, noise, good, shape) -> np.ndarray:
+    """Return the factors (m,) of the variances, by edges that are not straight: squares of the profiles' pulls at the
+    offset over what the noise of single pixels makes of them, for each tag."""
     of_profile = ((weight * offset * residual).sum(2) ** 2).sum(1)
     profiles = weight.any(2).sum(1)
     expected = noise * (weight * offset**2).sum((1, 2)) * (1 - 2 / np.maximum(profiles, 3))
     usable = np.where(good & (profiles > 3), 1.0, 0.0).reshape(shape)
     growth = (usable * of_profile.reshape(shape)).sum(1) / np.maximum((usable * expected.reshape(shape)).sum(1), 1e-12)
-    factor = noise * np.repeat(np.maximum(growth, 1.0), shape[1])
-    covariance = factor[:, None, None] * inverse
-    covariance += max(displaced, 0.0) * inverse @ np.swapaxes(pull, 1, 2) @ pull @ inverse
-    covariance[~good] = np.nan
-    return covariance[:, :2, :2].reshape(*shape, 2, 2)
-
-
-def solved(design: np.ndarray, weight: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least-squares solutions (m, q) and inverse normal matrices (m, q, q)."""
-    m, q = len(design), design.shape[-1]
-    rows, w = design.reshape(m, -1, q), weight.reshape(m, -1, 1)
-    normal = np.swapaxes(rows, 1, 2) @ (w * rows) + 1e-9 * np.eye(q)
-    inverse = np.linalg.inv(normal)
-    return (inverse @ (np.swapaxes(rows, 1, 2) @ (w * right.reshape(m, -1, 1))))[..., 0], inverse
+    return np.repeat(np.maximum(growth, 1.0), shape[1])
 
 
 def _line(place: np.ndarray, offset: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -483,7 +494,7 @@ def _of_size(grey, start, along, half: int, clear_px: np.ndarray) -> tuple[np.nd
         normal = np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
         off = pixels - (start + value[:, :2])[:, None]
         distance, place = (np.einsum("nki,nei->enk", off, axes) for axes in (normal, direction))
-        (one, slope1, wide1, _), (two, slope2, wide2, _) = (
+        (one, slope1, wide1), (two, slope2, wide2) = (
             integrated_step(distance[e], normal[:, e], value[:, 4]) for e in (0, 1)
         )
         # Where edges are not square, the pixel sees both at once (first term of the tetrachoric series).

@@ -23,7 +23,7 @@ HINT_T, SURE_SIGMAS = 3.0, 4.0
 """Student's t of a first test from which an offset is solved for, and number of its σ from which it is told: one sound
 set in 16,000 is beyond the latter."""
 FALLS = 0.98
-"""Largest ratio of the mean squares of residuals with and without an offset that is told."""
+"""Largest ratio of the mean squares of residuals with and without an offset that is told though it does no harm."""
 HARMFUL = 1.0
 """Change of the transform by the offset, in σ of the transform, from which the transform is called wrong."""
 ROW_S = 0.05
@@ -97,8 +97,8 @@ def lag_tried(
     gives velocities if they follow one another smoothly.
     """
     pairs = given.pairs
-    timed = given.timed if given.timed is not None else _by_order(pairs)
-    if timed is None or options.four_dof or len(result.outliers) != len(pairs) or not _close(timed):
+    timed = _moving(given)
+    if timed is None or options.four_dof or len(result.outliers) != len(pairs):
         return result, ()
     try:
         if abs(_lag_t(pairs, timed, setup, result)) < HINT_T:
@@ -110,7 +110,8 @@ def lag_tried(
     except StcalError:  # the motions tell no offset
         return result, ()
     fits = [float((_lengths(each) ** 2).mean()) for each in (before, after)]
-    if abs(lag.seconds) < SURE_SIGMAS * lag.sigma_s or fits[1] > FALLS * fits[0]:
+    harmful = _shift(result, lag) > HARMFUL
+    if abs(lag.seconds) < SURE_SIGMAS * lag.sigma_s or fits[1] > (1.0 if harmful else FALLS) * fits[0]:
         return result, ()
     old, new = (f"{np.degrees(each.rms()[0]):.2g}° and {each.rms()[1]:.3g} mm" for each in (before, after))
     if given.timed is not None:
@@ -128,19 +129,30 @@ def lag_tried(
         )
     if not any(isinstance(note, SizeDoubt) for note in after.notes):
         result = replace(result, notes=tuple(note for note in result.notes if not isinstance(note, SizeDoubt)))
-    return result, (Grave(said) if _shift(result, lag) > HARMFUL else said,)
+    return result, (Grave(said) if harmful else said,)
 
 
-def _by_order(pairs: HandEyePoses) -> Timed | None:
-    """Returns the robot's poses as a stream of equal steps, where they follow one another smoothly; else None."""
+def _moving(given: HandEyeInput) -> Timed | None:
+    """Returns the robot's poses as a stream that tells its velocities at the images, by times or by the order of the
+    rows; None where neither does.
+
+    Where there is about one sample for each image, the poses must follow one another smoothly.
+    """
+    pairs, timed = given.pairs, given.timed
+    if timed is not None and not _close(timed):
+        return None
+    if timed is not None and timed.stream.spacing_s() < float(np.median(np.diff(np.sort(timed.seconds)))) / 2:
+        return timed
     if len(pairs) < LEAST_ROWS:
         return None
-    seconds = ROW_S * np.arange(len(pairs))
-    stream = Stream(seconds, pairs.base_from_flange, Decimal(0), pairs.where)
-    steps = pairs.base_from_flange[1:].difference(pairs.base_from_flange[:-1]).reshape(-1, 2, 3)
+    if timed is None:
+        seconds = ROW_S * np.arange(len(pairs))
+        timed = Timed(Stream(seconds, pairs.base_from_flange, Decimal(0), pairs.where), seconds)
+    poses = timed.stream.base_from_flange
+    steps = poses[1:].difference(poses[:-1]).reshape(-1, 2, 3)
     steps_rms = np.sqrt((steps**2).sum(2).mean(0))
-    smooth = all(own < SMOOTH * step for own, step in zip(stream.rest(), steps_rms, strict=True))
-    return Timed(stream, seconds) if smooth else None
+    smooth = all(own < SMOOTH * step for own, step in zip(timed.stream.rest(), steps_rms, strict=True))
+    return timed if smooth else None
 
 
 def _close(timed: Timed) -> bool:

@@ -1,0 +1,1 @@
+"""Measuring edges by the areas of pixels."""

@@ -1,0 +1,226 @@
+"""Lines between the cells of tags, by the areas in each pixel: their scatter shows how far sampling displaces edges."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from stcal.boards.area.step import PIXEL_VARIANCE, Displacement, integrated_step, of_sampling
+
+CLEAR_BLURS = 2.5
+"""Distance from other lines, in σ of blur and pixel, from which on pixels are used."""
+END_BLURS = 1.5
+"""Distance from the ends of a cell's side, in the same, from which on pixels are used. Past its end the contrast of the
+side changes, but not its place."""
+LEAST_BLURS, MOST_BLURS = 1.5, 4.0
+"""Least and largest reach of pixels to either side of a line, in σ of blur and pixel."""
+FARTHEST_PX = 0.1
+"""Largest distance of a line from the tag's grid. Cells of a tag that is drawn or printed in dots are not all of one
+size; their lines are farther away."""
+MOST_PX = 0.04
+"""Largest displacement by sampling that is believed; lines of a tag that scatter by more show its print."""
+STEPS = 2
+UNKNOWNS = 4
+"""Of the lines in one direction: their middle, their spacing, its change, and the spread of black."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OuterLines:
+    """What was measured of the outer edges of n tags, from each corner to the next.
+
+    ``corners_px`` : (n, 4, 2); ``blur`` : (n,) variance, px²; ``dark``, ``rise`` : (n,) grey values; ``noise`` : (n,)
+    variance of pixels; ``variance`` : (n, 4) of the edges' offsets; ``by_sampling`` : (n, 4, 2) their derivatives by
+    the harmonics of sampling.
+    """
+
+    corners_px: np.ndarray
+    blur: np.ndarray
+    dark: np.ndarray
+    rise: np.ndarray
+    noise: np.ndarray
+    variance: np.ndarray
+    by_sampling: np.ndarray
+
+
+def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> Displacement:
+    """Return what lines between cells say about the displacement of edges by sampling.
+
+    The lines of a tag are evenly spaced, but for perspective and lens. Their scatter about that, beyond noise, is what
+    displaces each line for itself.
+    """
+    image_from_grid = _homographies(outer.corners_px) @ np.diag([1 / cells, 1 / cells, 1.0])
+    bright = _bright(grey, image_from_grid, outer, cells)
+    pieces = _pieces(image_from_grid, bright, cells)
+    lines = _offsets(grey, pieces, outer, cells)
+    return _scatter(lines, outer, cells)
+
+
+def _homographies(corners: np.ndarray) -> np.ndarray:
+    """Return the homographies (n, 3, 3) of the unit square to four corners (n, 4, 2) in cyclic order."""
+    p0, p1, p2, p3 = np.moveaxis(corners, 1, 0)
+    pair = np.stack([p1 - p2, p3 - p2], axis=-1)
+    g, h = np.linalg.solve(pair, (p0 - p1 + p2 - p3)[..., None])[..., 0].T
+    columns = [p1 - p0 + g[:, None] * p1, p3 - p0 + h[:, None] * p3, p0]
+    last = np.stack([g, h, np.ones_like(g)], axis=-1)
+    return np.concatenate([np.stack(columns, axis=-1), last[:, None]], axis=1)
+
+
+def _mapped(homography: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Return the points (..., 2) through homographies (..., 3, 3)."""
+    there = np.einsum("...ij,...j->...i", homography[..., :2], xy) + homography[..., 2]
+    return there[..., :2] / there[..., 2:]
+
+
+def _bright(grey: np.ndarray, image_from_grid: np.ndarray, outer: OuterLines, cells: int) -> np.ndarray:
+    """Return the cells (n, row, column) that are bright in their middle."""
+    middle = np.stack(np.meshgrid(np.arange(cells) + 0.5, np.arange(cells) + 0.5), axis=-1).reshape(-1, 2)
+    xy = _mapped(image_from_grid[:, None], middle).astype(np.float32)
+    level = cv2.remap(grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR).astype(float)
+    return (level > (outer.dark + outer.rise / 2)[:, None]).reshape(-1, cells, cells)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pieces:
+    """Sides of cells between dark and bright: ``tag``, ``axis`` (0 : lines of one x), ``line`` and ``sign`` (s,), +1
+    where the next cell is bright; ``start``, ``end`` (s, 2), px; ``normal`` (s, 2) towards the next cell; ``cell`` (s,)
+    the distance to the next line, px."""
+
+    tag: np.ndarray
+    axis: np.ndarray
+    line: np.ndarray
+    sign: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+    normal: np.ndarray
+    cell: np.ndarray
+
+
+def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pieces:
+    """Return the sides between cells of different colours."""
+    found = []
+    for axis in (0, 1):
+        colour = np.swapaxes(bright, 1, 2) if axis == 0 else bright  # (n, line, along)
+        change = colour[:, 1:].astype(int) - colour[:, :-1]
+        tag, line, along = np.nonzero(change)
+        line = line + 1
+        corner = np.stack([line, along] if axis == 0 else [along, line], axis=-1).astype(float)
+        step, across = (np.eye(2)[1], np.eye(2)[0]) if axis == 0 else (np.eye(2)[0], np.eye(2)[1])
+        start, end, before, after = (
+            _mapped(image_from_grid[tag], corner + move) for move in (0 * step, step, -across, across)
+        )
+        direction = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
+        normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
+        normal *= np.sign(((after - before) * normal).sum(1))[:, None]
+        widths = [np.abs(((there - start) * normal).sum(1)) for there in (before, after)]
+        sign = change[change != 0].astype(float)
+        found.append((tag, np.full(len(tag), axis), line, sign, start, end, normal, np.minimum(*widths)))
+    return _Pieces(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Offsets:
+    """Offsets of lines from the grid, px: ``offset``, ``variance`` (n, 2, lines, 2), of both signs apart, and
+    ``by_sampling`` (n, 2, lines, 2, 2); NaN where a line is not seen."""
+
+    offset: np.ndarray
+    variance: np.ndarray
+    by_sampling: np.ndarray
+
+
+def _offsets(grey: np.ndarray, pieces: _Pieces, outer: OuterLines, cells: int) -> _Offsets:
+    """Return the offsets of the lines between cells, with those of the outer edges, which the grid has."""
+    n = len(outer.blur)
+    shape = (n, 2, cells + 1, 2)
+    group = np.ravel_multi_index((pieces.tag, pieces.axis, pieces.line, (pieces.sign > 0).astype(int)), shape)
+    level, distance, used, rise = _pixels(grey, pieces, np.sqrt(outer.blur + PIXEL_VARIANCE))
+    blur, sign = outer.blur[pieces.tag], pieces.sign[:, None, None]
+    value = np.zeros((n * 4 * (cells + 1), 3))  # shift, dark, rise
+    value[:, 1], value[:, 2] = (np.repeat(part, 4 * (cells + 1)) for part in (outer.dark, outer.rise))
+    inverse, pull = np.zeros((len(value), 3, 3)), np.zeros((len(value), 3, 2))
+    for _ in range(STEPS):
+        own = value[group][:, :, None, None]
+        away = distance - own[:, 0]
+        step, slope = integrated_step(sign * away, pieces.normal, blur)[:2]
+        design = np.stack([-own[:, 2] * sign * slope, np.ones_like(step), step], axis=-1)
+        residual = level - own[:, 1] - own[:, 2] * step
+        sampling = of_sampling(-away / rise[:, None, None], design[..., 0])
+        rows = np.einsum(
+            "spa,spai,spaj->sij", used, design, np.concatenate([design, sampling, residual[..., None]], -1)
+        )
+        total = np.zeros((len(value), 3, 6))
+        np.add.at(total, group, rows)
+        seen = total[:, 1, 1] > 0
+        inverse = np.where(seen[:, None, None], np.linalg.inv(total[..., :3] + 1e-9 * np.eye(3)), np.nan)
+        value += (inverse @ total[..., 5:])[..., 0]
+        pull = inverse @ total[..., 3:5]
+    offset = value[:, 0].reshape(shape)
+    variance = inverse[:, 0, 0].reshape(shape) * outer.noise[:, None, None, None]
+    by_sampling = pull[:, 0].reshape(*shape, 2)
+    offset[~(np.abs(offset) < FARTHEST_PX)] = np.nan
+    for edge, axis, line, sign in ((0, 1, 0, 0), (1, 0, -1, 1), (2, 1, -1, 1), (3, 0, 0, 0)):
+        offset[:, axis, line, sign] = 0.0
+        variance[:, axis, line, sign] = outer.variance[:, edge]
+        by_sampling[:, axis, line, sign] = outer.by_sampling[:, edge]
+    return _Offsets(offset, variance, by_sampling)
+
+
+def _pixels(grey: np.ndarray, pieces: _Pieces, sigma: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return level, distance from the line and use (s, p, a) of the pixels about sides of cells, in p rows or columns
+    across the line, and the change of the distance (s,) from one pixel to the next."""
+    each, sigma = np.arange(len(pieces.tag)), sigma[pieces.tag]
+    along = pieces.end - pieces.start
+    length = np.linalg.norm(along, axis=1)
+    major = np.abs(along).argmax(1)
+    direction = along / np.maximum(length, 1e-9)[:, None]
+    ends = np.sort(np.stack([pieces.start[each, major], pieces.end[each, major]]), axis=0)
+    first, last = np.ceil(ends[0]), np.floor(ends[1])
+    reach = np.minimum(pieces.cell - CLEAR_BLURS * sigma, MOST_BLURS * sigma)
+    most = int(max(np.max(last - first, initial=0.0), 0.0)) + 1
+    half = int(np.ceil(np.max(reach, initial=1.0) * np.sqrt(2)))
+    column = first[:, None] + np.arange(most)
+    slope = along[each, 1 - major] / along[each, major]
+    middle = np.rint(pieces.start[each, 1 - major, None] + slope[:, None] * (column - pieces.start[each, major, None]))
+    across = middle[..., None] + np.arange(-half, half + 1)
+    by_column = (major == 0)[:, None, None]
+    x, y = np.where(by_column, column[..., None], across), np.where(by_column, across, column[..., None])
+    height, width = grey.shape
+    level = grey[y.clip(0, height - 1).astype(int), x.clip(0, width - 1).astype(int)].astype(float)
+    off = np.stack([x, y], axis=-1) - pieces.start[:, None, None]
+    place, distance = (np.einsum("spai,si->spa", off, axis) for axis in (direction, pieces.normal))
+    used = (np.abs(distance) <= reach[:, None, None]) & (column <= last[:, None])[..., None]
+    used &= np.abs(place - length[:, None, None] / 2) <= (length / 2 - END_BLURS * sigma)[:, None, None]
+    used &= (reach > LEAST_BLURS * sigma)[:, None, None] & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    return level, distance, used.astype(float), pieces.normal[each, 1 - major]
+
+
+def _scatter(lines: _Offsets, outer: OuterLines, cells: int) -> Displacement:
+    """Return what the scatter of evenly spaced lines says, for each tag and direction."""
+    n = len(outer.blur)
+    place = 2 * np.arange(cells + 1) / cells - 1
+    design = np.stack([np.ones_like(place), place, place**2], axis=-1)
+    design = np.repeat(design[:, None], 2, axis=1)
+    design = np.concatenate([design, np.broadcast_to([[[-1.0], [1.0]]], (cells + 1, 2, 1))], axis=2).reshape(
+        -1, UNKNOWNS
+    )
+    k = len(design)
+    offset, variance = lines.offset.reshape(2 * n, k), lines.variance.reshape(2 * n, k)
+    pull = np.nan_to_num(lines.by_sampling.reshape(2 * n, k, 2))
+    there = np.isfinite(offset) & np.isfinite(variance) & (variance > 0)
+    weight = np.where(there, 1 / np.where(there, variance, 1.0), 0.0)
+    root = np.sqrt(weight)
+    offset = np.where(there, offset, 0.0)
+    # Residuals over their σ, and the matrix that makes them of errors.
+    basis = root[..., None] * design
+    made = np.eye(k) - basis @ np.linalg.pinv(basis, rcond=1e-6)
+    made = made * there[:, None, :] * there[:, :, None]
+    left = np.einsum("gij,gj->gi", made, root * offset)
+    same = np.equal.outer(np.arange(k) // 2, np.arange(k) // 2)
+    shared = (pull @ np.swapaxes(pull, 1, 2)) * same * root[:, :, None] * root[:, None]
+    freedom = np.einsum("gii->g", made)
+    by_displacement = np.einsum("gij,gjk,gik->g", made, shared, made)
+    good = (freedom > 0.5) & (by_displacement > 1e-9)
+    by_displacement = np.where(good, by_displacement, 1.0)
+    square = ((left**2).sum(1) - freedom) / by_displacement
+    good &= square < MOST_PX**2 + 3 * np.sqrt(2 * freedom.clip(1)) / by_displacement
+    square[~good] = np.nan
+    return Displacement(square, freedom / by_displacement, np.maximum(freedom, 0.0))
