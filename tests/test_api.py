@@ -157,6 +157,7 @@ ROW = DHRow(100.0, 0.0, 0.0, 0.0)
         (lambda: replace(FACE, x=FACE.y, y=FACE.x), "E-TARGET-FRAME … clockwise"),
         (lambda: replace(FACE, radius_mm=5 * FACE.radius_mm), "E-TARGET-OVERLAP … face 1"),
         (lambda: replace(FACE, radius_mm=0 * FACE.radius_mm), "E-TARGET-RADIUS … 0 mm"),
+        (lambda: replace(FACE, radius_mm=-FACE.radius_mm), "E-TARGET-RADIUS … -"),
         (lambda: replace(reference_board(), polarity="black"), "E-OPTION-VALUE … 'black'"),
         (lambda: replace(reference_board(), radius_mm=15.0), "E-BOARD-RADIUS … 15 mm … 30 mm"),
         (lambda: replace(reference_board(), pitch_mm=0.03, radius_mm=0.01), "E-LENGTH-UNIT … 0.03 mm"),
