@@ -1,1 +1,1 @@
-"""Measuring edges by the areas of pixels."""
+"""Edges by the dark and bright areas of pixels: the profile of a step, and how sampling displaces lines."""
