@@ -21,7 +21,7 @@ MOST_PX = 0.04
 """Largest displacement by sampling that is believed; lines of a tag that scatter by more show its print."""
 STEPS = 2
 UNKNOWNS = 4
-"""The lines in one direction: their middle, their spacing, its change, and the spread of black."""
+"""Number of unknowns of the lines in one direction: middle, spacing, its change, and the spread of black."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
