@@ -1,6 +1,6 @@
 """Detection of the boards and tags on the faces of a body, all of one image together."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +10,16 @@ from stcal.boards.charuco import find_charuco
 from stcal.boards.chessboard import find_chessboard, why_no_chessboard
 from stcal.boards.design import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
 from stcal.boards.edges import ALONG, POINTS
-from stcal.boards.tags import find_tags, view_of_tags
+from stcal.boards.tags import find_tags, other_dictionaries, view_of_tags
+from stcal.boards.target import tags_on
+from stcal.design import FaceDesign
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
+from stcal.io.images import ImageFile, decode, grey_of
 from stcal.labels import BOARD
 
+LOOKED_AT = 5
+"""Number of images in which other tags are looked for."""
 LEAST_COSINE = float(np.cos(np.radians(70)))
 """Cosine of the tilt beyond which the corners of a tag are left out, as its edges meet at sharp angles: drawn tags had
 errors of 0.06 px RMS up to 70°, and of 0.27 to 0.45 px, 1.8 px at most, beyond."""
@@ -98,3 +103,25 @@ def shift_by_curves(corners_px: np.ndarray, camera: Camera) -> np.ndarray:
     normal = np.linalg.eigh(np.swapaxes(away, 2, 3) @ away)[1][..., 0]
     lines, offsets = (np.stack([np.roll(each, 1, axis=1), each], axis=2) for each in (normal, (normal * middle).sum(2)))
     return np.linalg.solve(lines, offsets[..., None])[..., 0] - corners_px
+
+
+def why_unseen(files: Sequence[ImageFile], faces: Sequence[FaceDesign]) -> str:
+    """Return why none of the images shows one of the printed faces.
+
+    Tags of other ids and of other dictionaries are looked for in the first images.
+    """
+    own = {tag for face in faces for tag in tags_on(face.printed)}
+    known = sorted({dictionary for dictionary, _ in own})
+    reason = f"no printed face of the target is seen in {len(files)} images"
+    for file in files[:LOOKED_AT] if known else ():
+        grey = grey_of(decode(file.read(), file.name), file.name)
+        read = find_tags(grey, known).tags
+        names = ", ".join(str(tag) for _, tag in read[:5])
+        if own.intersection(read):
+            return f"{reason}: {file.name} shows tags {names}, too small or too steep; go nearer, or turn the target"
+        if read:
+            return f"{reason}, and {file.name} shows tags {names} of its dictionaries; correct the ids in target.toml"
+        if others := other_dictionaries(grey, known):
+            name, count = others[0]
+            return f"{reason}, and {file.name} shows {count} tags of {name}; correct the dictionary in target.toml"
+    return f"{reason}; look at overlays (`stcal-sfm detect`), and check dictionary, ids and the exposure"

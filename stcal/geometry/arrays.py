@@ -48,7 +48,7 @@ def _brief(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"<array {'×'.join(map(str, value.shape))}>" if value.size > 1 else str(value)
     if isinstance(value, dict | list | tuple | set | frozenset):
-        return f"<{len(value)}>" if value else "<0>"
+        return f"<{len(value)}>"
     text = repr(value)
     return text if len(text) <= LONGEST else f"<{type(value).__name__}>"
 

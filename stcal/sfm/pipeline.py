@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from stcal.boards.design import CornerBoard
+from stcal.boards.faces import why_unseen
 from stcal.boards.file import run_board_of as board_of
-from stcal.boards.tags import find_tags, other_dictionaries
-from stcal.boards.target import body_of, tags_on
+from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference, with_drawn_size
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
 from stcal.geometry.camera import Camera
@@ -24,8 +24,6 @@ from stcal.io.images import (
     ImageFile,
     ImageFiles,
     chosen_images,
-    decode,
-    grey_of,
     mosaic_of,
     require_common_size,
 )
@@ -59,14 +57,13 @@ from stcal.sfm.runs.transaction import MarkerFile, RunFolder, frames_folder, req
 IN_MEMORY = "images in memory"
 """What a run's folder states as the folder of its images where there is none."""
 PHOTOGRAPHS = "the photographs"
-LOOKED_AT = 5
-"""Number of images in which other tags are looked for."""
+"""Where a camera that was found is from, for messages."""
 FOUND_BY_DOTS = "no --camera: found by the dots of the board, f {:.0f} px"
 ASSUMED = (
     "no --camera, and no board of dots that tells one: a lens without distortion is assumed, and centres are good "
     "for a look, not for measuring"
 )
-"""Where a camera that was found is from, for messages."""
+"""What `detect` says of the camera where none is given."""
 Images = str | Path | Mapping[str, Sequence[np.ndarray]]
 """A folder of images, or grey or RGB arrays by the name of their group."""
 OwnCheck = Callable[[RunResult], Check]
@@ -243,6 +240,8 @@ def _calibrated(
         if model is None or (board.rows and is_rough(model, options)):
             model = _camera_of_dots(files, model, folder, target, board, options, progress)
         detection, labelled = labelled_images(files, model, folder, target, board, options, progress)
+    if not (options.board_only or any(image.observations.face_ids() for image in labelled)):
+        _require_seen(files, labelled, target)
     with overlays_beside(detection, labelled, target, folder, progress):
         if is_board_assumed and not options.board_only and not _shows_dots(labelled):
             target = with_drawn_size(target, [image.observations.labels for image in labelled])
@@ -262,8 +261,7 @@ def _with_found_camera(
     printed = target.with_faces(printed=True)
     guesses = guessed_cameras(files[0])
     detection, labelled = _labelled(files, model_of(guesses[0], PHOTOGRAPHS), folder, printed, None, options, progress)
-    if unseen := why_unseen(files[0], labelled, target):
-        raise DetectionError("E-TARGET-UNSEEN", unseen)
+    _require_seen(files, labelled, target)
     observations = [image.observations for image in labelled]
     found = place_and_find_camera(observations, printed.faces, guesses).camera
     model = model_of(found, PHOTOGRAPHS)
@@ -308,6 +306,26 @@ def _camera_of_dots(
     detection, _ = _labelled(files, model_of(start, PHOTOGRAPHS), folder, target, board, options, told)
     found = camera_of_dots(files[0], detection, board, start, LENS).camera
     return model_of(unknown_lens(found), PHOTOGRAPHS)
+
+
+def _require_seen(files: ImageFiles, labelled: Sequence[LabelledImage], target: TargetDesign) -> None:
+    """Refuses images in which no printed face of the target is seen, and names the tags that are.
+
+    Raises
+    ------
+    DetectionError
+        No image shows one, and the target has some.
+    """
+    if unseen := _why_unseen(files, labelled, target):
+        raise DetectionError("E-TARGET-UNSEEN", unseen)
+
+
+def _why_unseen(files: ImageFiles, labelled: Sequence[LabelledImage], target: TargetDesign) -> str:
+    printed = target.with_faces(printed=True).faces
+    ids = {face.id for face in printed}
+    if not printed or any(ids.intersection(image.observations.face_ids()) for image in labelled):
+        return ""
+    return why_unseen(files[0], printed)
 
 
 def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
@@ -526,32 +544,10 @@ def detect(
         if target.with_faces(printed=False).faces:
             notes.append(FOUND_BY_DOTS.format(camera.focal[0]) if told else ASSUMED)
     detection, labelled = labelled_images(files, camera, folder, target, board, options, progress)
-    if unseen := why_unseen(files[0], labelled, target):
+    if unseen := _why_unseen(files, labelled, target):
         notes.append(unseen)
     with overlays_beside(detection, labelled, target, folder, progress):
         return detection, labelled, notes
-
-
-def why_unseen(files: Sequence[ImageFile], labelled: Sequence[LabelledImage], target: TargetDesign) -> str:
-    """Returns why no image shows a corner of the target's printed faces; empty if one does, or there are no such faces.
-
-    Tags of other dictionaries are looked for in the first images.
-    """
-    faces = [face for face in target.faces if face.printed is not None]
-    ids = {face.id for face in faces}
-    if not faces or any(ids.intersection(image.observations.face_ids()) for image in labelled):
-        return ""
-    reason = f"no face of the target is seen in {len(labelled)} images"
-    known = sorted({dictionary for face in faces for dictionary, _ in tags_on(face.printed)})
-    for file in files[:LOOKED_AT] if known else ():
-        grey = grey_of(decode(file.read(), file.name), file.name)
-        if read := find_tags(grey, known).tags:
-            names = ", ".join(str(tag) for _, tag in read[:5])
-            return f"{reason}, and {file.name} shows tags {names} of its dictionaries; correct the ids in target.toml"
-        if others := other_dictionaries(grey, known):
-            name, count = others[0]
-            return f"{reason}, and {file.name} shows {count} tags of {name}; correct the dictionary in target.toml"
-    return f"{reason}; look at overlays (`stcal-sfm detect`), and check dictionary, ids and the exposure"
 
 
 def labelled_images(
