@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from stcal.boards.area.step import PIXEL_VARIANCE, Displacement, integrated_step, of_sampling
+from stcal.geometry.plane import apply_homography, fit_homographies
 
 CLEAR_BLURS = 2.5
 """Distance from other lines, in σ of blur and pixel, from which on pixels are used."""
@@ -19,6 +20,8 @@ FARTHEST_PX = 0.1
 size; their lines are farther away."""
 MOST_PX = 0.04
 """Largest displacement by sampling that is believed; lines of a tag that scatter by more show its print."""
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+"""Corners of the unit square in cyclic order."""
 STEPS = 2
 UNKNOWNS = 4
 """Number of unknowns of the lines in one direction: middle, spacing, its change, and the spread of black."""
@@ -48,33 +51,18 @@ def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> Displaceme
     The lines of a tag are evenly spaced, but for perspective and lens. Their scatter about that, beyond noise, is what
     displaces each line for itself.
     """
-    image_from_grid = _homographies(outer.corners_px) @ np.diag([1 / cells, 1 / cells, 1.0])
+    square = np.broadcast_to(cells * SQUARE, outer.corners_px.shape)
+    image_from_grid = fit_homographies(square, outer.corners_px, np.ones(outer.corners_px.shape[:2], bool))
     bright = _bright(grey, image_from_grid, outer, cells)
     pieces = _pieces(image_from_grid, bright, cells)
     lines = _offsets(grey, pieces, outer, cells)
     return _scatter(lines, outer, cells)
 
 
-def _homographies(corners: np.ndarray) -> np.ndarray:
-    """Return the homographies (n, 3, 3) of the unit square to four corners (n, 4, 2) in cyclic order."""
-    p0, p1, p2, p3 = np.moveaxis(corners, 1, 0)
-    pair = np.stack([p1 - p2, p3 - p2], axis=-1)
-    g, h = np.linalg.solve(pair, (p0 - p1 + p2 - p3)[..., None])[..., 0].T
-    columns = [p1 - p0 + g[:, None] * p1, p3 - p0 + h[:, None] * p3, p0]
-    last = np.stack([g, h, np.ones_like(g)], axis=-1)
-    return np.concatenate([np.stack(columns, axis=-1), last[:, None]], axis=1)
-
-
-def _mapped(homography: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Return the points (..., 2) through homographies (..., 3, 3)."""
-    there = np.einsum("...ij,...j->...i", homography[..., :2], xy) + homography[..., 2]
-    return there[..., :2] / there[..., 2:]
-
-
 def _bright(grey: np.ndarray, image_from_grid: np.ndarray, outer: OuterLines, cells: int) -> np.ndarray:
     """Return the cells (n, row, column) that are bright in their middle."""
     middle = np.stack(np.meshgrid(np.arange(cells) + 0.5, np.arange(cells) + 0.5), axis=-1).reshape(-1, 2)
-    xy = _mapped(image_from_grid[:, None], middle).astype(np.float32)
+    xy = apply_homography(image_from_grid, middle).astype(np.float32)
     level = cv2.remap(grey, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR).astype(float)
     return (level > (outer.dark + outer.rise / 2)[:, None]).reshape(-1, cells, cells)
 
@@ -106,7 +94,8 @@ def _pieces(image_from_grid: np.ndarray, bright: np.ndarray, cells: int) -> _Pie
         corner = np.stack([line, along] if axis == 0 else [along, line], axis=-1).astype(float)
         step, across = (np.eye(2)[1], np.eye(2)[0]) if axis == 0 else (np.eye(2)[0], np.eye(2)[1])
         start, end, before, after = (
-            _mapped(image_from_grid[tag], corner + move) for move in (0 * step, step, -across, across)
+            apply_homography(image_from_grid[tag], (corner + move)[:, None])[:, 0]
+            for move in (0 * step, step, -across, across)
         )
         direction = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
         normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
