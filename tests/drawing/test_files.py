@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stcal.boards.cells import outlines
-from stcal.boards.design import AprilGridDesign, ChessboardDesign
+from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign
 from stcal.design import reference_board, reference_target
 from stcal.drawing.dimensions import framed
 from stcal.drawing.draw import SUFFIXES, draw
@@ -164,6 +164,13 @@ def test_parts_on_one_sheet_stand_in_rows():
 def test_the_side_and_the_step_of_an_aprilgrids_tags_are_said():
     (part,) = board_parts(AprilGridDesign(3, 4, 20.0, 0.3, 2), 10.0)
     assert {words for *_, words in part.spans} == {"20, step 26"}
+
+
+def test_the_lengths_to_check_of_a_charuco_board_are_said():
+    """Between the outermost inner corners: of 9 × 6 squares of 12 mm 7 × 4."""
+    (part,) = board_parts(CharucoDesign(6, 9, 12.0, 9.0, "DICT_4X4_50"), 10.0)
+    lengths = {words: high - low for _, low, high, words in part.spans}
+    assert lengths == {"7 × 12 = 84": 84.0, "4 × 12 = 48": 48.0}
 
 
 def test_the_outer_dimensions_of_a_part_are_said():

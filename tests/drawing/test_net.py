@@ -61,6 +61,21 @@ def test_a_box_is_one_net(target):
     np.testing.assert_allclose(lengths, sorted([SIZE[0]] * 2 + [SIZE[2]] * 2 + [SIZE[1]] * 4), atol=1e-9)
 
 
+def test_words_of_tabs_stand_on_them(target):
+    three = replace(target, faces=tuple(face for face in target.faces if face.id in ("front", "right", "top")))
+    turned = set()
+    for (part,) in (net_parts(target), net_parts(three)):
+        tabs = [line.points for line in part.lines if line.layer == "CUT" and len(line.points) == 4]
+        for word in (s for s in part.shapes if isinstance(s, Text) and s.words.startswith("under ")):
+            turned.add(word.turned)
+            across = word.height / 2
+            middle = np.array([word.x - across, word.y] if word.turned else [word.x, word.y + across])
+            (tab,) = (tab for tab in tabs if np.linalg.norm(tab.mean(0) - middle) < 0.1)
+            along = np.abs(tab[3] - tab[0])
+            assert (along[1] > along[0]) == word.turned
+    assert turned == {True, False}
+
+
 def test_plates_meet_in_the_net_as_they_do_in_space(target):
     """Folded circles' distances across an edge: at a fold both plates have the same corners."""
     (part,) = net_parts(target)

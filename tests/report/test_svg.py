@@ -14,6 +14,11 @@ def written(drawing: Drawing) -> ElementTree.Element:
     return ElementTree.fromstring(base64.b64decode(drawing.uri().partition(",")[2]))
 
 
+def test_a_drawing_is_as_large_as_asked():
+    root = written(Drawing(5, 4))
+    assert root.get("viewBox") == "0 0 360 288"  # pt
+
+
 @pytest.mark.parametrize("name", ["$x^{", "面", "_$\\frac", "<a & 'b'>", "\x07bell", "\udcff.jpg"])
 def test_any_name_can_be_written(name):
     drawing = Drawing(1, 1)

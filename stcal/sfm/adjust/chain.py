@@ -140,7 +140,10 @@ def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -
 
 
 def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
-    """Returns the simple ways from one face to another as (faces, groups), the shortest first."""
+    """Returns the simple ways from one face to another as (faces, groups), the shortest first.
+
+    None has more than one face more than the shortest.
+    """
     by_group: dict[str, list[str]] = {}
     for face in faces:
         by_group.setdefault(face.group, []).append(face.face)
@@ -151,9 +154,8 @@ def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
             if len(complete) == MAX_CHAINS:
                 break
             continue
-        if complete and len(way) > len(complete[0][0]):
-            break
-        if len(way) <= max(MAX_CHAIN_STEPS, len(by_group)):
+        longest = len(complete[0][0]) if complete else max(MAX_CHAIN_STEPS, len(by_group))
+        if len(way) <= longest:
             queue += [
                 ((*way, face_id), (*groups, group))
                 for group, members in by_group.items()

@@ -71,6 +71,17 @@ def test_the_share_of_the_image(truth):
     assert found.counts[-20:].max() == 0
 
 
+def test_cells_are_where_the_image_is(truth):
+    """A cell counts where its middle is covered: of five cells along each side, where the border is at 4.6, those at
+    4.5 cells count."""
+    camera = truth.views.camera
+    cell = max(camera.width, camera.height) / 60
+    end = 4.6 * cell - 0.5  # pixel centres are integers
+    counts = image_coverage(views_of(camera, [(-0.5, -0.5), (end, -0.5), (end, end), (-0.5, end)])).counts
+    assert counts[:5, :5].min() == 1
+    assert counts.sum() == 25
+
+
 def test_corners_on_a_line_cover_nothing(truth):
     line = [(x, 10) for x in range(10, 60, 10)]
     assert image_coverage(views_of(truth.views.camera, line)).share == 0

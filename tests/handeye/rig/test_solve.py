@@ -13,6 +13,7 @@ from stcal.handeye.data.pairs import Loop
 from stcal.handeye.methods.bundle import RigBundle, RigCorners
 from stcal.handeye.methods.reprojection import board_of, problem
 from stcal.handeye.rig.solve import alone, of_places
+from stcal.handeye.rig.validate import ERRORS, CameraHeldOut
 from stcal.io.cameras.model import camera_prior
 from tests.handeye.derivatives import assert_derivatives
 from tests.outcome import fails_with
@@ -243,3 +244,36 @@ def test_what_is_not_a_rig_is_refused():
         handeye_rig(truth.given, "eye-in-hand").camera("right")
     with fails_with("E-HANDEYE-FEW-POSES … camera left: 2 … 3"):
         handeye_rig(replace(truth.given, cameras=(camera[[0, 1]],)), "eye-in-hand")
+
+
+def test_a_cameras_gain_is_over_the_views_that_it_can_place_alone():
+    joint, by_itself = np.array([1.0, 2, 9]), np.array([2.0, 4, np.nan])
+    errors_of = dict.fromkeys(ERRORS, joint), dict.fromkeys(ERRORS, by_itself)
+    held_out = CameraHeldOut(np.zeros(3, int), np.arange(3), *errors_of)
+    assert held_out.gain() == pytest.approx(0.5)
+    none = {name: np.full(3, np.nan) for name in ERRORS}
+    held_out = CameraHeldOut(np.zeros(3, int), np.arange(3), errors_of[0], none)
+    assert held_out.gain() is None
+    assert held_out.means()["board_mm"] == pytest.approx(4.0)
+
+
+def moved(pose: Rigid, step: np.ndarray) -> Rigid:
+    return Rigid(Rigid.exp(step * [1, 1, 1, 0, 0, 0]).rotation @ pose.rotation, pose.translation + step[3:])
+
+
+def test_the_pose_between_two_cameras_has_the_σ_of_both():
+    """By central differences over both poses, perturbed from the left in the mount's frame."""
+    rng = np.random.default_rng(2)
+    x, y = (Rigid.exp([*rng.normal(0, 1, 3), *rng.normal(0, 300, 3)]) for _ in range(2))
+    truth = simulated_rig(rng, 12, "eye-in-hand", 2, ROBOT, PX, BOARD, 0.8)
+    rig = handeye_rig(truth.given, truth.setup)
+    placed = tuple(replace(camera, mount_from_camera=pose) for camera, pose in zip(rig.cameras, (x, y), strict=True))
+    rig = replace(rig, cameras=placed)
+    jacobian = np.zeros((6, len(rig.covariance)))
+    for i, step in enumerate(1e-6 * np.eye(12)):  # rotation and translation apart
+        ends = [moved(x, sign * step[:6]).inverse() @ moved(y, sign * step[6:]) for sign in (1, -1)]
+        jacobian[:, i] = apart(*ends) / 2e-6
+    pose, covariance = rig.relative(*rig.names)
+    assert np.abs(apart(pose, x.inverse() @ y)).max() < 1e-9
+    expected = jacobian @ rig.covariance @ jacobian.T
+    np.testing.assert_allclose(covariance, expected, atol=1e-6 * np.abs(expected).max())

@@ -10,6 +10,7 @@ from stcal.sfm.adjust.chain import chain_faces, measure_chains
 from stcal.sfm.adjust.faces import FaceInGroup, face_frame
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust
+from stcal.sfm.adjust.uncertainty import Derivatives
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.outcome import fails_with
 
@@ -59,6 +60,17 @@ def test_a_missing_frame_circle_is_named():
         face_frame(FACE, circles(keep="12467abc"), "plane", np.array([0, 0, 1.0]))
 
 
+def test_covariances_of_circles_are_the_blocks_of_that_of_all():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(6, 6))
+    derivatives = Derivatives(
+        {}, np.zeros((2, 3)), Rigid(), {}, rng.normal(size=(2, 3, 6)), {}, rng.normal(size=(2, 3, 4)), 0.02
+    )
+    every = derivatives.all_circles_covariance(root @ root.T)
+    for i, own in enumerate(derivatives.circle_covariance(root @ root.T)):
+        np.testing.assert_allclose(own, every[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], rtol=1e-12)
+
+
 # Chains ---------------------------------------------------------------------------------------------------------
 
 TRUE = {
@@ -104,6 +116,22 @@ def test_two_ways_to_a_face_are_combined_and_their_disagreement_is_told():
     ways = measure_chains(faces, target)["3"]
     assert {way.groups for way in ways} == {("a", "c"), ("b", "d")}
     assert sum(way.translation_mm for way in ways) == pytest.approx(0.03, rel=0.2)
+
+
+def ways_by(pairs: dict[str, str]) -> dict[str, set[str]]:
+    """Groups of the ways to each face, by groups that show two faces each."""
+    faces = [in_group(g, f) for g, pair in pairs.items() for f in pair]
+    ways = measure_chains(faces, chain_faces(faces, TARGET, "1"))
+    return {face: {"".join(way.groups) for way in own} for face, own in ways.items()}
+
+
+def test_ways_have_at_most_one_face_more_than_the_shortest():
+    pairs = {"a": "12", "b": "14", "c": "24", "d": "23"}
+    expected = {"2": {"a", "bc"}, "3": {"ad", "bcd"}, "4": {"b", "ac"}}
+    assert ways_by(pairs) == expected
+    assert ways_by(dict(reversed(pairs.items()))) == expected  # whatever the order of the groups
+    pairs["e"] = "34"
+    assert ways_by(pairs) == {"2": {"a", "bc"}, "3": {"ad", "be", "bcd", "ace"}, "4": {"b", "ac"}}
 
 
 def test_a_better_fixed_face_weighs_more():

@@ -191,6 +191,8 @@ def test_sizes_are_three_lengths(size):
         ("[[-5, -5], [90, -5], [90, 90], [-5, 90]]", "E-TARGET-OUTLINE … outline_mm"),
         ("[[-50, -50], [-50, -50], [190, 190]]", "E-TARGET-OUTLINE"),
         ("[[-50, -50], [190, 190]]", "E-KEY-VALUE … outline_mm"),
+        ("[[300, -50], [400, -40], [390, 190], [290, 180]]", "E-TARGET-OUTLINE … outline_mm"),  # beside all circles
+        ("[[-400, -50], [-300, -40], [-310, 190], [-410, 180]]", "E-TARGET-OUTLINE … outline_mm"),
     ],
 )
 def test_outlines_that_do_not_fit_are_refused(tmp_path, outline, said):

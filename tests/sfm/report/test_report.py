@@ -13,7 +13,7 @@ from stcal.report.figure import round_below
 from stcal.report.page import environment
 from stcal.report.text import number
 from stcal.sfm.report.figures import FIRST_IMAGES, shown_overlays
-from stcal.sfm.report.page import report_html
+from stcal.sfm.report.page import _factor_in_words, report_html
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
 VOID = {"meta", "img", "br", "link", "hr", "input"}
@@ -246,6 +246,11 @@ def test_banner_only_where_eccentricity_is_off(joint, chained):
     assert 'role="alert"' not in joint
     assert 'role="alert"' in chained
     assert "biased along their normals by tens of µm; residuals do not show it" in Page(chained).text
+
+
+@pytest.mark.parametrize(("factor", "words"), [(0.95, "as large as"), (1.0, "as large as"), (0.9, "0.9 times")])
+def test_residuals_within_5_percent_are_as_large_as_stated(factor, words):
+    assert f"residuals are {words} the centres' own σ" in _factor_in_words(factor)
 
 
 def test_numbers_have_their_digits(joint):

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from stcal.io.images import same_photograph
+from stcal.io.images import ImageFile, same_photograph
+from stcal.sfm.detect.files import _same_pixels
 from tests.sfm.conftest import SMALL
 
 pytestmark = pytest.mark.usefixtures("no_page")
@@ -62,3 +63,13 @@ def test_png_and_jpeg_of_one_photograph_are_one_view(stcal_sfm, small_set):
     assert "skipped 12/IMG_1001.jpg: the same image as 12/IMG_1001.png, saved in another form" in out
     assert "skipped 12/IMG_1002 (copy).jpg: the same image as 12/IMG_1002.jpg" in out
     assert "skipped 12/Copy of IMG_1003.jpg: the same image as 12/IMG_1003.jpg" in out
+
+
+@pytest.mark.parametrize("content", [b"", b"not an image", None])
+def test_what_cannot_be_read_again_is_no_copy(tmp_path, content):
+    """A photograph that was there at its detection, and is spoiled or gone when its pixels are compared."""
+    kept, other = tmp_path / "a.png", tmp_path / "b.jpg"
+    cv2.imwrite(str(kept), np.zeros((40, 60), np.uint8))
+    if content is not None:
+        other.write_bytes(content)
+    assert not _same_pixels(ImageFile(kept, "a.png", ""), ImageFile(other, "b.jpg", ""))
