@@ -59,6 +59,7 @@ def test_a_smear_in_any_direction_is_less_sharp():
     assert sharpness(np.zeros((40, 40), np.uint8)) == 0
 
 
+@pytest.mark.slow
 def test_frames_are_sharp_and_apart():
     count, blurred = 40, set(range(0, 40, 3))
     numbers = [frame.number for frame in chosen_frames(iter(moving(count, blurred)), AUTO)]
@@ -80,6 +81,7 @@ def test_of_every_so_many_frames_the_sharpest_is_taken():
     assert [number // 5 for number in numbers] == [0, 1, 2, 3]
 
 
+@pytest.mark.slow
 def test_chosen_frames_are_written_and_listed_and_replace_earlier_ones(tmp_path):
     video = clip_of(moving(40), tmp_path / "clip.mp4")
     with pytest.warns(InputNote, match=r"clip.mp4: \d+ frames chosen.*rolling shutter"):

@@ -282,6 +282,7 @@ def test_widths_that_are_none_are_refused():
         tag_body("cube", "60", "4X4_50", 47)
 
 
+@pytest.mark.slow
 def test_tags_of_other_dictionaries_or_ids_are_named(tmp_path, stcal_sfm):
     scene = make_body_scene(tag_cube(60.0), body_camera(640), BodyOptions(images=2, distance_mm=300))
     write_body(tmp_path / "set", scene)

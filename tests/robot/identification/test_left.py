@@ -226,6 +226,7 @@ def test_sigma_of_base_and_tool_is_that_of_their_errors():
     assert np.mean(squares) == pytest.approx(1, abs=0.25)  # 480 numbers, of which those of one arm go together
 
 
+@pytest.mark.slow
 def test_what_is_not_seen_of_base_and_tool_has_no_sigma():
     data = simulated(11, 45)[1]
     position = identify(mh80(), data, replace(QUICK, observe="position"))

@@ -151,6 +151,7 @@ def test_two_mistakes_of_different_kinds_are_named():
         start(with_zero(mh80()), data)
 
 
+@pytest.mark.slow
 def test_reasons_that_explain_as_much_are_named_together():
     """Of an arm whose joint 1 is square to joint 2 half a turn of the one's zero is the opposite sign of the other."""
     robot = mh80()

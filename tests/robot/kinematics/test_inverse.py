@@ -184,6 +184,7 @@ def test_branches_are_within_limits_and_the_same_every_time():
     np.testing.assert_array_equal(first.q, second.q)
 
 
+@pytest.mark.slow
 def test_out_of_reach_is_named_with_what_remains():
     robot = ARMS["made"]
     q = joint_vectors(robot, 3, np.random.default_rng(6))

@@ -57,6 +57,7 @@ def case(tmp_path):
     return Case(tmp_path)
 
 
+@pytest.mark.slow
 def test_joint_values_command_what_the_nominal_robot_makes_of_them(case):
     targets = read_targets(case.write(JOINTS, case.joint_rows()), case.real)
     result = compensate(case.real, targets, case.nominal)
@@ -215,6 +216,7 @@ def test_far_moves_are_told_from_singular_ones(case):
     assert any(re.search(r"the nominal joint values err by \d+(\.\d+)? mm and", note) for note in told)
 
 
+@pytest.mark.slow
 def test_a_long_way_near_a_singularity_is_told(case):
     """Wrist bent by 2 mrad: errors of half of that turn its joints by several degrees."""
     q = np.array([[0.3, 0.4, -0.2, 0.5, 2e-3, 0.7]])

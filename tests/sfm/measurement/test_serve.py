@@ -329,6 +329,7 @@ def test_images_of_clients_that_left_are_not_measured(known):
         lines[0].close()
 
 
+@pytest.mark.slow
 def test_idle_connections_make_room(known):
     """Those that were never answered go first: a client that keeps its connection does not lose it."""
     with held(known) as (server, process):
