@@ -150,10 +150,12 @@ def test_calls_of_several_threads_leave_no_limit_behind(said):
     assert said[SEVERAL_THREADS] == ["1", CORES]
 
 
+@pytest.mark.slow
 def test_an_error_lifts_the_limit(said):
     assert said[ERROR] == [CORES]
 
 
+@pytest.mark.slow
 def test_nothing_is_left_behind(said):
     """By the first work of a process, in a thread of asyncio; by two threads at once; the main one; after an error."""
     assert said[NOTHING_LEFT] == ["answered"]
@@ -183,6 +185,7 @@ def in_a_pool() -> tuple[list, list[str]]:
     return found, [str(note.message) for note in noted]
 
 
+@pytest.mark.slow
 def test_workers_have_one_thread(said):
     assert said[WORKERS] == ["1", "1"]
 

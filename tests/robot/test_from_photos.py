@@ -108,6 +108,7 @@ def test_each_model_errs_less_than_the_one_before(swept):
     assert len(swept.data) == len(SWEEPS) + 29
 
 
+@pytest.mark.slow
 def test_rows_and_photographs_without_partner_are_named_with_their_number(swept):
     alone = [note for note in swept.notes if "no partner" in note]
     assert [note.split(" rows")[0] for note in alone] == ["1", "1"]
@@ -130,6 +131,7 @@ def test_the_sigma_at_the_targets_is_that_of_the_errors_there():
     assert 0.3 < np.mean(missed) < 2
 
 
+@pytest.mark.slow
 def test_targets_among_the_rows_are_known_as_these_are(cell, swept):
     here = swept.identified.predicted.here_mm
     assert 0.8 < np.median(swept.sigma_mm()) / np.median(here) < 1.25  # 0.97 to 1.06 of 20 arms

@@ -16,6 +16,7 @@ from tests.fuzzing.mutations import BY_SUFFIX
 from tests.fuzzing.pool import mistaken, went_through
 from tests.levels import sampled
 
+pytestmark = pytest.mark.slow
 SEED = int(os.environ.get("STCAL_SEED", "20"))
 """`scripts/full` draws another one each time."""
 CASES, PARTS = 360, 30
@@ -42,7 +43,6 @@ def shortest_first() -> list[tuple[int, str]]:
     return [(n, calls[n].command) for n in sorted(range(CASES), key=lambda n: calls[n].seconds)]
 
 
-@pytest.mark.slow
 def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, tmp_path):
     cases = shortest_first()
     first = {command: n for n, command in reversed(cases)}
@@ -55,7 +55,6 @@ def test_a_case_of_every_command_and_kind_of_file_is_judged(stock, tmp_path):
     assert len(found) < 2 * len(first)
 
 
-@pytest.mark.slow
 def test_the_cases_are_of_every_command_but_long_ones():
     left_out = set(COMMANDS) - {command for _, command in shortest_first()}
     assert [c.command for c in CALLS if c.command in left_out and c.seconds <= BRIEF_S] == []
@@ -77,7 +76,6 @@ QUICK = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_a_mistake_is_told(stock, tmp_path, name):
     assert name in MISTAKES

@@ -50,7 +50,6 @@ def test_no_four_circles_are_alike_in_two_readings(made):
             assert in_common(face, other, mirrored=True) == 0
 
 
-@pytest.mark.slow
 class Alike(TargetDesign):
     """Faces that look alike, which a design refuses."""
 
@@ -58,6 +57,7 @@ class Alike(TargetDesign):
         pass
 
 
+@pytest.mark.slow
 def test_likeness_is_found_where_there_is_some(made):
     """A face beside itself, turned and mirrored; and the cases of hidden circles fail."""
     face = made.pattern.target.faces[0]

@@ -38,6 +38,7 @@ def test_each_step_is_worth_something(compared, small_result):
         assert np.array_equal(pose.matrix(), compared.target.target_from_face[face].matrix())
 
 
+@pytest.mark.slow
 def test_the_comparison_is_in_the_report(compared):
     report = json.loads((compared.out / "report.json").read_text())
     assert report["comparison"]["with"] == "paper"
