@@ -202,6 +202,17 @@ def test_outlines_that_do_not_fit_are_refused(tmp_path, outline, said):
         load_target(tmp_path / "target.toml")
 
 
+@pytest.mark.parametrize("angle_deg", range(0, 180, 20))
+def test_outlines_at_any_angle_are_taken(tmp_path, angle_deg):
+    design = second_design()[0]
+    middle, reach = design.faces[0].xy_mm.mean(0), np.ptp(design.faces[0].xy_mm, axis=0).max()
+    angles = np.radians(angle_deg) + np.pi * np.array([0.1, 0.8, 1.2, 1.7])  # no two sides are parallel
+    corners = middle + 3 * reach * np.column_stack([np.cos(angles), np.sin(angles)])
+    text = target_toml(design).replace("circles = [", f"outline_mm = {corners.tolist()}\ncircles = [", 1)
+    (tmp_path / "target.toml").write_text(text)
+    np.testing.assert_allclose(load_target(tmp_path / "target.toml").faces[0].outline_mm, corners)
+
+
 @pytest.mark.slow
 def test_the_command_keeps_a_board_and_replaces_nothing(tmp_path, capsys):
     (tmp_path / "board.toml").write_text('rows = 5\ncolumns = 6\npitch_mm = 40\nradius_mm = 10\npolarity = "dark"\n')
