@@ -200,6 +200,8 @@ def test_a_face_that_was_read_and_left_out_and_a_lost_group_call_for_care():
     told = judgement_of(own)
     assert (told.verdict, told.missing) == ("with care", ["group 25"])
     assert told.use.endswith("; group 25 was left out whole.")
+    own["checks"][0] = check("a", "suspicious")
+    assert judgement_of(own).use.count("With care: ") == 1
 
 
 def test_a_face_of_one_image_is_in_the_sentence():
