@@ -65,13 +65,13 @@ class Declared:
     reads_images: bool
 
 
-def declared(parameter: str, annotation: Any, in_panel: bool = True) -> Declared:
-    """Returns Typer's form of a parameter. ``in_panel`` : whether its panel of the help text follows from its kind."""
+def declared(parameter: str, annotation: Any) -> Declared:
+    """Returns Typer's form of a parameter."""
     kind, text, *rest = get_args(annotation)
     [given] = rest or [Opt()]
     info = given.info(parameter, text)
     is_path = "Path" in str(kind)
-    info.rich_help_panel = panel_of(parameter, is_path, given.writes) if in_panel else None
+    info.rich_help_panel = panel_of(parameter, is_path, given.writes)
     # With Annotated, Typer takes an option's first name for its default.
     word = info.default if isinstance(given, Opt) else parameter
     of_images = is_path and (parameter in ("images", "exposures") or "IMAGES" in (given.metavar or ""))

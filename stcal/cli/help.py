@@ -18,7 +18,7 @@ PLAIN: dict[str, Any] = {
 PANELS = {
     "Input": ("setup", "dry_run"),
     "Method": (),
-    "Output": ("out", "strict"),
+    "Output": ("out", "strict", "overwrite", "quiet", "verbose"),
     "Performance": ("workers", "scheduler", "send_images"),
     "Input in other forms": (
         *(
@@ -32,6 +32,8 @@ PANELS = {
             "columns",
             "columns_a",
             "undo_flips",
+            "camera_name",
+            "bayer",
         ),
     ),
     "Noise": (
@@ -49,8 +51,7 @@ PANELS = {
     ),
 }
 """Panels of the help text in their order, each with the names of its parameters. All other parameters are in Input if
-they are paths to read, in Output if they are paths to write, and else in Method. Options of all commands, such as
-``--quiet`` and ``--help``, are added without a panel and shown in Output."""
+they are paths to read, in Output if they are paths to write, and else in Method. ``--help`` is shown in Output."""
 
 
 def panel_of(name: str, reads: bool, writes: bool) -> str:

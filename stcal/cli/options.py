@@ -314,7 +314,7 @@ def _protected(command: Callable) -> Callable:
     further |= {"quiet": (Quiet, False), "verbose": (Verbose, False)}
     every = [each.replace(annotation=parameters[name].annotation) for name, each in signature.parameters.items()]
     for name, (annotation, default) in further.items():
-        kind = declared(name, annotation, in_panel=False).annotation
+        kind = declared(name, annotation).annotation
         every.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind))
     # Typer reads both.
     checked.__signature__ = signature.replace(parameters=every)  # type: ignore[attr-defined]
