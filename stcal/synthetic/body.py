@@ -30,6 +30,8 @@ SAMPLES, LATTICE = 13, 8
 where it is, which a grid of points places in steps."""
 LIGHT = np.array([0.3, -0.5, -0.8])
 LEAST_FACES = 2
+LEAST_VIEWS = 2
+"""Number of photographs that show each face, as far as there are enough of them."""
 TRIALS = 2000
 
 
@@ -87,6 +89,8 @@ def body_camera(width: int) -> Camera:
 def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions) -> BodyScene:
     """Returns a body with faces near their rough poses, in random poses in which it shows two faces at least.
 
+    The last photographs show the faces that fewer than two of the others do.
+
     Raises
     ------
     InputError
@@ -109,11 +113,21 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions) 
     reference = moved[target.faces[0].id]
     target_from_face = {face_id: reference.inverse() @ pose for face_id, pose in moved.items()}
     scene = BodyScene(target, target_from_face, camera, (), options)
-    return replace(scene, camera_from_target=tuple(_pose(scene, rng) for _ in range(options.images)))
+    views, poses = dict.fromkeys(target_from_face, 0), []
+    for left in range(options.images, 0, -1):
+        lacking = {face: LEAST_VIEWS - count for face, count in views.items() if count < LEAST_VIEWS}
+        due = left <= sum(lacking.values()) / LEAST_FACES + 1
+        wanted = max(lacking, key=lacking.__getitem__) if lacking and due else ""
+        pose, shown = _pose(scene, wanted, rng)
+        poses.append(pose)
+        for face_id in shown:
+            views[face_id] += 1
+    return replace(scene, camera_from_target=tuple(poses))
 
 
-def _pose(scene: BodyScene, rng: np.random.Generator) -> Rigid:
-    """Returns a random pose in which two faces and more look at the camera, within the image."""
+def _pose(scene: BodyScene, wanted: str, rng: np.random.Generator) -> tuple[Rigid, list[str]]:
+    """Returns a random pose in which two faces and more, among them the ``wanted`` one, look at the camera, within the
+    image; and these faces' names."""
     points = np.array(list(scene.circles_target().values()))
     middle = (points.min(0) + points.max(0)) / 2
     options, camera = scene.options, scene.camera
@@ -130,8 +144,9 @@ def _pose(scene: BodyScene, rng: np.random.Generator) -> Rigid:
         pixels = camera.project(xyz)
         if (pixels < 0).any() or (pixels > size - 1).any():
             continue
-        if sum(_looks_here(scene, face, pose) for face in scene.target.faces) >= LEAST_FACES:
-            return pose
+        shown = [face.id for face in scene.target.faces if _looks_here(scene, face, pose)]
+        if len(shown) >= LEAST_FACES and (not wanted or wanted in shown):
+            return pose, shown
     raise InputError(
         "E-SIMULATE-BODY",
         f"target {scene.target.name}: no pose at {options.distance_mm:g} mm in which it is in the image and shows two "

@@ -117,10 +117,12 @@ def place_group(
     assert best is not None  # PLACES is more than none
     target_from_board, views, valid = best
     if len(valid) < count:
+        width, height = np.ptp(shape.outline_board[:, :2], axis=0)
         raise DegenerateError(
             "E-SCENE-VIEWS",
             f"{shape.name}: {len(valid)} of {tried} views show faces and board ({shown} show the faces), "
-            f"{count} needed; enlarge distance_mm or reduce the focal length",
+            f"{count} needed; a smaller board than {width:.0f} × {height:.0f} mm, a larger distance_mm or a smaller "
+            "focal length needed",
         )
     picked = rng.permutation(_farthest(views.centres[valid] - shape.circles.mean(0), count))
     return target_from_board, [views.pose(i) for i in valid[picked]]

@@ -220,7 +220,7 @@ def test_images_of_one_tag_beside_circles_are_placed():
     middle = Rigid(np.diag([1.0, -1, -1]), [0.0, 0.0, 0.0]) @ Rigid(np.eye(3), np.append(-circles.xy_mm.mean(0), 0))
     sides = {"2": replace(circles, id="2", rough_target_from_face=cube.faces[1].rough_target_from_face @ middle)}
     target = replace(cube, polarity="dark", faces=tuple(sides.get(face.id, face) for face in cube.faces))
-    scene, images = observed(target, 14, 3, 450)
+    scene, images = observed(target, 16, 3, 450)
     printed = target.with_faces(printed=True).faces
     alone, both = (place_with_camera(images, faces, scene.camera) for faces in (printed, target.faces))
     assert len(alone.camera_from_body) < len(both.camera_from_body) == len(images)
@@ -247,12 +247,22 @@ def test_contributions_of_a_body_add_up_to_its_covariance():
     assert all(np.trace(found.covariance_mm2[kind]) > 0 for kind in (PRINT, SIZES, DISTANCES, INTRINSICS))
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_few_photographs_show_each_face_twice(seed):
+    """At random a face of a cube is in one of ten images or in none in every third set."""
+    scene = make_body_scene(tag_cube(60), body_camera(900), BodyOptions(images=10, distance_mm=300, seed=seed))
+    shown = [face.id for image in range(10) for face in scene.faces_in_view(image)]
+    assert all(shown.count(face.id) >= 2 for face in scene.target.faces)
+
+
 def test_more_images_and_a_known_distance_help_a_planned_body():
     target = tag_cube(60)
     plan = plan_body(PlanOptions(images=12, distance_mm=300, width=900), target, target.rough_poses())
     worst = plan.forecast.worst()[1]
     remedies = {remedy.what: remedy.sigma_mm for remedy in plan.remedies}
-    assert set(plan.shares["2"]) == {"image noise", "print", "intrinsics"}
+    assert set(plan.shares["2"]) == {"image noise", "print", "flatness", "intrinsics"}
+    for shares in plan.shares.values():
+        assert sum(shares.values()) == pytest.approx(1, abs=2e-3)
     assert all(sigma < worst for sigma in remedies.values())
     assert remedies["a distance known to 20 µm"] < 0.6 * worst  # the edges of tags leave the size open
 

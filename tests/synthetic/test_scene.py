@@ -153,7 +153,7 @@ def test_simulated_centres_have_the_noise_asked_for(scene):
 
 @pytest.mark.slow  # thousands of poses are tried; quick by the command that plans
 def test_a_target_too_near_is_refused():
-    with pytest.raises(DegenerateError, match="enlarge distance_mm"):
+    with pytest.raises(DegenerateError, match="a larger distance_mm"):
         make_scene(replace(OPTIONS, distance_mm=350, groups=(("1", "2"),)))
 
 

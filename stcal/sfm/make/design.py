@@ -26,6 +26,8 @@ RADIUS_SHARE = 1 / 30
 RADIUS_STEP_MM = 0.25
 PITCH_SHARE = 0.23
 """Pitch of the board, as a share of the box's longest side. The board then reaches beyond the box on all sides."""
+FIELD_SHARE = 0.8
+"""Share of the width that the camera sees at the stated distance, in which box and board stand side by side."""
 PITCH_STEP_MM = 5.0
 ATTEMPTS = 8
 """Largest number of patterns drawn until one is identified in all cases."""
@@ -151,6 +153,10 @@ def _named(
 def _board(options: MakeOptions, least_mm: float) -> BoardDesign:
     pitch = max(PITCH_SHARE * max(options.size_mm), 4 * least_mm)
     pitch = float(np.ceil(pitch / PITCH_STEP_MM - 1e-9) * PITCH_STEP_MM)
+    camera, (width, _, depth) = options.ideal_camera(), options.size_mm
+    beside = FIELD_SHARE * options.distance_mm * camera.width / camera.focal[0] - np.hypot(width, depth)
+    while pitch * COLUMNS > beside and pitch - PITCH_STEP_MM >= 4 * least_mm:
+        pitch -= PITCH_STEP_MM
     plain = BoardDesign(ROWS, COLUMNS, pitch, pitch / 4, options.polarity, BOARD_SIGMA_MM)
     return replace(plain, corner=(0, COLUMNS - 1), corner_radius_mm=1.5 * pitch / 4)
 

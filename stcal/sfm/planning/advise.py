@@ -21,7 +21,6 @@ from stcal.sfm.planning.forecast import (
     Setup,
     forecast,
     variance_shares,
-    without_sources,
     worst_of,
 )
 from stcal.sfm.planning.nominal import observe, true_models
@@ -162,7 +161,7 @@ def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Ad
     setup = known.setup
     photographs = photographs_of(known.models, setup.board, setup.camera, setup.prior)
     now = forecast(known.models, setup, photographs=photographs)
-    shares = variance_shares(now, without_sources(known.models, setup, now.derivatives, photographs))
+    shares = variance_shares(now, known.models, setup, photographs)
     with kept_processes():
         views = [view for views_of_group in _candidates(known) for view in views_of_group]
         chosen = _greedy(known, views, now, photographs, count, progress or (lambda *_: None))

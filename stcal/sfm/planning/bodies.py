@@ -17,7 +17,7 @@ from stcal.sfm.adjust.scale import with_edge_sigma
 from stcal.sfm.data.model import ImageObservations, MetricModel
 from stcal.sfm.mapping.incremental import assemble
 from stcal.sfm.mapping.placed import unknown_lens
-from stcal.sfm.planning.forecast import CentreNoise, Setup, forecast, variance_shares, without_sources
+from stcal.sfm.planning.forecast import CentreNoise, Setup, forecast, variance_shares
 from stcal.sfm.planning.session import NEARER, Plan, PlanOptions, Remedy, widest_aperture_mm
 from stcal.sfm.planning.views import PlannedView, axes_of, looking_at, single
 from stcal.synthetic.body import BodyOptions, BodyScene, body_camera, make_body_scene
@@ -72,7 +72,7 @@ def plan_body(options: PlanOptions, target: TargetDesign, nominal: dict[str, Rig
         float(np.sqrt((model.sigma_px() ** 2).mean())),
         widest_aperture_mm([model], scene.camera),
         expected,
-        variance_shares(expected, without_sources([model], setup, expected.derivatives)),
+        variance_shares(expected, [model], setup),
         tuple(remedies),
     )
 

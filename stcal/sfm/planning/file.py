@@ -14,8 +14,8 @@ from stcal.sfm.planning.views import PlannedView
 
 MICRO = 1e3
 PPM = 1e6
-
-
+LEAST_SHARE = 0.005
+"""Least share of a variance that is printed."""
 USUAL_FOCAL_MM = 24.0
 """Focal length of the lens that is planned with if no camera is given, on a sensor 22.3 mm wide."""
 
@@ -52,9 +52,9 @@ class ForecastPart(Part):
     faces: dict[ByFace, FaceForecast] = Field(
         description="all faces but the reference: `translation_sigma_um` and `rotation_sigma_mdeg` (x, y, z), "
         "`position_sigma_um` (root of the summed variances of x, y, z), `worst_circle` and its "
-        "`worst_circle_sigma_um` (likewise), `variance_shares`: by source (`image noise`, `board`, `intrinsics` where "
-        "refined, `rims` where estimated) the share of the position's variance that goes when the source is switched "
-        "off; they need not add up to 1"
+        "`worst_circle_sigma_um` (likewise), `variance_shares`: by source (`image noise`, `board` or `print`, "
+        "`flatness` where stated, `intrinsics` where adjusted, `rims` where estimated) the share of the position's "
+        "variance that is due to the source; they add up to 1"
     )
 
     @classmethod
@@ -236,9 +236,9 @@ def forecast_table(forecast: Forecast, shares: dict[str, dict[str, float]]) -> l
 
 
 def _shares_text(shares: dict[str, float]) -> str:
-    """Returns the shares as a text, the largest first."""
-    ordered = sorted(shares.items(), key=lambda item: -item[1])
-    return ", ".join(f"{source.removeprefix('image ')} {100 * max(share, 0.0):.0f} %" for source, share in ordered)
+    """Returns the shares of half a percent and more as a text, the largest first."""
+    ordered = sorted((item for item in shares.items() if item[1] >= LEAST_SHARE), key=lambda item: -item[1])
+    return ", ".join(f"{source.removeprefix('image ')} {100 * share:.0f} %" for source, share in ordered)
 
 
 def plan_text(plan: Plan, noise: str) -> str:

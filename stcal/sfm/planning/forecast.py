@@ -37,8 +37,8 @@ ONE_PLATE = 0.99
 """Share of the board's variance that all groups have in common if the same plate is in all of them."""
 ENOUGH = 10_000
 """Number of observations from which the parameters of their noise are estimated."""
-OFF = 1e-2
-"""Share of its σ that a source of error keeps when it is switched off, so that nothing becomes singular."""
+SMALLER = 1 - 1e-3
+"""Factor on the σ of a source of error whose share of the variance is sought."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,31 +283,34 @@ def position_sigma_mm(face_covariance: np.ndarray) -> float:
     return float(np.sqrt(np.trace(face_covariance[3:, 3:])))
 
 
-def without_sources(
-    models: Sequence[MetricModel], setup: Setup, known: Derivatives, photographs: Photographs | None = None
-) -> dict[str, Forecast]:
-    """Returns the forecast with each source of error switched off in turn: images, board, intrinsics if refined,
-    and rims if estimated."""
-    if photographs is None:
-        fixed, quiet = None, None
-        quieter = [replace(model, covariance_px2=OFF**2 * model.covariance_px2) for model in models]
-    else:
-        fixed = {m.group: photographs[m.group][: 3 * len(m.labels), : 3 * len(m.labels)] for m in models}
-        quiet, quieter = {group: normal / OFF**2 for group, normal in photographs.items()}, models
-    forecasts = {
-        "image noise": forecast(quieter, setup, known, quiet),
-        setup.size_source: forecast(models, setup.better_board(OFF), known, photographs),
+def variance_shares(
+    now: Forecast, models: Sequence[MetricModel], setup: Setup, photographs: Photographs | None = None
+) -> dict[str, dict[str, float]]:
+    """Returns, by face and source, the share of the variance of the face's position that is due to the source.
+
+    Sources are images, board or print, flatness if stated, intrinsics if adjusted, and rims if estimated. A variance
+    grows by f² where the σ of all sources do by f, so that its derivatives by the sources' variances add up to it.
+
+    ``now`` : forecast of ``models`` and ``setup``; ``photographs`` : as in :func:`forecast`.
+    """
+    smaller: dict[str, tuple[Sequence[MetricModel], Setup, Photographs | None]] = {
+        "image noise": (
+            [replace(model, covariance_px2=SMALLER**2 * model.covariance_px2) for model in models],
+            setup,
+            photographs and {group: normal / SMALLER**2 for group, normal in photographs.items()},
+        ),
+        setup.size_source: (models, setup.better_board(SMALLER), photographs),
     }
+    if setup.flatness_mm is not None:
+        smaller["flatness"] = models, replace(setup, flatness_mm=SMALLER * setup.flatness_mm), photographs
     if setup.prior is not None:
-        forecasts["intrinsics"] = forecast(models, replace(setup, prior=None), known, fixed)
+        prior = replace(setup.prior, covariance=SMALLER**2 * setup.prior.covariance)
+        smaller["intrinsics"] = models, replace(setup, prior=prior), photographs
     if setup.rims_mm2 is not None:
-        forecasts["rims"] = forecast(models, replace(setup, rims_mm2=None), known, photographs)
-    return forecasts
-
-
-def variance_shares(whole: Forecast, without: dict[str, Forecast]) -> dict[str, dict[str, float]]:
-    """Returns, by face and source, the share of the variance of the face's position that is due to the source."""
-    return {
-        face: {source: 1 - (quieter.position_sigma_mm()[face] / sigma) ** 2 for source, quieter in without.items()}
-        for face, sigma in whole.position_sigma_mm().items()
-    }
+        smaller["rims"] = models, replace(setup, rims_mm2=SMALLER**2 * setup.rims_mm2), photographs
+    shares: dict[str, dict[str, float]] = {face: {} for face in now.face_covariance}
+    for source, (own_models, own_setup, own_photographs) in smaller.items():
+        less = forecast(own_models, own_setup, now.derivatives, own_photographs).position_sigma_mm()
+        for face, sigma in now.position_sigma_mm().items():
+            shares[face][source] = (1 - (less[face] / sigma) ** 2) / (1 - SMALLER**2)
+    return shares

@@ -23,7 +23,6 @@ from stcal.sfm.planning.forecast import (
     Setup,
     forecast,
     variance_shares,
-    without_sources,
 )
 from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
@@ -210,7 +209,7 @@ def plan(
         float(np.sqrt(np.concatenate([m.sigma_px() ** 2 for m in models]).mean())),
         widest_aperture_mm(models, scene.camera),
         expected,
-        variance_shares(expected, without_sources(models, setup, expected.derivatives)),
+        variance_shares(expected, models, setup),
         tuple(remedies),
     )
 

@@ -15,6 +15,7 @@ from stcal.sfm.make import design
 from stcal.sfm.make.box import NAMES, faces_of, sides_of, size_of
 from stcal.sfm.make.design import MakeOptions, make_target
 from stcal.sfm.make.pattern import HIDDEN, LARGE, LEAST_CIRCLES, make_pattern, unnamed_cases
+from stcal.sfm.planning.session import PlanOptions, plan
 from stcal.synthetic.designs import face_of_drawing, second_design
 from tests.outcome import fails_with
 
@@ -211,6 +212,16 @@ def test_outlines_at_any_angle_are_taken(tmp_path, angle_deg):
     text = target_toml(design).replace("circles = [", f"outline_mm = {corners.tolist()}\ncircles = [", 1)
     (tmp_path / "target.toml").write_text(text)
     np.testing.assert_allclose(load_target(tmp_path / "target.toml").faces[0].outline_mm, corners)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("distance_mm", [400.0, 600.0, 1000.0])
+def test_box_and_board_fit_the_image_side_by_side(distance_mm):
+    made = make_target(MakeOptions((130.0, 110.0, 90.0), distance_mm=distance_mm, faces=("front", "right", "top")))
+    assert made.board.radius_mm >= made.least_mm
+    target = made.pattern.target
+    planned = plan(PlanOptions(images=3, distance_mm=distance_mm), target, made.board, target.rough_poses())
+    assert planned.forecast.worst()[1] > 0
 
 
 @pytest.mark.slow

@@ -32,7 +32,7 @@ from stcal.sfm.planning.forecast import (
     Setup,
     _rim_integrals,
     forecast,
-    without_sources,
+    variance_shares,
 )
 from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.planning.session import PlanOptions, widest_aperture_mm
@@ -359,7 +359,8 @@ def test_advice_holds_the_sigma_of_estimated_rims(small_run):
     summary = saved.report["summary"] | {"rim_sigma_mm": 0.01}
     known = known_of(replace(saved, faces=faces, report=saved.report | {"summary": summary}))
     now = forecast(known.models, known.setup)
-    seen = without_sources(known.models, known.setup, now.derivatives)["rims"]
+    seen = forecast(known.models, replace(known.setup, rims_mm2=None), now.derivatives)
+    shares = variance_shares(now, known.models, known.setup)
     normal = {face: np.array(m)[:3, 2] for face, m in saved.faces.target_from_face.items()}
     model = known.models[0]
     view = replace(
@@ -373,6 +374,8 @@ def test_advice_holds_the_sigma_of_estimated_rims(small_run):
         expected = 0.005 * np.linalg.norm(normal[face] - normal[saved.faces.reference_face])
         added = np.trace((covariance - seen.face_covariance[face])[3:, 3:])
         assert np.sqrt(added) == pytest.approx(expected, rel=0.02)
+        assert shares[face]["rims"] == pytest.approx(added / np.trace(covariance[3:, 3:]), rel=0.01)
+        assert sum(shares[face].values()) == pytest.approx(1, abs=1e-3)
         assert np.sqrt(further[face] ** 2 - further_seen[face] ** 2) == pytest.approx(expected, rel=0.02)
 
 
@@ -497,7 +500,7 @@ def test_plan_says_what_is_wrong(stcal_sfm, arguments, message):
 def test_plan_out_of_reach(stcal_sfm):
     code, _, error = stcal_sfm("plan", "--distance", 300, "--images", 2, "--groups", "12")
     assert (code, error.count("\n")) == (3, 1)
-    assert "enlarge distance_mm" in error
+    assert "a larger distance_mm" in error
 
 
 @pytest.mark.parametrize(
