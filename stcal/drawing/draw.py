@@ -1,5 +1,6 @@
 """Drawing of a target or a board from its file."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,6 +83,17 @@ def sheets_of(parts: list[Part], paper: str, title: str, apart: bool) -> list[Sh
     return [one_sheet([part], f"{title}, {part.name}" if len(parts) > 1 else title) for part in parts]
 
 
+def paper_for(parts: Sequence[Part]) -> str | None:
+    """Return the smallest paper of the A series that takes each part on one sheet, or None."""
+    for paper in ("A5", "A4", "A3", "A2", "A1", "A0"):
+        try:
+            if len(paper_sheets(parts, paper, "")) == len(parts):
+                return paper
+        except InputError:  # more sheets than are drawn
+            continue
+    return None
+
+
 def content_of(sheets: list[Sheet], path: Path) -> str | bytes:
     """Return the content of a file in the form of its suffix.
 
@@ -135,7 +147,7 @@ def drawn_text(drawn: Drawn) -> str:
     else:
         lines.append("print at 100 %, not fitted to the page, and measure the scale bars")
     if drawn.paper != OWN and sheets > len(drawn.parts):
-        lines.append(
-            "parts that are glued of several sheets are off at the seams: state it in sigma_mm, or print larger"
-        )
+        whole = paper_for(drawn.parts)
+        larger = f"print with --paper {whole}" if whole else "have it printed on one sheet"
+        lines.append(f"parts that are glued of several sheets are off at the seams: state it in sigma_mm, or {larger}")
     return "\n".join(lines)

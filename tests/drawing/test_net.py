@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stcal.design import TargetDesign, reference_target
-from stcal.drawing.draw import OWN, draw, sheets_of
+from stcal.drawing.draw import OWN, draw, drawn_text, sheets_of
 from stcal.drawing.net import _overlap, net_parts
 from stcal.drawing.shapes import Disc, Text
 from stcal.geometry.rigid import Rigid
@@ -74,6 +74,15 @@ def test_words_of_tabs_stand_on_them(target):
             along = np.abs(tab[3] - tab[0])
             assert (along[1] > along[0]) == word.turned
     assert turned == {True, False}
+
+
+def test_the_paper_for_a_whole_net_is_named(target, tmp_path):
+    (tmp_path / "target.toml").write_text(target_toml(target))
+    text = drawn_text(draw(tmp_path / "target.toml", tmp_path / "net.pdf", net=True))
+    assert text.endswith("state it in sigma_mm, or print with --paper A2")  # 400 × 200 mm and more
+    whole = draw(tmp_path / "target.toml", tmp_path / "a2.pdf", paper="A2", net=True)
+    assert len(whole.sheets) == 1
+    assert len(draw(tmp_path / "target.toml", tmp_path / "a3.pdf", paper="A3", net=True).sheets) > 1
 
 
 def test_plates_meet_in_the_net_as_they_do_in_space(target):
