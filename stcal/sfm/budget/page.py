@@ -97,11 +97,10 @@ def budget_report(file: BudgetFile) -> Document:
                 "Result",
                 [
                     tiles(_headline(file)),
-                    page_only(
-                        f"U is the expanded uncertainty with k = {file.coverage_factor:g} (JCGM 100:2008, GUM), of a "
-                        "face's position or rotation the radius about it: twice the root of the summed variances of "
-                        "x, y and z"
-                    ),
+                    f"U is the expanded uncertainty with k = {file.coverage_factor:g} (JCGM 100:2008, GUM): along one "
+                    f"axis {file.coverage_factor:g} times the σ that the run states, with what is stated of sizes and "
+                    "temperatures; in the tiles and under Contributions of x, y and z together, the root of their "
+                    "summed variances",
                     Notes(file.notes),
                     *([f"May the run be used? {file.use}"] if file.use else []),
                     f"Lengths and positions hold at {file.reference_temperature_c:g} °C{_corrected(file)}",
