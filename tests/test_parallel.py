@@ -3,6 +3,7 @@ processes that are kept from call to call."""
 
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from stcal.parallel import ONE_THREAD, counted, kept_processes, run_briefly, run_parallel
+from stcal.parallel import ONE_THREAD, _deaf_to_interrupts, counted, kept_processes, run_briefly, run_parallel
 
 UNLIMITED = {name: value for name, value in os.environ.items() if name not in ONE_THREAD}
 
@@ -270,3 +271,16 @@ def test_processes_end_when_the_work_is_broken_off():
     for child in multiprocessing.active_children():
         child.join(10)
     assert not multiprocessing.active_children()
+
+
+def test_a_request_to_end_while_processes_start_is_answered_after_it():
+    answered: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: answered.append(number))
+    try:
+        with _deaf_to_interrupts():
+            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(signal.SIGINT)
+            assert answered == []
+        assert answered == [signal.SIGTERM]
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -134,14 +134,21 @@ KINDS = {"circles": ("circles of the faces", "the faces lie"), "dots": ("dots of
 """Name of each kind of circle, and what lies where its circles do."""
 
 
-def rim_check(rims: Mapping[str, Rim], sigma_mm: float | None, allowed_mm: Mapping[str, float | None]) -> Check:
+def rim_check(
+    rims: Mapping[str, Rim],
+    sigma_mm: float | None,
+    allowed_mm: Mapping[str, float | None],
+    has_circles: bool = True,
+) -> Check:
     """Tests whether circles lie behind a rim, from the change of their radii with tilt.
 
     ``rims`` : by kind of circle; ``sigma_mm`` : largest σ of a face's position; a rim that moves the faces by less
     than this is seen and does no harm; ``allowed_mm`` : by kind of circle, the height that the result allows for, None
-    if it takes what is estimated here; 0 of other kinds.
+    if it takes what is estimated here; 0 of other kinds; ``has_circles`` : False if there are corners alone.
     """
     key, title = "rim", "Rim in front of the circles"
+    if not has_circles:
+        return impossible(key, title, "corners alone, which have no rim", "")
     if not rims:
         return impossible(key, title, "too few tilts of circles to tell", "photograph faces from several angles")
     measured, names, reasons, settled = [], [], [], []
@@ -280,9 +287,9 @@ def pitch_check(calibrated: CalibratedTarget, target: TargetDesign, radii: Radii
         return impossible("pitch", PITCH, "the drawing defines the size", "state a known distance with scale")
     measures = [m for m in (_size_by_positions(calibrated, target), size_by_radii(radii)) if m is not None]
     if not measures:
-        return impossible(
-            "pitch", PITCH, f"no face with {MIN_DOTS} circles, and no circles of two sizes", "add views of the faces"
-        )
+        reason = f"no face with {MIN_DOTS} circles, and no circles of two sizes"
+        has_circles = any(face.printed is None for face in target.faces)
+        return impossible("pitch", PITCH, reason, "add views of the faces" if has_circles else "")
     weight = np.array([1 / m.sigma**2 for m in measures])
     size = float(weight @ [m.size for m in measures] / weight.sum())
     variance = 1 / weight.sum() + DESIGN_SCALE**2 + (calibrated.scale_sigma or 0.0) ** 2

@@ -41,6 +41,11 @@ class Again:
     board: BoardDesign
     options: AdjustOptions
 
+    def loop_remedy(self) -> str:
+        """Returns what makes comparisons of groups possible; nothing where all images are one group without a board."""
+        needed = self.board.rows or len(self.joint.models) > 1
+        return "to be able to make it, add a group that closes a loop of faces" if needed else ""
+
     def adjust(self, parts: Sequence[Sequence[MetricModel]]) -> list[JointResult | StcalError]:
         """Adjusts parts of the models as the run did; returns the error of a part that has no result."""
         jobs = [(models, self.board, self.options.flatness_mm, self.joint) for models in parts]
@@ -159,7 +164,7 @@ def groups_check(again: Again, networks: Sequence[Network]) -> Check:
             trials.append(_nested_trial(name, change, larger, whole.face_covariance[face], joint.redundancy))
     if not trials:
         reason = "every group holds a face that no other links"
-        return impossible(key, title, reason, "to be able to make it, add a group that closes a loop of faces")
+        return impossible(key, title, reason, again.loop_remedy())
     check = judge(key, title, [t for t in trials if t.freedom], "faces", "")
     if not check.names:
         return check
@@ -237,7 +242,7 @@ def loops_check(again: Again) -> Check:
         trials.append(_face_trial(name, difference, ends[0][1] + ends[1][1], redundancy))
     if not trials:
         reason = "no face is reached in two ways that share no group"
-        return impossible(key, title, reason, "to be able to make it, add a group that closes a loop of faces")
+        return impossible(key, title, reason, again.loop_remedy())
     remedy = "a group of these ways is wrong: compare with the result without each group, and look for what moved in it"
     return judge(key, title, trials, "loops", remedy)
 

@@ -142,7 +142,7 @@ def run_checks(evidence: Evidence, progress: Progress | None = None) -> tuple[Ch
         lambda: board_checks(networks, board),
         lambda: pitch_check(calibration.target, target, radii, bool(board.rows)),
         lambda: radius_checks(radii),
-        lambda: rim_check(rims, sigma_mm, allowed),
+        lambda: rim_check(rims, sigma_mm, allowed, bool(evidence.radius_mm())),
         lambda: flatness_check(networks, evidence.options.flatness_mm, *_bend(evidence)),
         lambda: control_check(evidence, networks),
     )

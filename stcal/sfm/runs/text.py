@@ -259,14 +259,22 @@ def _boards(result: RunResult) -> Iterator[str]:
 
 
 def _checks(checks: Sequence[Check], images: frozenset[str]) -> Iterator[str]:
-    """Yields the number of checks with each verdict, and the checks that did not pass, the worst first."""
+    """Yields the number of checks with each verdict, and the checks that did not pass, the worst first.
+
+    Those that nobody can make possible, such as tests of circles where corners alone are seen, are in one line.
+    """
     yield f"checks: {count_verdicts([check.verdict for check in checks])}"
     if any(check.verdict in ("failed", "suspicious") for check in checks):
         yield f"  ({BY_CHANCE})"
+    no_matter = [check for check in checks if check.verdict == "not possible" and not check.remedy]
     for check in ranked(checks, images):
-        if check.verdict != "passed":
+        if check.verdict != "passed" and check not in no_matter:
             remedy = f"; {check.remedy}" if check.remedy else ""
             yield f"  {check.verdict}: {check.title}: {check.reason}{remedy}"
+    if len(no_matter) == 1:
+        yield f"  not possible: {no_matter[0].title}: {no_matter[0].reason}"
+    elif no_matter:
+        yield f"  not possible with what was photographed: {'; '.join(check.title for check in no_matter)}"
 
 
 def _compared(comparison: Comparison) -> Iterator[str]:

@@ -8,10 +8,11 @@ from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board,
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
+from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.board import find_boards
 from stcal.sfm.detect.circles.candidates import Candidates, Ellipses
 from stcal.sfm.detect.faces import FaceFinder
-from stcal.sfm.detect.sightings import confusable, is_named, mirror_images
+from stcal.sfm.detect.sightings import BoardSighting, ImageDetection, confusable, is_named, mirror_images
 
 CAMERA = Camera(2592, 1728, [2785.0, 2785.0], [1295.5, 863.5], np.zeros(8))
 TARGET = reference_target()
@@ -81,6 +82,24 @@ def test_up_to_two_hidden_circles_leave_the_name(hidden):
     assert finding.faces[0].count() == 10 - len(hidden)
     missing = [TARGET.face("4").ids[i] for i in np.flatnonzero(finding.faces[0].index < 0)]
     assert set(missing) == set(hidden)
+
+
+def test_a_circle_of_another_size_is_left_out_of_its_face():
+    """Twice as large as designed, on circles of 20 px, where the outline's error is a hundredth of it."""
+    face, at = TARGET.face("3"), pose(30, 20, 100, depth=500.0)
+    radius = face.radius_mm * np.where(np.array(face.ids) == "2", 2.0, 1.0)
+    (found,) = find_faces(ellipses_of(at, face.xy_mm, radius)).faces
+    assert [face.ids[i] for i in np.flatnonzero(found.index < 0)] == ["2"]
+
+
+@pytest.mark.parametrize(("dots", "repeated"), [(63, True), (51, True), (50, False)])
+def test_a_second_board_counts_if_it_is_of_similar_size(dots, repeated):
+    cells = np.array([[r, c] for r in range(7) for c in range(9)])
+    boards = [BoardSighting(np.arange(n), cells[None, :n]) for n in (63, dots)]
+    nothing = Centres(*(np.zeros((0, *shape)) for shape in ((2,), (2,), (2, 2), (2, 2), *[()] * 4, (2,), ())))
+    found = ImageDetection(nothing, (), tuple(boards))
+    assert found.repeated == (("board",) if repeated else ())
+    assert (found.board is None) == repeated
 
 
 def test_without_the_circle_that_tells_the_faces_apart_nothing_is_named():
