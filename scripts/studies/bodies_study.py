@@ -67,7 +67,9 @@ def main() -> None:
         position, rotation, normalised, found, lost = [], [], [], 0, 0
         for seed in range(arguments.draws):
             scene = make_body_scene(
-                target, body_camera(WIDTH), BodyOptions(images=images, distance_mm=distance_mm, seed=seed)
+                target,
+                body_camera(WIDTH),
+                BodyOptions(images=images, distance_mm=distance_mm, seed=seed, print_errors=1.0),
             )
             with tempfile.TemporaryDirectory() as scratch:
                 folder = Path(scratch)

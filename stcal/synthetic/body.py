@@ -7,12 +7,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial.transform import Rotation
 
 from stcal.boards.cells import black_areas, clear_mm
 from stcal.boards.target import body_toml
 from stcal.design import FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
+from stcal.geometry.align import align_rigid
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import write_cameras_txt
@@ -28,6 +30,10 @@ CIRCLE_CORNERS = 360
 SAMPLES, LATTICE = 13, 8
 """Samples of a pixel: a Fibonacci lattice, shifted at random from pixel to pixel. An edge along the pixel rows is then
 where it is, which a grid of points places in steps."""
+EDGE_SIGMA_PX = 0.1
+"""σ of the shift that ink, light and the camera's response give the edges of all tags alike."""
+BEND_MM = 0.02
+"""σ of a point of a printed face about its plane."""
 LIGHT = np.array([0.3, -0.5, -0.8])
 LEAST_FACES = 2
 LEAST_VIEWS = 2
@@ -41,7 +47,8 @@ class BodyOptions:
 
     ``images`` ; ``distance_mm`` : of the camera from the middle of the body, to ± ``depth_share`` of it; ``noise`` :
     fraction of full scale; ``blur_px`` ; ``seed`` ; ``pose_sigma_mm``, ``pose_sigma_deg`` : of the faces about their
-    rough poses.
+    rough poses; ``print_errors`` : factor on the σ that the design states of printed faces, and on the bends of
+    :data:`BEND_MM`; 0 for exact ones.
     """
 
     images: int = 24
@@ -52,24 +59,37 @@ class BodyOptions:
     seed: int = 0
     pose_sigma_mm: float = 0.3
     pose_sigma_deg: float = 0.5
+    print_errors: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyScene:
-    """A body with its true poses, mm: ``target_from_face`` by face, ``camera_from_target`` by image."""
+    """A body with its true poses, mm: ``target_from_face`` by face, ``camera_from_target`` by image.
+
+    ``off_mm`` : (n, 3) by face, how far its points are from the design, without a shift or turn of the whole.
+    """
 
     target: TargetDesign
     target_from_face: dict[str, Rigid]
     camera: Camera
     camera_from_target: tuple[Rigid, ...]
     options: BodyOptions = field(default_factory=BodyOptions)
+    off_mm: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def drawings(self) -> dict[str, "Drawing"]:
+        """Returns the drawings of the faces, as they are printed."""
+        polarity = self.target.polarity
+        return {face.id: drawing_of(face, polarity, self.off_mm.get(face.id)) for face in self.target.faces}
 
     def circles_target(self) -> dict[str, np.ndarray]:
         """Returns the corners by label, target frame, mm."""
+        places = {face.id: face.places_mm(face.ids) for face in self.target.faces}
+        for face_id, off in self.off_mm.items():
+            places[face_id] += off
         return {
             str(label): xyz
             for face in self.target.faces
-            for label, xyz in zip(face.labels(), self.target_from_face[face.id] @ face.places_mm(face.ids), strict=True)
+            for label, xyz in zip(face.labels(), self.target_from_face[face.id] @ places[face.id], strict=True)
         }
 
     def faces_in_view(self, image: int) -> list[FaceDesign]:
@@ -112,7 +132,7 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions) 
         moved[face_id] = Rigid(pose.rotation @ turn, pose.translation + shift)
     reference = moved[target.faces[0].id]
     target_from_face = {face_id: reference.inverse() @ pose for face_id, pose in moved.items()}
-    scene = BodyScene(target, target_from_face, camera, (), options)
+    scene = BodyScene(target, target_from_face, camera, (), options, _print_errors(target, camera, options))
     views, poses = dict.fromkeys(target_from_face, 0), []
     for left in range(options.images, 0, -1):
         lacking = {face: LEAST_VIEWS - count for face, count in views.items() if count < LEAST_VIEWS}
@@ -123,6 +143,34 @@ def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions) 
         for face_id in shown:
             views[face_id] += 1
     return replace(scene, camera_from_target=tuple(poses))
+
+
+def _print_errors(target: TargetDesign, camera: Camera, options: BodyOptions) -> dict[str, np.ndarray]:
+    """Returns how far the points of printed faces are off, (n, 3) mm by face, drawn by the σ of the design.
+
+    One error of size and one shift of the edges of tags, of σ :data:`EDGE_SIGMA_PX` at the stated distance and a tilt
+    of 45°, are common to all faces.
+    """
+    if not options.print_errors:
+        return {}
+    rng = np.random.default_rng([options.seed, 3])
+    size, shift_px = options.print_errors * rng.normal(size=2) * [1.0, EDGE_SIGMA_PX]
+    shift_mm = float(shift_px * options.distance_mm / (np.mean(camera.focal) * np.sqrt(0.5)))
+    off = {}
+    for face in target.faces:
+        if face.printed is None:
+            continue
+        moved = face.xy_mm * (1 + size * face.size_sigma)
+        if face.of_tags:
+            tags = moved.reshape(-1, 4, 2)
+            sides = np.roll(tags, -1, axis=1) - tags
+            sides = sides / np.linalg.norm(sides, axis=2, keepdims=True)
+            tags += shift_mm * (np.roll(sides, 1, axis=1) - sides)
+        sigma_mm = options.print_errors * np.array([face.sigma_mm or 0.0, face.sigma_mm or 0.0, BEND_MM])
+        design = face.places_mm(face.ids)
+        printed = np.pad(moved, ((0, 0), (0, 1))) + sigma_mm * rng.normal(size=design.shape)
+        off[face.id] = align_rigid(design, printed) @ printed - design
+    return off
 
 
 def _pose(scene: BodyScene, wanted: str, rng: np.random.Generator) -> tuple[Rigid, list[str]]:
@@ -169,16 +217,21 @@ def _inward(face: FaceDesign, camera_from_face: Rigid) -> np.ndarray:
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawing:
     """A face as a picture: ``grey`` (h, w) its brightness, ``solid`` (h, w) where its plate is; ``px_mm`` pixels in a
-    mm; ``origin`` (2,) its first pixel."""
+    mm; ``origin`` (2,) its first pixel; ``bend`` (h, w) mm along Z, None of a plane."""
 
     grey: np.ndarray
     solid: np.ndarray
     px_mm: float
     origin: np.ndarray
+    bend: np.ndarray | None = None
 
 
-def drawing_of(face: FaceDesign, polarity: Polarity = "bright") -> Drawing:
-    """Returns the drawing of a face with the plate about it; ``polarity`` : of circles."""
+def drawing_of(face: FaceDesign, polarity: Polarity = "bright", off_mm: np.ndarray | None = None) -> Drawing:
+    """Returns the drawing of a face with the plate about it.
+
+    ``polarity`` : of circles; ``off_mm`` : (n, 3) how far the points of a printed face are off; between them, and
+    along the edges that they end, it changes linearly.
+    """
     if face.printed is None:
         around = 2 * np.pi * np.arange(CIRCLE_CORNERS) / CIRCLE_CORNERS
         unit = np.column_stack([np.cos(around), np.sin(around)])
@@ -186,6 +239,8 @@ def drawing_of(face: FaceDesign, polarity: Polarity = "bright") -> Drawing:
         margin, dark = float(face.radius_mm.max()), polarity == "dark"
     else:
         areas, margin, dark = black_areas(face.printed), clear_mm(face.printed), True  # type: ignore[arg-type]
+    if off_mm is not None:
+        areas = [[line + _off_at(line, face.xy_mm, off_mm[:, :2]) for line in area] for area in areas]
     every = np.concatenate([line for area in areas for line in area])
     plate = face.outline_mm
     if plate is None:
@@ -199,7 +254,17 @@ def drawing_of(face: FaceDesign, polarity: Polarity = "bright") -> Drawing:
     size = int(height), int(width)
     grey = ground + (ink - ground) * covered_share([[(line - low) * px_mm for line in area] for area in areas], size)
     solid = covered_share([[(plate - low) * px_mm]], size)
-    return Drawing(grey, solid, px_mm, low)
+    if off_mm is None:
+        return Drawing(grey, solid, px_mm, low)
+    x, y = (low[k] + (np.arange(n) + 0.5) / px_mm for k, n in ((0, width), (1, height)))
+    bend = _off_at(np.stack(np.meshgrid(x, y), axis=-1), face.xy_mm, off_mm[:, 2])
+    return Drawing(grey, solid, px_mm, low, bend.astype(np.float32))
+
+
+def _off_at(places: np.ndarray, xy_mm: np.ndarray, off_mm: np.ndarray) -> np.ndarray:
+    """Returns how far places (…, 2) are off: linear between the points ``xy_mm``, beyond them as the nearest one."""
+    between = LinearNDInterpolator(xy_mm, off_mm)(places)
+    return np.where(np.isnan(between), NearestNDInterpolator(xy_mm, off_mm)(places), between)
 
 
 def covered_share(areas: list[list[np.ndarray]], size: tuple[int, int]) -> np.ndarray:
@@ -271,6 +336,10 @@ def render_body(scene: BodyScene, image: int, drawings: dict[str, Drawing]) -> n
             depth = -start[2] / np.where(np.abs(rays[..., 2]) > 1e-9, rays[..., 2], 1e-9)
             at = start[:2] + depth[..., None] * rays[..., :2]
             place = ((at - drawing.origin) * drawing.px_mm - 0.5).astype(np.float32)
+            if drawing.bend is not None:
+                bend = cv2.remap(drawing.bend, place[..., 0], place[..., 1], cv2.INTER_LINEAR)
+                at += (bend / np.where(np.abs(rays[..., 2]) > 1e-9, rays[..., 2], 1e-9))[..., None] * rays[..., :2]
+                place = ((at - drawing.origin) * drawing.px_mm - 0.5).astype(np.float32)
             inside = ((at >= drawing.origin) & (at <= drawing.origin + extent)).all(2)
             value, solid = (
                 cv2.remap(picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -334,7 +403,7 @@ def write_body(
         raise InputError(
             "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
         ) from error
-    drawings = {face.id: drawing_of(face, scene.target.polarity) for face in scene.target.faces}
+    drawings = scene.drawings()
     count = len(scene.camera_from_target)
     paths = [folder / "images" / _image_name(i, image_format) for i in range(count)]
     jobs = [(path, scene, i, drawings, jpeg_quality) for i, path in enumerate(paths)]

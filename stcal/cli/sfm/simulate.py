@@ -127,8 +127,8 @@ def simulate(
                 "E-OPTION-CONFLICT",
                 f"{unfit[0]}: not for photographs of a body with boards or tags on its faces; leave it out",
             )
-        _body(folder, body, camera, BodyOptions(images, distance, noise=noise, blur_px=blur, seed=seed), width, kind,
-              workers)  # fmt: skip
+        shape = BodyOptions(images, distance, noise=noise, blur_px=blur, seed=seed, print_errors=1.0)
+        _body(folder, body, camera, shape, width, kind, workers)
         return
     if second_design and (target or board):
         raise InputError("E-OPTION-CONFLICT", "--second-design and --target or --board: two designs; give one of them")
