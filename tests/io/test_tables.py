@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stcal.io.join import join
-from stcal.io.table import LENGTHS, read_table
+from stcal.io.table import COVARIANCE, LENGTHS, read_table
 from tests.outcome import fails_with
 
 POINTS = np.array([[-594.288, -1.155, 162.397], [1616.584, -790.796, 506.870], [0.125, 2.0, -3.5]])
@@ -147,3 +147,11 @@ def test_a_line_that_is_no_header_is_named(tmp_path):
         table(tmp_path, "My measurement\nname,x_mm,y_mm\nA,1,2\n")
     with fails_with("E-TABLE-HEADER … line 1 … header = false … --columns"):
         table(tmp_path, "P1 1.5 2.5 3.5\nP2 4 5 6\n")
+
+
+def test_a_covariance_is_whole_or_there_is_none(tmp_path):
+    given = [f"tool_{name}" for name in COVARIANCE if name != "cov_ry_tz"]
+    found = table(tmp_path, ",".join(given) + "\n" + ",".join(["1"] * len(given)) + "\n")
+    with fails_with("E-TABLE-COLUMN-MISSING … tool_cov_ry_tz"):
+        found.pose_covariances("tool_")
+    assert found.pose_covariances("other_") is None
