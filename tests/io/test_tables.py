@@ -150,8 +150,8 @@ def test_a_line_that_is_no_header_is_named(tmp_path):
 
 
 def test_a_covariance_is_whole_or_there_is_none(tmp_path):
-    given = [f"tool_{name}" for name in COVARIANCE if name != "cov_ry_tz"]
+    given = [f"tool_{name}" for name in COVARIANCE if name != "cov_ry_z"]
     found = table(tmp_path, ",".join(given) + "\n" + ",".join(["1"] * len(given)) + "\n")
-    with fails_with("E-TABLE-COLUMN-MISSING … tool_cov_ry_tz"):
+    with fails_with("E-TABLE-COLUMN-MISSING … tool_cov_ry_z"):
         found.pose_covariances("tool_")
     assert found.pose_covariances("other_") is None
