@@ -266,7 +266,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
             "E-TABLE-HEADER", f"{where}: line {used[0][0]}: {error}; a header with names and units needed"
         ) from error
     names, used = _with_units_of_a_row(names, used, between)
-    names = canonical(names, comments)
+    names = canonical(names if names[0] else ["index", *names[1:]], comments)  # pandas writes its index without a name
     for name in names:
         if names.count(name) > 1 or not name:
             shown = name or "without a name"
@@ -373,6 +373,7 @@ def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
             if bracketed is None
             else f"{bracketed[1]}_{(bracketed[2] or bracketed[3]).lower().replace('µ', 'u').replace('°', 'deg')}"
         )
+        new = RTDE.get(new, new)
         lower = new.lower()
         if unit and lower in ("x", "y", "z"):
             lower = new = f"{lower}_{unit}"
@@ -381,6 +382,15 @@ def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
     return found
 
 
+RTDE = dict(
+    zip(
+        [f"actual_TCP_pose_{i}" for i in range(6)],
+        [f"{c}_m" for c in "xyz"] + [f"r{c}_rad" for c in "xyz"],
+        strict=True,
+    )
+)
+RTDE |= {f"actual_q_{i}": f"q{i + 1}_rad" for i in range(6)}
+"""Names of columns in recordings of Universal Robots' interface RTDE: the pose of the tool, and joint values."""
 _WORDS = {"mm": "millimet", "cm": "centimet", "m": "met", "in": "inch"}
 
 
