@@ -292,9 +292,17 @@ class BoardDesign:
         """Returns row and column of every dot, (rows·columns, 2), row-major."""
         return np.column_stack(np.divmod(np.arange(self.rows * self.columns), self.columns))
 
+    def steps(self) -> np.ndarray:
+        """Returns the steps (2, 2), as columns, from column to column and from row to row, in pitches."""
+        return np.eye(2)
+
+    def flat(self, column_row: np.ndarray) -> np.ndarray:
+        """Returns the positions (n, 2) of columns and rows (n, 2), in pitches."""
+        return column_row @ self.steps().T
+
     def xy_mm(self) -> np.ndarray:
         """Returns the grid positions, (rows·columns, 2), row-major, mm."""
-        return self.pitch_mm * self.cells()[:, ::-1].astype(float)
+        return self.pitch_mm * self.flat(self.cells()[:, ::-1].astype(float))
 
     def radii_mm(self) -> np.ndarray:
         """Returns the dot radii, (rows·columns,), row-major, mm."""
@@ -310,7 +318,7 @@ class BoardDesign:
     def places_mm(self, labels: Iterable[Label]) -> np.ndarray:
         """Returns the places at which these dots are seen, (n, 3), board frame: half of a rim before the surface."""
         cells = dot_cells(labels)
-        return np.column_stack([self.pitch_mm * cells[:, ::-1], np.full(len(cells), -0.5 * self.rim_mm)])
+        return np.column_stack([self.pitch_mm * self.flat(cells[:, ::-1]), np.full(len(cells), -0.5 * self.rim_mm)])
 
     def radius_of(self) -> dict[DotLabel, float]:
         """Returns the radius in mm by label."""

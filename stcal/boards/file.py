@@ -16,6 +16,7 @@ from stcal.boards.design import (
     ChessboardDesign,
     CornerBoard,
     FlatBoard,
+    HexagonalCirclesDesign,
     LatticePart,
     TagLayout,
 )
@@ -32,12 +33,12 @@ from stcal.io.json import mistake
 from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_string, validated
 from stcal.lengths import Length, radius, require_millimetres, side, stated_unusual
 
-KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles")
+KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles", "hexagonal-circles")
 """Types of flat boards."""
 SET = "boards"
 REMEDY = (
-    'a file with type = "chessboard", "charuco", "tags", "aprilgrid" or "asymmetric-circles" needed, one of dots, or '
-    "one of Kalibr, see data_layout.md"
+    'a file with type = "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles" or "hexagonal-circles" '
+    "needed, one of dots, or one of Kalibr, see data_layout.md"
 )
 MOST_MARKER = 0.99
 """Largest ratio of a ChArUco tag's side to its square's: detection needs white around a tag."""
@@ -88,7 +89,7 @@ class _AprilGrid(Sized):
 
 
 class _AsymmetricCircles(Sized):
-    type: Literal["asymmetric-circles"]
+    type: Literal["asymmetric-circles", "hexagonal-circles"]
     rows: Count
     columns: Count
     spacing_mm: Positive
@@ -227,6 +228,7 @@ TYPES = {
     CharucoDesign: "charuco",
     AprilGridDesign: "aprilgrid",
     AsymmetricCirclesDesign: "asymmetric-circles",
+    HexagonalCirclesDesign: "hexagonal-circles",
     TagLayout: "tags",
 }
 """The word of each kind of board in files."""
@@ -335,7 +337,7 @@ def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
         return _tags(validated(content, TagsFile, where), where)
     if kind == "aprilgrid":
         return _aprilgrid(validated(content, _AprilGrid, where), where)
-    if kind == "asymmetric-circles":
+    if kind in ("asymmetric-circles", "hexagonal-circles"):
         return _asymmetric(validated(content, _AsymmetricCircles, where), where)
     if kind == SET:
         raise InputError(
@@ -491,11 +493,19 @@ def _asymmetric(data: _AsymmetricCircles, where: str) -> AsymmetricCirclesDesign
     radius_mm = data.radius_mm if data.diameter_mm is None else data.diameter_mm / 2
     lengths = [side("spacing_mm", data.spacing_mm), radius("radius of the circles", radius_mm or 0.0)]
     require_millimetres(lengths, data.unusual_size, where)
-    most = data.spacing_mm / np.sqrt(2)
+    kind, said = CIRCLES[data.type]
+    board = kind(data.rows, data.columns, data.spacing_mm, radius_mm, data.polarity, data.sigma_mm)
+    most = board.nearest_mm() / 2
     if radius_mm is None or radius_mm >= most:
         raise InputError(
             "E-BOARD-RADIUS",
-            f"{where}: radius {radius_mm:g} mm, under {most:g} mm needed for circles apart; spacing_mm is half of what "
-            "neighbours in a row are apart",
+            f"{where}: radius {radius_mm:g} mm, under {most:g} mm needed for circles apart; spacing_mm is {said}",
         )
-    return AsymmetricCirclesDesign(data.rows, data.columns, data.spacing_mm, radius_mm, data.polarity, data.sigma_mm)
+    return board
+
+
+CIRCLES = {
+    "asymmetric-circles": (AsymmetricCirclesDesign, "half of what neighbours in a row are apart"),
+    "hexagonal-circles": (HexagonalCirclesDesign, "what neighbours are apart"),
+}
+"""Grids of circles with shifted rows, and what their spacing is."""

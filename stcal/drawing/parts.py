@@ -99,7 +99,9 @@ def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: fl
     spans = []
     for axis in (0, 1):
         low, high = float(xy[:, axis].min()), float(xy[:, axis].max())
-        spans.append((axis, low, high, f"{round((high - low) / pitch)} × {said_mm(pitch)} = {said_mm(high - low)}"))
+        count, length = round((high - low) / pitch), said_mm(high - low)
+        whole = abs(count * pitch - (high - low)) < 1e-6 * pitch  # rows of a hexagonal grid are nearer
+        spans.append((axis, low, high, f"{count} × {said_mm(pitch)} = {length}" if whole else length))
     sizes = " and ".join(said_mm(2 * radius) for radius in sorted(set(radii.tolist())))
     description = f"{name}: {board.rows} × {board.columns} dots, diameter {sizes} mm"
     return _part(description, _discs(xy, radii, names, board.polarity), board.polarity, margin_mm, tuple(spans))
