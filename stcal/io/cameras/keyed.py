@@ -197,7 +197,8 @@ class _Reading:
                 known[role], keys[role] = value, key
         for key in list(unread):
             allowed, of_roi = NEUTRAL.get(plain(key.split(".")[-1])), plain(key).startswith("roi")
-            if (allowed and unread[key] in allowed) or (of_roi and _full_image(key, unread, known)):
+            unscaled = plain(key.split(".")[-1]) == "scale" and unread[key] == 1
+            if unscaled or (allowed and unread[key] in allowed) or (of_roi and _full_image(key, unread, known)):
                 del unread[key]
             elif allowed or of_roi:
                 raise InputError(
