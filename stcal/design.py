@@ -261,6 +261,8 @@ class BoardDesign:
         Whether a pitch or radius that no hardware has in mm is meant as it stands.
     rim_mm : float
         Height of the rims in front of the dots, negative for dots that stand out; mm.
+    rings : tuple of (int, int)
+        Row and column of each dot with a hole, which tell the board from its turns.
 
     Raises
     ------
@@ -279,6 +281,7 @@ class BoardDesign:
     stated: StatedSize = StatedSize()
     unusual_size: bool = False
     rim_mm: float = 0.0
+    rings: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self):
         require_choices(self, "board")
@@ -291,6 +294,10 @@ class BoardDesign:
     def cells(self) -> np.ndarray:
         """Returns row and column of every dot, (rows·columns, 2), row-major."""
         return np.column_stack(np.divmod(np.arange(self.rows * self.columns), self.columns))
+
+    def unique(self) -> bool:
+        """Returns True if the board looks different after any turn."""
+        return self.corner is not None or bool(self.rings)
 
     def steps(self) -> np.ndarray:
         """Returns the steps (2, 2), as columns, from column to column and from row to row, in pitches."""

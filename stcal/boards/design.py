@@ -228,7 +228,7 @@ class AsymmetricCirclesDesign:
     ``spacing_mm``: neighbours in a row are two spacings apart, rows one. X along a row, Y down the columns, Z into the
     board, origin at circle (0, 0). OpenCV's own pattern has 11 rows and 4 columns. ``radius_mm`` : radius of all
     circles, None if it is to be determined from images; ``polarity`` : circles against the board; ``sigma_mm`` : σ of a
-    circle about the grid.
+    circle about the grid; ``rings`` : row and place of each circle with a hole, which tell the board from its turn.
     """
 
     rows: int
@@ -237,6 +237,7 @@ class AsymmetricCirclesDesign:
     radius_mm: float | None
     polarity: Polarity
     sigma_mm: float = 0.005
+    rings: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self):
         require_choices(self, "asymmetric circles")
@@ -251,7 +252,11 @@ class AsymmetricCirclesDesign:
 
     def symmetries(self) -> list[Rigid]:
         """Return a half turn if the number of rows is even, so that first and last row differ in their shift."""
-        return [] if self.rows % 2 else turns(self.xy_mm(), [2])
+        return [] if self.rows % 2 or self.rings else turns(self.xy_mm(), [2])
+
+    def _ring_cells(self, cells: np.ndarray) -> tuple[tuple[int, int], ...]:
+        """Return row and column in the lattice of the circles with a hole; ``cells`` : (n, 2) of all circles."""
+        return tuple((int(v), int(u)) for v, u in (cells[row * self.columns + place] for row, place in self.rings))
 
     def radii_mm(self) -> np.ndarray:
         """Return the radii, (rows·columns,), mm.
@@ -323,7 +328,8 @@ class HexagonalCirclesDesign(AsymmetricCirclesDesign):
         cells = cells - cells.min(0)
         rows, columns = (cells.max(0) + 1).tolist()
         sizes = rows, columns, self.spacing_mm, self.radii_mm()[0]
-        return HexagonalPart(*sizes, self.polarity, self.sigma_mm, taken=cells, circles=self)
+        rings = self._ring_cells(cells)
+        return HexagonalPart(*sizes, self.polarity, self.sigma_mm, rings=rings, taken=cells, circles=self)
 
 
 FlatBoard = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign | AsymmetricCirclesDesign

@@ -26,7 +26,7 @@ from stcal.boards.foreign import Few, bundle_content, kalibr_board_of, kalibr_co
 from stcal.design import BoardDesign, Polarity, reference_board
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.design import BoardEntry, Count, Squares, board_design, board_toml
+from stcal.io.design import BoardEntry, Count, Rings, Squares, board_design, board_toml, rings_of
 from stcal.io.design import load_board as load_dots
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.json import mistake
@@ -97,6 +97,7 @@ class _AsymmetricCircles(Sized):
     diameter_mm: Positive | None = None
     polarity: Polarity
     sigma_mm: Positive = 0.005
+    rings: Rings = ()
 
 
 class TagEntry(Strict):
@@ -250,7 +251,7 @@ def keys_of(board: FlatBoard) -> list[str]:
     """Return ``key = value`` for each number and word of a board of squares, tags or circles, as its file has them."""
     skipped = ("tags", "corners_mm") if isinstance(board, TagLayout) else ()
     stated = {entry.name: getattr(board, entry.name) for entry in fields(board) if entry.name not in skipped}
-    return [f"{key} = {_toml_value(value)}" for key, value in stated.items() if value is not None]
+    return [f"{key} = {_toml_value(value)}" for key, value in stated.items() if value not in (None, ())]
 
 
 def tag_rows(layout: TagLayout) -> list[str]:
@@ -265,6 +266,8 @@ def tag_rows(layout: TagLayout) -> list[str]:
 def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, tuple):
+        return repr(list(map(list, value)))
     return toml_string(value) if isinstance(value, str) else repr(value)
 
 
@@ -494,7 +497,8 @@ def _asymmetric(data: _AsymmetricCircles, where: str) -> AsymmetricCirclesDesign
     lengths = [side("spacing_mm", data.spacing_mm), radius("radius of the circles", radius_mm or 0.0)]
     require_millimetres(lengths, data.unusual_size, where)
     kind, said = CIRCLES[data.type]
-    board = kind(data.rows, data.columns, data.spacing_mm, radius_mm, data.polarity, data.sigma_mm)
+    rings = rings_of(data.rings, data.rows, data.columns, False, where)
+    board = kind(data.rows, data.columns, data.spacing_mm, radius_mm, data.polarity, data.sigma_mm, rings)
     most = board.nearest_mm() / 2
     if radius_mm is None or radius_mm >= most:
         raise InputError(

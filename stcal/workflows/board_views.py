@@ -81,7 +81,7 @@ def symmetries(board: Board) -> list[Rigid]:
     """Returns the rotations after which the board looks the same, as board_from_board, without the identity."""
     if not isinstance(board, BoardDesign):
         return board.symmetries()
-    if board.corner is not None:
+    if board.unique():
         return []
     return turns(board.xy_mm(), [1, 2, 3] if board.rows == board.columns else [2])
 

@@ -91,3 +91,52 @@ def test_a_covered_strip_is_said():
     view, why = find_board(view_of(board, TILTS[1], (112.0, -np.inf))[0], "a", CAMERA, board)
     assert view is None
     assert "strip of the board is hidden" in why
+
+
+def with_holes(board: HexagonalCirclesDesign, rings, share: float, tilt, hidden_from_mm=(np.inf, np.inf)):
+    """A view with holes, ``share`` of the radius, in the circles ``rings``, (row, place)."""
+    image, pose = view_of(board, tilt, hidden_from_mm)
+    fine, angle = cv2.resize(image, None, fx=8, fy=8, interpolation=cv2.INTER_CUBIC), np.linspace(0, 2 * np.pi, 100)
+    rim = share * board.radius_mm * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    for row, place in rings:
+        px = CAMERA.project(pose @ (np.append(board.xy_mm()[row * board.columns + place], 0.0) + rim))
+        cv2.fillPoly(fine, [np.rint(((px + 0.5) * 8 - 0.5) * 16).astype(np.int32)], 220, cv2.LINE_AA, 4)
+    return cv2.resize(fine, image.shape[::-1], interpolation=cv2.INTER_AREA), pose
+
+
+@pytest.mark.parametrize("share", [0.35, 0.6])
+@pytest.mark.parametrize("tilt", TILTS[1:])
+def test_rings_tell_the_ends_of_a_board(share, tilt):
+    """The board has an even number of rows and looks the same turned, but for its rings."""
+    rings = ((1, 2), (1, 3), (4, 6))
+    board = HexagonalCirclesDesign(8, 8, 20.0, 6.0, "dark", rings=rings)
+    image, pose = with_holes(board, rings, share, tilt)
+    view, why = find_board(image, "a", CAMERA, board)
+    assert view is not None, why
+    assert board.symmetries() == []
+    assert len(view) >= 61
+    assert np.abs(view.xy_px - CAMERA.project(pose @ view.xyz_board)).max() < 0.06
+
+
+def test_rings_tell_which_columns_are_seen():
+    rings = ((2, 1), (5, 3))
+    board = HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark", rings=rings)
+    image, pose = with_holes(board, rings, 0.4, TILTS[1], (112.0, -np.inf))
+    view, why = find_board(image, "a", CAMERA, board)
+    assert view is not None, why
+    assert 40 < len(view) < 56
+    assert np.abs(view.xy_px - CAMERA.project(pose @ view.xyz_board)).max() < 0.06
+
+
+def test_rings_in_files(tmp_path):
+    dots = 'rows = 5\ncolumns = 7\npitch_mm = 20.0\nradius_mm = 5.0\npolarity = "dark"\n'
+    for text in (f"{TEXT}rings = [[1, 2], [0, 3]]\n", f"{dots}rings = [[0, 3], [1, 2]]\n"):
+        (tmp_path / "b.toml").write_text(text)
+        board = load_flat_board(tmp_path / "b.toml")
+        assert board.rings == ((0, 3), (1, 2))
+        (tmp_path / "again.toml").write_text(run_board_toml(load_run_board(tmp_path / "b.toml")))
+        assert load_flat_board(tmp_path / "again.toml").rings == board.rings
+    for rings, named in (("[[5, 0]]", "[5, 0]"), ("[[0, 0], [4, 6]]", "2 rings that look the same after a turn")):
+        (tmp_path / "b.toml").write_text(f"{dots}rings = {rings}\n")
+        with fails_with(f"E-BOARD-RINGS … {named}"):
+            load_flat_board(tmp_path / "b.toml")

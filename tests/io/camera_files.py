@@ -406,7 +406,8 @@ FILES |= {
     ),
     "ORB-SLAM, rectified": (ORB.format(kind="Rectified", distortion=""), perspective([0.0] * 4)),
     "rpg_vikit": (
-        "cam_model: Pinhole\ncam_width: 1280\ncam_height: 720\nscale: 1.0\ncam_fx: 911.5\ncam_fy: 910.25\ncam_cx: 639.0\n"
+        "cam_model: Pinhole\ncam_width: 1280\ncam_height: 720\nscale: 1.0\ncam_fx: 911.5\ncam_fy: 910.25\n"
+        "cam_cx: 639.0\n"
         "cam_cy: 359.0\ncam_d0: -0.2\ncam_d1: 0.05\ncam_d2: 0.001\ncam_d3: -0.0005\n",
         perspective(D4),
     ),

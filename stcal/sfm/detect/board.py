@@ -5,12 +5,14 @@ which rows or columns are seen. A reading therefore carries every numbering that
 (``stcal.sfm.detect.labels``).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from stcal.design import BoardDesign
 from stcal.errors import DegenerateError
+from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian
 from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, match_pattern, singular_values
 
@@ -211,6 +213,45 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
     if not placements:
         return None
     return _reading(placements, candidates, board)
+
+
+def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera) -> BoardReading:
+    """Returns the reading with the numberings that put the board's dots with a hole where the image shows holes.
+
+    A dot has a hole if its middle differs from its body by much of what bodies differ from the board.
+
+    ``grey`` : (height, width) 8-bit image; ``camera`` : its camera.
+    """
+    angle = np.arange(0, 2 * np.pi, np.pi / 8)
+    around = np.column_stack([np.cos(angle), np.sin(angle)])
+    cells = board.cells()
+    rings = np.array([tuple(cell) in board.rings for cell in cells.tolist()])
+    middles = board.pitch_mm * board.flat(cells[:, ::-1].astype(float))[:, None]
+    wrong = []
+    for homography in reading.homographies:
+        values = []
+        for share in RING_SHARES:
+            xy = apply_homography(homography, (middles + share * board.radius_mm * around).reshape(-1, 2))
+            px = camera.project(np.column_stack([xy, np.ones(len(xy))]))
+            sampled = cv2.remap(grey, px.astype(np.float32)[None], None, cv2.INTER_LINEAR)[0]  # type: ignore[call-overload]
+            values.append(sampled.reshape(len(cells), -1).mean(1))
+        inside = ((px > 0) & (px < np.array(grey.shape[::-1]) - 1)).all(1).reshape(len(cells), -1).all(1)
+        middle, body, outside = values
+        holes = np.abs(middle - body) > HOLE_SHARE * np.median(np.abs(body - outside)[inside])
+        wrong.append(int((holes != rings)[inside].sum()))
+    best = min(wrong)
+    kept = [i for i, count in enumerate(wrong) if count == best]
+    if best > MOST_WRONG:
+        return reading
+    return replace(reading, numberings=reading.numberings[kept], homographies=reading.homographies[kept])
+
+
+RING_SHARES = (0.15, 0.75, 1.25)
+"""Radii of the circles on which the middle of a dot, its body and the board about it are sampled, in its radii."""
+HOLE_SHARE = 0.5
+"""Smallest difference between middle and body of a dot with a hole, over that between bodies and the board."""
+MOST_WRONG = 1
+"""Largest number of dots whose hole is missed, or seen where none is."""
 
 
 def needed_dots(board: BoardDesign) -> float:
