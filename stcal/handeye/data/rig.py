@@ -196,5 +196,5 @@ def read_rig_file(path: Path) -> RigFiles:
             )
         files = (folder / name for name in (entry.images, entry.camera, poses))
         times = folder / entry.times if entry.times else None
-        cameras.append(RigCameraFiles(entry.name, *files, times, entry.camera_name))
+        cameras.append(RigCameraFiles(entry.name, *files, times=times, camera_name=entry.camera_name))
     return RigFiles(path, content.setup, folder / content.board, tuple(cameras))
