@@ -426,6 +426,26 @@ FILES |= {
         "  Distortion: \tBrown Conrady\n  Coeffs:     \t-0.2  \t0.05  \t0.001  \t-0.0005  \t0.01  \n",
         perspective(D5),
     ),
+    "VSLAM-LAB": (
+        "cameras:\n  - cam_name: rgb_0\n    cam_type: gray\n    cam_model: pinhole\n    focal_length: [911.5, 910.25]\n"
+        "    principal_point: [639.0, 359.0]\n    distortion_type: equid4\n"
+        f"    distortion_coefficients: {K4}\n    image_dimension: [1280, 720]\n    fps: 20.0\n",
+        equidistant(K4),
+    ),
+    "a list of nested cameras": (
+        json.dumps(
+            {
+                "cameras": [
+                    {
+                        "camera_id": "00",
+                        "intrinsics": {"resolution": SIZE, "camera_matrix": FLAT, "distortion_coefficients": D5},
+                        "extrinsics": {"view_matrix": EYE},
+                    }
+                ]
+            }
+        ),
+        perspective(D5),
+    ),
     "calibdb": (
         json.dumps(
             {"camera_matrix": NESTED, "distortion_coefficients": D5, "distortion_model": "rectilinear"}

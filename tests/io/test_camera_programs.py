@@ -139,7 +139,7 @@ def test_a_key_of_the_projection_is_taken_or_refused(tmp_path, name, key):
         refused = error
     else:
         confirmed = key == "fisheye_model" and name.endswith(
-            ("KB", "fisheye", "camera_model", "ROS 1", "kb4", "Gyroflow", "OpenMVG, fisheye")
+            ("KB", "fisheye", "camera_model", "ROS 1", "kb4", "Gyroflow", "OpenMVG, fisheye", "VSLAM-LAB")
         )
         assert confirmed or np.abs(project(changed) - wanted).max() > 1
         return
@@ -147,7 +147,17 @@ def test_a_key_of_the_projection_is_taken_or_refused(tmp_path, name, key):
     assert key.split("_")[0] in str(refused)
 
 
-ONE_BLOCK = ("mrcal", "ROS, ini", "Kalibr", "stella_vslam", "aslam, SVO", "Anipose", "ZED", "rs-enumerate-devices")
+ONE_BLOCK = (
+    "mrcal",
+    "ROS, ini",
+    "Kalibr",
+    "stella_vslam",
+    "aslam, SVO",
+    "Anipose",
+    "ZED",
+    "rs-enumerate-devices",
+    "VSLAM-LAB",
+)
 REORDERED = {name: text for name, (text, _) in FILES.items() if name not in (*XML, *ONE_BLOCK)}
 
 
@@ -225,6 +235,11 @@ REFUSED = {
         f"image_size: {list(SIZE)}\nfocal_length: 16.0\nprincipal_point: [640, 360]\n",
         "E-CAMERA-FOCAL … 16 … mm",
     ),
+    "a lens in mm without a size": (
+        "focal_length: 16.0\nprincipal_point: [640, 360]\n",
+        "E-CAMERA-FOCAL … 16 … mm",
+    ),
+    "shares of a side": ("fx: 0.75\nfy: 0.76\ncx: 0.51\ncy: 0.49\n", "E-CAMERA-FOCAL … 0.75 … shares"),
     "a centre from the middle": (
         f"image_size: {list(SIZE)}\nfx: 911.5\nfy: 910\ncx: -3.2\ncy: 7.5\n",
         "E-CAMERA-CENTRE … -3.2 … middle",
@@ -337,11 +352,12 @@ def test_a_camera_of_a_list_is_chosen(tmp_path):
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps({"cameras": [{"name": "a", "K": EYE}, {"name": "b", "K": FLAT, "D": {"k1": -0.2}}]}))
     np.testing.assert_allclose(project(read_lens(path, "b")), perspective([-0.2, 0, 0, 0]), atol=1e-9)
+    other = [800.0, 0, 630.0, 0, 801.0, 350.0, 0, 0, 1]
     path.write_text(
-        ORB.format(kind="PinHole", distortion="") + f"LEFT.height: 480\nLEFT.K: {EYE}\nLEFT.D: {D4}\nRIGHT.K: {EYE}\n"
+        ORB.format(kind="PinHole", distortion="") + f"LEFT.height: 480\nLEFT.K: {other}\nLEFT.D: {D4}\nRIGHT.K: {EYE}\n"
     )
     np.testing.assert_allclose(project(read_lens(path, "Camera")), perspective([0.0] * 4), atol=1e-9)
-    np.testing.assert_allclose(project(read_lens(path, "LEFT")), perspective(D4, (1, 1, 0, 0)), atol=1e-9)
+    np.testing.assert_allclose(project(read_lens(path, "LEFT")), perspective(D4, (800, 801, 630, 350)), atol=1e-9)
 
 
 def test_the_camera_of_kittis_odometry_is_that_of_rectified_images(tmp_path):

@@ -23,16 +23,18 @@ RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 PERSPECTIVE = {
     *("plumbbob", "rationalpolynomial", "radtan", "radialtangential", "brown", "brownconrady", "opencv", "fullopencv"),
     *("distortionbrownconrady", "thinprism", "tilted", "opencvstandard", "pinholeradtan", "standard"),
-    *("pinholefull", "rectilinear"),
+    *("pinholefull", "rectilinear", "radtan4", "radtan5", "radtan8", "pinholeradtan8"),
 }
 """Values of a model that mean OpenCV's perspective lens."""
 UNDISTORTED = {
     *("none", "", "null", "false", "camera", "pinhole", "rectified", "simplepinhole", "perspective", "opengl"),
-    *("distortionnone", "perspectiveprojwithdistortion", "perspectiveprojwithoutdistortion"),
+    *("distortionnone", "nodistortion", "perspectiveprojwithdistortion", "perspectiveprojwithoutdistortion"),
 }
 """Values of a model that say nothing of distortion."""
+COLOURS = frozenset(("rgb", "bgr", "gray", "grey", "mono", "monochrome", "color", "colour", "depth", "infrared"))
+"""Types of cameras that say nothing of a lens."""
 FISHEYE = frozenset([*map(plain, EQUIDISTANT), "kannalabrandt8", "kannalabrandt4", "kb4", "opencvfisheye"])
-FISHEYE_ALSO = frozenset(["distortionkannalabrandt4", "fisheyeopencv", "pinholeequi", "equi"])
+FISHEYE_ALSO = frozenset(["distortionkannalabrandt4", "fisheyeopencv", "pinholeequi", "equi", "equid4", "equidistant4"])
 UNIFIED = frozenset(["omni", "omnidir", "omnidirectional", "mei", "unified"])
 INVERSE = frozenset(["inversebrownconrady", "distortioninversebrownconrady", "modifiedbrownconrady"])
 """Models of which zeros alone are read: their polynomials are other ones than OpenCV's."""
@@ -184,7 +186,7 @@ class _Reading:
                 role = "matrix"
             if role == "distortion" and isinstance(value, str) and value.strip() and not numbers_of(value).size:
                 role = "model"
-            if is_fundamental(plain(path[-1]), value):
+            if is_fundamental(plain(path[-1]), value) or (role == "camera model" and plain(value) in COLOURS):
                 continue
             if role is None:
                 unread[key] = value

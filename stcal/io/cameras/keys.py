@@ -11,7 +11,7 @@ from stcal.errors import InputError, InputNote
 
 _HARMLESS = """
 alphacerror appliedtransform boardheight boardsize boardwidth calibdate calibrationdate calibrationtime calibtime
-cameraid cameraindex cameraname cameraserial camoverlaps comment cornerdist createdate createdby data date depthscale
+cameraid cameraindex cameraname cameraserial camname camoverlaps comment cornerdist createdate createdby data date depthscale
 description fileversion flags fps frameid framescount framescounter generatedon header hostname id imagename
 imagetopic label localtransform make name nbcamera nframes notes nrofframes nrofimages p pattern patternsize
 projectionmatrix r ratehz rectificationmatrix ret rms rostopic sensortype serial serialnumber source squaresize stamp
@@ -110,7 +110,8 @@ def plain(key: object) -> str:
 
 def role_of(key: str) -> str | None:
     """Return what a key holds, by :data:`ROLES`; None if it is not known."""
-    return ROLES.get(plain(key)) or ROLES.get(plain(PREFIX.sub("", key)))
+    bare = plain(PREFIX.sub("", key))
+    return ROLES.get(plain(key)) or ROLES.get(f"camera{bare}") or ROLES.get(bare)
 
 
 def may_be_coefficients(value: object) -> bool:

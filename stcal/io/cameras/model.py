@@ -148,6 +148,8 @@ def cameras_txt(camera: Camera) -> str:
 LEAST_FOCAL = {False: 0.1, True: 0.05}
 """Smallest focal length over the longer side, by whether the lens is a fisheye: an image of 157° from edge to edge, and
 a circle of 280° on a third of the side. Lengths in mm are shorter."""
+LEAST_FOCAL_PX = 5.0
+"""Smallest focal length, px: shares of a side, which files without a size have, are shorter."""
 AT_CORNER = 0.02
 """Share of each side within which a principal point is at the image's corner, as one relative to the middle is."""
 
@@ -178,11 +180,13 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path)
             raise InputError(
                 "E-CAMERA-SIZE", f"camera file {path}: image side {side:g} px; a whole number in 1…{MAX_SIDE_PX} needed"
             )
-    if width and height and flat[:2].max() < LEAST_FOCAL[FISHEYE in colmap_model] * max(width, height):
+    longer = max(width, height) if width and height else 2 * float(flat[2:4].max())
+    if flat[:2].max() < max(LEAST_FOCAL[FISHEYE in colmap_model] * longer, LEAST_FOCAL_PX):
+        size = f" of an image of {width:g}×{height:g} px" if width and height else ""
         raise InputError(
             "E-CAMERA-FOCAL",
-            f"camera file {path}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}) of an image "
-            f"of {width:g}×{height:g} px; px needed: are they mm, or shares of a side?",
+            f"camera file {path}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}; px "
+            "needed: are they mm, or shares of a side?",
         )
     if width and height and (np.abs(flat[2:4]) < AT_CORNER * np.array([width, height])).all():
         raise InputError(
