@@ -11,8 +11,8 @@ from stcal.errors import InputError, InputNote
 
 _HARMLESS = """
 alphacerror appliedtransform boardheight boardsize boardwidth calibdate calibrationdate calibrationtime calibtime
-cameraid cameraindex cameraname cameraserial camname camoverlaps comment cornerdist createdate createdby data date depthscale
-description fileversion flags fps frameid framescount framescounter generatedon header hostname id imagename
+cameraid cameraindex cameraname cameraserial camname camoverlaps comment cornerdist createdate createdby data date
+depthscale description fileversion flags fps frameid framescount framescounter generatedon header hostname id imagename
 imagetopic label localtransform make name nbcamera nframes notes nrofframes nrofimages p pattern patternsize
 projectionmatrix r ratehz rectificationmatrix ret rms rostopic sensortype serial serialnumber source squaresize stamp
 t target tbs tcamimu tcncnm1 testfilenames time timeshiftcamimu timestamp topic trainfilenames units valfilenames
