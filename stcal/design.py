@@ -261,6 +261,8 @@ class BoardDesign:
         Whether a pitch or radius that no hardware has in mm is meant as it stands.
     rim_mm : float
         Height of the rims in front of the dots, negative for dots that stand out; mm.
+    rings : tuple of (int, int)
+        Row and column of each dot with a hole, which tell the board from its turns.
 
     Raises
     ------
@@ -279,6 +281,7 @@ class BoardDesign:
     stated: StatedSize = StatedSize()
     unusual_size: bool = False
     rim_mm: float = 0.0
+    rings: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self):
         require_choices(self, "board")
@@ -292,9 +295,21 @@ class BoardDesign:
         """Returns row and column of every dot, (rows·columns, 2), row-major."""
         return np.column_stack(np.divmod(np.arange(self.rows * self.columns), self.columns))
 
+    def unique(self) -> bool:
+        """Returns True if the board looks different after any turn."""
+        return self.corner is not None or bool(self.rings)
+
+    def steps(self) -> np.ndarray:
+        """Returns the steps (2, 2), as columns, from column to column and from row to row, in pitches."""
+        return np.eye(2)
+
+    def flat(self, column_row: np.ndarray) -> np.ndarray:
+        """Returns the positions (n, 2) of columns and rows (n, 2), in pitches."""
+        return column_row @ self.steps().T
+
     def xy_mm(self) -> np.ndarray:
         """Returns the grid positions, (rows·columns, 2), row-major, mm."""
-        return self.pitch_mm * self.cells()[:, ::-1].astype(float)
+        return self.pitch_mm * self.flat(self.cells()[:, ::-1].astype(float))
 
     def radii_mm(self) -> np.ndarray:
         """Returns the dot radii, (rows·columns,), row-major, mm."""
@@ -310,7 +325,7 @@ class BoardDesign:
     def places_mm(self, labels: Iterable[Label]) -> np.ndarray:
         """Returns the places at which these dots are seen, (n, 3), board frame: half of a rim before the surface."""
         cells = dot_cells(labels)
-        return np.column_stack([self.pitch_mm * cells[:, ::-1], np.full(len(cells), -0.5 * self.rim_mm)])
+        return np.column_stack([self.pitch_mm * self.flat(cells[:, ::-1]), np.full(len(cells), -0.5 * self.rim_mm)])
 
     def radius_of(self) -> dict[DotLabel, float]:
         """Returns the radius in mm by label."""

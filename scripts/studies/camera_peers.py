@@ -84,7 +84,7 @@ def boards() -> dict[str, tuple[BoardDesign, float, float]]:
     """Board, and how far its points are from the grid at random and by a bow, mm."""
     own = reference_board()
     large = replace(own, radius_mm=0.35 * own.pitch_mm, corner=None, corner_radius_mm=None)
-    corners = replace(own, radius_mm=1e-6, corner=None, corner_radius_mm=None)
+    corners = replace(own, radius_mm=1e-6, unusual_size=True, corner=None, corner_radius_mm=None)
     return {
         "dots, exact board": (own, 0.0, 0.0),
         f"dots, board to {own.sigma_mm:g} mm": (own, own.sigma_mm, 0.0),

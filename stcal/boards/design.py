@@ -228,7 +228,7 @@ class AsymmetricCirclesDesign:
     ``spacing_mm``: neighbours in a row are two spacings apart, rows one. X along a row, Y down the columns, Z into the
     board, origin at circle (0, 0). OpenCV's own pattern has 11 rows and 4 columns. ``radius_mm`` : radius of all
     circles, None if it is to be determined from images; ``polarity`` : circles against the board; ``sigma_mm`` : σ of a
-    circle about the grid.
+    circle about the grid; ``rings`` : row and place of each circle with a hole, which tell the board from its turn.
     """
 
     rows: int
@@ -237,6 +237,7 @@ class AsymmetricCirclesDesign:
     radius_mm: float | None
     polarity: Polarity
     sigma_mm: float = 0.005
+    rings: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self):
         require_choices(self, "asymmetric circles")
@@ -251,7 +252,11 @@ class AsymmetricCirclesDesign:
 
     def symmetries(self) -> list[Rigid]:
         """Return a half turn if the number of rows is even, so that first and last row differ in their shift."""
-        return [] if self.rows % 2 else turns(self.xy_mm(), [2])
+        return [] if self.rows % 2 or self.rings else turns(self.xy_mm(), [2])
+
+    def _ring_cells(self, cells: np.ndarray) -> tuple[tuple[int, int], ...]:
+        """Return row and column in the lattice of the circles with a hole; ``cells`` : (n, 2) of all circles."""
+        return tuple((int(v), int(u)) for v, u in (cells[row * self.columns + place] for row, place in self.rings))
 
     def radii_mm(self) -> np.ndarray:
         """Return the radii, (rows·columns,), mm.
@@ -265,16 +270,66 @@ class AsymmetricCirclesDesign:
             raise InputError("E-BOARD-RADIUS", "asymmetric circles: no radius; radius_mm needed")
         return np.full(self.rows * self.columns, self.radius_mm)
 
+    def nearest_mm(self) -> float:
+        """Return the distance of neighbouring circles, mm."""
+        return float(np.sqrt(2) * self.spacing_mm)
+
     def lattice(self) -> LatticePart:
         """Return the square lattice, rotated by 45°, of which the circles occupy some places."""
         x, y = self._steps().T
         cells = np.column_stack([y - x, y + x]) // 2
         cells = cells - cells.min(0)
         rows, columns = (cells.max(0) + 1).tolist()
-        pitch = float(np.sqrt(2) * self.spacing_mm)
         return LatticePart(
-            rows, columns, pitch, self.radii_mm()[0], self.polarity, self.sigma_mm, taken=cells, circles=self
+            rows,
+            columns,
+            self.nearest_mm(),
+            self.radii_mm()[0],
+            self.polarity,
+            self.sigma_mm,
+            taken=cells,
+            circles=self,
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HexagonalPart(LatticePart):
+    """A hexagonal lattice of which circles occupy some places; rows are shifted by half a pitch each."""
+
+    def steps(self) -> np.ndarray:
+        """Return the steps (2, 2), as columns, from column to column and from row to row, in pitches."""
+        return HEXAGONAL.copy()
+
+
+HEXAGONAL = np.array([[1.0, 0.5], [0.0, np.sqrt(3) / 2]])
+"""Steps of a hexagonal lattice, as columns, in pitches."""
+
+
+@dataclass(frozen=True, slots=True)
+class HexagonalCirclesDesign(AsymmetricCirclesDesign):
+    """A hexagonal grid of ``rows`` rows of ``columns`` circles, every second row shifted by half a step.
+
+    Circle (i, j), row i and place j in it, both from 0, lies at x = (j + (i mod 2) / 2) · ``spacing_mm``, y = i ·
+    √3 / 2 · ``spacing_mm``: all six neighbours are one spacing away. Else it is as :class:`AsymmetricCirclesDesign`.
+    """
+
+    def _steps(self) -> np.ndarray:
+        row, place = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        return np.column_stack([place - row // 2, row]) @ HEXAGONAL.T
+
+    def nearest_mm(self) -> float:
+        """Return the distance of neighbouring circles, mm."""
+        return self.spacing_mm
+
+    def lattice(self) -> HexagonalPart:
+        """Return the hexagonal lattice, whose rows are shifted by half a pitch each."""
+        row, place = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        cells = np.column_stack([row, place - row // 2])
+        cells = cells - cells.min(0)
+        rows, columns = (cells.max(0) + 1).tolist()
+        sizes = rows, columns, self.spacing_mm, self.radii_mm()[0]
+        rings = self._ring_cells(cells)
+        return HexagonalPart(*sizes, self.polarity, self.sigma_mm, rings=rings, taken=cells, circles=self)
 
 
 FlatBoard = ChessboardDesign | CharucoDesign | TagLayout | AprilGridDesign | AsymmetricCirclesDesign

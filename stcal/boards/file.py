@@ -16,6 +16,7 @@ from stcal.boards.design import (
     ChessboardDesign,
     CornerBoard,
     FlatBoard,
+    HexagonalCirclesDesign,
     LatticePart,
     TagLayout,
 )
@@ -25,19 +26,19 @@ from stcal.boards.foreign import Few, bundle_content, kalibr_board_of, kalibr_co
 from stcal.design import BoardDesign, Polarity, reference_board
 from stcal.errors import InputError
 from stcal.io.covariance import Rows, require_covariance
-from stcal.io.design import BoardEntry, Count, Squares, board_design, board_toml
+from stcal.io.design import BoardEntry, Count, Rings, Squares, board_design, board_toml, rings_of
 from stcal.io.design import load_board as load_dots
 from stcal.io.files import SETTINGS_BYTES, read_bytes, require_same, save, text_of
 from stcal.io.json import mistake
 from stcal.io.toml import Finite, Positive, Sized, Strict, load_toml, toml_string, validated
 from stcal.lengths import Length, radius, require_millimetres, side, stated_unusual
 
-KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles")
+KINDS = ("circles", "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles", "hexagonal-circles")
 """Types of flat boards."""
 SET = "boards"
 REMEDY = (
-    'a file with type = "chessboard", "charuco", "tags", "aprilgrid" or "asymmetric-circles" needed, one of dots, or '
-    "one of Kalibr, see data_layout.md"
+    'a file with type = "chessboard", "charuco", "tags", "aprilgrid", "asymmetric-circles" or "hexagonal-circles" '
+    "needed, one of dots, or one of Kalibr, see data_layout.md"
 )
 MOST_MARKER = 0.99
 """Largest ratio of a ChArUco tag's side to its square's: detection needs white around a tag."""
@@ -88,7 +89,7 @@ class _AprilGrid(Sized):
 
 
 class _AsymmetricCircles(Sized):
-    type: Literal["asymmetric-circles"]
+    type: Literal["asymmetric-circles", "hexagonal-circles"]
     rows: Count
     columns: Count
     spacing_mm: Positive
@@ -96,6 +97,7 @@ class _AsymmetricCircles(Sized):
     diameter_mm: Positive | None = None
     polarity: Polarity
     sigma_mm: Positive = 0.005
+    rings: Rings = ()
 
 
 class TagEntry(Strict):
@@ -227,6 +229,7 @@ TYPES = {
     CharucoDesign: "charuco",
     AprilGridDesign: "aprilgrid",
     AsymmetricCirclesDesign: "asymmetric-circles",
+    HexagonalCirclesDesign: "hexagonal-circles",
     TagLayout: "tags",
 }
 """The word of each kind of board in files."""
@@ -248,7 +251,7 @@ def keys_of(board: FlatBoard) -> list[str]:
     """Return ``key = value`` for each number and word of a board of squares, tags or circles, as its file has them."""
     skipped = ("tags", "corners_mm") if isinstance(board, TagLayout) else ()
     stated = {entry.name: getattr(board, entry.name) for entry in fields(board) if entry.name not in skipped}
-    return [f"{key} = {_toml_value(value)}" for key, value in stated.items() if value is not None]
+    return [f"{key} = {_toml_value(value)}" for key, value in stated.items() if value not in (None, ())]
 
 
 def tag_rows(layout: TagLayout) -> list[str]:
@@ -263,6 +266,8 @@ def tag_rows(layout: TagLayout) -> list[str]:
 def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, tuple):
+        return repr(list(map(list, value)))
     return toml_string(value) if isinstance(value, str) else repr(value)
 
 
@@ -335,7 +340,7 @@ def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
         return _tags(validated(content, TagsFile, where), where)
     if kind == "aprilgrid":
         return _aprilgrid(validated(content, _AprilGrid, where), where)
-    if kind == "asymmetric-circles":
+    if kind in ("asymmetric-circles", "hexagonal-circles"):
         return _asymmetric(validated(content, _AsymmetricCircles, where), where)
     if kind == SET:
         raise InputError(
@@ -491,11 +496,20 @@ def _asymmetric(data: _AsymmetricCircles, where: str) -> AsymmetricCirclesDesign
     radius_mm = data.radius_mm if data.diameter_mm is None else data.diameter_mm / 2
     lengths = [side("spacing_mm", data.spacing_mm), radius("radius of the circles", radius_mm or 0.0)]
     require_millimetres(lengths, data.unusual_size, where)
-    most = data.spacing_mm / np.sqrt(2)
+    kind, said = CIRCLES[data.type]
+    rings = rings_of(data.rings, data.rows, data.columns, False, where)
+    board = kind(data.rows, data.columns, data.spacing_mm, radius_mm, data.polarity, data.sigma_mm, rings)
+    most = board.nearest_mm() / 2
     if radius_mm is None or radius_mm >= most:
         raise InputError(
             "E-BOARD-RADIUS",
-            f"{where}: radius {radius_mm:g} mm, under {most:g} mm needed for circles apart; spacing_mm is half of what "
-            "neighbours in a row are apart",
+            f"{where}: radius {radius_mm:g} mm, under {most:g} mm needed for circles apart; spacing_mm is {said}",
         )
-    return AsymmetricCirclesDesign(data.rows, data.columns, data.spacing_mm, radius_mm, data.polarity, data.sigma_mm)
+    return board
+
+
+CIRCLES = {
+    "asymmetric-circles": (AsymmetricCirclesDesign, "half of what neighbours in a row are apart"),
+    "hexagonal-circles": (HexagonalCirclesDesign, "what neighbours are apart"),
+}
+"""Grids of circles with shifted rows, and what their spacing is."""

@@ -117,7 +117,7 @@ def _require_told_apart(found: BoardSet, where: str) -> None:
 
 
 def _turnable(board: BoardDesign | FlatBoard) -> bool:
-    return board.corner is None if isinstance(board, BoardDesign) else bool(board.symmetries())
+    return not board.unique() if isinstance(board, BoardDesign) else bool(board.symmetries())
 
 
 def _alike(first: BoardDesign | FlatBoard, second: BoardDesign | FlatBoard) -> str:

@@ -92,6 +92,10 @@ def board_part(board: BoardDesign | FlatBoard, name: str, margin_mm: float) -> P
     return _part(f"{name}: {description}", areas, "dark", max(margin_mm, clear_mm(board)), spans)
 
 
+HOLE = 0.5
+"""Radius of the hole of a ring over the radius of its dot."""
+
+
 def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: float) -> Part:
     xy, radii = board.xy_mm() * [1, -1], board.radii_mm()
     names = board.labels() if isinstance(board, BoardDesign) else [""] * len(xy)
@@ -99,10 +103,19 @@ def _dots(board: BoardDesign | AsymmetricCirclesDesign, name: str, margin_mm: fl
     spans = []
     for axis in (0, 1):
         low, high = float(xy[:, axis].min()), float(xy[:, axis].max())
-        spans.append((axis, low, high, f"{round((high - low) / pitch)} × {said_mm(pitch)} = {said_mm(high - low)}"))
+        count, length = round((high - low) / pitch), said_mm(high - low)
+        whole = abs(count * pitch - (high - low)) < 1e-6 * pitch  # rows of a hexagonal grid are nearer
+        spans.append((axis, low, high, f"{count} × {said_mm(pitch)} = {length}" if whole else length))
     sizes = " and ".join(said_mm(2 * radius) for radius in sorted(set(radii.tolist())))
     description = f"{name}: {board.rows} × {board.columns} dots, diameter {sizes} mm"
-    return _part(description, _discs(xy, radii, names, board.polarity), board.polarity, margin_mm, tuple(spans))
+    dots = _discs(xy, radii, names, board.polarity)
+    if board.rings:
+        in_rows = np.column_stack(np.divmod(np.arange(len(xy)), board.columns))
+        cells = board.cells() if isinstance(board, BoardDesign) else in_rows
+        holed = np.array([tuple(cell) in board.rings for cell in cells.tolist()])
+        other: Polarity = "bright" if board.polarity == "dark" else "dark"
+        dots += _discs(xy[holed], HOLE * radii[holed], [""] * int(holed.sum()), other)
+    return _part(description, dots, board.polarity, margin_mm, tuple(spans))
 
 
 def _squares_said(board: SquaresOrTags) -> tuple[str, tuple[tuple[int, float, float, str], ...]]:

@@ -162,6 +162,34 @@ class SizeEntry(Strict):
         return StatedSize(**{key: None if value is None else float(value) for key, value in values.items()})
 
 
+Place = Annotated[int, Field(ge=0, le=999, strict=True)]
+Rings = Annotated[tuple[tuple[Place, Place], ...], Field(max_length=1000)]
+"""Row and column, or place in the row, of each dot with a hole."""
+
+
+def rings_of(rings: Sequence[Sequence[int]], rows: int, columns: int, quarters: bool, where: str) -> tuple:
+    """Return the dots with a hole, as (row, column); ``quarters`` : True if rows and columns are alike.
+
+    Raises InputError: a dot that the board does not have, or rings that look the same after a turn of the board.
+    """
+    told = {(row, column) for row, column in rings}
+    for row, column in told:
+        if row >= rows or column >= columns:
+            raise InputError(
+                "E-BOARD-RINGS",
+                f"{where}: rings has [{row}, {column}] of {rows} rows of {columns} dots, counted from 0; correct it",
+            )
+    half = {(rows - 1 - row, columns - 1 - column) for row, column in told}
+    quarter = {(column, rows - 1 - row) for row, column in told} if quarters and rows == columns else set()
+    if told and told in (half, quarter):
+        raise InputError(
+            "E-BOARD-RINGS",
+            f"{where}: {len(told)} rings that look the same after a turn of the board; such that tell its ends apart "
+            "needed, else leave rings out",
+        )
+    return tuple(sorted(told))
+
+
 class BoardSizeEntry(SizeEntry):
     """All keys of :class:`StatedSize`."""
 
@@ -181,6 +209,7 @@ class BoardEntry(BoardSizeEntry):
     corner: _CornerFile | None = None
     rim_mm: RimHeight = 0.0
     unusual_size: bool = False
+    rings: Rings = ()
 
 
 PrintedReader = Callable[[PrintedFaceFile, bool, str], FaceDesign]
@@ -280,6 +309,7 @@ def board_design(data: BoardEntry, where: str) -> BoardDesign:
         data.stated(),
         data.unusual_size,
         data.rim_mm,
+        rings_of(data.rings, data.rows, data.columns, True, where),
     )
 
 
@@ -460,6 +490,7 @@ def board_toml(board: BoardDesign) -> str:
                 f"sigma_mm = {_number(board.sigma_mm)}  # standard deviation of the dots' positions, per axis",
                 *([f"rim_mm = {_number(board.rim_mm)}  # height of rims before the dots"] if board.rim_mm else []),
                 *(f"{key} = {_number(value)}" for key, value in sizes if value is not None),
+                *([f"rings = {list(map(list, board.rings))}  # dots with a hole"] if board.rings else []),
                 *stated_unusual(board_lengths(board.pitch_mm, board.radius_mm)),
                 "",
                 "# One larger dot in a corner of the grid tells the orientation; without it the board looks the",

@@ -96,7 +96,7 @@ class ImageFile:
         except FileNotFoundError as error:
             reason = "was there when the work began, and is gone; put it back, or begin again without it"
             raise InputError("E-IMAGES-GONE", f"{self.path}: {reason}") from error
-        return _without_mosaic(data, self.name, self.bayer) if self.bayer else data
+        return without_mosaic(data, self.name, self.bayer)
 
     def carried(self) -> "ImageFile":
         """Return the file with its content. An unreadable file is unchanged: its later read reports the error."""
@@ -143,8 +143,21 @@ def image_file(path: Path) -> ImageFile:
     return ImageFile(path, path.name, TOP_GROUP, bayer=_bayer.get())
 
 
-def _without_mosaic(data: bytes, name: str, pattern: str) -> bytes:
-    """Return a PNG of the grey image of a mosaic; data that are no image stay, as their decoder says why."""
+def stated_mosaic() -> str:
+    """Return the pattern of :func:`mosaic_of` that is in force, or an empty text."""
+    return _bayer.get()
+
+
+def without_mosaic(data: bytes, name: str, pattern: str) -> bytes:
+    """Return a PNG of the grey image of a mosaic; data that are no image stay, as their decoder says why.
+
+    ``data`` : content of an image file; ``name`` : name of the image, for messages; ``pattern`` : colours of the
+    mosaic, or empty, where the data stay.
+
+    Raises InputError: the image has colours already.
+    """
+    if not pattern:
+        return data
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if image is None:

@@ -257,7 +257,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
     between = _separator([line for _, line in used])
     if separator_stated(used[0][1]):
         used = used[1:] or used
-    if between in ";\t" and used[0][1].rstrip(" ").endswith(between):  # behind the last column, too
+    if between != " " and used[0][1].rstrip(" ").endswith(between):  # behind the last column, too
         used = [(i, line.rstrip(" ").removesuffix(between)) for i, line in used]
     try:
         names = [name.strip() for name in cells_of(used[0][1], between)]
@@ -266,19 +266,19 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
             "E-TABLE-HEADER", f"{where}: line {used[0][0]}: {error}; a header with names and units needed"
         ) from error
     names, used = _with_units_of_a_row(names, used, between)
-    names = canonical(names, comments)
-    for name in names:
-        if names.count(name) > 1 or not name:
-            shown = name or "without a name"
-            raise InputError(
-                "E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; every name once needed"
-            )
+    names = canonical(names if names[0] else ["index", *names[1:]], comments)  # pandas writes its index without a name
     if 2 * sum(_is_number(name.replace(",", ".")) for name in names) > len(names):
         raise InputError(
             "E-TABLE-HEADER",
             f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm; or give "
             "header = false in a file of --columns",
         )
+    for name in names:
+        if names.count(name) > 1 or not name:
+            shown = name or "without a name"
+            raise InputError(
+                "E-TABLE-HEADER", f"{where}: column {shown} occurs {names.count(name)} times; every name once needed"
+            )
     if len(names) == 1 and len(used) > 2 and len(cells_of(used[1][1], _separator([used[1][1]]))) > 1:
         raise InputError(
             "E-TABLE-HEADER",
@@ -317,7 +317,9 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
 
 SEPARATORS = {";": "';' between columns", "\t": "tabs between columns", " ": "spaces between columns"}
 """Separators beside the comma, in words."""
-_UNIT_WORD = "mm|cm|um|µm|m|in|rad|deg|°"
+_LONG = {"mm": "millimet", "cm": "centimet", "m": "met", "in": "inch", "deg": "degree", "rad": "radian"}
+"""Beginnings of units in full."""
+_UNIT_WORD = "mm|cm|um|µm|m|in|rad|deg|°|(?:milli|centi)?met(?:er|re)s?|inch(?:es)?|degrees?|radians?"
 _UNIT = re.compile(rf"(.*?)\s*(?:[\[(]\s*({_UNIT_WORD})\s*[\])]|/\s*({_UNIT_WORD}))", re.I)
 _IN_A_ROW = re.compile(rf"[\[(]?\s*({_UNIT_WORD}|)\s*[\])]?", re.I)
 """A cell of a row of units below the header."""
@@ -363,16 +365,13 @@ def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
     unit of columns x, y, z without one.
     """
     said = [match[1].lower() for line in comments for match in _UNIT_SAID.finditer(line)]
-    units = {next(u for u in ("mm", "cm", "m", "in") if word.startswith((u, _WORDS[u]))) for word in said}
+    units = {next(u for u in ("mm", "cm", "m", "in") if word.startswith((u, _LONG[u]))) for word in said}
     unit = units.pop() if len(units) == 1 else ""
     found = []
     for name in names:
         bracketed = _UNIT.fullmatch(name)
-        new = (
-            name
-            if bracketed is None
-            else f"{bracketed[1]}_{(bracketed[2] or bracketed[3]).lower().replace('µ', 'u').replace('°', 'deg')}"
-        )
+        new = name if bracketed is None else f"{bracketed[1]}_{_short(bracketed[2] or bracketed[3])}"
+        new = RTDE.get(new, new)
         lower = new.lower()
         if unit and lower in ("x", "y", "z"):
             lower = new = f"{lower}_{unit}"
@@ -381,7 +380,15 @@ def canonical(names: Sequence[str], comments: Sequence[str] = ()) -> list[str]:
     return found
 
 
-_WORDS = {"mm": "millimet", "cm": "centimet", "m": "met", "in": "inch"}
+RTDE = {f"actual_TCP_pose_{i}": name for i, name in enumerate(("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"))}
+RTDE |= {f"actual_q_{i}": f"q{i + 1}_rad" for i in range(6)}
+"""Names of columns in recordings of Universal Robots' interface RTDE: the pose of the tool, and joint values."""
+
+
+def _short(unit: str) -> str:
+    """Return a unit as the package writes it."""
+    word = unit.lower().replace("µ", "u").replace("°", "deg")
+    return next((short for short, long in _LONG.items() if word.startswith(long)), word)
 
 
 def _with_units_of_a_row(

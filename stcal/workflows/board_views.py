@@ -19,6 +19,7 @@ from stcal.boards.design import (
     CharucoDesign,
     ChessboardDesign,
     FlatBoard,
+    HexagonalCirclesDesign,
     TagLayout,
     turns,
 )
@@ -67,6 +68,7 @@ KINDS = {
     TagLayout: "tags",
     AprilGridDesign: "AprilGrid",
     AsymmetricCirclesDesign: "asymmetric circles",
+    HexagonalCirclesDesign: "hexagonal circles",
 }
 
 
@@ -79,7 +81,7 @@ def symmetries(board: Board) -> list[Rigid]:
     """Returns the rotations after which the board looks the same, as board_from_board, without the identity."""
     if not isinstance(board, BoardDesign):
         return board.symmetries()
-    if board.corner is not None:
+    if board.unique():
         return []
     return turns(board.xy_mm(), [1, 2, 3] if board.rows == board.columns else [2])
 
@@ -221,7 +223,7 @@ def _radius_seen(image: np.ndarray, camera: Camera, board: AsymmetricCirclesDesi
         ..., 0
     ]
     steps = np.median(np.linalg.norm(apart, axis=2).min(1))
-    return float(np.sqrt(2) * board.spacing_mm / steps)
+    return board.nearest_mm() / steps
 
 
 def _find_circles(
@@ -237,7 +239,7 @@ def _find_circles(
     ``grid`` : the lattice in which the circles of the board are found; ``place`` : (rows, columns) of the lattice, rows
     of its circles in the board's ``xy_mm``.
     """
-    pattern = "board of dots" if grid is board else "asymmetric grid of circles"
+    pattern = "board of dots" if grid is board else f"grid of {kind_of(board)}"
     detected = detect_image(image, camera, TargetDesign("none", grid.polarity, ()), grid, EllipseOptions())
     if detected.repeated:
         return None, "the board is in view more than once"

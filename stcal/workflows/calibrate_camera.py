@@ -14,6 +14,7 @@ from stcal.boards.design import (
     CharucoDesign,
     CornerBoard,
     FlatBoard,
+    HexagonalCirclesDesign,
     TagLayout,
 )
 from stcal.design import BoardDesign, TargetDesign
@@ -169,7 +170,7 @@ def _gated(view: ImageObservations, grid: BoardDesign, result: Intrinsics) -> Im
     return view
 
 
-ROUNDS = {AprilGridDesign: 2, AsymmetricCirclesDesign: 3}
+ROUNDS = {AprilGridDesign: 2, AsymmetricCirclesDesign: 3, HexagonalCirclesDesign: 3}
 """Rounds of detection where the camera helps to find the points, and for circles also moves them: an error of their
 eccentricity shrinks to less than a tenth with each round. Corners of chessboards and ChArUco boards need one."""
 

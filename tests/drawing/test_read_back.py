@@ -131,6 +131,14 @@ def test_asymmetric_circles_lie_where_the_design_has_them():
     np.testing.assert_allclose(places, board.xy_mm())
 
 
+def test_rings_have_their_holes():
+    board = AsymmetricCirclesDesign(5, 4, 10.0, 3.0, "dark", rings=((0, 1), (3, 2)))
+    (part,) = board_parts(board, 10.0)
+    holes = [s for s in part.pattern() if isinstance(s, Disc) and s.ink == "white"]
+    np.testing.assert_allclose([[s.x, -s.y] for s in holes], board.xy_mm()[[1, 14]])
+    assert [s.radius for s in holes] == [1.5, 1.5]
+
+
 def test_plates_have_their_margin():
     for part, face in zip(target_parts(reference_target(), 7.0), reference_target().faces, strict=True):
         rims = face.xy_mm + np.array([[-1.0], [1.0]])[:, :, None] * face.radius_mm[:, None]

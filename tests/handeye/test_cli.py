@@ -486,7 +486,7 @@ def test_a_board_file_without_a_type_is_said(command, chessboard, tmp_path):
     board.write_text("rows = 5\ncolumns = 8\nsquare_mm = 20.0\n")
     code, _, err = command(*chessboard.arguments()[:-1], board)
     assert code == INPUT
-    assert 'board.toml: no type; a file with type = "chessboard", "charuco", "tags", "aprilgrid" or' in err
+    assert 'board.toml: no type; a file with type = "chessboard", "charuco", "tags", "aprilgrid", ' in err
 
 
 def test_the_order_of_quaternions_is_an_option(command, tmp_path):

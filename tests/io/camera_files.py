@@ -354,3 +354,104 @@ FILES |= {
     ),
 }
 """Those of further programs."""
+MVG = {"focal_length": 911.5, "height": 720, "principal_point": list(LENS[2:]), "width": 1280}
+SQUARE_LENS = (911.5, 911.5, 639.0, 359.0)
+
+
+def openmvg(kind: str, data: dict) -> str:
+    value = {"polymorphic_id": 1, "polymorphic_name": kind, "ptr_wrapper": {"id": 2, "data": data}}
+    return json.dumps({"sfm_data_version": "0.3", "intrinsics": [{"key": 0, "value": value}], "views": []})
+
+
+def node(values: list, rows: int) -> dict:
+    return {"rows": rows, "cols": len(values) // rows, "type": 6, "data": values}
+
+
+PHOTON = {"resolution": {"width": 1280.0, "height": 720.0}, "cameraIntrinsics": node(FLAT, 3)}
+FILES |= {
+    "OpenMVG, k3": (
+        openmvg("pinhole_radial_k3", MVG | {"disto_k3": [-0.2, 0.05, 0.01]}),
+        perspective([-0.2, 0.05, 0, 0, 0.01], SQUARE_LENS),
+    ),
+    "OpenMVG, brown": (
+        openmvg("pinhole_brown_t2", {"value0": MVG, "disto_t2": [-0.2, 0.05, 0.01, 1e-3, -5e-4]}),
+        perspective(D5, SQUARE_LENS),
+    ),
+    "OpenMVG, fisheye": (openmvg("fisheye", {"value0": MVG, "fisheye": K4}), equidistant(K4, SQUARE_LENS)),
+    "OpenSfM, reconstruction": (
+        "["
+        + OPENSFM.format(kind="brown", k='"k1": -0.2, "k2": 0.05, "k3": 0.01, "p1": 0.001, "p2": -0.0005').replace(
+            '{"v2', '{"cameras": {"v2', 1
+        )
+        + ', "shots": {}}]',
+        perspective(D5, OPENSFM_LENS),
+    ),
+    "PhotonVision": (
+        json.dumps(
+            PHOTON
+            | {"distCoeffs": node(D5, 1), "lensmodel": "LENSMODEL_OPENCV", "calobjectSpacing": 0.025}
+            | {"calobjectWarp": [0.1, 0.2], "observations": []}
+        ),
+        perspective(D5),
+    ),
+    "PhotonVision 2023": (json.dumps(PHOTON | {"cameraExtrinsics": node(D5, 1)}), perspective(D5)),
+    "camodocal, full": (
+        VINS.format(
+            model="PINHOLE_FULL",
+            parameters=CAMODOCAL["PINHOLE"].replace(
+                "   p1", "   k3: 0.01\n   k4: 0.02\n   k5: -0.01\n   k6: 0.003\n   p1"
+            ),
+        ),
+        perspective([*D5, 0.02, -0.01, 0.003]),
+    ),
+    "ORB-SLAM, rectified": (ORB.format(kind="Rectified", distortion=""), perspective([0.0] * 4)),
+    "rpg_vikit": (
+        "cam_model: Pinhole\ncam_width: 1280\ncam_height: 720\nscale: 1.0\ncam_fx: 911.5\ncam_fy: 910.25\n"
+        "cam_cx: 639.0\n"
+        "cam_cy: 359.0\ncam_d0: -0.2\ncam_d1: 0.05\ncam_d2: 0.001\ncam_d3: -0.0005\n",
+        perspective(D4),
+    ),
+    "R3LIVE": (
+        f"r3live_vio:\n   image_width: 1280\n   image_height: 720\n   camera_intrinsic:\n      {FLAT}\n"
+        f"   camera_dist_coeffs: {D5}\n",
+        perspective(D5),
+    ),
+    "BOP": (
+        json.dumps({str(i): {"cam_K": FLAT, "depth_scale": 1.0, "width": 1280, "height": 720} for i in range(4)}),
+        perspective([0.0] * 4),
+    ),
+    "rs-enumerate-devices": (
+        ' Intrinsic of "Color" / 1280x720 / {YUYV/RGB8}:\n  Width:      \t1280\n  Height:     \t720\n'
+        "  PPX:        \t639.0\n  PPY:        \t359.0\n  Fx:         \t911.5\n  Fy:         \t910.25\n"
+        "  Distortion: \tBrown Conrady\n  Coeffs:     \t-0.2  \t0.05  \t0.001  \t-0.0005  \t0.01  \n",
+        perspective(D5),
+    ),
+    "VSLAM-LAB": (
+        "cameras:\n  - cam_name: rgb_0\n    cam_type: gray\n    cam_model: pinhole\n    focal_length: [911.5, 910.25]\n"
+        "    principal_point: [639.0, 359.0]\n    distortion_type: equid4\n"
+        f"    distortion_coefficients: {K4}\n    image_dimension: [1280, 720]\n    fps: 20.0\n",
+        equidistant(K4),
+    ),
+    "a list of nested cameras": (
+        json.dumps(
+            {
+                "cameras": [
+                    {
+                        "camera_id": "00",
+                        "intrinsics": {"resolution": SIZE, "camera_matrix": FLAT, "distortion_coefficients": D5},
+                        "extrinsics": {"view_matrix": EYE},
+                    }
+                ]
+            }
+        ),
+        perspective(D5),
+    ),
+    "calibdb": (
+        json.dumps(
+            {"camera_matrix": NESTED, "distortion_coefficients": D5, "distortion_model": "rectilinear"}
+            | {"img_size": SIZE, "type": "camera"}
+        ),
+        perspective(D5),
+    ),
+}
+"""Those of programs whose names for cameras and coefficients differ further."""

@@ -113,7 +113,7 @@ def test_projection_agrees_with_pycolmap(tmp_path, name):
 
 @given(
     st.sampled_from(sorted(COLMAP_CASES)),
-    st.lists(st.floats(100, 20000), min_size=3, max_size=3),
+    st.lists(st.floats(600, 20000), min_size=3, max_size=3),
     st.floats(0.2, 5),
     st.lists(st.floats(-1, 1), min_size=8, max_size=8),
 )

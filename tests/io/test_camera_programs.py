@@ -82,8 +82,16 @@ def with_key(text: str, key: str, value: str) -> str:
         return f"{text}{key} = {value};\n"
     if text.startswith("{\n    'lens"):
         return text.replace("{", f"{{ '{key}': {value}, ", 1)
-    if text.startswith("{"):
-        beside = ('"intrinsicMatrix"', '"fx"', '"K"', '"camera_matrix"', '"projection_type"', '"intrinsicId"')
+    if text.startswith(("{", "[{")):
+        beside = (
+            '"intrinsicMatrix"',
+            '"focal_length"',
+            '"fx"',
+            '"K"',
+            '"camera_matrix"',
+            '"projection_type"',
+            '"intrinsicId"',
+        )
         at = next((text.index(lens) for lens in beside if lens in text), 1)
         return f'{text[:at]}"{key}": {value}, {text[at:]}'
     if "[narrow_stereo]" in text:
@@ -92,7 +100,13 @@ def with_key(text: str, key: str, value: str) -> str:
         return f"{text}{key} = {value}\n"
     if "cameras:\n     - {" in text:
         return text.replace("- {", f"- {{{key}: {value}, ")
-    for start, indent in (("cam0:", 2), ("Camera:", 2), ("cameras:", 4), ("%YAML:1.0\n---\nnb_camera", 3)):
+    for start, indent in (
+        ("cam0:", 2),
+        ("Camera:", 2),
+        ("cameras:", 4),
+        (" Intrinsic", 2),
+        ("%YAML:1.0\n---\nnb_camera", 3),
+    ):
         if text.startswith(start):
             return f"{text}{' ' * indent}{key}: {value}\n"
     return text.removesuffix("---\n") + f"{key}: {value}\n"
@@ -125,7 +139,7 @@ def test_a_key_of_the_projection_is_taken_or_refused(tmp_path, name, key):
         refused = error
     else:
         confirmed = key == "fisheye_model" and name.endswith(
-            ("KB", "fisheye", "camera_model", "ROS 1", "kb4", "Gyroflow")
+            ("KB", "fisheye", "camera_model", "ROS 1", "kb4", "Gyroflow", "OpenMVG, fisheye", "VSLAM-LAB")
         )
         assert confirmed or np.abs(project(changed) - wanted).max() > 1
         return
@@ -133,7 +147,17 @@ def test_a_key_of_the_projection_is_taken_or_refused(tmp_path, name, key):
     assert key.split("_")[0] in str(refused)
 
 
-ONE_BLOCK = ("mrcal", "ROS, ini", "Kalibr", "stella_vslam", "aslam, SVO", "Anipose", "ZED")
+ONE_BLOCK = (
+    "mrcal",
+    "ROS, ini",
+    "Kalibr",
+    "stella_vslam",
+    "aslam, SVO",
+    "Anipose",
+    "ZED",
+    "rs-enumerate-devices",
+    "VSLAM-LAB",
+)
 REORDERED = {name: text for name, (text, _) in FILES.items() if name not in (*XML, *ONE_BLOCK)}
 
 
@@ -192,6 +216,38 @@ REFUSED = {
         METASHAPE.replace("<f>910.25</f>", "<fx>910.25</fx><fy>910</fy>"),
         "E-CAMERA-MODEL … fx and fy … export … anew",
     ),
+    "RealityCapture, table": (
+        "#cameras 1\n#name,x,y,alt,yaw,pitch,roll,f,px,py,k1\na.jpg,1,2,3,4,5,6,24,0,0,0\n",
+        "E-CAMERA-MODEL … RealityCapture … export … COLMAP",
+    ),
+    "Kalibr's report": (
+        "Calibration results \n====\nCamera-system parameters:\ncam0 (/cam0):\n    type: x\n",
+        "E-CAMERA-MODEL … Kalibr … camchain.yaml",
+    ),
+    "HALCON": ("ParGroup: Camera: Parameter;\n\n  Focus:foc: 0.0083;\n", "E-CAMERA-MODEL … HALCON … calibrate"),
+    "OCamCalib": (
+        "#polynomial coefficients for the DIRECT mapping function\n\n5 -2.1e+02 0 1e-3\n",
+        "E-CAMERA-MODEL … OCamCalib … calibrate",
+    ),
+    "COLMAP's poses": ("# Image list with two lines\n1 1 0 0 0 0 0 0 1 a.jpg\n\n", "E-CAMERA-MODEL … cameras.txt"),
+    "a fisheye without a model": (f"K: {FLAT}\nD: {K4}\n", "E-CAMERA-MODEL … D … -0.0248 … equidistant"),
+    "a lens in mm": (
+        f"image_size: {list(SIZE)}\nfocal_length: 16.0\nprincipal_point: [640, 360]\n",
+        "E-CAMERA-FOCAL … 16 … mm",
+    ),
+    "a lens in mm without a size": (
+        "focal_length: 16.0\nprincipal_point: [640, 360]\n",
+        "E-CAMERA-FOCAL … 16 … mm",
+    ),
+    "shares of a side": ("fx: 0.75\nfy: 0.76\ncx: 0.51\ncy: 0.49\n", "E-CAMERA-FOCAL … 0.75 … shares"),
+    "a centre from the middle": (
+        f"image_size: {list(SIZE)}\nfx: 911.5\nfy: 910\ncx: -3.2\ncy: 7.5\n",
+        "E-CAMERA-CENTRE … -3.2 … middle",
+    ),
+    "an aspect ratio": (
+        f"image_size: {list(SIZE)}\nf: 911.5\ncx: 640\ncy: 360\naspect_ratio: 1.01\n",
+        "E-CAMERA-KEY … aspect_ratio … fx and fy",
+    ),
     "a pickle": (b"\x80\x04\x95\x10\xff", "E-CAMERA-UNREADABLE … a pickle … numpy.savez"),
     "a matrix transposed": (f"K: {matrix().T.ravel().tolist()}\n", "E-CAMERA-MATRIX … transposed"),
     "YAML key twice": (f"K: {FLAT}\nD: {D4}\nD: {D5}\n", "E-CAMERA-UNREADABLE … D twice"),
@@ -211,6 +267,26 @@ def test_what_cannot_be_told_is_named_in_one_line(tmp_path, name):
     with fails_with(said) as caught:
         read(tmp_path, text)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["kc", "dist_vec", "calib_dist", "rect_distortion", "D_vec", "lens", "num_dist"])
+def test_coefficients_under_any_name_are_refused(tmp_path, key):
+    with fails_with(f"E-CAMERA-KEY … {key} … distortion_coefficients"):
+        read(tmp_path, f"camera_matrix: {FLAT}\n{key}: {D5}\n")
+
+
+@pytest.mark.parametrize("other", ["turn: [0.5, 0.5, 0.5, 0.5]", "window: [0, 0, 1280, 720]", "tvec: [0.1, 2, 3, 4.5]"])
+def test_lists_that_are_no_coefficients_pass(tmp_path, other):
+    lens = read(tmp_path, f"camera_matrix: {FLAT}\ndist: {D5}\n{other}\n")
+    np.testing.assert_allclose(project(lens), perspective(D5), atol=1e-9)
+    lens = read(tmp_path, f"camera_matrix: {FLAT}\n{other}\n")
+    np.testing.assert_allclose(project(lens), perspective([0.0] * 5), atol=1e-9)
+
+
+def test_four_coefficients_without_a_model_are_named(tmp_path):
+    with pytest.warns(InputNote, match="equidistant"):
+        lens = read(tmp_path, f"K: {FLAT}\nD: {D4}\n")
+    np.testing.assert_allclose(project(lens), perspective(D4), atol=1e-9)
 
 
 def test_an_archive_of_numpy_is_read(tmp_path):
@@ -276,11 +352,12 @@ def test_a_camera_of_a_list_is_chosen(tmp_path):
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps({"cameras": [{"name": "a", "K": EYE}, {"name": "b", "K": FLAT, "D": {"k1": -0.2}}]}))
     np.testing.assert_allclose(project(read_lens(path, "b")), perspective([-0.2, 0, 0, 0]), atol=1e-9)
+    other = [800.0, 0, 630.0, 0, 801.0, 350.0, 0, 0, 1]
     path.write_text(
-        ORB.format(kind="PinHole", distortion="") + f"LEFT.height: 480\nLEFT.K: {EYE}\nLEFT.D: {D4}\nRIGHT.K: {EYE}\n"
+        ORB.format(kind="PinHole", distortion="") + f"LEFT.height: 480\nLEFT.K: {other}\nLEFT.D: {D4}\nRIGHT.K: {EYE}\n"
     )
     np.testing.assert_allclose(project(read_lens(path, "Camera")), perspective([0.0] * 4), atol=1e-9)
-    np.testing.assert_allclose(project(read_lens(path, "LEFT")), perspective(D4, (1, 1, 0, 0)), atol=1e-9)
+    np.testing.assert_allclose(project(read_lens(path, "LEFT")), perspective(D4, (800, 801, 630, 350)), atol=1e-9)
 
 
 def test_the_camera_of_kittis_odometry_is_that_of_rectified_images(tmp_path):

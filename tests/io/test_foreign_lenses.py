@@ -205,7 +205,7 @@ def test_other_commands_ask_for_the_conversion(tmp_path):
     [
         ("1 FOV 9 9 1 1 1 1", "E-CAMERA-COEFFICIENTS … 4 … FOV … 5"),
         ("1 FOV 9 9 -1 1 1 1 1", "E-CAMERA-FOCAL … -1 … 1"),
-        ("1 FOV 9 9 1 1 1 1 nan", "E-CAMERA-NOT-FINITE"),
+        ("1 FOV 9 9 9 9 1 1 nan", "E-CAMERA-NOT-FINITE"),
         ("1 EQUIRECTANGULAR 9 9 9 9", "E-CAMERA-MODEL … EQUIRECTANGULAR"),
         ("1 PINHOLE 9 9 1 1 1 1\n1 PINHOLE 9 9 1 1 1 1", "E-CAMERA-REPEATED"),
         (KALIBR.format("omni", [1, 2, 3], "none", []), "E-CAMERA-COEFFICIENTS … omni … none … 5 … 0"),

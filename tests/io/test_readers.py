@@ -3,8 +3,10 @@
 One key more is named. Camera files: ``test_camera_programs.py``.
 """
 
+import json
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +18,17 @@ from stcal.boards.target import load_body
 from stcal.errors import InputError, InputNote, StcalError
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import read_pairs, require_own
+from stcal.handeye.data.rig import read_rig_file
 from stcal.handeye.data.robot_poses import read_robot_poses
 from stcal.io.design import load_target
 from stcal.io.files import text_of
+from stcal.io.poses.columns import read_mapped
 from stcal.io.table import read_table
 from stcal.locate.data.layout import load_plan
 from stcal.robot.kinematics.file import load_robot, robot_toml
-from stcal.robot.urdf.universal import kinematics_content, robot_of_kinematics
+from stcal.robot.urdf.read import load_urdf
+from stcal.robot.urdf.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
+from stcal.sfm.budget.sources import StatedSize, statement_of
 
 TABLE = "name,x_mm,y_mm,z_mm\n" + "".join(f"P{i},{i}.25,{-i}.5,{10 * i}\n" for i in range(1, 5))
 CIRCLES = "\n".join(
@@ -96,6 +102,54 @@ def of_pairs(path: Path) -> np.ndarray:
         require_own(path)  # what a command does next
     assert told is not None
     return np.hstack([told.pairs.base_from_flange.translation, told.pairs.camera_from_board.translation])
+
+
+URDF = '<robot name="a">\n  <link name="base_link"/>\n' + "".join(
+    f'  <link name="l{i}"/>\n  <joint name="j{i}" type="revolute">\n    <parent link="{parent}"/>\n'
+    f'    <child link="l{i}"/>\n    <origin xyz="0.{i} 0 0.3" rpy="{roll} 0 0"/>\n    <axis xyz="0 0 1"/>\n'
+    '    <limit lower="-3" upper="3" effort="1" velocity="1"/>\n  </joint>\n'
+    for i, parent, roll in ((1, "base_link", 0.0), (2, "l1", 1.5), (3, "l2", -1.5))
+)
+URDF += "</robot>\n"
+RIG = 'setup = "eye-in-hand"\nboard = "b.toml"\nposes = "p.csv"\n' + "".join(
+    f'\n[[camera]]\nname = "{name}"\nimages = "{name}"\ncamera = "c.yaml"\ncamera_name = "{name}"\n' for name in "ab"
+)
+CONF = (
+    "[mounting]\ndelta_theta = [ 1e-5, 0.3, -0.3, 1e-5, -2e-5, 0]\ndelta_a = [ 1e-5, 0.02, 3e-3, -5e-5, 8e-6, 0]\n"
+    "delta_d = [ 4e-5, 300.0, -320.0, 20.0, 1e-5, -4e-4]\ndelta_alpha = [ 1e-4, 3e-4, 6e-3, -1e-3, -2e-4, 0]\n"
+    "\n[DH]\na = [0, -0.6127, -0.57155, 0, 0, 0]\nd = [0.1807, 0, 0, 0.17415, 0.11985, 0.11655]\n"
+    "alpha = [1.570796327, 0, 0, 1.570796327, -1.570796327, 0]\n"
+)
+MATRICES = [
+    [[c, -s, 0, x], [s, c, 0, 0.2], [0, 0, 1, 0.5], [0, 0, 0, 1]] for x, s, c in ((0.1, 0.6, 0.8), (0.2, 0.8, 0.6))
+]
+
+
+def of_urdf(path: Path) -> np.ndarray:
+    return np.array(robot_toml(load_urdf(path).robot).splitlines())
+
+
+def of_conf(path: Path) -> np.ndarray:
+    try:
+        text = text_of(path.read_bytes())
+    except UnicodeDecodeError as error:  # named by the command
+        raise InputError("E-FILE-UNREADABLE", f"{path}: {error}") from error
+    assert is_conf(text)
+    return np.array(robot_toml(robot_of_conf(text, str(path), None, "standard")).splitlines())
+
+
+def of_rig(path: Path) -> np.ndarray:
+    return np.array([repr(replace(read_rig_file(path), file=path))])
+
+
+def of_columns(path: Path) -> np.ndarray:
+    (path.parent / "data.csv").write_text("A;B\n1,5;2\n3;4\n")
+    table = read_mapped(path.parent / "data.csv", path, "points")
+    return np.column_stack([table.numbers("x_mm"), table.numbers("y_mm")])
+
+
+def of_statement(path: Path) -> np.ndarray:
+    return np.array([repr(statement_of(StatedSize(), path))])
 
 
 READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
@@ -176,10 +230,29 @@ READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
         ),
         of_robot_poses,
     ),
+    "URDF": (URDF, of_urdf),
+    "calibration.conf": (CONF, of_conf),
+    "rig": (RIG, of_rig),
+    "map of columns": (
+        'delimiter = "semicolon"\ndecimal_comma = true\n\n[columns]\nx_mm = "A"\ny_mm = "B"\n',
+        of_columns,
+    ),
+    "statement": ('[fields]\noperator = "A"\n\n[board]\ntemperature_c = 21.5\n', of_statement),
+    "poses, JSON": (json.dumps({"base_from_flange": MATRICES, "units": "m"}, indent=1), of_robot_poses),
+    "poses, MoveIt": (
+        "".join(f"- effector_wrt_world: {each}\n  object_wrt_sensor: {each}\n" for each in MATRICES),
+        of_pairs,
+    ),
+    "poses, KUKA": (
+        "".join(f"DECL E6POS XP{i}={{X {i}00.5,Y 20,Z 30,A {10 * i},B 20,C 30}}\n" for i in range(1, 4)),
+        of_robot_poses,
+    ),
     "layout": (LAYOUT, lambda path: np.array([repr(load_plan(path))])),
 }
 OF_YAML = [name for name in READERS if name.startswith(("Kalibr", "easy", "apriltag_ros", "Universal"))]
-OF_ROWS = [name for name in READERS if "table" in name or "rows" in name or name == "SpatialAnalyzer"]
+OF_ROWS = [name for name in READERS if "table" in name or "rows" in name or name in ("SpatialAnalyzer", "poses, KUKA")]
+WITH_SETTINGS = ("easy_handeye", "apriltag_ros", "URDF", "calibration.conf", "poses, JSON", "poses, MoveIt")
+"""Their other keys are settings of their programs, or properties of other parts of the robot, and change nothing."""
 OF_KEYS = [name for name in READERS if name not in OF_ROWS]
 
 
@@ -220,10 +293,10 @@ def test_another_encoding_or_line_end_changes_nothing(tmp_path, name, form):
 def test_text_of_another_encoding_is_named(tmp_path, name):
     """Latin-1 is no UTF-8; of a table of numbers it could be guessed, and is not."""
     text, read = READERS[name]
-    comment = "// Gerät\n" if name in OF_ROWS else "# Gerät\n"
+    comment = "// Gerät\n" if name in OF_ROWS else "<!-- Gerät -->" if name == "URDF" else "# Gerät\n"
     found, said = outcome(read, tmp_path / "file", f"{comment}{text}".encode("latin-1"))
     assert found is None
-    assert "UTF-8" in said[0] or "utf-8" in said[0], said
+    assert any(word in said[0] for word in ("UTF-8", "utf-8", "not XML")), said
     assert "\n" not in said[0]
 
 
@@ -231,8 +304,13 @@ def test_text_of_another_encoding_is_named(tmp_path, name):
 def test_an_unknown_key_is_named(tmp_path, name):
     text, read = READERS[name]
     more = "operator_42: 7\n" if name in OF_YAML else "operator_42 = 7\n"
-    found, said = outcome(read, tmp_path / "file", f"{more}{text}".encode())
-    if name in ("easy_handeye", "apriltag_ros"):  # their other keys are settings of the program, and change nothing
+    longer = {
+        "URDF": text.replace("<axis", '<operator_42 value="7"/>\n    <axis'),
+        "poses, JSON": text.replace("{", '{"operator_42": 7,', 1),
+        "poses, MoveIt": text.replace("- eff", "- operator_42: 7\n  eff"),
+    }.get(name, f"{more}{text}")
+    found, said = outcome(read, tmp_path / "file", longer.encode())
+    if name in WITH_SETTINGS:
         np.testing.assert_array_equal(found, outcome(read, tmp_path / "file", text.encode())[0])
     else:
         assert any("operator_42" in each for each in said), said
@@ -247,6 +325,15 @@ def test_another_order_of_keys_changes_nothing(tmp_path, name):
         head, bracket, rest = "", "", ",\n".join([first, *reversed(links)]) + "}\n"
     if name == "easy_handeye":
         head, bracket, rest = "", "", "samples:" + text.split("samples:")[1] + text.split("samples:")[0]
+    if name == "URDF":
+        parts = text.split("  <joint")
+        joints = "".join(f"  <joint{each}" for each in reversed(parts[1:])).replace("</robot>\n", "")
+        head, bracket, rest = "", "", f"{parts[0]}{joints}</robot>\n"
+    if name == "poses, JSON":
+        head, bracket, rest = "", "", json.dumps(dict(reversed(json.loads(text).items())))
+    if name == "poses, MoveIt":
+        pairs = [(*text.splitlines()[i : i + 2],) for i in (0, 2)]
+        head, bracket, rest = "", "", "".join(f"- {two[2:]}\n  {one[2:]}\n" for one, two in pairs)
     lines = head.splitlines(keepends=True)
     turned = "".join(reversed(lines)) if all("=" in line or ":" in line for line in lines if line.strip()) else head
     wanted, _ = outcome(read, tmp_path / "file", text.encode())

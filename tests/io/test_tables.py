@@ -33,13 +33,30 @@ def test_separators_and_decimal_commas(tmp_path, separator, comma):
 
 @pytest.mark.parametrize(
     "head",
-    ["name;X [mm];Y [mm];Z [mm]", "name;X_mm;Y_MM;z_mm", "name;x (mm);y(mm);z (MM)", "name;X;Y;Z;"],
+    [
+        "name;X [mm];Y [mm];Z [mm]",
+        "name;X_mm;Y_MM;z_mm",
+        "name;x (mm);y(mm);z (MM)",
+        "name;X;Y;Z;",
+        "name;X (millimeters);Y (Millimetres);Z [millimeter]",
+    ],
 )
 def test_names_of_columns(tmp_path, head):
     text = f"# Units: Millimeters\nsep=;\n{head}\n{lines(';')}\n"
     if head.endswith(";"):
         text = text.replace("\nP", ";\nP").replace(f"{head};", head).rstrip() + ";\n"
     np.testing.assert_array_equal(table(tmp_path, text).points(), POINTS)
+
+
+def test_a_comma_behind_the_last_column_is_none(tmp_path):
+    found = table(tmp_path, "name,x_mm,y_mm,z_mm,\nP1,1.5,2,3,\nP2,1,4,5,\n")
+    np.testing.assert_array_equal(found.points(), [[1.5, 2, 3], [1, 4, 5]])
+
+
+def test_rows_without_a_header_are_named(tmp_path):
+    """Not the two columns that happen to be equal."""
+    with fails_with("E-TABLE-HEADER … line 1 … numbers … header = false"):
+        table(tmp_path, "PT0;10.5;2000.25;-3.125;0;0;1\nPT1;11.5;2000.25;-3.5;0;0;1\n")
 
 
 def test_the_case_of_turned_axes_stays(tmp_path):

@@ -1,9 +1,10 @@
-"""A run whose board is OpenCV's asymmetric grid of circles: the lattice's places are its dots."""
+"""A run whose board is a grid of circles with shifted rows, OpenCV's asymmetric or hexagonal: the lattice's places are
+its dots."""
 
 import numpy as np
 import pytest
 
-from stcal.boards.design import AsymmetricCirclesDesign, LatticePart
+from stcal.boards.design import AsymmetricCirclesDesign, HexagonalCirclesDesign, LatticePart
 from stcal.boards.file import load_run_board, run_board_toml
 from stcal.labels import DotLabel
 from stcal.sfm import run
@@ -54,10 +55,11 @@ def test_other_boards_are_refused_with_what_takes_them(tmp_path, text, error):
 
 
 @pytest.mark.slow
-def test_faces_beside_asymmetric_circles_are_right(tmp_path):
+@pytest.mark.parametrize("circles", [CIRCLES, HexagonalCirclesDesign(9, 7, 27.0, 6.0, "dark")])
+def test_faces_beside_circles_in_shifted_rows_are_right(tmp_path, circles):
     target, _, *rough = second_design()
     options = SceneOptions(seed=5, width=1728, height=1152, images_per_group=4)
-    scene = make_scene(options, target, CIRCLES.lattice(), *rough)
+    scene = make_scene(options, target, circles.lattice(), *rough)
     data = tmp_path / "data"
     write_dataset(data, scene)
     result = run(data / "images", data / "cameras.txt", tmp_path / "run", data / "target.toml", data / "board.toml")
@@ -76,4 +78,4 @@ def test_faces_beside_asymmetric_circles_are_right(tmp_path):
         if face_id != comparison["reference_face"]:
             assert row["normalised_error"] < 2.0, face_id
             assert row["translation_um"] < 40, face_id
-    assert load_run(tmp_path / "run").board_design.labels() == CIRCLES.lattice().labels()
+    assert load_run(tmp_path / "run").board_design.labels() == circles.lattice().labels()

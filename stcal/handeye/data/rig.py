@@ -131,6 +131,7 @@ class _CameraFile(Strict):
     name: Name
     images: FileName
     camera: FileName
+    camera_name: str = ""
     poses: FileName | None = None
     times: FileName | None = None
 
@@ -145,13 +146,15 @@ class _RigFile(Strict):
 @dataclass(frozen=True, slots=True)
 class RigCameraFiles:
     """``name`` of a camera; ``images`` : folder; ``camera`` : intrinsics; ``poses`` : the robot's poses at its images;
-    ``times`` : times of its images, where their names are not times."""
+    ``times`` : times of its images, where their names are not times; ``camera_name`` : name of the intrinsics in a file
+    of several cameras."""
 
     name: str
     images: Path
     camera: Path
     poses: Path
     times: Path | None = None
+    camera_name: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,5 +195,6 @@ def read_rig_file(path: Path) -> RigFiles:
                 "E-RIG-CAMERAS", f"{WHAT} {path}: camera {number} is called {entry.name!r} as another is; one name each"
             )
         files = (folder / name for name in (entry.images, entry.camera, poses))
-        cameras.append(RigCameraFiles(entry.name, *files, times=folder / entry.times if entry.times else None))
+        times = folder / entry.times if entry.times else None
+        cameras.append(RigCameraFiles(entry.name, *files, times=times, camera_name=entry.camera_name))
     return RigFiles(path, content.setup, folder / content.board, tuple(cameras))

@@ -180,7 +180,8 @@ def one_of(names: list[str], choice: str, source: str) -> str:
         shown = ", ".join(names[:12]) + (" …" if len(names) > 12 else "")
         raise InputError(
             "E-CAMERA-SEVERAL",
-            f"camera file {source}: {asked}; choose of {shown} with `stcal camera … --name`, elsewhere --camera-name",
+            f"camera file {source}: {asked}; choose of {shown} with `stcal camera … --name`, elsewhere --camera-name, "
+            "and in a rig file camera_name",
         )
     return choice or names[0]
 

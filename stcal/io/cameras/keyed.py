@@ -5,16 +5,17 @@ A program is read by what its keys are called: ``ROLES`` of :mod:`stcal.io.camer
 :func:`stcal.io.cameras.keys.require_known`.
 """
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from stcal.errors import InputError
+from stcal.errors import InputError, InputNote
 from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN
 from stcal.io.cameras.foreign import SQUARE, ForeignLens, of_kalibr, of_opencv, of_parts, one_of
-from stcal.io.cameras.keys import CONTAINERS, ROLES, is_neutral, leaves, numbers_of, plain, require_known
+from stcal.io.cameras.keys import CONTAINERS, ROLES, is_neutral, leaves, numbers_of, plain, require_known, role_of
 from stcal.io.cameras.model import EQUIDISTANT, MAX_SIDE_PX, CameraModel, camera_from_opencv, camera_model
 from stcal.io.cameras.several import NEAR, cameras_of, is_fundamental, shallow
 
@@ -22,21 +23,28 @@ RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 PERSPECTIVE = {
     *("plumbbob", "rationalpolynomial", "radtan", "radialtangential", "brown", "brownconrady", "opencv", "fullopencv"),
     *("distortionbrownconrady", "thinprism", "tilted", "opencvstandard", "pinholeradtan", "standard"),
+    *("pinholefull", "rectilinear", "radtan4", "radtan5", "radtan8", "pinholeradtan8"),
 }
 """Values of a model that mean OpenCV's perspective lens."""
-UNDISTORTED = frozenset(
-    ["none", "", "pinhole", "simplepinhole", "perspective", "distortionnone", "null", "false", "opengl"]
-    + [f"perspectiveprojwith{out}distortion" for out in ("", "out")]
-)
+UNDISTORTED = {
+    *("none", "", "null", "false", "camera", "pinhole", "rectified", "simplepinhole", "perspective", "opengl"),
+    *("distortionnone", "nodistortion", "perspectiveprojwithdistortion", "perspectiveprojwithoutdistortion"),
+}
 """Values of a model that say nothing of distortion."""
+COLOURS = frozenset(("rgb", "bgr", "gray", "grey", "mono", "monochrome", "color", "colour", "depth", "infrared"))
+"""Types of cameras that say nothing of a lens."""
 FISHEYE = frozenset([*map(plain, EQUIDISTANT), "kannalabrandt8", "kannalabrandt4", "kb4", "opencvfisheye"])
-FISHEYE_ALSO = frozenset(["distortionkannalabrandt4", "fisheyeopencv", "pinholeequi", "equi"])
+FISHEYE_ALSO = frozenset(["distortionkannalabrandt4", "fisheyeopencv", "pinholeequi", "equi", "equid4", "equidistant4"])
 UNIFIED = frozenset(["omni", "omnidir", "omnidirectional", "mei", "unified"])
 INVERSE = frozenset(["inversebrownconrady", "distortioninversebrownconrady", "modifiedbrownconrady"])
 """Models of which zeros alone are read: their polynomials are other ones than OpenCV's."""
 BY_COLUMNS = "intrinsicmatrix"
 """Key of Open3D and MATLAB, whose matrices stand column by column."""
 OTHER_WAY = "its coefficients are those of another formula, and under another name they make a wrong camera"
+MOST_ALIKE = 2
+"""Largest number of equal cameras that are a rig; more are one camera, stated for each image, as BOP does."""
+MOST_TANGENTIAL = 0.02
+"""Largest tangential coefficient of real lenses: 0.02 is a sensor tilted by 2° behind the lens."""
 IGNORED = "label"
 """Role of keys that name a camera or a lens in words."""
 
@@ -100,6 +108,18 @@ TABLES = (
         model="equidistant",
         harmless=("origdimension*", "outputdimension*", "rmserror", "cameramodel", "lensmodel"),
     ),
+    Table(
+        "rpg_vikit",
+        frozenset(["camfx"]),
+        {"camd0": "k1", "camd1": "k2", "camd2": "p1", "camd3": "p2", "camd4": "k3", "camheight": "height"},
+    ),
+    Table("PhotonVision", frozenset(["cameraintrinsics", "cameraextrinsics"]), {"cameraextrinsics": "distortion"}),
+    Table(
+        "PhotonVision",
+        frozenset(["calobjectspacing"]),
+        {"lensmodel": IGNORED},
+        harmless=("calobject*", "observations"),
+    ),
     Table("ViSP", frozenset(["px", "py", "u0"]), {"px": "fx", "py": "fy", "kud": "k1"}, harmless=("kdu",)),
     Table("OpenSfM", frozenset(["projectiontype"]), {"focal": "f"}, relative=True, harmless=("focalprior*",)),
     Table("a file", frozenset()),
@@ -127,6 +147,8 @@ def from_keys(values: dict, choice: str, source: str) -> CameraModel | ForeignLe
             "camera_info",
         )
     names = list(cameras)
+    if not choice and len(names) > MOST_ALIKE and all(each == cameras[names[0]] for each in cameras.values()):
+        names, cameras = [""], {"": cameras[names[0]]}
     chosen = cameras[names[0] if names == [""] else one_of(names, choice, source)]
     return _Reading.of(chosen, source).lens()
 
@@ -138,8 +160,9 @@ def _role_of(path: tuple[str, ...], table: Table) -> str | None:
         parts = parts[1:]
     if len(path) > 1 and (joined := plain("".join(path[-2:]))) in ROLES:  # distortion: {type: …, parameters: …}
         return table.roles.get(joined) or ROLES[joined]
-    name = plain(parts[0]) if len(parts) == 1 else ""
-    return table.roles.get(name) or (ROLES.get(name) if name not in table.needs or name in ROLES else None)
+    if len(parts) > 1:
+        return None
+    return table.roles.get(plain(parts[0])) or role_of(parts[0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,7 +184,9 @@ class _Reading:
             role, key = _role_of(path, table), ".".join(path)
             if role == "lens" and numbers_of(value).size == 9:
                 role = "matrix"
-            if is_fundamental(plain(path[-1]), value):
+            if role == "distortion" and isinstance(value, str) and value.strip() and not numbers_of(value).size:
+                role = "model"
+            if is_fundamental(plain(path[-1]), value) or (role == "camera model" and plain(value) in COLOURS):
                 continue
             if role is None:
                 unread[key] = value
@@ -174,7 +199,8 @@ class _Reading:
                 known[role], keys[role] = value, key
         for key in list(unread):
             allowed, of_roi = NEUTRAL.get(plain(key.split(".")[-1])), plain(key).startswith("roi")
-            if (allowed and unread[key] in allowed) or (of_roi and _full_image(key, unread, known)):
+            unscaled = plain(key.split(".")[-1]) == "scale" and unread[key] == 1
+            if unscaled or (allowed and unread[key] in allowed) or (of_roi and _full_image(key, unread, known)):
                 del unread[key]
             elif allowed or of_roi:
                 raise InputError(
@@ -182,7 +208,16 @@ class _Reading:
                     f"camera file {source}: {key} = {unread[key]}, so that images are a part of the one that K is for; "
                     "set it to 0 if your images have the file's full size, else calibrate at their size",
                 )
-        require_known(unread, source, (*table.harmless, *SLAM_SETTINGS))
+        if "f" in known and "fy" not in known:  # else f, or K, has both
+            for key in [each for each in unread if plain(each.split(".")[-1]) in ("aspectratio", "pixelaspectratio")]:
+                if not (is_neutral(unread[key]) or unread.pop(key) == 1):
+                    raise InputError(
+                        "E-CAMERA-KEY",
+                        f"camera file {source}: {key} makes fy, by × in one program and by ÷ in another; "
+                        "write fx and fy",
+                    )
+        undistorted = known.keys().isdisjoint(("distortion", *RADIAL_TANGENTIAL))
+        require_known(unread, source, (*table.harmless, *SLAM_SETTINGS), undistorted)
         industrial = {"fx", "cx"} & known.keys() != set() and keys.get("fx", keys.get("cx", "")).startswith(
             "intrinsics"
         )
@@ -272,7 +307,7 @@ class _Reading:
         value = self.known["matrix"]
         matrix = np.asarray(value.replace(",", " ").split() if isinstance(value, str) else value, float)
         if matrix.size != 9:
-            raise self.fault("E-CAMERA-COEFFICIENTS", f"camera_matrix of {matrix.size} numbers; 3×3 needed")
+            raise self.fault("E-CAMERA-COEFFICIENTS", f"{self.keys['matrix']} of {matrix.size} numbers; 3×3 needed")
         matrix = matrix.reshape(3, 3)
         if not matrix.any():
             raise self.fault(
@@ -367,6 +402,12 @@ class _Reading:
                     "E-CAMERA-REPEATED",
                     f"{self.keys['distortion']} and {self.keys[extra[0]]} both state distortion; leave one in",
                 )
+            if (
+                kind == "perspective"
+                and given.size == 4
+                and {"model", "camera model", "fisheye"}.isdisjoint(self.known)
+            ):
+                self._say_no_model(given)
             last = 4 if kind == "equidistant" else 5
             given = given[:last] if last < len(given) < 8 and not given[last:].any() else given
             if kind == "equidistant" and len(given) not in (0, 4):
@@ -395,6 +436,20 @@ class _Reading:
             )
         given = np.array([self.number(role) for role in RADIAL_TANGENTIAL])
         return given if given[5:].any() else given[:5]
+
+    def _say_no_model(self, given: np.ndarray) -> None:
+        """Name four coefficients without a model, as OpenCV's fisheye has; refuse those that must be a fisheye's."""
+        key, model = self.keys["distortion"], "distortion_model: equidistant"
+        if np.abs(given[2:]).max() > MOST_TANGENTIAL:
+            raise self.fault(
+                "E-CAMERA-MODEL",
+                f"{key} has 4 coefficients and no model says of which lens: as tangential ones, {given[2]:g} and "
+                f"{given[3]:g} are larger than {MOST_TANGENTIAL:g}; add {model} if the lens is OpenCV's fisheye, else "
+                "distortion_model: plumb_bob",
+            )
+        if given.any():
+            said = f"{key}: 4 coefficients without a model, taken as k1, k2, p1, p2; of OpenCV's fisheye, add {model}"
+            warnings.warn(f"camera file {self.source}: {said}", InputNote, stacklevel=2)
 
     def lens(self) -> CameraModel | ForeignLens:
         """Return the camera."""

@@ -11,8 +11,8 @@ from stcal.errors import InputError, InputNote
 
 _HARMLESS = """
 alphacerror appliedtransform boardheight boardsize boardwidth calibdate calibrationdate calibrationtime calibtime
-cameraid cameraindex cameraname cameraserial camoverlaps comment cornerdist createdate createdby data date depthscale
-description fileversion flags fps frameid framescount framescounter generatedon header hostname id imagename
+cameraid cameraindex cameraname cameraserial camname camoverlaps comment cornerdist createdate createdby data date
+depthscale description fileversion flags fps frameid framescount framescounter generatedon header hostname id imagename
 imagetopic label localtransform make name nbcamera nframes notes nrofframes nrofimages p pattern patternsize
 projectionmatrix r ratehz rectificationmatrix ret rms rostopic sensortype serial serialnumber source squaresize stamp
 t target tbs tcamimu tcncnm1 testfilenames time timeshiftcamimu timestamp topic trainfilenames units valfilenames
@@ -61,7 +61,7 @@ ROLES: Mapping[str, str] = {
         "distortion": "distortioncoefficients d distcoeffs distcoeff distcoefs distortioncoeffs distortioncoefs coeffs "
         "distortion dist distortionvector distortions distortioncoeff distortioncoef distcoef distcoefficients "
         "distortionparams distortionparameters",
-        "lens": "intrinsics",
+        "lens": "intrinsics cameraintrinsics cameraintrinsic",
         "f": "f focal focallength",
         "fx": "fx flx focalx gamma1 focallengthx",
         "fy": "fy fly focaly gamma2 focallengthy",
@@ -72,7 +72,7 @@ ROLES: Mapping[str, str] = {
         "xi": "xi",
         "width": "imagewidth width w imgwidth imwidth",
         "height": "imageheight height h imgheight imheight",
-        "size": "imagesize resolution cameraresolution imgsize imagedimension imagedimensions size s",
+        "size": "imagesize resolution cameraresolution imgsize imagedimension imagedimensions size s dim",
         "camera model": "cameramodel modeltype projectionmodel projectiontype cameratype type",
         "model": "distortionmodel model lensmodel distortiontype",
         "fisheye": "fisheyemodel fisheye isfisheye usefisheye",
@@ -87,8 +87,18 @@ CONTAINERS = re.compile(
     r"|image|imagesize|resolution|calibdimension|fisheyeparams|focallength|principalpoint|opencvstorage|value0)\d*$"
 )
 """Keys that hold others and add nothing to their meaning."""
+DISTORTION = re.compile(r"dist(?!anc)|coef|^kc")
+"""Parts of names of lists of distortion coefficients, also of keys that begin harmlessly, as ``calib_dist`` does."""
 OF_DISTORTION = re.compile(r"distort|dist|mirror|^d$")
 """Containers whose every key is a parameter of the lens."""
+PREFIX = re.compile(r"(camera|cam)(?=[_A-Z])")
+"""Beginning of keys that adds nothing to their meaning, as of ``cam_fx`` and ``cameraIntrinsics``."""
+COUNTS = (4, 5, 8, 12, 14)
+"""Numbers of OpenCV's distortion coefficients."""
+MOST_COEFFICIENT = 100.0
+"""Largest distortion coefficient by which a list is told from pixels and times."""
+UNIT_WITHIN = 1e-3
+"""Largest deviation of a quaternion's length from 1."""
 SHOWN = 6
 """Largest number of keys that a message names."""
 
@@ -96,6 +106,20 @@ SHOWN = 6
 def plain(key: object) -> str:
     """Return a key in small letters and digits alone: programs differ in capitals, dots and underscores."""
     return re.sub(r"[^a-z0-9]", "", str(key).lower())
+
+
+def role_of(key: str) -> str | None:
+    """Return what a key holds, by :data:`ROLES`; None if it is not known."""
+    bare = plain(PREFIX.sub("", key))
+    return ROLES.get(plain(key)) or ROLES.get(f"camera{bare}") or ROLES.get(bare)
+
+
+def may_be_coefficients(value: object) -> bool:
+    """Return True for a list of as many numbers as distortion has, unless they are whole, or a quaternion."""
+    numbers = numbers_of(value)
+    if isinstance(value, str) or numbers.size not in COUNTS or not np.abs(numbers).max() < MOST_COEFFICIENT:
+        return False
+    return bool((numbers % 1).any()) and abs(float(np.linalg.norm(numbers)) - 1) > UNIT_WITHIN
 
 
 def numbers_of(value: object) -> np.ndarray:
@@ -135,13 +159,14 @@ def leaves(values: Mapping, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[
             yield inner, value
 
 
-def require_known(unread: Mapping, source: str, harmless: Collection[str] = ()) -> None:
+def require_known(unread: Mapping, source: str, harmless: Collection[str] = (), undistorted: bool = False) -> None:
     """Name the keys of a camera file that its reader did not take.
 
     Harmless ones pass in silence, others with an :class:`InputNote`.
 
     ``unread`` : keys and values; values may hold further keys; ``source`` : camera file, for messages; ``harmless`` :
-    further harmless keys of the format, or beginnings of them that end in ``*``; as :func:`plain` writes them.
+    further harmless keys of the format, or beginnings of them that end in ``*``; as :func:`plain` writes them;
+    ``undistorted`` : True if no distortion was found, so that an unknown list of coefficients may be it.
 
     Raises InputError: a key may change the projection, and its value is not 0 or empty.
     """
@@ -155,15 +180,19 @@ def require_known(unread: Mapping, source: str, harmless: Collection[str] = ()) 
         if not (HARMLESS | set(harmless)).isdisjoint(names):
             continue
         of_a_lens = bool(SUSPECT.fullmatch(plain(path[-1])))
-        if not of_a_lens and (plain(path[-1]).endswith(HARMLESS_ENDS) or any(n.startswith(beginnings) for n in names)):
+        coefficients = may_be_coefficients(value)
+        uncertainty = plain(path[-1]).endswith(HARMLESS_ENDS)
+        of_a_lens |= coefficients and not uncertainty and bool(DISTORTION.search(plain(path[-1])))
+        if not of_a_lens and (uncertainty or any(n.startswith(beginnings) for n in names)):
             continue
-        if not of_a_lens and not any(SUSPECT_PART.search(name) for name in named):
+        if not (of_a_lens or (undistorted and coefficients)) and not any(SUSPECT_PART.search(name) for name in named):
             unknown.append(".".join(path))
         elif not is_neutral(value):
+            taken = "call it distortion_coefficients if it is OpenCV's k1, k2, p1, p2, k3 …; " if coefficients else ""
             raise InputError(
                 "E-CAMERA-KEY",
                 f"camera file {source}: {'.'.join(path)[:80]} = {_short(value)} may change the projection and is not "
-                "taken here; remove it if the lens is right without it, or calibrate without it",
+                f"taken here; {taken}remove it if the lens is right without it, or calibrate without it",
             )
     if unknown:
         more = f" and {len(unknown) - SHOWN} more" if len(unknown) > SHOWN else ""

@@ -145,8 +145,13 @@ def cameras_txt(camera: Camera) -> str:
     return "\n".join(lines) + "\n"
 
 
-LEAST_SHARE_OF_SIDE = 0.015
-"""Share of the longer side that focal length or principal point of every lens exceed; lengths in mm do not."""
+LEAST_FOCAL = {False: 0.1, True: 0.05}
+"""Smallest focal length over the longer side, by whether the lens is a fisheye: an image of 157° from edge to edge, and
+a circle of 280° on a third of the side. Lengths in mm are shorter."""
+LEAST_FOCAL_PX = 5.0
+"""Smallest focal length, px: shares of a side, which files without a size have, are shorter."""
+AT_CORNER = 0.02
+"""Share of each side within which a principal point is at the image's corner, as one relative to the middle is."""
 
 
 def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:
@@ -175,11 +180,19 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path)
             raise InputError(
                 "E-CAMERA-SIZE", f"camera file {path}: image side {side:g} px; a whole number in 1…{MAX_SIDE_PX} needed"
             )
-    if width and height and flat[:4].max() < LEAST_SHARE_OF_SIDE * max(width, height):
+    longer = max(width, height) if width and height else 2 * float(flat[2:4].max())
+    if flat[:2].max() < max(LEAST_FOCAL[FISHEYE in colmap_model] * longer, LEAST_FOCAL_PX):
+        size = f" of an image of {width:g}×{height:g} px" if width and height else ""
         raise InputError(
             "E-CAMERA-FOCAL",
-            f"camera file {path}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}) of an image "
-            f"of {width:g}×{height:g} px; px needed: are they mm, or shares of a side?",
+            f"camera file {path}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}; px "
+            "needed: are they mm, or shares of a side?",
+        )
+    if width and height and (np.abs(flat[2:4]) < AT_CORNER * np.array([width, height])).all():
+        raise InputError(
+            "E-CAMERA-CENTRE",
+            f"camera file {path}: principal point ({flat[2]:g}, {flat[3]:g}) px is at the corner of {width:g}×"
+            f"{height:g} px; px from the image's corner needed: are they from its middle?",
         )
     width, height = (None if side is None else int(side) for side in (width, height))
     return CameraModel(flat[:2], flat[2:4], flat[4:], colmap_model, width, height, str(path))

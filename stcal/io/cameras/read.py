@@ -152,17 +152,36 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
         ) from error
 
 
-REALITY_CAPTURE = ("capturingreality.com", "#name,x,y,alt,heading,pitch,roll,f,px,py")
-"""What tells the XMP and the table of RealityCapture."""
+PHOTONVISION = '"cameraIntrinsics"'
+"""Key of PhotonVision, which names mrcal's lens models, too."""
+ANEW = "calibrate with OpenCV's model, as `stcal-sfm calibrate-camera` does"
+UNREAD = (
+    (
+        r"capturingreality\.com|^#name,.*\bpx,py\b",
+        "of RealityCapture, relative to an image whose size it does not state; export the registration as COLMAP, and "
+        "give its cameras.txt",
+    ),
+    (r"\A# Bundle file", "of Bundler, without the images' size and middle; export as COLMAP, and give its cameras.txt"),
+    (r"\A# Image list", "COLMAP's images.txt, which has poses; give the cameras.txt beside it"),
+    (r"\ACalibration results\s+=", "Kalibr's report, with fewer decimals; give the camchain.yaml beside it"),
+    (r"\AF \S+\s+Px \S+|\AfileName imageWidth imageHeight", "of Pix4D; export as COLMAP, and give its cameras.txt"),
+    (r"ParGroup: Camera|^Kappa\b", f"of HALCON, in metres and by other formulas; {ANEW}"),
+    (
+        r"polynomial coefficients for the DIRECT|SCARAMUZZA",
+        f"of OCamCalib (SCARAMUZZA), a lens by polynomials of its own; {ANEW}",
+    ),
+    ("<ExportAPERO", f"of MicMac, whose distortion leads from the image to the ray; {ANEW}"),
+    ("<BlocksExchange", "of ContextCapture; export as COLMAP, and give its cameras.txt"),
+    (r'VICON_RADIAL|qtm-version=|KC1="', f"of a system of motion capture, with formulas of its own; {ANEW}"),
+    ('"CalibrationInformation"', "of Azure Kinect, in shares of a side; write what its SDK says for your images' size"),
+)
+"""Patterns that tell files of programs whose cameras are not read, and why and what to do."""
 
 
 def _of_text(text: str, name: str, path: Path) -> CameraModel | ForeignLens:
-    if any(word in text for word in REALITY_CAPTURE):
-        raise InputError(
-            "E-CAMERA-MODEL",
-            f"camera file {path}: of RealityCapture, relative to an image whose size it does not state; export the "
-            "registration as COLMAP, and give its cameras.txt",
-        )
+    for pattern, why in UNREAD:
+        if re.search(pattern, text, re.MULTILINE):
+            raise InputError("E-CAMERA-MODEL", f"camera file {path}: {why}")
     if text.lstrip().startswith("<"):
         root = ElementTree.fromstring(text)
         if root.tag == "calibration":
@@ -171,7 +190,7 @@ def _of_text(text: str, name: str, path: Path) -> CameraModel | ForeignLens:
             return metashape.from_cameras(root, name, str(path))
         return from_keys(values_of(text), name, str(path))
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    if rows and rows[0][0].startswith("{") and "lensmodel" in text:
+    if rows and rows[0][0].startswith("{") and "lensmodel" in text and PHOTONVISION not in text:
         return forms.from_mrcal(text, str(path))
     if rows and len(rows[0]) >= 5 and re.fullmatch(r"[A-Z][A-Z0-9_]+", rows[0][1]):
         lens = _from_colmap(rows, name, path)

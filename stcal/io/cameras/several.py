@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 
 from stcal.errors import InputNote
-from stcal.io.cameras.keys import CONTAINERS, ROLES, numbers_of, plain
+from stcal.io.cameras.keys import CONTAINERS, numbers_of, plain, role_of
 
 NUMBERED = re.compile(r"(.+?)[ _]?(\d+|left|right|l|r)$|(left|right|cam\d+)[ _.](.*)$", re.IGNORECASE)
 """A key with the number or the side of its camera, behind or in front."""
@@ -19,8 +19,8 @@ def _holds_lens(values: object) -> bool:
         return False
     if sum(map(_holds_lens, values.values())) > 1:  # several cameras
         return False
-    found = {plain(path[-1].split(".")[-1]): value for path, value in shallow(values)}
-    roles = {ROLES.get(name) for name, value in found.items() if not is_fundamental(name, value)}
+    found = {path[-1].split(".")[-1]: value for path, value in shallow(values)}
+    roles = {role_of(key) for key, value in found.items() if not is_fundamental(plain(key), value)}
     return bool({"matrix", "lens", "fx", "f"} & roles) or "mu" in found or {"px", "u0"} <= found.keys()
 
 
@@ -48,13 +48,15 @@ def cameras_of(values: dict) -> dict[str, dict]:
     frames = values.get("frames")
     if isinstance(frames, list) and any(_holds_lens(frame) for frame in frames):
         shared = {key: value for key, value in values.items() if key != "frames"}
-        kept = [{k: v for k, v in f.items() if plain(k) in ROLES} for f in frames if isinstance(f, dict)]
+        kept = [{k: v for k, v in f.items() if role_of(k)} for f in frames if isinstance(f, dict)]
         if all(each == kept[0] for each in kept):
             return {"": shared | kept[0]}
         names = [str(frame.get("file_path", i)) for i, frame in enumerate(frames) if isinstance(frame, dict)]
         return {name: shared | own for name, own in zip(names, kept, strict=True)}
     if isinstance(values.get("intrinsics"), list) and any(isinstance(each, dict) for each in values["intrinsics"]):
         stated = [each for each in values["intrinsics"] if isinstance(each, dict)]
+        if all("key" in each and isinstance(each.get("value"), dict) for each in stated):
+            return {str(each["key"]): _of_openmvg(each["value"]) for each in stated}
         if all(isinstance(each.get("intrinsics"), dict) for each in stated):
             return _of_basalt(stated, values.get("resolution", []))
         own = [_of_meshroom(each) for each in stated]
@@ -68,7 +70,7 @@ def cameras_of(values: dict) -> dict[str, dict]:
         return {"": values}
     if inner:
         return {name: own | value for name, value in inner.items()}
-    shared = {key: value for key, value in values.items() if ROLES.get(plain(key)) in ("width", "height", "size")}
+    shared = {key: value for key, value in values.items() if role_of(key) in ("width", "height", "size")}
     for value in values.values():  # a list or a mapping of cameras, one level down
         if isinstance(value, list):
             pairs = [each for each in value if isinstance(each, list) and len(each) == 2 and _holds_lens(each[1])]
@@ -108,6 +110,30 @@ def _of_basalt(stated: list[dict], sizes: object) -> dict[str, dict]:
         else:
             cameras[str(i)] = {"camera_model": kind.removesuffix("8"), **own, **size}
     return cameras
+
+
+OPENMVG = {
+    "disto_k1": ("opencv", "k1"),
+    "disto_k3": ("opencv", "k1 k2 k3"),
+    "disto_t2": ("opencv", "k1 k2 k3 p1 p2"),
+    "fisheye": ("fisheye", "k1 k2 k3 k4"),
+}
+"""Keys of OpenMVG's coefficients: the model, and their order (openMVG, ``cameras/Camera_Pinhole_Brown.hpp``)."""
+
+
+def _of_openmvg(stated: dict) -> dict:
+    """Return an entry of OpenMVG's ``intrinsics``, whose lengths are px from the centre of the first pixel.
+
+    Raises ValueError: the lens is another one, or the number of coefficients is wrong.
+    """
+    data = dict(stated.get("ptr_wrapper", {}).get("data", {}))
+    data |= data.pop("value0", {})
+    kinds = [key for key in OPENMVG if key in data]
+    names = OPENMVG[kinds[0]][1].split() if kinds else []
+    given = [float(each) for each in data.pop(kinds[0])] if kinds else []
+    if len(kinds) > 1 or len(given) != len(names) or "focal_length" not in data:
+        raise ValueError(f"lens {stated.get('polymorphic_name', '')!r} of OpenMVG; {', '.join(OPENMVG)} are read")
+    return data | dict(zip(names, given, strict=True)) | {"model": OPENMVG[kinds[0]][0] if kinds else "pinhole"}
 
 
 MESHROOM = {
@@ -186,4 +212,4 @@ def _numbered(values: dict) -> dict[str, dict]:
 def _is_matrix(value: object, base: str, role: str) -> bool:
     if role == "p":
         return plain(base) == "p" and numbers_of(value).size == 12
-    return ROLES.get(plain(base)) == role and numbers_of(value).size == 9
+    return role_of(base) == role and numbers_of(value).size == 9

@@ -25,7 +25,7 @@ def values_of(text: str) -> dict:
     """
     if text.lstrip().startswith("<"):
         return _xml_values(ElementTree.fromstring(text))
-    if text.lstrip().startswith("{"):
+    if re.match(r"\s*(\[\s*)?\{", text):
         try:
             values = json.loads(text, strict=False, object_pairs_hook=_once)
         except json.JSONDecodeError:  # YAML has braces, too
@@ -41,6 +41,8 @@ def values_of(text: str) -> dict:
         values, *more = documents
         if any(_without_header(each) != _without_header(values) for each in more):
             raise ValueError(f"{len(documents)} documents that differ; leave one in")
+    if isinstance(values, list) and values and all(isinstance(each, dict) for each in values):
+        values = values[0] if len(values) == 1 else {"cameras": values}
     made = _with_data(values) if isinstance(values, dict) else None
     if not isinstance(made, dict):
         raise ValueError("no keys")

@@ -70,8 +70,9 @@ def places_of(table: Table) -> tuple[str, ...]:
 
 
 def find_column(table: Table, prefix: str, name: str) -> str | None:
-    """Return the column of a name, also in capital letters; None if there is none."""
-    return next((c for c in (f"{prefix}{name}", f"{prefix}{name.upper()}") if c in table), None)
+    """Return the column of a name, also with capital letters; None if there is none."""
+    wanted = f"{prefix}{name}"
+    return wanted if wanted in table else next((c for c in table.columns if c.lower() == wanted.lower()), None)
 
 
 def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) -> Turned | None:

@@ -38,6 +38,8 @@ LIKELY = {
     "quaternions": "wxyz or xyzw",
 }
 """Suggestions for ``--rotation`` by the names of the columns."""
+MOST_RAD = 2 * np.pi * 1.01
+"""Largest angle that a rotation is stated by in radians: a turn."""
 _ORDER = re.compile(r"[xyz]{3}|[XYZ]{3}")
 
 
@@ -114,10 +116,15 @@ def rotations(
     Raises InputError: values are not finite, or their unit is ambiguous.
     """
     require_finite(values, places, where)
-    unit, guessed = convention.unit, False
+    unit, guessed, largest = convention.unit, False, float(np.abs(values).max(initial=0.0))
+    if unit == "rad" and largest > MOST_RAD:
+        raise InputError(
+            "E-ROTATION-AMBIGUOUS",
+            f"{where}: angles up to {largest:.3g}, more than a turn in radians; of degrees give --rotation "
+            f"{convention.order}-deg, or name the columns _deg",
+        )
     if not unit:
-        largest = float(np.abs(values).max())
-        if largest <= 2 * np.pi * 1.01:
+        if largest <= MOST_RAD:
             raise InputError(
                 "E-ROTATION-AMBIGUOUS",
                 f"{where}: angles up to {largest:.3g} may be radians or degrees; give --rotation "

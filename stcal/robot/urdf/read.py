@@ -11,6 +11,7 @@ from stcal.errors import InputError, StcalError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
+from stcal.io.poses.rotations import MOST_RAD
 from stcal.lengths import MOST_LINK_MM
 from stcal.robot.kinematics.dh import robot_between, robot_from_chain
 from stcal.robot.kinematics.forward import carried_poses, fixed_values, flange_poses, forward
@@ -21,6 +22,8 @@ WORLD, BASE, FLANGE, TOOL, TOOL0 = "world", "base_link", "flange", "tool", "tool
 """Names of links; other tools are ``tool_NAME``."""
 UNLIMITED = 1e6
 """Value in rad or m beyond which a limit counts as unlimited; URDF cannot state only one of two limits."""
+PLACED_BY = {"origin": ("xyz", "rpy"), "axis": ("xyz",)}
+"""Elements of a joint that place it, and their attributes."""
 MOVING: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 
 
@@ -275,11 +278,23 @@ def _read_joint(element: ElementTree.Element, where: str) -> UrdfJoint:
     name, kind = element.get("name", ""), element.get("type", "")
     where = f"{where}: joint {name}"
     parts = {part.tag: part.attrib for part in element}
+    for tag, known in PLACED_BY.items():
+        if (count := len(element.findall(tag))) > 1:
+            raise InputError("E-URDF-CONTENT", f"{where}: {tag} {count} times; leave one in")
+        if unknown := parts.get(tag, {}).keys() - known:
+            raise InputError(
+                "E-URDF-CONTENT",
+                f"{where}: {tag} has {min(unknown)}, which is none of URDF's {', '.join(known)}; write it by these",
+            )
     parent, child = parts.get("parent", {}).get("link"), parts.get("child", {}).get("link")
     if not (name and parent and child):
         raise InputError("E-URDF-CONTENT", f"{where}: its name, parent or child is missing; all three needed")
     origin = parts.get("origin", {})
     place, turn = _three(origin.get("xyz", "0 0 0"), where), _three(origin.get("rpy", "0 0 0"), where)
+    if (most := float(np.abs(turn).max())) > MOST_RAD:
+        raise InputError(
+            "E-URDF-CONTENT", f"{where}: rpy of {most:g}, more than a turn: URDF is in radians; divide degrees by 57.3"
+        )
     axis = _three(parts.get("axis", {}).get("xyz", "1 0 0"), where)
     length = float(np.linalg.norm(axis))
     if not length > 1e-9:

@@ -68,7 +68,7 @@ def instant_of(image: str) -> str:
 
 def symmetries(board: BoardDesign, unique: bool) -> list[Rigid]:
     """Returns the symmetries of a board, board_from_board; only the identity if ``unique``."""
-    if unique or board.corner is not None:
+    if unique or board.unique():
         return [Rigid()]
     middle = np.append(board.pitch_mm * np.array([board.columns - 1, board.rows - 1]) / 2, 0.0)
     turns = []

@@ -5,12 +5,14 @@ which rows or columns are seen. A reading therefore carries every numbering that
 (``stcal.sfm.detect.labels``).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from stcal.design import BoardDesign
 from stcal.errors import DegenerateError
+from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homography, homography_jacobian
 from stcal.sfm.detect.circles.candidates import MAX_AXIS_RATIO, Candidates, match_pattern, singular_values
 
@@ -83,7 +85,7 @@ def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: Boar
         # A dot that has been in two grids is not likely to start a better third one.
         if not free[seed] or inside[seed] >= 2:
             continue
-        cells = _grow(candidates, links, steps, seed, free)
+        cells = _grow(candidates, links, steps, seed, free, board)
         inside[list(cells)] += 1
         if len(cells) > len(best):
             best = cells
@@ -94,9 +96,9 @@ def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: Boar
 
 def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:
     """Finds for each candidate, mapped to a circle of the board's radius, the dots one pitch away in the four
-    directions that most neighbours agree on. Returns (n, 4) indices or −1, and (n, 2, 2) whose columns are the two
-    steps."""
-    n = len(candidates)
+    directions, of a hexagonal board six, that most neighbours agree on. Returns (n, 4 or 6) indices or −1, and
+    (n, 2, 2) whose columns are the two steps."""
+    n, sides = len(candidates), directions(board)
     k = min(NEIGHBOURS + 1, n)
     near = candidates.tree.query(candidates.xy, k=k)[1][:, 1:]
     inverse = np.linalg.inv(candidates.shape)
@@ -107,26 +109,39 @@ def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.n
     # Blur makes small dots look larger, and diagonal neighbours then pass for direct ones: the nearest tell.
     ok &= length < DIAGONAL * np.where(ok, length, np.inf).min(1, initial=np.inf)[:, None]
     angle = np.arctan2(step[..., 1], step[..., 0])
-    quarter = np.where(ok, np.exp(4j * angle), 0).sum(1)
-    agreed = np.angle(quarter) / 4
-    turns = (angle - agreed[:, None]) / (np.pi / 2)
-    direction = np.round(turns).astype(int) % 4
+    together = np.where(ok, np.exp(sides * 1j * angle), 0).sum(1)
+    agreed = np.angle(together) / sides
+    turns = (angle - agreed[:, None]) / (2 * np.pi / sides)
+    direction = np.round(turns).astype(int) % sides
     error = np.abs(turns - np.round(turns)) + np.abs(length - 1)
     ok &= np.abs(turns - np.round(turns)) < STEP_TOLERANCE
-    links = np.full((n, 4), -1)
-    for side in range(4):
+    links = np.full((n, sides), -1)
+    for side in range(sides):
         cost = np.where(ok & (direction == side), error, np.inf)
         best = cost.argmin(1)
         links[:, side] = np.where(np.isfinite(cost.min(1)), near[np.arange(n), best], -1)
     pitch = board.pitch_mm / board.radius_mm
     axes = np.stack([np.cos(agreed), -np.sin(agreed), np.sin(agreed), np.cos(agreed)], 1).reshape(n, 2, 2) * pitch
-    return links, candidates.shape @ axes
+    return links, candidates.shape @ axes @ board.steps()
 
 
-def _grow(candidates: Candidates, links, steps, seed: int, free) -> dict[int, tuple[int, int]]:
+def directions(board: BoardDesign) -> int:
+    """Returns the number of directions in which a dot has neighbours: 4, or 6 if rows are shifted by half a pitch."""
+    return 6 if board.steps()[0, 1] else 4
+
+
+def _turn(board: BoardDesign, turn: int) -> np.ndarray:
+    """Returns the whole numbers (2, 2) that turn columns and rows by ``turn`` of the board's directions."""
+    angle, steps = 2 * np.pi * turn / directions(board), board.steps()
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.rint(np.linalg.solve(steps, rotation @ steps)).astype(int)
+
+
+def _grow(candidates: Candidates, links, steps, seed: int, free, board: BoardDesign) -> dict[int, tuple[int, int]]:
     """Returns cells (u, v) by candidate, grown from neighbour to neighbour; the steps are updated on the way."""
     start = np.array(steps[seed])
-    for axis, (ahead, behind) in enumerate(((0, 2), (1, 3))):
+    half = directions(board) // 2
+    for axis, (ahead, behind) in enumerate(((0, half), (1, 1 + half))):
         steps_at_seed = [
             s * (candidates.xy[links[seed][d]] - candidates.xy[seed])
             for d, s in ((ahead, 1), (behind, -1))
@@ -136,7 +151,8 @@ def _grow(candidates: Candidates, links, steps, seed: int, free) -> dict[int, tu
             start[:, axis] = np.mean(steps_at_seed, axis=0)
     across = np.linalg.solve(candidates.shape[seed], start)
     lengths = np.linalg.norm(across, axis=0)
-    if abs(across[:, 0] @ across[:, 1]) > MAX_COSINE * lengths.prod() or lengths.max() > DIAGONAL * lengths.min():
+    cosine = across[:, 0] @ across[:, 1] / lengths.prod() - board.steps()[:, 0] @ board.steps()[:, 1]
+    if abs(cosine) > MAX_COSINE or lengths.max() > DIAGONAL * lengths.min():
         return {}
     cells = {int(seed): (0, 0)}
     taken_cells = {(0, 0)}
@@ -167,30 +183,75 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
     """Fits the homography of the grown cells, matches all dots with it, and lists the numberings that fit."""
     index = np.array(list(cells))
     uv = np.array(list(cells.values()))
-    homography = _robust_homography(uv, candidates, index)
+    homography = _robust_homography(board.flat(uv), candidates, index)
     if homography is None:
         return None
     lowest, highest = uv.min(0) - 2, uv.max(0) + 2
     sides = [np.arange(a, b + 1) for a, b in zip(lowest, highest, strict=True)]
     grid = np.stack(np.meshgrid(*sides), -1).reshape(-1, 2)
-    centre = uv.mean(0)
-    depth = np.column_stack([grid, np.ones(len(grid))]) @ homography[2]
+    centre = board.flat(uv).mean(0)
+    depth = np.column_stack([board.flat(grid), np.ones(len(grid))]) @ homography[2]
     grid = grid[depth * np.sign(homography[2] @ [*centre, 1]) > 0]
     radius = np.full(len(grid), board.radius_mm / board.pitch_mm)
-    matched = match_pattern(candidates, homography, grid, radius)
+    matched = match_pattern(candidates, homography, board.flat(grid), radius)
     if board.corner is not None:
-        large = match_pattern(candidates, homography, grid, radius * board.corner_radius_mm / board.radius_mm)
+        larger = radius * board.corner_radius_mm / board.radius_mm
+        large = match_pattern(candidates, homography, board.flat(grid), larger)
         matched = np.where(matched >= 0, matched, large)
     uv, index = grid[matched >= 0], matched[matched >= 0]
     if np.linalg.det(homography) < 0:
-        uv, homography = uv[:, ::-1], homography[:, [1, 0, 2]]
+        steps = board.steps()
+        mirror = np.eye(3)
+        mirror[:2, :2] = steps @ np.linalg.solve(steps.T, [[0.0, 1.0], [1.0, 0.0]]).T
+        uv, homography = uv[:, ::-1], homography @ mirror
     if len(uv) < needed_dots(board):
         return None
-    readings = [_place(candidates, uv, index, turn, board, homography, image_corners) for turn in range(4)]
+    readings = [
+        _place(candidates, uv, index, turn, board, homography, image_corners) for turn in range(directions(board))
+    ]
     placements = sorted((p for reading in readings for p in reading), key=lambda p: (p.unexplained, -len(p.inside)))
     if not placements:
         return None
     return _reading(placements, candidates, board)
+
+
+def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera) -> BoardReading:
+    """Returns the reading with the numberings that put the board's dots with a hole where the image shows holes.
+
+    A dot has a hole if its middle differs from its body by much of what bodies differ from the board.
+
+    ``grey`` : (height, width) 8-bit image; ``camera`` : its camera.
+    """
+    angle = np.arange(0, 2 * np.pi, np.pi / 8)
+    around = np.column_stack([np.cos(angle), np.sin(angle)])
+    cells = board.cells()
+    rings = np.array([tuple(cell) in board.rings for cell in cells.tolist()])
+    middles = board.pitch_mm * board.flat(cells[:, ::-1].astype(float))[:, None]
+    wrong = []
+    for homography in reading.homographies:
+        values = []
+        for share in RING_SHARES:
+            xy = apply_homography(homography, (middles + share * board.radius_mm * around).reshape(-1, 2))
+            px = camera.project(np.column_stack([xy, np.ones(len(xy))]))
+            sampled = cv2.remap(grey, px.astype(np.float32)[None], None, cv2.INTER_LINEAR)[0]  # type: ignore[call-overload]
+            values.append(sampled.reshape(len(cells), -1).mean(1))
+        inside = ((px > 0) & (px < np.array(grey.shape[::-1]) - 1)).all(1).reshape(len(cells), -1).all(1)
+        middle, body, outside = values
+        holes = np.abs(middle - body) > HOLE_SHARE * np.median(np.abs(body - outside)[inside])
+        wrong.append(int((holes != rings)[inside].sum()))
+    best = min(wrong)
+    kept = [i for i, count in enumerate(wrong) if count == best]
+    if best > MOST_WRONG:
+        return reading
+    return replace(reading, numberings=reading.numberings[kept], homographies=reading.homographies[kept])
+
+
+RING_SHARES = (0.15, 0.75, 1.25)
+"""Radii of the circles on which the middle of a dot, its body and the board about it are sampled, in its radii."""
+HOLE_SHARE = 0.5
+"""Smallest difference between middle and body of a dot with a hole, over that between bodies and the board."""
+MOST_WRONG = 1
+"""Largest number of dots whose hole is missed, or seen where none is."""
 
 
 def needed_dots(board: BoardDesign) -> float:
@@ -232,10 +293,8 @@ class _Placement:
 def _place(
     candidates: Candidates, uv, index, turn: int, board: BoardDesign, homography, image_corners
 ) -> list[_Placement]:
-    """Returns the placements of the grid turned by ``turn`` quarters."""
-    rotation = np.array([[1, 0], [0, 1]])
-    for _ in range(turn):
-        rotation = rotation @ np.array([[0, -1], [1, 0]])
+    """Returns the placements of the grid turned by ``turn`` of the board's directions."""
+    rotation = _turn(board, turn)
     turned = uv @ rotation.T
     size = np.array([board.columns, board.rows])
     all_cells = board.cells()[:, ::-1]
@@ -254,13 +313,12 @@ def _place(
             at_corner = (column_row == board.corner[::-1]).all(1)
             if (large != at_corner)[inside].any():
                 continue
-        grid_cells = (all_cells - offset) @ rotation
+        grid_cells = (all_cells - offset) @ _turn(board, -turn).T
         occupied = np.zeros_like(has_dot)
         occupied[tuple(column_row[inside, ::-1].T)] = True
         missing = ~occupied[tuple(all_cells[:, ::-1].T)]
-        expected = _inside_image(
-            apply_homography(homography, grid_cells[missing]), homography, grid_cells[missing], image_corners
-        )
+        absent = board.flat(grid_cells[missing])
+        expected = _inside_image(apply_homography(homography, absent), homography, absent, image_corners)
         unexplained = int(expected.sum() + outside_count)
         placements.append(_Placement(unexplained, inside, column_row[:, ::-1], index))
     return placements
@@ -280,7 +338,7 @@ def _large_dots(candidates: Candidates, uv, index, board: BoardDesign, homograph
     """Returns the mask of the dots that are as large as the larger corner dot."""
     if board.corner is None or board.corner_radius_mm is None:
         return np.zeros(len(uv), bool)
-    local = np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, uv))))
+    local = np.sqrt(np.abs(np.linalg.det(homography_jacobian(homography, board.flat(uv)))))
     size = candidates.radius[index] / local
     return size / np.median(size) > 1 + CORNER_MARGIN * (board.corner_radius_mm / board.radius_mm - 1)
 
@@ -302,6 +360,7 @@ def _reading(placements: list[_Placement], candidates: Candidates, board: BoardD
     common = np.logical_and.reduce([p.inside for p in likely])
     index = placements[0].index[common]
     numberings = np.stack([p.cells[common] for p in likely])
-    homographies = [fit_homography(board.pitch_mm * n[:, ::-1].astype(float), candidates.xy[index]) for n in numberings]
+    places = [board.pitch_mm * board.flat(n[:, ::-1].astype(float)) for n in numberings]
+    homographies = [fit_homography(xy_mm, candidates.xy[index]) for xy_mm in places]
     further = [p.cells[common] for p in placements if p.unexplained > most and p.inside[common].all()]
     return BoardReading(index, numberings, np.stack(homographies), np.array(further, int).reshape(-1, len(index), 2))

@@ -80,8 +80,9 @@ def _views(image: DetectedImage, target: TargetDesign, board: BoardDesign) -> li
 
 
 def _is_symmetry(difference: Rigid, board: BoardDesign) -> bool:
-    width, height = board.pitch_mm * (board.columns - 1), board.pitch_mm * (board.rows - 1)
-    corners = np.array([[0.0, 0, 0], [width, 0, 0], [0, height, 0], [width, height, 0]])
+    width, height = board.columns - 1, board.rows - 1
+    xy = board.pitch_mm * board.flat(np.array([[0.0, 0], [width, 0], [0, height], [width, height]]))
+    corners = np.pad(xy, ((0, 0), (0, 1)))
     away = np.linalg.norm((difference @ corners)[:, None] - corners, axis=2)
     return bool(away.min(1).max() < MAX_SHIFT_PITCHES * board.pitch_mm)
 

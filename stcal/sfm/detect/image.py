@@ -15,7 +15,7 @@ from stcal.geometry.plane import apply_homography, fit_homography
 from stcal.io.images import grey_8bit, grey_fine, require_grey
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import Centres
-from stcal.sfm.detect.board import BoardReading, find_boards
+from stcal.sfm.detect.board import BoardReading, by_rings, find_boards
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, find_ellipses
 from stcal.sfm.detect.circles.centres import measure_centres
 from stcal.sfm.detect.faces import FaceFinder, FaceFinding, FaceReading
@@ -91,6 +91,8 @@ def _read_once(
     free = {p: np.ones(len(e), bool) for p, e in found.items()}
     if board is not None:
         boards = find_boards(Candidates.of(found[board.polarity], camera), board, image_corners(camera))
+        if board.rings:
+            boards = [by_rings(each, board, grey, camera) for each in boards]
         for each in boards:
             free[board.polarity][each.candidates] = False
     all_free = found[target.polarity].select(free[target.polarity])

@@ -18,7 +18,7 @@ from stcal.handeye.data.stream import Timed
 from stcal.handeye.judge.flips import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.methods import closed_form
-from stcal.io.cameras.model import CameraPrior, camera_prior, refinable
+from stcal.io.cameras.model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
 from stcal.io.table import Table
@@ -262,7 +262,7 @@ class Photographed:
 def photographed(
     source: Path,
     robot: RobotPoses,
-    camera: Path,
+    model: CameraModel,
     design: Board,
     workers: int | None,
     progress: Progress,
@@ -272,7 +272,6 @@ def photographed(
 
     Raises InputError: no image shows the board, or no image has a pose.
     """
-    model = read_camera(camera)
     files, skipped = find_images(source)
     at_images = robot_at_images(robot, [file.name for file in files], timing)
     robot, late = at_images.robot, dict(at_images.left_out)
@@ -322,7 +321,7 @@ def _from_images(
 ) -> HandEyeInput:
     """Returns the pairs of all images that show the board and have a pose."""
     design = load_boards(board)
-    photos = photographed(source, robot, camera, design, workers, progress, timing)
+    photos = photographed(source, robot, read_camera(camera), design, workers, progress, timing)
     robot = photos.robot
     pairs = pairs_of_views(photos.base_from_flange[photos.rows], photos.seen, photos.names, str(source))
     if photos.covariance is not None:

@@ -17,6 +17,7 @@ from stcal.handeye.report.outcome import Outcome, RigOutcome
 from stcal.handeye.rig.solve import Rig, RigOptions, alone_or_none, handeye_rig, of_places, same_numbering
 from stcal.handeye.rig.validate import RigHeldOut, cross_validate_rig, widened_by_scatter
 from stcal.handeye.validate import LEAST_LEFT, splits
+from stcal.io.cameras.read import read_camera
 from stcal.parallel import Progress, one_thread
 from stcal.workflows.handeye.calibrate import Splits
 from stcal.workflows.handeye.inputs import Photographed, photographed, pitch_of
@@ -59,7 +60,8 @@ def read_rig(
     for camera_files, robot in zip(files.cameras, robots, strict=True):
         named, timing = partial(_named, progress, camera_files.name), Timing(tolerance_s, camera_files.times)
         try:
-            photos = photographed(camera_files.images, robot, camera_files.camera, design, workers, named, timing)
+            model = read_camera(camera_files.camera, camera_files.camera_name)
+            photos = photographed(camera_files.images, robot, model, design, workers, named, timing)
         except InputError as error:
             raise InputError(error.code, f"camera {camera_files.name}: {error}") from error
         cameras.append(photos)

@@ -9,7 +9,9 @@ import pytest
 
 from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye.data.rig import read_rig_file
 from stcal.handeye.data.robot_poses import read_robot_poses
+from stcal.workflows.handeye.rig import read_rig
 from tests.handeye.rig.photographed import LEFT_FROM, photographed_rig, write_poses
 from tests.outcome import ended
 from tests.shared import own_copy
@@ -110,6 +112,19 @@ def test_mistakes_in_the_file_are_named(rig, files, old, new, said):
     assert code == INPUT
     assert said in error
     assert error.strip().splitlines()[-1].startswith("error: ")
+
+
+def test_a_camera_of_a_file_of_several_is_named(rig, files):
+    (line,) = [line for line in (files / "cameras.txt").read_text().splitlines() if line[:1] == "1"]
+    (files / "both.txt").write_text(f"{line}\n{line.replace('1', '2', 1)}\n")
+    text = (files / "rig.toml").read_text().replace('camera = "cameras.txt"', 'camera = "both.txt"')
+    (files / "rig.toml").write_text(text)
+    code, _, error = rig(files / "rig.toml", "--splits", 0)
+    assert code == INPUT
+    assert "camera left: camera file" in error
+    assert "in a rig file camera_name" in error
+    (files / "rig.toml").write_text(text.replace('"both.txt"', '"both.txt"\ncamera_name = "2"'))
+    assert read_rig(read_rig_file(files / "rig.toml"), 1).given.cameras[0].name == "left"
 
 
 def test_what_it_reads_is_not_written_over(rig, files):

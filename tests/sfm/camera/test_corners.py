@@ -12,6 +12,7 @@ from stcal.boards.design import (
     AsymmetricCirclesDesign,
     CharucoDesign,
     ChessboardDesign,
+    HexagonalCirclesDesign,
     TagLayout,
 )
 from stcal.labels import DotLabel
@@ -61,18 +62,22 @@ def test_an_aprilgrid_of_kalibr_gives_the_camera(tmp_path, stcal_sfm):
 
 
 @pytest.mark.slow
-def test_asymmetric_circles_give_the_camera(tmp_path, stcal_sfm):
+@pytest.mark.parametrize(
+    ("kind", "across", "down"), [("asymmetric", 2.0, 1.0), ("hexagonal", 1.5, 1.5 * np.sqrt(0.75))]
+)
+def test_circles_in_shifted_rows_give_the_camera(tmp_path, stcal_sfm, kind, across, down):
     rows, columns, spacing, radius = 11, 4, 8.0, 4.0
-    sheet = np.full((120 * 4, 100 * 4), 255, np.uint8)
+    sheet = np.full((160 * 4, 100 * 4), 255, np.uint8)
     for row in range(rows):
         for place in range(columns):
-            x, y = 20 + spacing * (2 * place + row % 2), 20 + spacing * row
+            x, y = 20 + spacing * across * (place + row % 2 / 2), 20 + spacing * down * row
             centre = (round((4 * x - 0.5) * 16), round((4 * y - 0.5) * 16))  # mm begin at the edge of the first pixel
             cv2.circle(sheet, centre, round(radius * 4 * 16), 0, -1, cv2.LINE_AA, 4)
     (tmp_path / "photographs").mkdir()
     taken(tmp_path / "photographs", sheet, (20, 20), np.array([28.0, 40.0, 0.0]), 8, (190, 240))
+    stated = 8.0 if kind == "asymmetric" else 12.0
     (tmp_path / "board.toml").write_text(
-        'type = "asymmetric-circles"\nrows = 11\ncolumns = 4\nspacing_mm = 8.0\nradius_mm = 4.0\npolarity = "dark"\n'
+        f'type = "{kind}-circles"\nrows = 11\ncolumns = 4\nspacing_mm = {stated}\nradius_mm = 4.0\npolarity = "dark"\n'
     )
     code, _, error = stcal_sfm(
         *("calibrate-camera", tmp_path / "photographs", "--board", tmp_path / "board.toml"),
@@ -88,6 +93,7 @@ def test_asymmetric_circles_give_the_camera(tmp_path, stcal_sfm):
         AprilGridDesign(3, 4, 20.0, 0.3),
         AsymmetricCirclesDesign(5, 3, 8.0, 2.0, "dark"),
         AsymmetricCirclesDesign(4, 3, 8.0, None, "dark"),
+        HexagonalCirclesDesign(5, 4, 8.0, 2.0, "dark"),
         ChessboardDesign(4, 6, 25.0),
         CharucoDesign(5, 7, 30.0, 20.0, "DICT_4X4_50"),
     ],

@@ -403,7 +403,7 @@ CAMERAS = {
         "1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1",
         ("2 cameras, 1 needed; choose of 1, 2 with `stcal camera",),
     ),
-    "field of view": ("1 FOV 9 9 1 1 1 1 1", ("COLMAP's FOV", "fit one of them to it with `stcal camera convert`")),
+    "field of view": ("1 FOV 9 9 9 9 4 4 1", ("COLMAP's FOV", "fit one of them to it with `stcal camera convert`")),
     "no number": ("1 PINHOLE 1296 864 f f 1 1", ("'f'; numbers needed",)),
 }
 

@@ -25,7 +25,7 @@ from stcal.handeye.data.formats.record import (
 )
 from stcal.handeye.data.formats.single import ROS
 from stcal.io.poses.columns import find_column, places_of, read_rotations
-from stcal.io.poses.rotations import of_quaternions, require_finite, turned_values
+from stcal.io.poses.rotations import of_quaternions, require_finite, said_convention, turned_values
 from stcal.io.table import LENGTHS, Table
 
 _SEPARATORS = re.compile(r"[\s,;]+")
@@ -35,6 +35,9 @@ TUM, MATRIX = 8, 16
 """Numbers in a line that holds a whole pose."""
 PAIRS = (12, 14)
 """Numbers in a line that holds the poses of both sides, three angles or a quaternion each."""
+NANOSECONDS = 19
+"""Digits of a time in ns since 1970."""
+QUATERNIONS_OPEN = "the last four numbers after a time in ns"
 THREE_ROWS = 12
 ORTHOGONAL = 0.05
 """Largest deviation of RRᵀ from the identity of numbers that are a rotation; six other numbers of a pose deviate by
@@ -89,13 +92,15 @@ def read_numbers(text: str, statements: Said, where: str) -> Content | None:
         raise InputError(
             "E-MATRIX-ROWS", f"{where}: {width} numbers in a line, as of a matrix 3×4 or 3×3; 4×4 needed: add 0 0 0 1"
         )
+    values, places = np.array([line.values for line in lines]), tuple(f"line {line.number}" for line in lines)
+    if width > TUM and any(_of_euroc(comment, width) for comment in comments):  # velocities and biases follow
+        values, width = values[:, :TUM], TUM
     if width not in (6, 7, TUM, MATRIX, *PAIRS):
         return None
-    values, places = np.array([line.values for line in lines]), tuple(f"line {line.number}" for line in lines)
     require_finite(values, places, where)
     names = tuple(line.label for line in lines) if all(line.label for line in lines) else ()
     if width == TUM:
-        return _tum(values, lines, places, comments, where)
+        return _tum(values, lines, places, comments, statements, where)
     require_each_once(names, places[: len(names)], where)
     if width == MATRIX:
         rotation, translation = of_matrices(values.reshape(-1, 4, 4), places, where)
@@ -223,12 +228,30 @@ def _blocks(lines: list[Line], where: str) -> Content | None:
     return Content("4×4 matrices as text", (Side(rotation, translation, places, MATRICES, names=tuple(names)),))
 
 
-def _tum(values: np.ndarray, lines: list[Line], places: tuple[str, ...], comments: list[str], where: str) -> Content:
+def _of_euroc(comment: str, width: int) -> bool:
+    """Returns True for a header of EuRoC's ground truth, of as many columns, with a pose in the first ones."""
+    cells = comment.split(",")
+    return len(cells) == width and len(_QUATERNION.findall(",".join(cells[4:TUM]).lower())) == len("wxyz")
+
+
+def _tum(
+    values: np.ndarray,
+    lines: list[Line],
+    places: tuple[str, ...],
+    comments: list[str],
+    statements: Said,
+    where: str,
+) -> Content:
     """Returns poses from lines of timestamp tx ty tz qx qy qz qw. A comment may state another order of the quaternion,
-    as in EuRoC."""
-    order = next((letters for c in comments if len(letters := _QUATERNION.findall(c.lower())) == 4), list("xyzw"))
+    as in EuRoC; whole nanoseconds without one are of programs that write w first, or of others.
+
+    Raises InputError: a row occurs twice, a quaternion is not of unit length, or its order must be stated.
+    """
+    order = next((letters for c in comments if len(letters := _QUATERNION.findall(c.lower())) == 4), [])
     if sorted(order) != sorted("wxyz"):
         order = list("xyzw")
+        if statements.rotation or all(line.first.isdigit() and len(line.first) >= NANOSECONDS for line in lines):
+            order = list(said_convention(statements.rotation, QUATERNIONS_OPEN, where, len("wxyz")).order)
     names = tuple(line.first for line in lines)
     require_each_once(names, places, where)
     wxyz = values[:, 4:][:, [order.index(component) for component in "wxyz"]]

@@ -12,6 +12,7 @@ from stcal.geometry.rigid import Order
 from stcal.handeye.data.formats import colmap
 from stcal.handeye.data.formats.arrays import NPY, NPZ, load_npy, load_npz
 from stcal.handeye.data.formats.numeric import TABLE, read_columns, read_numbers, todays
+from stcal.handeye.data.formats.programs import read_program
 from stcal.handeye.data.formats.record import Content, Said, Side, require_each_once
 from stcal.handeye.data.formats.tree import read_tree
 from stcal.io.files import MB, SETTINGS_BYTES, TABLE_BYTES, read_bytes, text_of
@@ -28,6 +29,9 @@ SUFFIXES = (".yaml", ".yml", ".json", ".txt", ".csv", ".npy", ".npz")
 
 _BRACKETED_UNIT = re.compile(r"(?<=\w)\s*\[[a-zµ°]{1,3}\]", re.I)
 """A unit in the header of a table, which is no list of YAML."""
+
+_SPACED = re.compile(r"([A-Za-z_]\w*\s+){5,}[A-Za-z_]\w*")
+"""A header of columns between which spaces stand, of six names at least, as a pose needs."""
 
 
 class NotToldError(InputError):
@@ -87,12 +91,14 @@ def _of_text(text: str, path: Path, statements: Said, key: str, quaternions: Ord
         return None
     if first[0] in "{[" and (content := _json(text)) is not None:
         return _required(read_tree(content, "JSON", statements, where), where)
+    if (content := read_program(text, where)) is not None:
+        return content
     if colmap.is_text(text):
         return colmap.read_text(text, where)
     content = read_numbers(text, statements, where)
     if content is not None:
         return content
-    if re.match(r"[^:\[{]*[,;\t]", _BRACKETED_UNIT.sub("", first)):
+    if re.match(r"[^:\[{]*[,;\t]", _BRACKETED_UNIT.sub("", first)) or _SPACED.fullmatch(first):
         table = read_table(path, "pose file", quaternions)
         return None if todays(table) else read_columns(table, key, statements)
     value = _yaml(text, where)

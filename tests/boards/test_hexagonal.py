@@ -1,0 +1,142 @@
+"""Hexagonal grids of circles: views drawn by their definition, each pixel from where its ray meets the board."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from stcal.boards.design import HexagonalCirclesDesign
+from stcal.boards.file import load_flat_board, load_run_board, run_board_toml
+from stcal.geometry.camera import Camera
+from stcal.geometry.rigid import Rigid
+from stcal.workflows.board_views import find_board
+from tests.outcome import fails_with
+
+CAMERA = Camera(800, 600, [900.0, 905.0], [390.0, 305.0], np.zeros(12))
+FINER, MARGIN_MM = 2, 25.0
+TEXT = 'type = "hexagonal-circles"\nrows = 9\ncolumns = 8\nspacing_mm = 20.0\nradius_mm = 6.0\npolarity = "dark"\n'
+TILTS = [(0.0, 0.0, 0.1), (0.5, 0.0, 0.3), (0.0, 0.6, -1.2), (0.3, -0.4, 2.5)]
+
+
+def view_of(board: HexagonalCirclesDesign, tilt, hidden_from_mm=(np.inf, np.inf)) -> tuple[np.ndarray, Rigid]:
+    """A grey image, and camera_from_board; what lies beyond ``hidden_from_mm`` along X and Y is covered."""
+    xy = board.xy_mm()
+    turn = Rigid.exp([*tilt, 0, 0, 0]).rotation
+    middle = np.append((xy.min(0) + xy.max(0)) / 2, 0.0)
+    pose = Rigid(turn, np.array([0, 0, 470.0]) - turn @ middle)
+    y, x = (np.mgrid[: CAMERA.height * FINER, : CAMERA.width * FINER] + 0.5) / FINER - 0.5
+    rays = np.column_stack([CAMERA.normalised_from_pixel(np.column_stack([x.ravel(), y.ravel()])), np.ones(x.size)])
+    normal = turn[:, 2]
+    met = ((rays * (normal @ pose.translation / (rays @ normal))[:, None]) - pose.translation) @ turn
+    on_board = ((met[:, :2] > xy.min(0) - MARGIN_MM) & (met[:, :2] < xy.max(0) + MARGIN_MM)).all(1)
+    grey = np.where(on_board & (cKDTree(xy).query(met[:, :2])[0] > board.radius_mm), 220.0, 40.0)
+    grey[(met[:, :2] > hidden_from_mm).all(1)] = 130.0
+    small = cv2.resize(grey.reshape(x.shape), (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
+    noise = np.random.default_rng(0).normal(0, 1.5, small.shape)
+    return np.clip(cv2.GaussianBlur(small, (0, 0), 0.7) + noise, 0, 255).astype(np.uint8), pose
+
+
+def test_a_file_and_back(tmp_path):
+    (tmp_path / "b.toml").write_text(TEXT)
+    board = load_flat_board(tmp_path / "b.toml")
+    assert board == HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark")
+    (tmp_path / "again.toml").write_text(run_board_toml(load_run_board(tmp_path / "b.toml")))
+    assert load_flat_board(tmp_path / "again.toml") == board
+    (tmp_path / "b.toml").write_text(TEXT.replace("6.0", "10.5"))
+    with fails_with("E-BOARD-RADIUS … 10.5 mm, under 10 mm … neighbours"):
+        load_flat_board(tmp_path / "b.toml")
+
+
+def test_six_neighbours_are_one_spacing_away():
+    board = HexagonalCirclesDesign(5, 6, 20.0, 6.0, "dark")
+    for xy in (board.xy_mm(), board.lattice().xy_mm()):
+        apart = np.linalg.norm(xy[:, None] - xy, axis=2)
+        assert np.isclose(apart[14], 20.0).sum() == 6
+        assert np.sort(apart[14])[7] == pytest.approx(20 * np.sqrt(3))
+    lattice = board.lattice()
+    np.testing.assert_allclose(lattice.xy_mm() - lattice.xy_mm()[0], board.xy_mm() - board.xy_mm()[0], atol=1e-12)
+    np.testing.assert_allclose(lattice.places_mm(lattice.labels())[:, :2], lattice.xy_mm(), atol=1e-12)
+
+
+@pytest.mark.parametrize("rows", [7, 8])
+@pytest.mark.parametrize("tilt", TILTS)
+def test_a_view_has_its_circles_where_they_are(rows, tilt):
+    """An even number of rows looks the same after half a turn, an odd one does not."""
+    board = HexagonalCirclesDesign(rows, 8, 20.0, 6.0, "dark")
+    image, pose = view_of(board, tilt)
+    view, why = find_board(image, "a", CAMERA, board)
+    assert view is not None, why
+    assert len(view) == 8 * rows
+    turned = [Rigid(), *board.symmetries()]
+    assert len(turned) == 2 - rows % 2
+    off = [view.xy_px - CAMERA.project(pose @ (turn @ view.xyz_board)) for turn in turned]
+    nearest = min(off, key=np.max)
+    assert np.abs(nearest).max() < 0.06  # px; noise of 1.5 grey levels of 180
+    in_sigma = np.einsum("ni,nij,nj->n", nearest, np.linalg.inv(view.covariance_px2), nearest) / 2
+    assert 0.4 < in_sigma.mean() < 2.5
+
+
+def test_a_covered_corner_is_no_harm():
+    board = HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark")
+    image, pose = view_of(board, TILTS[1], (100.0, 80.0))
+    view, why = find_board(image, "a", CAMERA, board)
+    assert view is not None, why
+    assert 55 < len(view) < 68
+    assert np.abs(view.xy_px - CAMERA.project(pose @ view.xyz_board)).max() < 0.06
+
+
+def test_a_covered_strip_is_said():
+    """Which columns are seen is open: they are all alike."""
+    board = HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark")
+    view, why = find_board(view_of(board, TILTS[1], (112.0, -np.inf))[0], "a", CAMERA, board)
+    assert view is None
+    assert "strip of the board is hidden" in why
+
+
+def with_holes(board: HexagonalCirclesDesign, rings, share: float, tilt, hidden_from_mm=(np.inf, np.inf)):
+    """A view with holes, ``share`` of the radius, in the circles ``rings``, (row, place)."""
+    image, pose = view_of(board, tilt, hidden_from_mm)
+    fine, angle = cv2.resize(image, None, fx=8, fy=8, interpolation=cv2.INTER_CUBIC), np.linspace(0, 2 * np.pi, 100)
+    rim = share * board.radius_mm * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    for row, place in rings:
+        px = CAMERA.project(pose @ (np.append(board.xy_mm()[row * board.columns + place], 0.0) + rim))
+        cv2.fillPoly(fine, [np.rint(((px + 0.5) * 8 - 0.5) * 16).astype(np.int32)], 220, cv2.LINE_AA, 4)
+    return cv2.resize(fine, image.shape[::-1], interpolation=cv2.INTER_AREA), pose
+
+
+@pytest.mark.parametrize("share", [0.35, 0.6])
+@pytest.mark.parametrize("tilt", TILTS[1:])
+def test_rings_tell_the_ends_of_a_board(share, tilt):
+    """The board has an even number of rows and looks the same turned, but for its rings."""
+    rings = ((1, 2), (1, 3), (4, 6))
+    board = HexagonalCirclesDesign(8, 8, 20.0, 6.0, "dark", rings=rings)
+    image, pose = with_holes(board, rings, share, tilt)
+    view, why = find_board(image, "a", CAMERA, board)
+    assert view is not None, why
+    assert board.symmetries() == []
+    assert len(view) >= 61
+    assert np.abs(view.xy_px - CAMERA.project(pose @ view.xyz_board)).max() < 0.06
+
+
+def test_rings_tell_which_columns_are_seen():
+    rings = ((2, 1), (5, 3))
+    board = HexagonalCirclesDesign(9, 8, 20.0, 6.0, "dark", rings=rings)
+    image, pose = with_holes(board, rings, 0.4, TILTS[1], (112.0, -np.inf))
+    view, why = find_board(image, "a", CAMERA, board)
+    assert view is not None, why
+    assert 40 < len(view) < 56
+    assert np.abs(view.xy_px - CAMERA.project(pose @ view.xyz_board)).max() < 0.06
+
+
+def test_rings_in_files(tmp_path):
+    dots = 'rows = 5\ncolumns = 7\npitch_mm = 20.0\nradius_mm = 5.0\npolarity = "dark"\n'
+    for text in (f"{TEXT}rings = [[1, 2], [0, 3]]\n", f"{dots}rings = [[0, 3], [1, 2]]\n"):
+        (tmp_path / "b.toml").write_text(text)
+        board = load_flat_board(tmp_path / "b.toml")
+        assert board.rings == ((0, 3), (1, 2))
+        (tmp_path / "again.toml").write_text(run_board_toml(load_run_board(tmp_path / "b.toml")))
+        assert load_flat_board(tmp_path / "again.toml").rings == board.rings
+    for rings, named in (("[[5, 0]]", "[5, 0]"), ("[[0, 0], [4, 6]]", "2 rings that look the same after a turn")):
+        (tmp_path / "b.toml").write_text(f"{dots}rings = {rings}\n")
+        with fails_with(f"E-BOARD-RINGS … {named}"):
+            load_flat_board(tmp_path / "b.toml")
