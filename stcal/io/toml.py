@@ -1,6 +1,7 @@
 """TOML files, validated by a pydantic model; messages name file and place of a mistake and lengths that are not mm."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -14,6 +15,8 @@ from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 from stcal.io.json import first_mistake
 
 M = TypeVar("M", bound=BaseModel)
+YAML_LINE = re.compile(r"^\s*(?:%YAML|[\w-]+\s*:(?:\s|$))", re.MULTILINE)
+"""A line as YAML has it."""
 
 
 class Strict(BaseModel):
@@ -76,13 +79,16 @@ def load_toml(path: str | Path, model: type[M], what: str, remedy: str) -> M:
     Raises InputError: the file is unreadable, not TOML, or does not fit ``model``; the message names file, place and
     reason.
     """
+    text = ""
     try:
         text = text_of(read_bytes(path, SETTINGS_BYTES))
         content = tomllib.loads(text)
     except OSError as error:
         raise InputError("E-FILE-UNREADABLE", f"{what} {path}: {error.strerror or error}; {remedy}") from error
     except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, numbers of 5000 digits
-        raise InputError("E-TOML-INVALID", f"{what} {path}: not valid TOML: {error}") from error
+        looks = "JSON" if text.lstrip().startswith("{") else "YAML" if YAML_LINE.search(text) else ""
+        said = f"it looks like {looks}; lines of TOML such as `name = 12` needed" if looks else "correct it"
+        raise InputError("E-TOML-INVALID", f"{what} {path}: not valid TOML: {error}; {said}") from error
     return validated(content, model, f"{what} {path}")
 
 

@@ -209,6 +209,8 @@ def test_no_negative_zero_is_written():
 WRONG_TARGETS = {
     "empty": ("", "E-KEY-MISSING … 1"),
     "prose": ("hello", "E-TOML-INVALID"),
+    "JSON": ('{"rows": 7}', "E-TOML-INVALID … JSON … TOML"),
+    "YAML": ("board:\n  rows: 7\n", "E-TOML-INVALID … YAML … TOML"),
     "binary": (bytes(range(256)), "E-TOML-INVALID"),
     "NUL": ("a = \0", "E-TOML-INVALID"),
     "5000 digits": (changed("x_mm = 40", f"x_mm = {'9' * 5000}"), "E-TOML-INVALID"),
