@@ -104,6 +104,7 @@ class _Linear:
     def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, float]:
         """Returns the step of the images (6m,) and planes, and the predicted gain."""
         damped = self.poses * (1 + damping * np.eye(6))
+        damped[~self.poses.any(axis=(1, 2))] = np.eye(6)  # an image without points keeps its pose
         away = reduce(damped, self.pose_right, self.cross)
         k = len(self.plane_right)
         own = self.planes * (1 + damping * np.eye(k)) - away.normal
