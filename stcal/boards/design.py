@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from stcal.boards.dictionaries import known_tags
 from stcal.design import POINT_RADIUS_MM, BoardDesign, Polarity
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen, require_choices
+from stcal.geometry.arrays import Brief, frozen, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel, Label, dot_cells
 
@@ -79,8 +79,8 @@ UNIT_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 """Corners of a tag of side 1 about its middle: top left, top right, bottom right, bottom left."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TagLayout:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class TagLayout(Brief):
     """Tags in one plane, Z into it.
 
     Parameters
@@ -98,6 +98,7 @@ class TagLayout:
     sigma_mm: float = 0.0
 
     def __post_init__(self):
+        require_fields(self, "tag layout", sigma_mm=0)
         object.__setattr__(self, "tags", known_tags(self.tags, "tag layout"))
         object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (len(self.tags), 4, 2), "tags' corners"))
 
@@ -239,7 +240,7 @@ class AsymmetricCirclesDesign:
     sigma_mm: float = 0.005
 
     def __post_init__(self):
-        require_choices(self, "asymmetric circles")
+        require_fields(self, "asymmetric circles")
 
     def _steps(self) -> np.ndarray:
         row, place = np.divmod(np.arange(self.rows * self.columns), self.columns)

@@ -16,7 +16,7 @@ from stcal.cli import cameras, handeye, locate, register, robot, sfm
 from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import protect_outputs
 from stcal.cli.terminal import printable, say
-from stcal.errors import NO_MEMORY, StcalError, lacks_memory
+from stcal.errors import NO_MEMORY, StcalError, at_command_line, lacks_memory
 
 INTERRUPTED, TERMINATED = 130, 143
 MESSAGE_CHARACTERS = 600
@@ -70,6 +70,7 @@ def main_sfm() -> None:
     _guarded(sfm.app)
 
 
+@at_command_line()
 def _guarded(application: typer.Typer) -> None:
     debug = "--debug" in sys.argv
     if any(name.startswith("_STCAL") and name.endswith("_COMPLETE") for name in os.environ):

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.errors import ConvergenceError, InputError
-from stcal.geometry.arrays import Array, freeze, frozen
+from stcal.geometry.arrays import Array, freeze, frozen, require_fields
 
 MAX_NEWTON_STEPS = 50
 COEFFICIENTS = 12
@@ -84,9 +84,11 @@ class Camera:
     covariance: np.ndarray | None = None
 
     def __post_init__(self):
+        require_fields(self, "camera")
         freeze(self, "focal", (2,), "focal length")
         freeze(self, "centre", (2,), "principal point")
-        if np.shape(self.distortion) == (8,):
+        freeze(self, "distortion", None, "distortion")
+        if self.distortion.shape == (8,):
             object.__setattr__(self, "distortion", np.pad(self.distortion, (0, 4)))
         freeze(self, "distortion", (COEFFICIENTS,), "distortion")
         if (self.focal <= 0).any():

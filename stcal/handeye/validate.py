@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.cross_validation import repeated_splits
 from stcal.errors import DegenerateError, InputError, StcalError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
@@ -29,8 +29,8 @@ LEAST_LEFT = 3
 """Least number of poses that must remain to solve with."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldOutPoses:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class HeldOutPoses(Brief):
     """Errors on held-out poses, in s splits of k poses. One row of an array is one split.
 
     Parameters
@@ -77,8 +77,8 @@ class HeldOutPoses:
         return {name: float(getattr(self, name)[mask].mean()) for name in names if getattr(self, name) is not None}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Compared:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Compared(Brief):
     """Result and errors of one method in a comparison.
 
     Parameters
@@ -457,8 +457,8 @@ def widened_by_scatter(result: HandEye, held_out: HeldOutPoses) -> HandEye:
     return replace(result.widened(factor), notes=(*result.notes, *scatter_notes(factor, "both")))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldOutMotions:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class HeldOutMotions(Brief):
     """Errors of the last k motions, predicted by the solution from the poses before them: Jin et al., eqs. 24–26.
 
     Parameters

@@ -10,7 +10,7 @@ import numpy as np
 from stcal.boards.design import TagLayout
 from stcal.boards.tags import other_dictionaries
 from stcal.errors import InputError, StcalError
-from stcal.geometry.arrays import Brief
+from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model
@@ -53,6 +53,7 @@ class LocateOptions:
     workers: int | None = None
 
     def __post_init__(self):
+        require_fields(self, "locate", workers=1)
         if self.method not in ("joint", "patent"):
             raise InputError("E-OPTION-METHOD", f"method {self.method!r}: joint or patent needed")
         if not self.moved_px > 0:

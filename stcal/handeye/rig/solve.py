@@ -6,7 +6,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from stcal.errors import DegenerateError, InputError, StcalError
-from stcal.geometry.arrays import Brief, frozen
+from stcal.geometry.arrays import Brief, frozen, require_fields
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import Loop, Setup
 from stcal.handeye.data.rig import RigPoses
@@ -157,6 +157,9 @@ class RigOptions:
     refine: bool = False
     with_scale: bool = False
     symmetries: tuple[Rigid, ...] = ()
+
+    def __post_init__(self):
+        require_fields(self, "rig")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

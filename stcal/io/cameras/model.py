@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_fields
 from stcal.geometry.camera import (
     COLMAP_LAYOUT,
     COLMAP_PIXEL_ORIGIN,
@@ -91,6 +92,9 @@ class CameraPrior:
 
     colmap_model: str
     covariance: np.ndarray
+
+    def __post_init__(self):
+        require_fields(self, "prior of the camera")
 
 
 WITHOUT_DISTORTION = ("SIMPLE_PINHOLE", "PINHOLE")

@@ -11,6 +11,7 @@ from stcal.boards.design import BoardView
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
+from stcal.geometry.arrays import Brief
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import minimise
 from stcal.geometry.normal_equations import Reduction, reduce
@@ -298,8 +299,8 @@ MIN_IMAGES = 2
 MIN_BOARD_POINTS = 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CalibratedLayout:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class CalibratedLayout(Brief):
     """Result of a target's calibration.
 
     Parameters

@@ -11,7 +11,7 @@ from stcal.boards.design import TagLayout as TagLayout
 from stcal.boards.dictionaries import known_tags
 from stcal.boards.file import TagsFile, load_tags, require_sizes
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_fields
 from stcal.io.files import require_written
 from stcal.io.toml import toml_string
 from stcal.lengths import side, stated_unusual
@@ -21,8 +21,8 @@ WRITTEN_MM = 1e-6
 """Largest difference of a written corner, mm: its last decimal."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LayoutPlan:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LayoutPlan(Brief):
     """Nominal target, for its calibration.
 
     Parameters
@@ -46,11 +46,15 @@ class LayoutPlan:
     corners_mm: np.ndarray
 
     def __post_init__(self):
+        require_fields(self, "target layout", origin=0)
         object.__setattr__(self, "tags", known_tags(self.tags, "target layout"))
+        for name, shape in (("size_mm", ()), ("corners_mm", (4, 2))):
+            values = frozen(getattr(self, name), (len(self.tags), *shape), f"target layout: {name}", finite=False)
+            object.__setattr__(self, name, values)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TargetLayout:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class TargetLayout(Brief):
     """Target with known corners.
 
     {obj} : origin in the middle of the tag in row ``origin``, X along its upper edge, Y down, Z into the target.
@@ -81,6 +85,7 @@ class TargetLayout:
     tag_sigma_px: float = 0.0
 
     def __post_init__(self):
+        require_fields(self, "target layout", origin=0, sigma_px=0, tag_sigma_px=0)
         n = len(self.tags)
         object.__setattr__(self, "tags", known_tags(self.tags, "target layout"))
         object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (n, 4, 2), "tags' corners"))

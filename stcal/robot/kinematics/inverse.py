@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from scipy.stats import qmc
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.model import Robot
@@ -190,8 +190,8 @@ REACHED, ORIENTATION, SINGULAR_POSE = "reached", "orientation", "singular"
 LIMIT, UNREACHABLE = "limit", "unreachable"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Inverse:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Inverse(Brief):
     """Joint vectors found for m poses.
 
     ``q`` : (m, n) values of the controller, rad or mm, always within the limits; where the pose is not reached, those

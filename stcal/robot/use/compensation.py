@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import Brief
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.table import pose_values, read_table
@@ -117,8 +118,8 @@ MEANING = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Compensated:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Compensated(Brief):
     """The commanded poses with the corrected values for the controller.
 
     Parameters

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import fdtrc
 
+from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.robust import ratio_limit
 from stcal.sfm.report.checks import ORDER
 from stcal.sfm.report.judgement import CAUSE, GENERAL
@@ -49,8 +50,8 @@ class Measured:
         return f"{self.value:.3g}{unit}{limit}"
 
 
-@dataclass(frozen=True, slots=True)
-class Check:
+@dataclass(frozen=True, slots=True, repr=False)
+class Check(Brief):
     """Result of a check.
 
     Parameters
@@ -82,6 +83,9 @@ class Check:
     names: tuple[str, ...]
     remedy: str
 
+    def __post_init__(self):
+        require_fields(self, f"check {self.key}", tested=0)
+
 
 @dataclass(frozen=True, slots=True)
 class Trial:
@@ -112,6 +116,9 @@ class Trial:
     freedom: int
     redundancy: float = KNOWN
     ratio: bool = False
+
+    def __post_init__(self):
+        require_fields(self, f"trial {self.name}", statistic=0, freedom=1, redundancy=0)
 
     def limit(self, count: int) -> float | None:
         """Returns the value beyond which one of ``count`` values is suspicious."""

@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from stcal.errors import DegenerateError
+from stcal.geometry.arrays import Brief
 from stcal.parallel import Progress, kept_processes, one_thread, run_briefly
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.equations import rows_of_view
@@ -64,8 +65,8 @@ class NewGroup:
     sigma_mm: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Advice:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Advice(Brief):
     """Further photographs, and what each of them would improve.
 
     ``now`` : forecast of the run as it is; ``shares`` : of its variance, by face and source; ``choices`` : views, each
@@ -92,8 +93,8 @@ class Advice:
         return self.shares[self.now.worst()[0]].get("board", 0.0) > BOARD_DOMINATES
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Known:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Known(Brief):
     """A finished run as input of a forecast: models in mm, target frame, with the σ of the run's adjustment."""
 
     models: tuple[MetricModel, ...]

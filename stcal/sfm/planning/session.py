@@ -8,6 +8,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
@@ -40,8 +41,8 @@ FINE_DOTS, MAX_CENTRES = 500, 450_000
 """Largest number of dots in all images, for boards of more than ``FINE_DOTS`` dots: about a minute and 0.8 GB."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlanOptions:
+@dataclass(frozen=True, slots=True, repr=False)
+class PlanOptions(Brief):
     """The plan of a session.
 
     Parameters
@@ -88,6 +89,7 @@ class PlanOptions:
     margin_mm: float = FACE_MARGIN_MM
 
     def __post_init__(self):
+        require_fields(self, "plan", spread_deg=0, distance_mm=0, width=1, seed=0, margin_mm=0)
         if self.images < MIN_IMAGES:
             raise InputError(
                 "E-OPTION-RANGE", f"plan: {self.images} images in each group, {MIN_IMAGES} needed; plan for more"
@@ -110,8 +112,8 @@ class Remedy:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Plan(Brief):
     """A plan with its forecast and remedies.
 
     ``observations`` : number of centres; ``centre_sigma_px`` : RMS of their σ; ``aperture_mm`` : see

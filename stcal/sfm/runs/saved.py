@@ -256,9 +256,8 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
         if unknown or len(set(labels)) < len(labels):
             raise ValueError(f"image {name}: {f'no circle {unknown[0]}' if unknown else 'a label twice'}")
         columns = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", *COVARIANCE)
-        values = frozen(
-            [[row[column] for column in columns] for row in image_rows] or np.zeros((0, 7)), (None, 7), name
-        )
+        texts = [[row[column] for column in columns] for row in image_rows]
+        values = frozen(np.array(texts or np.zeros((0, 7)), float), (None, 7), name)
         covariance = values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
         fault = first_fault(covariance, OF_PIXEL, definite=True)
         if fault is not None:
