@@ -298,11 +298,11 @@ def test_errors_speak_of_arguments(monkeypatch):
     assert str(pickle.loads(pickle.dumps(said))) == str(said)
 
 
-def test_options_that_errors_name_are_arguments_in_python():
+def test_options_that_errors_name_are_arguments_in_python(monkeypatch):
     """Those of errors that a call from Python can raise: where the command's name differs, `PYTHON_NAMES` has it."""
-    with fails_with("E-OPTION-RANGE") as caught:
+    monkeypatch.delenv(errors.COMMAND_LINE)
+    with fails_with("E-OPTION-RANGE … flatness_mm 1e+09"):
         RunOptions(flatness_mm=1e9).settled(reference_target())
-    assert "flatness_mm" in str(caught.value)
     assert all(name.split(".")[0] in RunOptions.__dataclass_fields__ for name in errors.PYTHON_NAMES.values())
 
 

@@ -68,7 +68,7 @@ LIBRARIES = {
 }
 """Library: folders or files that may use it. ``cv2`` where pixels are, and in two places for a method of its own."""
 GEOMETRY_USES = {"numpy", "scipy", "dataclasses", "typing", "types", "collections"}
-GEOMETRY_USES |= {"math", "numbers", "functools", "itertools"}
+GEOMETRY_USES |= {"math", "numbers", "inspect", "functools", "itertools"}
 
 
 @functools.cache

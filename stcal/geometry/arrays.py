@@ -3,10 +3,22 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
-from functools import lru_cache
+from functools import lru_cache, wraps
+from inspect import signature
 from numbers import Integral, Real
 from types import UnionType
-from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    NoReturn,
+    ParamSpec,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
@@ -59,6 +71,9 @@ def _brief(value: object) -> str:
 
 Rule = tuple[Callable[[Any], bool], str]
 """Whether a value is of a type, and the type in words."""
+NO_RULE: tuple[Rule, bool] = ((lambda _: True), ""), False
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def _rule(hint: Any, may_be_infinite: bool = False) -> Rule | None:
@@ -101,11 +116,22 @@ def _rule_of_sequence(origin: Any, parts: tuple) -> Rule:
     words = f"a tuple, each {rules[0][1]}," if count is None else f"a tuple of {', '.join(rule[1] for rule in rules)}"
 
     def admits(value: object) -> bool:
-        if not isinstance(value, Sequence) or isinstance(value, str) or count not in (None, len(value)):
+        if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or count not in (None, len(value)):
             return False
         return all(rules[i % len(rules)][0](entry) for i, entry in enumerate(value))
 
     return admits, words
+
+
+def _is_choice(hint: Any) -> bool:
+    return any(get_origin(part) is Literal for part in (hint, *get_args(hint)))
+
+
+def _refuse(what: str, name: str, value: object, words: str, is_choice: bool) -> NoReturn:
+    if is_choice:
+        words = words.removesuffix(" or None")
+        raise InputError("E-OPTION-VALUE", f"{what}: {name} {_brief(value)}: not a choice; use {words}")
+    raise InputError("E-FIELD-TYPE", f"{what}: {name} {_brief(value)}: {words} needed")
 
 
 @lru_cache
@@ -116,7 +142,7 @@ def _rules(kind: type) -> dict[str, tuple[Rule, bool]]:
         hint = hints[entry.name]
         rule = _rule(hint, isinstance(entry.default, float) and math.isinf(entry.default))
         if rule and entry.init:
-            found[entry.name] = rule, any(get_origin(part) is Literal for part in (hint, *get_args(hint)))
+            found[entry.name] = rule, _is_choice(hint)
     return found
 
 
@@ -134,13 +160,29 @@ def require_fields(instance: object, what: str, **least: float) -> None:
     for name, ((admits, words), is_choice) in _rules(type(instance)).items():
         value = getattr(instance, name)
         if not admits(value):
-            shown = _brief(value)
-            if is_choice:
-                words = words.removesuffix(" or None")
-                raise InputError("E-OPTION-VALUE", f"{what}: {name} {shown}: not a choice; use {words}")
-            raise InputError("E-FIELD-TYPE", f"{what}: {name} {shown}: {words} needed")
+            _refuse(what, name, value, words, is_choice)
         if name in least and value is not None and value < least[name]:
             raise InputError("E-OPTION-RANGE", f"{what}: {name} {value:g}: {least[name]:g} or more needed")
+
+
+def require_arguments(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function, which then refuses arguments that are not of their annotated type, as fields are refused."""
+    bind = signature(function).bind
+
+    @lru_cache
+    def rules() -> dict[str, tuple[Rule, bool]]:
+        hints = get_type_hints(function)
+        return {name: (rule, _is_choice(hint)) for name, hint in hints.items() if (rule := _rule(hint))}
+
+    @wraps(function)
+    def judged(*args: P.args, **kwargs: P.kwargs) -> R:
+        for name, value in bind(*args, **kwargs).arguments.items():
+            (admits, words), is_choice = rules().get(name, NO_RULE)
+            if not admits(value):
+                _refuse(function.__name__, name, value, words, is_choice)
+        return function(*args, **kwargs)
+
+    return judged
 
 
 def frozen(

@@ -283,7 +283,7 @@ class Poses(_ByValue, Brief):
             Another shape; or a matrix that is not finite, left-handed, scaled or transposed, named by its number.
         """
         rigid = []
-        for number, matrix in enumerate(np.asarray(matrices, float), 1):
+        for number, matrix in enumerate(frozen(matrices, (None, None, None), "poses", finite=False), 1):
             try:
                 rigid.append(Rigid.from_matrix(matrix))
             except InputError as error:

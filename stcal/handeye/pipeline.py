@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.handeye import solve
 from stcal.handeye.choose import Choice, choose
@@ -95,6 +96,7 @@ def handeye(
     setup: Setup,
     unit: LengthUnit = "mm",
 ) -> HandEye: ...
+@require_arguments
 @one_thread()
 def handeye(
     base_from_flange,

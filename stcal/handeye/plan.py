@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
@@ -54,6 +54,7 @@ class NextPoses(Brief):
         object.__setattr__(self, "turn_rad", frozen(self.turn_rad, (k,), "turns"))
 
 
+@require_arguments
 def plan_poses(
     pairs: HandEyePoses,
     result: HandEye,

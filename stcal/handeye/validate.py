@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.cross_validation import repeated_splits
 from stcal.errors import DegenerateError, InputError, StcalError
-from stcal.geometry.arrays import Brief, frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
@@ -99,6 +99,7 @@ class Compared(Brief):
     reason: str = ""
 
 
+@require_arguments
 def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int = 0) -> np.ndarray:
     """Draws the poses to hold out: at random, in rounds, each of which holds out every pose about once.
 
@@ -132,6 +133,7 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
     return repeated_splits(count, k, repeats, np.random.default_rng(seed))
 
 
+@require_arguments
 @one_thread()
 def cross_validate(
     pairs: HandEyePoses,
@@ -299,6 +301,7 @@ def better_setup(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, row
     )
 
 
+@require_arguments
 @one_thread()
 def compare(
     pairs: HandEyePoses,
@@ -500,6 +503,7 @@ def motion_errors(mount_from_camera: Rigid, motions: Motions) -> np.ndarray:
     return np.column_stack([np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)])
 
 
+@require_arguments
 @one_thread()
 def predict_motions(
     pairs: HandEyePoses,

@@ -10,7 +10,7 @@ import numpy as np
 from stcal.boards.design import TagLayout
 from stcal.boards.tags import other_dictionaries
 from stcal.errors import InputError, StcalError
-from stcal.geometry.arrays import Brief, require_fields
+from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model
@@ -93,6 +93,7 @@ class Located(Brief):
         return self.tags.name
 
 
+@require_arguments
 def run(
     scenes: Sequence[SceneFiles],
     layout: TargetLayout,
@@ -123,6 +124,7 @@ def run(
         yield _named(locate_scene(tags, layout, model, options), layout, partial(_first_image, tags, files))
 
 
+@require_arguments
 def locate_image(
     image: np.ndarray,
     layout: TargetLayout | TagLayout,

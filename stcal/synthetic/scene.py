@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, frozen, require_fields
+from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
 from stcal.geometry.camera import FISHEYE, Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
@@ -172,6 +172,7 @@ class Scene(Brief):
         return self.groups[group].target_from_board @ _board_rectangle(self.board)
 
 
+@require_arguments
 def make_scene(
     options: SceneOptions | None = None,
     target: TargetDesign | None = None,

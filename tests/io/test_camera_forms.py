@@ -48,7 +48,7 @@ def test_what_is_written_reads_back(tmp_path, form, model):
     camera = camera_of(model)
     path = tmp_path / f"camera{SUFFIX[form]}"
     if form in REFUSED[model]:
-        with pytest.raises(InputError, match=f"{form} has no place for .* of {model}; write form colmap"):
+        with pytest.raises(InputError, match=f"{form} has no place for .* of {model}; write --form colmap"):
             written(camera, form, "cam0")
         return
     content = written(camera, form, "cam0").content

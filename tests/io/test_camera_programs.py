@@ -277,10 +277,10 @@ def test_a_camera_of_a_list_is_chosen(tmp_path):
     path.write_text(json.dumps({"cameras": [{"name": "a", "K": EYE}, {"name": "b", "K": FLAT, "D": {"k1": -0.2}}]}))
     np.testing.assert_allclose(project(read_lens(path, "b")), perspective([-0.2, 0, 0, 0]), atol=1e-9)
     path.write_text(
-        ORB.format(kind="PinHole", distortion="") + f"LEFT.height: 480\nLEFT.K: {EYE}\nLEFT.D: {D4}\nRIGHT.K: {EYE}\n"
+        ORB.format(kind="PinHole", distortion="") + f"LEFT.height: 480\nLEFT.K: {FLAT}\nLEFT.D: {D4}\nRIGHT.K: {EYE}\n"
     )
     np.testing.assert_allclose(project(read_lens(path, "Camera")), perspective([0.0] * 4), atol=1e-9)
-    np.testing.assert_allclose(project(read_lens(path, "LEFT")), perspective(D4, (1, 1, 0, 0)), atol=1e-9)
+    np.testing.assert_allclose(project(read_lens(path, "LEFT")), perspective(D4), atol=1e-9)
 
 
 def test_the_camera_of_kittis_odometry_is_that_of_rectified_images(tmp_path):

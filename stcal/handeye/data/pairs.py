@@ -95,7 +95,7 @@ class HandEyePoses(Brief):
                 sides.append(Poses(matrices.rotation, factor * matrices.translation))
                 continue
             rigid = []
-            for i, matrix in enumerate(np.asarray(matrices, float)):
+            for i, matrix in enumerate(frozen(matrices, None, f"{where}: {side}", finite=False)):
                 name = names[i] if i < len(names) else f"pose {i + 1}"
                 try:
                     rigid.append(Rigid.from_matrix(matrix))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, frozen, require_fields
+from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import Minimum, NormalEquations, minimise, perturbed
 from stcal.geometry.plane import camera_from_plane, fit_homography
@@ -129,6 +129,7 @@ def resect(views: Views, names: tuple[str, ...]) -> Resection:
     return Resection(Poses.of(poses), covariance, float(np.sqrt(variance)))
 
 
+@require_arguments
 def pairs_of_views(
     base_from_flange: Poses, views: Views, names: tuple[str, ...] = (), where: str = "views"
 ) -> HandEyePoses:

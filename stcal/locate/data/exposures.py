@@ -12,7 +12,7 @@ from pydantic import Field
 import stcal
 from stcal.boards.tags import Tags, find_tags
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, require_fields
+from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.io.device import DARK, SATURATED, Source, checked_name, png
 from stcal.io.files import json_text, real_place, save
 from stcal.io.images import SUFFIXES, TOP_GROUP, USUAL, ImageFile, decode, find_images, grey_8bit, image_file
@@ -93,6 +93,7 @@ def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
     return np.geomspace(shortest, longest, count)
 
 
+@require_arguments
 def find_scenes(path: str | Path) -> list[SceneFiles]:
     """Finds the scenes in a folder.
 

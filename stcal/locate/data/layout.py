@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.design import UNIT_SQUARE
+from stcal.boards.design import UNIT_SQUARE, require_tags
 from stcal.boards.design import TagLayout as TagLayout
 from stcal.boards.dictionaries import known_tags
 from stcal.boards.file import TagsFile, load_tags, require_sizes
@@ -37,6 +37,8 @@ class LayoutPlan(Brief):
         Row of the tag whose middle is the origin of {obj}.
     corners_mm : (n, 4, 2) array
         Nominal corners in the plane of the target, NaN if a place is not given.
+    unusual_size : bool
+        Whether sides that no hardware has in mm are meant as they stand.
     """
 
     name: str
@@ -44,6 +46,7 @@ class LayoutPlan(Brief):
     size_mm: np.ndarray
     origin: int
     corners_mm: np.ndarray
+    unusual_size: bool = False
 
     def __post_init__(self):
         require_fields(self, "target layout", origin=0)
@@ -51,6 +54,7 @@ class LayoutPlan(Brief):
         for name, shape in (("size_mm", ()), ("corners_mm", (4, 2))):
             values = frozen(getattr(self, name), (len(self.tags), *shape), f"target layout: {name}", finite=False)
             object.__setattr__(self, name, values)
+        require_tags(self.tags, self.corners_mm, self.unusual_size, "target layout")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -74,6 +78,8 @@ class TargetLayout(Brief):
     sigma_px, tag_sigma_px : float
         σ due to print, lens and flatness, in addition to the measured σ of a corner: of each corner by itself, and of
         the four corners of a tag together. Estimated from the residuals of the calibration.
+    unusual_size : bool
+        Whether sides that no hardware has in mm are meant as they stand.
     """
 
     name: str
@@ -83,6 +89,7 @@ class TargetLayout(Brief):
     origin: int
     sigma_px: float = 0.0
     tag_sigma_px: float = 0.0
+    unusual_size: bool = False
 
     def __post_init__(self):
         require_fields(self, "target layout", origin=0, sigma_px=0, tag_sigma_px=0)
@@ -90,12 +97,14 @@ class TargetLayout(Brief):
         object.__setattr__(self, "tags", known_tags(self.tags, "target layout"))
         object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (n, 4, 2), "tags' corners"))
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (8 * n, 8 * n), "corners' covariance"))
+        require_tags(self.tags, self.corners_mm, self.unusual_size, "target layout")
 
     @classmethod
     def of(cls, layout: TagLayout, name: str = "") -> "TargetLayout":
         """Returns tags with known places as a target. The middle of the first tag is the origin of {obj}."""
         corners = _in_obj(layout.corners_mm, 0)
-        return cls(name, layout.tags, corners, layout.sigma_mm**2 * np.eye(corners.size), 0)
+        covariance = layout.sigma_mm**2 * np.eye(corners.size)
+        return cls(name, layout.tags, corners, covariance, 0, unusual_size=layout.unusual_size)
 
     def dictionaries(self) -> tuple[str, ...]:
         """Returns each dictionary of the tags once."""
@@ -162,7 +171,8 @@ def load_layout(path: str | Path) -> TargetLayout:
     if stated is None:
         corners = _in_obj(corners, plan.origin)
     covariance = data.sigma_mm**2 * np.eye(corners.size) if stated is None else _without_rounding(stated)
-    return TargetLayout(plan.name, plan.tags, corners, covariance, plan.origin, data.sigma_px, data.tag_sigma_px)
+    sigmas_px = data.sigma_px, data.tag_sigma_px
+    return TargetLayout(plan.name, plan.tags, corners, covariance, plan.origin, *sigmas_px, data.unusual_size)
 
 
 def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
@@ -231,7 +241,8 @@ def _plan(data: TagsFile, where: str) -> LayoutPlan:
                 )
             corners[row] = place
     size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])
-    return LayoutPlan(data.name, tuple((tag.dictionary, tag.id) for tag in data.tag), size, ids.index(origin), corners)
+    tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
+    return LayoutPlan(data.name, tags, size, ids.index(origin), corners, data.unusual_size)
 
 
 def _in_obj(corners: np.ndarray, origin: int) -> np.ndarray:

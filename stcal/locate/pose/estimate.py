@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from stcal.boards.edges import corners_by_edges
 from stcal.errors import DegenerateError
 from stcal.geometry import least_squares
-from stcal.geometry.arrays import Brief, frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import (
     Minima,
@@ -248,6 +248,7 @@ class ObjPose(ImageFit, Brief):
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
 
 
+@require_arguments
 def locate(
     seen: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None = None, where: str = "scene"
 ) -> ObjPose:

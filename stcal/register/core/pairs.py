@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, Brief, freeze, require_fields
+from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, require_fields
 from stcal.io.covariance import OF_POINT, first_fault
 from stcal.io.table import LENGTHS, Table, read_table
 from stcal.register.core.models import Model, Transform, fit, rounding_mm, squares, whitened
@@ -64,6 +64,7 @@ class Pairs(Brief):
         return len(self.lines)
 
 
+@require_arguments
 def read_pairs(path: str | Path | Table) -> Pairs:
     """Reads ``ax_mm, ay_mm, az_mm, bx_mm, by_mm, bz_mm`` and the stated noise (form: ``data_layout.md``).
 

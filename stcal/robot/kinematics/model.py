@@ -17,6 +17,8 @@ from stcal.robot.kinematics.conditions import loaded
 
 Convention = Literal["standard", "modified"]
 JointType = Literal["revolute", "prismatic"]
+MOST_RAD = 2 * np.pi + 1e-6
+"""Largest angle of a row, beside the joint's: one that is larger is taken to be in degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +64,11 @@ class DHRow:
             value = getattr(self, name)
             if not isinstance(value, Real) or not math.isfinite(value):
                 raise InputError("E-ROBOT-ROW", f"row: {name} is {value!r}; a finite number needed")
+            if name in ("alpha", "theta", "beta") and abs(value) > MOST_RAD:
+                raise InputError(
+                    "E-ANGLE-UNIT",
+                    f"row: {name} is {value:g} rad, a turn is 6.28; if angles are degrees, convert them: np.radians",
+                )
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError, StcalError
-from stcal.geometry.arrays import Brief
+from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
@@ -76,6 +76,7 @@ class UrdfJoint:
     mimics: str
 
 
+@require_arguments
 def load_urdf(
     path: str | Path, from_link: str = "", to_link: str | Sequence[str] = "", convention: Convention = "standard"
 ) -> UrdfRobot:

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Array, Brief, freeze, require_fields
+from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, require_fields
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.table import POSE, pose_cells, pose_values, read_table, require_pose_table_written
@@ -137,6 +137,7 @@ class DesignOptions:
             )
 
 
+@require_arguments
 @one_thread()
 def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
     """Chooses poses for the identification of ``robot``, the same for the same seed.

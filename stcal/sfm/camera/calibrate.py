@@ -9,7 +9,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, StcalError
-from stcal.geometry.arrays import Brief
+from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import COLMAP_MODELS, Camera
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
@@ -78,6 +78,7 @@ class CameraCalibration(Brief):
     candidates: tuple[Candidate, ...] = ()
 
 
+@require_arguments
 @one_thread()
 def calibrate_camera(
     images: str | Path,

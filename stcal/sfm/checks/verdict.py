@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import fdtrc
 
-from stcal.geometry.arrays import Brief, require_fields
+from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.robust import ratio_limit
 from stcal.sfm.report.checks import ORDER
 from stcal.sfm.report.judgement import CAUSE, GENERAL
@@ -129,6 +129,7 @@ class Trial:
         return float(self.value**grown) if self.ratio else abs(self.value) * grown
 
 
+@require_arguments
 def judge(key: str, title: str, trials: Sequence[Trial], what: str, remedy: str, worst: Verdict = "failed") -> Check:
     """Returns the check with its verdict over all trials.
 

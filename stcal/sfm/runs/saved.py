@@ -14,7 +14,7 @@ from stcal.boards.file import load_run_board
 from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign, scale_reference
 from stcal.errors import InputError, StcalError
-from stcal.geometry.arrays import Brief, frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior, camera_prior
@@ -133,6 +133,7 @@ class SavedRun(Brief):
         return Camera.of(camera, self.camera.colmap_model)
 
 
+@require_arguments
 def load_run(folder: str | Path) -> SavedRun:
     """Reads a finished run.
 

@@ -85,7 +85,7 @@ def test_a_registration_leads_to_the_base_too(files, tmp_path):
 )
 def test_a_registration_that_is_no_rigid_motion_is_refused(tmp_path, matrix, model, size):
     file = registered(tmp_path / "register.json", matrix, model, np.eye(size))
-    with pytest.raises(InputError, match=f"no rigid motion \\({model}: .*register with model rigid"):
+    with pytest.raises(InputError, match=f"no rigid motion \\({model}: .*register with --model rigid"):
         read_registered(file)
 
 

@@ -66,7 +66,7 @@ def test_a_rim_that_harms_nothing_is_no_fault():
 
 @pytest.mark.parametrize("solve", ["chain", "paper"])
 def test_rims_need_the_joint_adjustment(scene, solve):
-    with pytest.raises(InputError, match="solve joint") as error:
+    with pytest.raises(InputError, match="--solve joint") as error:
         RunOptions(solve=solve, rim=True).settled(scene.target)
     assert error.value.code == "E-RIM-SOLVE"
     assert RunOptions(rim=True).settled(scene.target).rim

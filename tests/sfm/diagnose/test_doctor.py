@@ -363,7 +363,7 @@ def test_images_that_moved_or_are_gone(patient, tmp_path):
     assert found(moved).gate == "hidden"
     shutil.copy(patient.good / FIRST, moved / FIRST)
     assert found(moved).gate == "found_now"
-    with pytest.raises(InputError, match="not a folder; give the folder of the run's images with images"):
+    with pytest.raises(InputError, match="not a folder; give the folder of the run's images with --images"):
         found(tmp_path / "nowhere")
 
 
