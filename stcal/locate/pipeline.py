@@ -96,7 +96,7 @@ class Located(Brief):
 @require_arguments
 def run(
     scenes: Sequence[SceneFiles],
-    layout: TargetLayout,
+    layout: TargetLayout | TagLayout,
     camera: Camera | CameraModel,
     options: LocateOptions | None = None,
 ) -> Iterator[Located]:
@@ -106,7 +106,7 @@ def run(
     ----------
     scenes : sequence of SceneFiles
         Scenes from :func:`~stcal.locate.find_scenes`.
-    layout : TargetLayout
+    layout : TargetLayout or TagLayout
         The target.
     camera : Camera
         The camera that took the exposures.
@@ -120,6 +120,7 @@ def run(
         ends the run.
     """
     options, model = options or LocateOptions(), camera_model(camera)
+    layout = TargetLayout.of(layout) if isinstance(layout, TagLayout) else layout
     for files, tags in zip(scenes, read_scenes(scenes, layout, options.workers), strict=True):
         yield _named(locate_scene(tags, layout, model, options), layout, partial(_first_image, tags, files))
 
