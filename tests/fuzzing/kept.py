@@ -25,6 +25,8 @@ LONGEST_CALL_S = 6.0
 KEPT_IN = ("run", "detected")
 """Folders of the stock that commands keep for the next one."""
 COMPARED = {".json", ".csv", ".urdf", ".xacro", ".yaml", ".yml", ".ply", ".nvm", ".bin", ".dxf", ".gltf", ".glb"}
+REMADE_BY = ("sfm run", "sfm detect", "sfm watch")
+"""Commands that make what they keep anew; others leave what was spoiled as it is."""
 NOT_KEPT = {"lock", "holder.txt"}
 DAYS_S = 86_400.0
 WHEN = re.compile(rb'"(created|seconds|duration_s|made)[^,}]*')
@@ -38,14 +40,17 @@ def of_kept(stock: Path, folder: Path, seed: int, number: int) -> Judged:
     clean = _clean(stock, folder, call)
     read, written = lay_out(stock, folder, call, earlier=False)
     files = [path for below in (read, written) for place in KEPT_IN for path in _kept(below / place)]
+    laid_out = hashes(folder)
     said = [_spoil(files, rng) for _ in range(1 + int(rng.integers(2)))]
     before = hashes(folder)
+    spoiled = {os.path.relpath(path, folder / OUT) for path in laid_out if before.get(path) != laid_out[path]}
     outcome = in_process(call, "stcal", folder)
     found = [each for each in failures(call, folder, outcome, before, refused=False) if each[0] != "noise"]
     if outcome.code == 0:
         answered = _answers(call, folder)
-        changed = sorted(name for name, digest in clean.items() if answered.get(name, digest) != digest)
-        told = not call.folders and "not as the run left it" in _all_said(call, folder, outcome)
+        given = set() if call.command in REMADE_BY else spoiled
+        changed = sorted(name for name in clean if name not in given and answered.get(name, clean[name]) != clean[name])
+        told = call.command not in REMADE_BY and "not as the run left it" in _all_said(call, folder, outcome)
         found += [("silent wrong", f"{name} is another one: {outcome.said[-300:]}") for name in changed[:1] if not told]
     return Judged(
         f"s{number}", f"{call.command}: {'; '.join(said)}", tuple(found), outcome.code, outcome.seconds, call.command

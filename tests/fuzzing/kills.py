@@ -32,7 +32,7 @@ from tests.fuzzing.judged import (
 )
 from tests.fuzzing.mutations import pick
 
-ENDED = {signal.SIGKILL: (-9, 0.5), signal.SIGINT: (130, 2.0), signal.SIGTERM: (143, 2.0)}
+ENDED = {signal.SIGKILL: (-9, 2.0), signal.SIGINT: (130, 2.0), signal.SIGTERM: (143, 2.0)}
 """Exit code, and within which time, s."""
 STARTING_S = 0.3
 """Until then Python itself may be loading, and no program answers a signal yet."""
