@@ -77,7 +77,7 @@ def validated(
 
 @overload
 def handeye(
-    base_from_flange: HandEyePoses,
+    pairs: HandEyePoses,
     camera_from_board: Setup = "eye-in-hand",
     method: str | None = None,
     views: Views | None = None,
@@ -99,7 +99,7 @@ def handeye(
 @require_arguments
 @one_thread()
 def handeye(
-    base_from_flange,
+    base_from_flange=None,
     camera_from_board=None,
     method: str | None = None,
     views: Views | None = None,
@@ -107,6 +107,7 @@ def handeye(
     *,
     setup: Setup | None = None,
     unit: LengthUnit = "mm",
+    pairs: HandEyePoses | None = None,
 ) -> HandEye:
     """Returns where the camera is on the flange, or in the robot's base frame: the answer of ``stcal handeye``.
 
@@ -115,11 +116,10 @@ def handeye(
 
     Parameters
     ----------
-    base_from_flange : Poses, (m, 4, 4) array or HandEyePoses
-        At least three poses, rotated about two axes that are not parallel; or pairs of poses, in place of both. See
-        :func:`~stcal.handeye.read_poses`, :func:`~stcal.handeye.pairs_of_views`.
+    base_from_flange : Poses or (m, 4, 4) array
+        At least three poses, rotated about two axes that are not parallel.
     camera_from_board : Poses or (m, 4, 4) array
-        The pose of the board in the camera in each of them. After pairs of poses, the setup may stand here.
+        The pose of the board in the camera in each of them. After ``pairs``, the setup may stand here.
     method : str, optional
         One of :data:`METHODS`. If None, the way that predicts poses held out best, among all methods, with the board's
         size as stated or solved for; ``reprojection`` with views, else ``pose``, where ``options`` name unknowns.
@@ -132,6 +132,9 @@ def handeye(
         ``eye-in-hand``: the camera on the flange, also if None; ``eye-to-hand``: the board on the flange.
     unit : {"mm", "m", "cm", "um", "in"}
         Unit of translations.
+    pairs : HandEyePoses
+        Pairs of poses in place of the first two, also as the first argument; see :func:`~stcal.handeye.read_poses`,
+        :func:`~stcal.handeye.pairs_of_views`.
 
     Returns
     -------
@@ -153,11 +156,12 @@ def handeye(
     >>> found = handeye(pairs, setup="eye-in-hand")  # doctest: +SKIP
     >>> found.flange_from_camera @ [0, 0, 500]  # a point half a metre before the camera  # doctest: +SKIP
     """
-    if isinstance(base_from_flange, HandEyePoses):
-        pairs, setup = base_from_flange, setup or camera_from_board or SETUPS[0]
+    pairs = base_from_flange if isinstance(base_from_flange, HandEyePoses) else pairs
+    if pairs is not None:
+        setup = setup or camera_from_board or SETUPS[0]
         if unit != "mm":
             raise InputError("E-OPTION-CONFLICT", f"hand-eye: unit {unit!r} of pairs of poses, which are in mm already")
-    elif camera_from_board is None or isinstance(camera_from_board, str):
+    elif base_from_flange is None or camera_from_board is None or isinstance(camera_from_board, str):
         raise InputError("E-POSES-COUNT", "hand-eye: poses of the flange alone; give camera_from_board of each, too")
     else:
         pairs = HandEyePoses.from_matrices(base_from_flange, camera_from_board, unit=unit)

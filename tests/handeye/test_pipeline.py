@@ -53,6 +53,7 @@ def test_matrices_in_metres_are_pairs_of_poses(pairs):
         metres(pairs.base_from_flange), metres(pairs.camera_from_board), setup="eye-in-hand", unit="m", method="pose"
     )
     same = handeye.handeye(pairs, "eye-in-hand", "pose")
+    assert handeye.handeye(pairs=pairs, method="pose").mount_from_camera == same.mount_from_camera
     np.testing.assert_allclose(found.mount_from_camera.matrix(), same.mount_from_camera.matrix(), atol=1e-9)
     off = found.mount_from_camera.translation - FLANGE_FROM_CAMERA.translation
     assert np.linalg.norm(off) < 1.0  # noise of 0.2 mm an axis
