@@ -41,7 +41,7 @@ def in_python(message: str) -> str:
         if option["name"] is None:
             return option[0]
         name = option["name"].replace("-", "_")
-        return PYTHON_NAMES.get(name, name) + ("=False" if option["no"] else "")
+        return f"{PYTHON_NAMES.get(name, name)}{'=False' if option['no'] else ''}"
 
     return OPTION.sub(named, message)
 

@@ -99,7 +99,7 @@ def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusua
     InputError
         The message begins with ``where`` and names the tag or the tags.
     """
-    known = np.flatnonzero(np.isfinite(corners_mm).all((1, 2)))
+    known = np.flatnonzero(np.isfinite(corners_mm).all((1, 2))).tolist()
     ids, middles, sides = [tags[i][1] for i in known], corners_mm[known].mean(1), sides_mm(corners_mm[known])
     lengths = (side(f"side of tag {tag} by corners_mm", float(mm)) for tag, mm in zip(ids, sides, strict=True))
     require_millimetres(lengths, unusual_size, where)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +12,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.handeye import solve
 from stcal.handeye.choose import Choice, choose
-from stcal.handeye.data.pairs import SETUPS, HandEyePoses, LengthUnit, Setup
+from stcal.handeye.data.pairs import HandEyePoses, LengthUnit, Setup
 from stcal.handeye.data.views import Views
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import HandEyeOptions
@@ -99,8 +99,8 @@ def handeye(
 @require_arguments
 @one_thread()
 def handeye(
-    base_from_flange=None,
-    camera_from_board=None,
+    base_from_flange: Any = None,
+    camera_from_board: Any = None,
     method: str | None = None,
     views: Views | None = None,
     options: HandEyeOptions | None = None,
@@ -156,18 +156,19 @@ def handeye(
     >>> found = handeye(pairs, setup="eye-in-hand")  # doctest: +SKIP
     >>> found.flange_from_camera @ [0, 0, 500]  # a point half a metre before the camera  # doctest: +SKIP
     """
-    pairs = base_from_flange if isinstance(base_from_flange, HandEyePoses) else pairs
+    if isinstance(base_from_flange, HandEyePoses):
+        pairs, base_from_flange = base_from_flange, None
+    asked = setup or "eye-in-hand"
     if pairs is not None:
-        setup = setup or camera_from_board or SETUPS[0]
+        asked = setup or camera_from_board or "eye-in-hand"
         if unit != "mm":
             raise InputError("E-OPTION-CONFLICT", f"hand-eye: unit {unit!r} of pairs of poses, which are in mm already")
     elif base_from_flange is None or camera_from_board is None or isinstance(camera_from_board, str):
         raise InputError("E-POSES-COUNT", "hand-eye: poses of the flange alone; give camera_from_board of each, too")
     else:
         pairs = HandEyePoses.from_matrices(base_from_flange, camera_from_board, unit=unit)
-        setup = setup or SETUPS[0]
     options = options or HandEyeOptions()
     rows = splits(len(pairs)) if len(pairs) > LEAST_LEFT else np.zeros((0, 0), int)
     prior = None if views is None else options.camera
     choosing = method is None and not options.names_unknowns
-    return validated(pairs, setup, method, views, options, prior, rows, choosing=choosing).result
+    return validated(pairs, asked, method, views, options, prior, rows, choosing=choosing).result

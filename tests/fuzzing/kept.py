@@ -27,6 +27,7 @@ KEPT_IN = ("run", "detected")
 COMPARED = {".json", ".csv", ".urdf", ".xacro", ".yaml", ".yml", ".ply", ".nvm", ".bin", ".dxf", ".gltf", ".glb"}
 REMADE_BY = ("sfm run", "sfm detect", "sfm watch")
 """Commands that make what they keep anew; others leave what was spoiled as it is."""
+TOLD = ("not as the run left it", "are not compared")
 NOT_KEPT = {"lock", "holder.txt"}
 DAYS_S = 86_400.0
 WHEN = re.compile(rb'"(created|seconds|duration_s|made)[^,}]*')
@@ -50,7 +51,8 @@ def of_kept(stock: Path, folder: Path, seed: int, number: int) -> Judged:
         answered = _answers(call, folder)
         given = set() if call.command in REMADE_BY else spoiled
         changed = sorted(name for name in clean if name not in given and answered.get(name, clean[name]) != clean[name])
-        told = call.command not in REMADE_BY and "not as the run left it" in _all_said(call, folder, outcome)
+        said_so = _all_said(call, folder, outcome)
+        told = call.command not in REMADE_BY and any(words in said_so for words in TOLD)
         found += [("silent wrong", f"{name} is another one: {outcome.said[-300:]}") for name in changed[:1] if not told]
     return Judged(
         f"s{number}", f"{call.command}: {'; '.join(said)}", tuple(found), outcome.code, outcome.seconds, call.command

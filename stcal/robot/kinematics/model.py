@@ -64,7 +64,7 @@ class DHRow:
             value = getattr(self, name)
             if not isinstance(value, Real) or not math.isfinite(value):
                 raise InputError("E-ROBOT-ROW", f"row: {name} is {value!r}; a finite number needed")
-            if name in ("alpha", "theta", "beta") and abs(value) > MOST_RAD:
+            if name in ("alpha", "theta", "beta") and abs(float(value)) > MOST_RAD:
                 raise InputError(
                     "E-ANGLE-UNIT",
                     f"row: {name} is {value:g} rad, a turn is 6.28; if angles are degrees, convert them: np.radians",
