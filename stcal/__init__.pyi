@@ -19,6 +19,8 @@ from .errors import StcalError as StcalError
 from .geometry.camera import Camera as Camera
 from .geometry.rigid import Poses as Poses
 from .geometry.rigid import Rigid as Rigid
+from .io.cameras.model import CameraPrior as CameraPrior
+from .io.cameras.model import camera_prior as camera_prior
 from .io.cameras.read import load_camera as load_camera
 from .io.cameras.write import save_camera as save_camera
 

@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, freeze, require_choices
+from stcal.geometry.arrays import Array, Brief, freeze, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.labels import BOARD, CircleLabel, DotLabel, Label, dot_cells
 from stcal.lengths import Length, radius, require_millimetres, side
@@ -19,6 +19,7 @@ POINT_RADIUS_MM = 1e-6
 """Radius of a corner as a circle: it has no extent and therefore no eccentricity."""
 
 
+@runtime_checkable
 class Printed(Protocol):
     """A board or tags printed on a face: what :mod:`stcal.boards` finds in images."""
 
@@ -27,8 +28,8 @@ class Printed(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FaceDesign:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FaceDesign(Brief):
     """One face of the target: circles in the face frame (origin circle at 0, X through the x circle, Z out of the box).
 
     Parameters
@@ -84,6 +85,7 @@ class FaceDesign:
     of_tags: bool = False
 
     def __post_init__(self):
+        require_fields(self, f"face {self.id}", sigma_mm=0, size_sigma=0)
         freeze(self, "xy_mm", (len(self.ids), 2), f"face {self.id}: circles")
         freeze(self, "radius_mm", (len(self.ids),), f"face {self.id}: radii")
         require_face(self.ids, self.xy_mm, self.radius_mm, (self.origin, self.x, self.y), f"face {self.id}")
@@ -120,9 +122,12 @@ class KnownDistance:
     sigma_mm: float
     drawn: bool = False
 
+    def __post_init__(self):
+        require_fields(self, "distance", mm=0, sigma_mm=0)
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TargetDesign:
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class TargetDesign(Brief):
     """Target: its faces, and whether its circles are brighter or darker than their surroundings.
 
     Parameters
@@ -152,7 +157,7 @@ class TargetDesign:
 
     def __post_init__(self):
         where = f"target {self.name}"
-        require_choices(self, where)
+        require_fields(self, where)
         require_ids([face.id for face in self.faces], where)
         circles = [face for face in self.faces if face.printed is None]
         sizes = [(label, mm) for face in circles for label, mm in zip(face.labels(), face.radius_mm, strict=True)]
@@ -236,6 +241,9 @@ class StatedSize:
     temperature_sigma_k: float | None = None
     reference_temperature_c: float | None = None
 
+    def __post_init__(self):
+        require_fields(self, "size", pitch_sigma_ppm=0, expansion_sigma_ppm_per_k=0, temperature_sigma_k=0)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardDesign:
@@ -284,7 +292,7 @@ class BoardDesign:
     rings: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self):
-        require_choices(self, "board")
+        require_fields(self, "board")
         if not (np.isfinite(self.sigma_mm) and self.sigma_mm >= 0):
             raise InputError("E-SIGMA-VALUE", f"board: sigma_mm {self.sigma_mm:g}; 0 or a positive number needed")
         require_millimetres(board_lengths(self.pitch_mm, self.radius_mm), self.unusual_size, "board")

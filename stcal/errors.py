@@ -9,6 +9,42 @@ code names one kind of mistake, wherever it is found. ``--debug`` and JSON show 
 lists all codes with their sentences.
 """
 
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+COMMAND_LINE = "STCAL_COMMAND_LINE"
+"""Environment variable that a program sets for itself and its processes: errors then speak of ``--options``."""
+OPTION = re.compile(r"`stcal[^`]*`|(?<![\w-])--(?P<no>no-)?(?P<name>[a-z][a-z-]*[a-z])")
+"""An option of the command line, or a whole command in quotes, which stays as it is."""
+PYTHON_NAMES = {"flatness": "flatness_mm", "max_angle": "pairs.max_angle_rad"}
+"""Arguments and fields of options in Python whose names are not those of the command line."""
+
+
+@contextmanager
+def at_command_line() -> Iterator[None]:
+    """Lets errors speak of options of the command line, in this process and in those that it starts."""
+    before = os.environ.get(COMMAND_LINE)
+    os.environ[COMMAND_LINE] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[COMMAND_LINE]
+
+
+def in_python(message: str) -> str:
+    """Returns a message with the names that arguments have in Python: ``refine_camera`` for ``--refine-camera``."""
+
+    def named(option: re.Match) -> str:
+        if option["name"] is None:
+            return option[0]
+        name = option["name"].replace("-", "_")
+        return f"{PYTHON_NAMES.get(name, name)}{'=False' if option['no'] else ''}"
+
+    return OPTION.sub(named, message)
+
 
 class StcalError(Exception):
     """Base of every error that stcal raises on purpose.
@@ -30,11 +66,11 @@ class StcalError(Exception):
         return self.args[0]
 
     def __str__(self) -> str:
-        return self.args[1]
+        return self.args[1] if COMMAND_LINE in os.environ else in_python(self.args[1])
 
     def append(self, text: str) -> None:
         """Appends text to the message."""
-        self.args = (self.code, f"{self}{text}")
+        self.args = (self.code, f"{self.args[1]}{text}")
 
 
 class InputError(StcalError):

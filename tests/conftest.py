@@ -3,8 +3,10 @@
 import os
 import signal
 
+from stcal.errors import COMMAND_LINE
 from stcal.parallel import ONE_THREAD
 
+os.environ[COMMAND_LINE] = "1"  # errors name options as they stand in the source
 os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # before numpy is loaded; for the commands that tests start, too
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # of a suite in the background: its commands could not be stopped
     signal.signal(signal.SIGINT, signal.default_int_handler)

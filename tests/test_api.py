@@ -7,21 +7,28 @@ import ast
 import dataclasses
 import importlib
 import inspect
+import os
+import pickle
 import re
 import subprocess
 import sys
 import textwrap
 from dataclasses import replace
+from typing import get_type_hints
 
+import numpy as np
 import pytest
 
 import stcal
-from stcal import errors
+from stcal import errors, handeye, locate, register, robot, sfm, synthetic
 from stcal.design import TargetDesign, reference_board, reference_target
 from stcal.errors import InputError
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses, Rigid, Similarity
+from stcal.handeye import HandEyePoses
+from stcal.locate import SeenTags
 from stcal.robot import DesignOptions, DHRow, IdentifyOptions, Joint, Robot
-from stcal.sfm import RunOptions
+from stcal.sfm import RunOptions, Trial
 from tests.outcome import fails_with
 
 SYSTEMS = ("sfm", "robot", "register", "handeye", "locate", "synthetic")
@@ -169,11 +176,88 @@ ROW = DHRow(100.0, 0.0, 0.0, 0.0)
         (lambda: RunOptions(graph="some"), "E-OPTION-VALUE … graph 'some' … sparse"),
         (lambda: IdentifyOptions(model="stiff"), "E-OPTION-VALUE … model 'stiff'"),
         (lambda: DesignOptions(observe="poses"), "E-OPTION-VALUE … observe 'poses'"),
+        (lambda: RunOptions(flatness_mm=float("nan")), "E-FIELD-TYPE … flatness_mm nan … finite"),
+        (lambda: RunOptions(workers=0), "E-OPTION-RANGE … workers 0 … 1"),
+        (lambda: RunOptions(exclude="12/a.jpg"), "E-FIELD-TYPE … exclude '12/a.jpg' … tuple"),
+        (lambda: replace(FACE, xy_mm=1j * FACE.xy_mm), "E-ARRAY-TYPE … face 1 … complex"),
+        (lambda: replace(FACE, xy_mm=[["0", "1"]] * len(FACE.ids)), "E-ARRAY-TYPE … face 1"),
+        (lambda: replace(FACE, xy_mm=[[0], [0, 1]]), "E-ARRAY-SHAPE … face 1"),
+        (lambda: Rigid.exp([0] * 6) and Rigid(translation=[0, "1", 2]), "E-ARRAY-TYPE … translation"),
+        (lambda: SeenTags([0.5], np.zeros((1, 4, 2)), np.eye(8)[None], [0.1]), "E-ARRAY-TYPE … rows … whole"),
+        (lambda: Camera(2.5, 3, [1, 1], [1, 1], [0] * 8), "E-FIELD-TYPE … width 2.5 … whole"),
+        (lambda: HandEyePoses(Poses.of([Rigid()]).matrix(), Poses.of([Rigid()])), "E-FIELD-TYPE … Poses"),
+        (lambda: Trial("a", 1.0, "mm", float("nan"), 1), "E-FIELD-TYPE … trial a … statistic nan"),
     ],
 )
 def test_constructors_are_as_strict_as_readers_of_files(make, error):
     with fails_with(error):
         make()
+
+
+def wrong_values(value: object, hint: object) -> list[object]:
+    """Values that no field of this type can have, beside one that it has."""
+    if isinstance(value, np.ndarray):
+        return ["word", [[1, 2], [3]], value + 1j, value[None], None if "None" not in str(hint) else object()]
+    if "str" in str(hint) and "tuple" not in str(hint):
+        return [object(), 7]
+    return [object(), "word", *([] if value is None or not isinstance(value, int | float) else [float("nan")])]
+
+
+INPUTS = [
+    Camera.from_opencv([[900, 0, 500], [0, 900, 400], [0, 0, 1]], [], (1000, 800)),
+    Rigid(),
+    Poses.of([Rigid()]),
+    FACE,
+    reference_target(),
+    reference_board(),
+    reference_board().stated,
+    RunOptions(),
+    RunOptions().pairs,
+    RunOptions().ellipses,
+    sfm.MeasureOptions(),
+    sfm.MeasureOptions().pose,
+    sfm.PlanOptions(),
+    sfm.PlanOptions().noise,
+    Trial("a", 1.0, "mm", 1.0, 1),
+    sfm.judge("key", "Title", [Trial("a", 1.0, "mm", 1.0, 1)], "faces", "nothing"),
+    ROW,
+    Joint(),
+    Robot("a", "standard", (ROW,), (Joint(),)),
+    robot.Measurements.from_arrays(np.zeros((3, 1)), np.zeros((3, 3))),
+    robot.Targets.from_poses(Poses.of([Rigid()])),
+    DesignOptions(),
+    IdentifyOptions(),
+    register.Pairs("pairs", range(3), np.eye(3), np.eye(3)),
+    register.Liu2017Options(),
+    HandEyePoses(Poses.of([Rigid()]), Poses.of([Rigid()])),
+    handeye.HandEyeOptions(),
+    handeye.RigOptions(),
+    handeye.EvolutionOptions(),
+    handeye.Noise(),
+    handeye.View(np.eye(4, 3), np.eye(4, 2)),
+    locate.TagLayout.from_tags("4X4_50", [3, 7], [[0, 0], [50, 0]], 30),
+    locate.LocateOptions(),
+    locate.VerdictOptions(),
+    locate.PatentOptions(),
+    SeenTags([0], np.zeros((1, 4, 2)), np.eye(8)[None], [0.1]),
+    synthetic.SceneOptions(),
+    synthetic.RenderOptions(),
+]
+
+
+@pytest.mark.parametrize("made", INPUTS, ids=lambda made: type(made).__name__)
+def test_no_field_takes_a_value_of_another_type(made):
+    hints, taken = get_type_hints(type(made)), []
+    for entry in (each for each in dataclasses.fields(made) if each.init):
+        for value in wrong_values(getattr(made, entry.name), hints[entry.name]):
+            if value is None and entry.default is None:
+                continue
+            try:
+                replace(made, **{entry.name: value})
+            except InputError:
+                continue
+            taken.append((entry.name, value))
+    assert taken == []
 
 
 # --- how results look in a notebook, and when transforms are equal ---
@@ -190,6 +274,36 @@ def test_transforms_are_equal_by_value():
     assert Poses.of([turned, Rigid()]) == Poses.of([turned, Rigid()]) != Poses.of([Rigid(), turned])
     assert Similarity(2.0, turned) == Similarity(2.0, turned) != Similarity(2.0, Rigid())
     assert Rigid() != "identity"
+
+
+@pytest.mark.parametrize("made", INPUTS, ids=lambda made: type(made).__name__)
+def test_a_value_shows_itself_in_a_line(made):
+    """Results with many values: in `tests/sfm/test_pipeline.py`, and by what they are made of."""
+    assert len(repr(made)) < 600
+    assert len(repr(made)) < 200 or "array([[" not in repr(made) or isinstance(made, Rigid)
+
+
+# --- errors in the words of Python ---
+
+
+def test_errors_speak_of_arguments(monkeypatch):
+    monkeypatch.delenv(errors.COMMAND_LINE, raising=False)
+    said = InputError("E-TEST", "--to-link a, --no-strict: give '--flatness 0.1', as `stcal robot --dh` has it; a--b")
+    assert str(said) == "to_link a, strict=False: give 'flatness_mm 0.1', as `stcal robot --dh` has it; a--b"
+    said.append(", or --out")
+    with errors.at_command_line():
+        assert str(said).startswith("--to-link a, --no-strict")
+        assert str(said).endswith(", or --out")
+    assert errors.COMMAND_LINE not in os.environ
+    assert str(pickle.loads(pickle.dumps(said))) == str(said)
+
+
+def test_options_that_errors_name_are_arguments_in_python(monkeypatch):
+    """Those of errors that a call from Python can raise: where the command's name differs, `PYTHON_NAMES` has it."""
+    monkeypatch.delenv(errors.COMMAND_LINE)
+    with fails_with("E-OPTION-RANGE … flatness_mm 1e+09"):
+        RunOptions(flatness_mm=1e9).settled(reference_target())
+    assert all(name.split(".")[0] in RunOptions.__dataclass_fields__ for name in errors.PYTHON_NAMES.values())
 
 
 # --- the checker itself ---

@@ -67,7 +67,8 @@ LIBRARIES = {
     ),
 }
 """Library: folders or files that may use it. ``cv2`` where pixels are, and in two places for a method of its own."""
-GEOMETRY_USES = {"numpy", "scipy", "dataclasses", "typing", "collections", "math", "functools", "itertools"}
+GEOMETRY_USES = {"numpy", "scipy", "dataclasses", "typing", "types", "collections"}
+GEOMETRY_USES |= {"math", "numbers", "inspect", "functools", "itertools"}
 
 
 @functools.cache

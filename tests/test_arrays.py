@@ -59,7 +59,7 @@ SKEWED = MATRIX + np.diag([2.0, 0], 1)
         (lambda: Camera(*SIZE, [9, 9], [5, 5], np.zeros(8), colmap_model="OPENCV_FISHEYE"), "E-CAMERA-MODEL … OPENCV"),
         (lambda: Camera(*SIZE, [9, 9], [5, 5], np.zeros(8), covariance=np.eye(3)), "E-ARRAY-SHAPE … (12, 12)"),
         (
-            lambda: Camera(*SIZE, [9, 9], [5, 5], [0, 0, 1e-3, 0, 0, 0, 0, 0], True).to_opencv(),
+            lambda: Camera(*SIZE, [900, 900], [640, 360], [0, 0, 1e-3, 0, 0, 0, 0, 0], True).to_opencv(),
             "E-CAMERA-MODEL … fish",
         ),
         (lambda: Rigid.from_quaternion([1, 0, 0, 0], order="zyxw"), "E-OPTION-VALUE … 'zyxw' … xyzw"),  # type: ignore

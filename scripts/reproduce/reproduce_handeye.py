@@ -23,10 +23,10 @@ import numpy as np
 
 from stcal.errors import StcalError
 from stcal.geometry.rigid import Rigid
-from stcal.handeye import METHODS, handeye, motion_errors
+from stcal.handeye import METHODS, motion_errors
 from stcal.handeye.data.pairs import Loop, Motions
 from stcal.handeye.methods.evolution import Bounds, EvolutionOptions, Objective, evolve, polish
-from stcal.handeye.solve import UNIT_MM
+from stcal.handeye.solve import UNIT_MM, handeye
 from stcal.parallel import one_thread
 from stcal.report.figure import save
 from stcal.workflows.cluster import executor_of

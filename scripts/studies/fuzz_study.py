@@ -2,12 +2,13 @@
 
 .venv/bin/python scripts/studies/fuzz_study.py [--count 1000] [--seed 1] [--kills 20] [--json FILE] [--only CASE]
 
-All commands of both programs, found in the tree: one without a call in `tests/commands.py` ends the study. Four
-parts: inputs spoiled by their bytes, place or structure (`c0`, `c1`, …), every option with every value that is none for
-it (`o0`, …), realistic mistakes (by name; "silent wrong" where nothing is said), and programs ended by signals, a full
-disk or little memory at random moments (`k0`, `k1`, …). With `--json` cases that the file has already are not run
-again: a study that was stopped goes on. The seed and the case's name repeat a case: `--seed 1 --only c17`. Simulated
-data; a small run is made first. Exits with 1 where anything failed.
+All commands of both programs, found in the tree: one without a call in `tests/commands.py` ends the study. Six parts:
+inputs spoiled by their bytes, place or structure (`c0`, `c1`, …), every option with every value that is none for it
+(`o0`, …), realistic mistakes (by name; "silent wrong" where nothing is said), programs ended by signals, and with a
+full disk, a limit of files (`ulimit -f`) or little memory, from the beginning or at random moments (`k0`, `k1`, …),
+what runs keep swapped, aged and changed (`s0`, …), and closed standard streams (`d0`, …). With `--json` cases that
+the file has already are not run again: a study that was stopped goes on. The seed and the case's name repeat a case:
+`--seed 1 --only c17`. Simulated data; a small run is made first. Exits with 1 where anything failed.
 """
 
 import argparse
@@ -41,14 +42,15 @@ SHOWN = 600
 
 
 def names_of(arguments: argparse.Namespace) -> list[str]:
-    """Cases: each call on good data, mistakes, every option with every odd value, kills, and spoiled inputs."""
+    """Cases: each call on good data, mistakes, every option with every odd value, and those that are drawn."""
     if arguments.only:
         return [arguments.only]
     valid = [f"v{i}" for i in range(len(CALLS))]
     mistakes = [] if arguments.no_mistakes else list(MISTAKES)
     options = [f"o{i}" for i in range(len(option_cases()))]
-    kills, spoilt = (f"k{i}" for i in range(arguments.kills)), (f"c{i}" for i in range(arguments.count))
-    return [*valid, *mistakes, *options, *kills, *spoilt]
+    counts = {"k": arguments.kills, "s": arguments.kept, "d": arguments.closed, "c": arguments.count}
+    drawn = [f"{letter}{i}" for letter, count in counts.items() for i in range(count)]
+    return drawn if arguments.drawn_only else [*valid, *mistakes, *options, *drawn]
 
 
 def kept(path: Path | None, seed: int) -> list[Judged]:
@@ -94,6 +96,9 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=1000, help="of spoiled inputs")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--kept", type=int, default=60, help="of files that runs keep")
+    parser.add_argument("--closed", type=int, default=20, help="of standard streams")
+    parser.add_argument("--drawn-only", action="store_true", help="no valid calls, mistakes and options")
     parser.add_argument("--json", type=Path, help="keep every case here, and run none that it has")
     parser.add_argument("--only", default="", metavar="CASE")
     parser.add_argument("--no-mistakes", action="store_true")

@@ -6,8 +6,10 @@ rate over connections that stay open; the fourth sends what is no photograph, wh
 broken requests, as many a second as each of the others. Lost is what gets no answer, or another image's. Memory is that
 of the server and its processes, pages that they share counted once, at the tenth and at the last part of the time.
 
-With ``--hostile`` one client follows the target, and another one attacks: connections that send nothing, photographs
-whose sender leaves, bytes one by one, uploads of 60 MB that lack the last byte, broken and smuggled requests.
+With ``--hostile`` one client follows the target, undisturbed for a quarter of the time, and then beside one that
+attacks: connections that send nothing, photographs whose sender leaves, bytes one by one, uploads of 60 MB that lack
+the last byte, broken and smuggled requests. Ends with 1 where an answer is lost, or takes longer than 2 s beside the
+attacker and three times as long as the slowest one before: a machine that is busy otherwise is slow in both parts.
 """
 
 import argparse
@@ -136,6 +138,8 @@ def rubbish(port: int, frames: list, start: float, seconds: float, rate: float) 
     return {"sent": i, "lost": lost}
 
 
+QUIET, MOST_S, AS_SLOW = 0.25, 2.0, 3.0
+"""Share of the time without an attack; longest time to an answer beside it, and over the longest one before it."""
 IDLE, STALLED, SLOW = 100, 20, 30
 """Number of connections of each kind that are held open."""
 STALLED_BYTES = 60_000_000
@@ -184,13 +188,14 @@ def attack(port: int, frames: list, start: float, seconds: float, rate: float) -
     return {"sent": i, "smuggled": smuggled}
 
 
-def hostile(options, films: list, port: int, pid: int) -> None:
-    """Send beside an attacker for the time, and print what came of it."""
+def hostile(options, films: list, port: int, pid: int) -> bool:
+    """Send beside an attacker for the time, and print what came of it; returns whether the client was served."""
     context = multiprocessing.get_context("fork")
     answers = [context.SimpleQueue() for _ in range(2)]
     start = time.time() + LATE_START_S
+    quiet = options.seconds * QUIET
     jobs = [(follow, 0, port, films[0], start, options.seconds, options.rate / 10)]
-    jobs.append((attack, port, films[0], start, options.seconds, options.rate))
+    jobs.append((attack, port, films[0], start + quiet, options.seconds - quiet, options.rate))
     clients = [context.Process(target=run_client, args=(q, *job)) for q, job in zip(answers, jobs, strict=True)]
     for client in clients:
         client.start()
@@ -203,9 +208,16 @@ def hostile(options, films: list, port: int, pid: int) -> None:
         client.join()
     print(f"{found['sent']} photographs beside {attacked['sent']} hostile requests in {options.seconds:g} s")
     print(f"lost answers: {found['lost']}; refused photographs: {found['refused']}; without a pose: {found['without']}")
-    print(f"from sent to answered, s: median {np.median(found['taken']):.2f}, most {max(found['taken']):.2f}; ", end="")
+    early = round(QUIET * len(found["taken"]))
+    before, beside = np.array(found["taken"][:early]), np.array(found["taken"][early:])
+    for words, taken in (("before", before), ("beside", beside)):
+        print(f"from sent to answered {words} the attack, s: median {np.median(taken):.2f}, most {taken.max():.2f}")
+    late = [f"{QUIET * options.seconds + i / (options.rate / 10):.0f}" for i in np.flatnonzero(beside > MOST_S)]
+    print(f"answers after more than {MOST_S:g} s: {len(late)}", *(f"at {second} s" for second in late[:9]))
     print(f"parts answered as second requests: {attacked['smuggled']}")
     print(f"memory: {memory[0]:.0f} MB at first, {max(memory):.0f} MB at most")
+    slow = beside.max() > max(MOST_S, AS_SLOW * before.max())
+    return not (found["lost"] or found["refused"] or attacked["smuggled"] or slow)
 
 
 def run_client(answers, function, *arguments) -> None:
@@ -239,9 +251,10 @@ def main() -> None:
         program = [sys.executable, "-P", "-c", "from stcal.cli.entry import main_sfm; main_sfm()", *map(str, words)]
         with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as server:
             port = int(re.search(r":(\d+)/measure", server.stdout.readline()).group(1))
-            (hostile if options.hostile else report)(options, films, port, server.pid)
+            served = (hostile if options.hostile else report)(options, films, port, server.pid)
             server.send_signal(signal.SIGINT)
             print("\n".join(server.stdout.read().split("\n")[:1]))
+    sys.exit(served is False)
 
 
 def report(options, films: list, port: int, pid: int) -> None:

@@ -9,9 +9,10 @@ from numpy.typing import ArrayLike
 from stcal.boards.dictionaries import known_tags
 from stcal.design import POINT_RADIUS_MM, BoardDesign, Polarity
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen, require_choices
+from stcal.geometry.arrays import Brief, frozen, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel, Label, dot_cells
+from stcal.lengths import require_millimetres, side
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +80,44 @@ UNIT_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 """Corners of a tag of side 1 about its middle: top left, top right, bottom right, bottom left."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TagLayout:
+NESTED = 0.5
+"""Largest ratio of the sides of two tags of which one may be inside the other, as in nested markers."""
+
+
+def sides_mm(corners_mm: np.ndarray) -> np.ndarray:
+    """Return the mean side (n,) of each of n quadrilaterals (n, 4, 2)."""
+    return np.linalg.norm(corners_mm - np.roll(corners_mm, 1, axis=1), axis=2).mean(1)
+
+
+def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusual_size: bool, where: str) -> None:
+    """Refuse tags whose sides are in another unit than mm, and tags that lie on each other.
+
+    ``corners_mm`` : (n, 4, 2), NaN for tags of no known place
+
+    Raises
+    ------
+    InputError
+        The message begins with ``where`` and names the tag or the tags.
+    """
+    known = np.flatnonzero(np.isfinite(corners_mm).all((1, 2))).tolist()
+    ids, middles, sides = [tags[i][1] for i in known], corners_mm[known].mean(1), sides_mm(corners_mm[known])
+    lengths = (side(f"side of tag {tag} by corners_mm", float(mm)) for tag, mm in zip(ids, sides, strict=True))
+    require_millimetres(lengths, unusual_size, where)
+    for i in range(1, len(ids)):
+        apart = np.linalg.norm(middles[:i] - middles[i], axis=1)
+        smaller, larger = np.minimum(sides[:i], sides[i]), np.maximum(sides[:i], sides[i])
+        over = np.flatnonzero((apart < smaller / 2) & (smaller > NESTED * larger) & (np.array(ids[:i]) != ids[i]))
+        if len(over):
+            j = over[0]
+            raise InputError(
+                "E-TAG-OVERLAP",
+                f"{where}: tags {ids[j]} and {ids[i]} lie on each other: {apart[j]:.3g} mm apart, "
+                f"sides {sides[j]:.3g} and {sides[i]:.3g} mm; are the places metres? correct them",
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class TagLayout(Brief):
     """Tags in one plane, Z into it.
 
     Parameters
@@ -91,15 +128,25 @@ class TagLayout:
         Top left, top right, bottom right and bottom left corner as printed, mm.
     sigma_mm : float
         σ of a corner's coordinate.
+    unusual_size : bool
+        Whether sides that no hardware has in mm are meant as they stand.
+
+    Raises
+    ------
+    InputError
+        Tags that are unknown, occur twice or lie on each other; corners of another shape; lengths that are not mm.
     """
 
     tags: tuple[tuple[str, int], ...]
     corners_mm: np.ndarray
     sigma_mm: float = 0.0
+    unusual_size: bool = False
 
     def __post_init__(self):
+        require_fields(self, "tag layout", sigma_mm=0)
         object.__setattr__(self, "tags", known_tags(self.tags, "tag layout"))
         object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (len(self.tags), 4, 2), "tags' corners"))
+        require_tags(self.tags, self.corners_mm, self.unusual_size, "tag layout")
 
     @classmethod
     def from_tags(
@@ -186,7 +233,7 @@ class AprilGridDesign:
         square = self.tag_mm * np.array([[0, -1], [1, -1], [1, 0], [0, 0]], float)
         square = square if self.upright else np.roll(square, -2, axis=0)
         tags = tuple((self.dictionary, tag) for tag in self.tag_ids())
-        return TagLayout(tags, first[:, None] + square, self.sigma_mm)
+        return TagLayout(tags, first[:, None] + square, self.sigma_mm, unusual_size=True)  # the board has been judged
 
     def xy_mm(self) -> np.ndarray:
         """Return the corners (4·rows·columns, 2), tag by tag, in the order of the detectors, mm."""
@@ -240,7 +287,7 @@ class AsymmetricCirclesDesign:
     rings: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self):
-        require_choices(self, "asymmetric circles")
+        require_fields(self, "asymmetric circles")
 
     def _steps(self) -> np.ndarray:
         row, place = np.divmod(np.arange(self.rows * self.columns), self.columns)

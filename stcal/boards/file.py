@@ -19,6 +19,7 @@ from stcal.boards.design import (
     HexagonalCirclesDesign,
     LatticePart,
     TagLayout,
+    require_tags,
 )
 from stcal.boards.dictionaries import count_of, known_dictionary, of_opencv
 from stcal.boards.foreign import KEYS as BUNDLE_KEYS
@@ -44,8 +45,6 @@ MOST_MARKER = 0.99
 """Largest ratio of a ChArUco tag's side to its square's: detection needs white around a tag."""
 LEAST_AREA = 1e-6
 """Smallest area of a tag over its longest side squared; below it the corners lie on a line."""
-NESTED = 0.5
-"""Largest ratio of the sides of two tags of which one may be inside the other, as in nested markers."""
 OF_OTHERS = {"square_mm", "marker_mm", "dictionary", "tag", "tag_mm", "spacing_mm", "board"}
 """Keys that occur only in files of other boards than dots."""
 
@@ -404,7 +403,8 @@ def _tags(data: TagsFile, where: str) -> TagLayout:
             )
         _require_convex(place, place_of_tag)
     try:
-        return TagLayout(tuple((tag.dictionary, tag.id) for tag in data.tag), np.array(corners), data.sigma_mm)
+        tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
+        return TagLayout(tags, np.array(corners), data.sigma_mm, data.unusual_size)
     except InputError as error:
         raise InputError(error.code, f"{where}: {error}") from error
 
@@ -418,23 +418,8 @@ def require_sizes(data: TagsFile, where: str) -> None:
         The message names the tag or the tags, and how to correct the file.
     """
     require_millimetres(tag_sides(data, where), data.unusual_size, where)
-    places = [(tag, corners) for tag in data.tag if (corners := tag.corners(where)) is not None]
-    if not places:
-        return
-    middles = np.array([corners.mean(axis=0) for _, corners in places])
-    sides = np.array([np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean() for _, corners in places])
-    for i in range(1, len(places)):
-        apart = np.linalg.norm(middles[:i] - middles[i], axis=1)
-        smaller, larger = np.minimum(sides[:i], sides[i]), np.maximum(sides[:i], sides[i])
-        other = np.array([tag.id != places[i][0].id for tag, _ in places[:i]])
-        over = np.flatnonzero((apart < smaller / 2) & (smaller > NESTED * larger) & other)
-        if len(over):
-            j = over[0]
-            raise InputError(
-                "E-TAG-OVERLAP",
-                f"{where}: tags {places[j][0].id} and {places[i][0].id} lie on each other: {apart[j]:.3g} mm apart, "
-                f"sides {sides[j]:.3g} and {sides[i]:.3g} mm; are the places metres? correct them",
-            )
+    corners = [place if (place := tag.corners(where)) is not None else np.full((4, 2), np.nan) for tag in data.tag]
+    require_tags([(tag.dictionary, tag.id) for tag in data.tag], np.array(corners), True, where)
 
 
 def tag_sides(data: TagsFile, where: str = "") -> list[Length]:

@@ -35,7 +35,9 @@ def _run(name: str) -> None:
         if sys.argv[1:] == ["--version"]:
             _print_version()
         else:
-            getattr(_program(), name)()
+            program = _program()
+            sys.unraisablehook = program.again
+            getattr(program, name)()
     finally:
         for number in LOADING:
             signal.signal(number, signal.SIG_IGN)

@@ -4,6 +4,7 @@ import json
 import os
 import signal
 import sys
+import threading
 from io import TextIOWrapper
 from itertools import pairwise
 from typing import Any, NoReturn
@@ -16,9 +17,11 @@ from stcal.cli import cameras, handeye, locate, register, robot, sfm
 from stcal.cli.help import PLAIN, Commands
 from stcal.cli.options import protect_outputs
 from stcal.cli.terminal import printable, say
-from stcal.errors import NO_MEMORY, StcalError, lacks_memory
+from stcal.errors import NO_MEMORY, StcalError, at_command_line, lacks_memory
 
 INTERRUPTED, TERMINATED = 130, 143
+AGAIN_S = 0.02
+"""Time after which a signal is sent once more, s."""
 MESSAGE_CHARACTERS = 600
 """Largest length of an error's line. Texts from files, which it may quote, can have any length."""
 RESUMED = {"run", "detect", "watch"}
@@ -70,6 +73,7 @@ def main_sfm() -> None:
     _guarded(sfm.app)
 
 
+@at_command_line()
 def _guarded(application: typer.Typer) -> None:
     debug = "--debug" in sys.argv
     if any(name.startswith("_STCAL") and name.endswith("_COMPLETE") for name in os.environ):
@@ -121,6 +125,16 @@ def _terminate(*_) -> NoReturn:
     """Ends a command at SIGTERM as at Ctrl-C: existing results stay, and no process is left behind."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     raise _Terminated
+
+
+def again(lost: "sys.UnraisableHookArgs") -> None:
+    """Sends a signal once more whose exception came where Python prints and forgets it, as in a finaliser."""
+    number = {KeyboardInterrupt: signal.SIGINT, _Terminated: signal.SIGTERM}.get(lost.exc_type)  # type: ignore[arg-type]
+    if number is None:
+        sys.__unraisablehook__(lost)
+        return
+    signal.signal(signal.SIGTERM, _terminate)
+    threading.Timer(AGAIN_S, signal.raise_signal, (number,)).start()
 
 
 class _Terminated(BaseException):

@@ -1,8 +1,24 @@
 """Read-only arrays of a checked shape, for the fields of the package's frozen dataclasses."""
 
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
+from functools import lru_cache, wraps
+from inspect import signature
+from numbers import Integral, Real
+from types import UnionType
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    NoReturn,
+    ParamSpec,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
@@ -53,34 +69,129 @@ def _brief(value: object) -> str:
     return text if len(text) <= LONGEST else f"<{type(value).__name__}>"
 
 
+Rule = tuple[Callable[[Any], bool], str]
+"""Whether a value is of a type, and the type in words."""
+NO_RULE: tuple[Rule, bool] = ((lambda _: True), ""), False
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _rule(hint: Any, may_be_infinite: bool = False) -> Rule | None:
+    """Return the rule of a field's type; None for arrays, which :func:`freeze` judges, and for functions."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return (lambda v: any(v is w or (isinstance(v, str) and v == w) for w in parts)), " or ".join(map(str, parts))
+    if origin in (Union, UnionType):
+        rules = [_rule(part, may_be_infinite) for part in parts]
+        known = [rule for rule in rules if rule]
+        words = " or ".join(rule[1] for rule in known)
+        return None if len(known) < len(rules) else ((lambda v: any(admits(v) for admits, _ in known)), words)
+    if origin in (tuple, list, Sequence) and parts:
+        return _rule_of_sequence(origin, parts)
+    if origin in (dict, Mapping):
+        (is_key, key), (is_value, value) = (_rule(part) or (lambda _: True, "value") for part in parts)
+        words = f"a mapping from {key} to {value}"
+        return (lambda v: isinstance(v, Mapping) and all(is_key(k) and is_value(w) for k, w in v.items())), words
+    if hint in PLAIN:
+        return PLAIN[hint]
+    if hint is float:
+        is_ok = (lambda v: v == v) if may_be_infinite else math.isfinite
+        return (lambda v: isinstance(v, Real) and not isinstance(v, bool) and is_ok(v)), "a finite number"
+    if not isinstance(hint, type) or hint is np.ndarray or hint is Any:
+        return None
+    return (lambda v: isinstance(v, hint)), f"a {hint.__name__}"
+
+
+PLAIN: dict[Any, Rule] = {
+    type(None): (lambda v: v is None, "None"),
+    bool: (lambda v: isinstance(v, bool | np.bool_), "True or False"),
+    int: (lambda v: isinstance(v, Integral) and not isinstance(v, bool), "a whole number"),
+    str: (lambda v: isinstance(v, str), "a text"),
+}
+
+
+def _rule_of_sequence(origin: Any, parts: tuple) -> Rule:
+    count = None if origin is not tuple or Ellipsis in parts else len(parts)
+    rules = [_rule(part) or (lambda _: True, "value") for part in parts if part is not Ellipsis]
+    words = f"a tuple, each {rules[0][1]}," if count is None else f"a tuple of {', '.join(rule[1] for rule in rules)}"
+
+    def admits(value: object) -> bool:
+        if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or count not in (None, len(value)):
+            return False
+        return all(rules[i % len(rules)][0](entry) for i, entry in enumerate(value))
+
+    return admits, words
+
+
+def _is_choice(hint: Any) -> bool:
+    return any(get_origin(part) is Literal for part in (hint, *get_args(hint)))
+
+
+def _refuse(what: str, name: str, value: object, words: str, is_choice: bool) -> NoReturn:
+    if is_choice:
+        words = words.removesuffix(" or None")
+        raise InputError("E-OPTION-VALUE", f"{what}: {name} {_brief(value)}: not a choice; use {words}")
+    raise InputError("E-FIELD-TYPE", f"{what}: {name} {_brief(value)}: {words} needed")
+
+
 @lru_cache
-def _choices(kind: type) -> dict[str, tuple]:
-    """Return the words that a dataclass's fields of a Literal type admit, by field; None among them if optional."""
-    found = {}
-    for name, hint in get_type_hints(kind).items():
-        parts = get_args(hint) if get_origin(hint) in (Union, type(int | str)) else (hint,)
-        words = [word for part in parts if get_origin(part) is Literal for word in get_args(part)]
-        if words:
-            found[name] = (*words, *([None] if type(None) in parts else []))
+def _rules(kind: type) -> dict[str, tuple[Rule, bool]]:
+    """Return the rules of a dataclass's fields, and whether each one is a choice of words."""
+    hints, found = get_type_hints(kind), {}
+    for entry in fields(kind):
+        hint = hints[entry.name]
+        rule = _rule(hint, isinstance(entry.default, float) and math.isinf(entry.default))
+        if rule and entry.init:
+            found[entry.name] = rule, _is_choice(hint)
     return found
 
 
-def require_choices(instance: object, what: str) -> None:
-    """Refuse words in fields of a dataclass that their Literal types do not list; to be called in ``__post_init__``.
+def require_fields(instance: object, what: str, **least: float) -> None:
+    """Refuse values of a dataclass that are not of their field's type; to be called in ``__post_init__``.
+
+    Numbers must be finite, words in fields of a Literal type must be among those that it lists. Arrays are left to
+    :func:`freeze`. ``least`` : lowest value of a number, by field.
 
     Raises
     ------
     InputError
-        The message begins with ``what`` and names the field and its choices.
+        The message begins with ``what`` and names the field and what is needed.
     """
-    for name, words in _choices(type(instance)).items():
+    for name, ((admits, words), is_choice) in _rules(type(instance)).items():
         value = getattr(instance, name)
-        if not any(value is word or (isinstance(value, str) and value == word) for word in words):
-            listed = " or ".join(str(word) for word in words if word is not None)
-            raise InputError("E-OPTION-VALUE", f"{what}: {name} {value!r}: not a choice; use {listed}")
+        if not admits(value):
+            _refuse(what, name, value, words, is_choice)
+        if name in least and value is not None and value < least[name]:
+            raise InputError("E-OPTION-RANGE", f"{what}: {name} {value:g}: {least[name]:g} or more needed")
 
 
-def frozen(values: ArrayLike, shape: Shape | None = None, what: str = "array", dtype: DTypeLike = float) -> np.ndarray:
+def require_arguments(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function, which then refuses arguments that are not of their annotated type, as fields are refused."""
+    bind = signature(function).bind
+
+    @lru_cache
+    def rules() -> dict[str, tuple[Rule, bool]]:
+        hints = get_type_hints(function)
+        return {name: (rule, _is_choice(hint)) for name, hint in hints.items() if (rule := _rule(hint))}
+
+    @wraps(function)
+    def judged(*args: P.args, **kwargs: P.kwargs) -> R:
+        for name, value in bind(*args, **kwargs).arguments.items():
+            (admits, words), is_choice = rules().get(name, NO_RULE)
+            if not admits(value):
+                _refuse(function.__name__, name, value, words, is_choice)
+        return function(*args, **kwargs)
+
+    return judged
+
+
+def frozen(
+    values: ArrayLike,
+    shape: Shape | None = None,
+    what: str = "array",
+    dtype: DTypeLike = float,
+    finite: bool = True,
+) -> np.ndarray:
     """Return a read-only copy.
 
     Parameters
@@ -91,6 +202,8 @@ def frozen(values: ArrayLike, shape: Shape | None = None, what: str = "array", d
     what : str
         Name of the values in messages.
     dtype : data type
+    finite : bool
+        Whether floats must be finite; if not, NaN stands for values that are not known.
 
     Returns
     -------
@@ -99,14 +212,25 @@ def frozen(values: ArrayLike, shape: Shape | None = None, what: str = "array", d
     Raises
     ------
     InputError
-        If the shape differs, or a float array holds a value that is not finite.
+        If the shape differs, the values are no numbers, or a float array holds a value that is not finite.
     """
-    array = np.array(values, dtype=dtype)
+    try:
+        array = np.array(values)
+    except ValueError as error:
+        raise InputError(
+            "E-ARRAY-SHAPE", f"{what}: rows of different lengths; {shape or 'equal ones'} needed"
+        ) from error
+    if array.dtype.kind not in "biuf" and dtype is not object and array.size:
+        raise InputError("E-ARRAY-TYPE", f"{what}: {array.dtype} values; real numbers needed")
+    if array.dtype.kind == "f" and np.dtype(dtype).kind in "iu" and (array != np.rint(array)).any():
+        raise InputError("E-ARRAY-TYPE", f"{what}: fractions; whole numbers needed")
+    array = array.astype(dtype, copy=False)
     if shape not in (None, array.shape) and (
         array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))
     ):
         raise InputError("E-ARRAY-SHAPE", f"{what}: shape {array.shape}, {shape} needed")
-    if array.dtype.kind == "f" and b"\0" in np.isfinite(array).tobytes():  # three times as fast as all() on few numbers
+    # three times as fast as all() on few numbers
+    if finite and array.dtype.kind == "f" and b"\0" in np.isfinite(array).tobytes():
         raise InputError("E-ARRAY-NOT-FINITE", f"{what}: holds values that are not finite")
     array.flags.writeable = False
     return array

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.errors import ConvergenceError, InputError
-from stcal.geometry.arrays import Array, freeze, frozen
+from stcal.geometry.arrays import Array, freeze, frozen, require_arguments, require_fields
 
 MAX_NEWTON_STEPS = 50
 COEFFICIENTS = 12
@@ -39,6 +39,16 @@ COLMAP_MODELS = tuple(COLMAP_LAYOUT)
 PARAMETER_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
 FISHEYE = "FISHEYE"
 """Part of the names of COLMAP's equidistant models."""
+
+
+MAX_FOCAL_RATIO = 10.0
+"""Largest ratio between fx and fy; anamorphic lenses have 2."""
+FARTHEST = 1e12
+"""Largest value of any parameter, whose square does not overflow."""
+MAX_SIDE_PX = 1_000_000
+"""Longest image side that a camera file may state, px."""
+LEAST_SHARE_OF_SIDE = 0.015
+"""Share of the longer side that focal length or principal point of every lens exceed; lengths in mm do not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,17 +94,13 @@ class Camera:
     covariance: np.ndarray | None = None
 
     def __post_init__(self):
+        require_fields(self, "camera")
         freeze(self, "focal", (2,), "focal length")
         freeze(self, "centre", (2,), "principal point")
-        if np.shape(self.distortion) == (8,):
+        freeze(self, "distortion", None, "distortion")
+        if self.distortion.shape == (8,):
             object.__setattr__(self, "distortion", np.pad(self.distortion, (0, 4)))
         freeze(self, "distortion", (COEFFICIENTS,), "distortion")
-        if (self.focal <= 0).any():
-            raise InputError(
-                "E-CAMERA-FOCAL", f"camera: focal length {self.focal.tolist()} px, positive numbers needed"
-            )
-        if self.width < 1 or self.height < 1:
-            raise InputError("E-CAMERA-SIZE", f"camera: size {self.width}×{self.height} px, a positive size needed")
         if self.fisheye and self.distortion[[6, 7, 9, 11]].any():
             raise InputError(
                 "E-CAMERA-COEFFICIENTS", "camera: k5, k6, s2 or s4 of an equidistant camera, which has none; 0 needed"
@@ -111,6 +117,7 @@ class Camera:
         if self.covariance is not None:
             count = len(COLMAP_LAYOUT[self.colmap_model])
             freeze(self, "covariance", (count, count), "camera's covariance")
+        require_lens(self.parameters(), self.width, self.height, "camera")
 
     @classmethod
     def of(cls, camera: "Camera", colmap_model: str, covariance: np.ndarray | None = None) -> "Camera":
@@ -119,6 +126,7 @@ class Camera:
         return cls(camera.width, camera.height, *lens, colmap_model, covariance)
 
     @classmethod
+    @require_arguments
     def from_opencv(
         cls, matrix: ArrayLike, distortion: ArrayLike, size: tuple[int, int], fisheye: bool = False
     ) -> "Camera":
@@ -372,6 +380,8 @@ class Camera:
     def project(self, xyz_camera: ArrayLike) -> np.ndarray:
         """Return the pixels (..., 2) of points (..., 3) in the camera frame."""
         xyz = np.asarray(xyz_camera, float)
+        if xyz.shape[-1:] != (3,):
+            raise InputError("E-ARRAY-SHAPE", f"camera: points of shape {xyz.shape}; (..., 3) needed")
         return self.pixel_from_normalised(xyz[..., :2] / xyz[..., 2:])
 
 
@@ -426,6 +436,44 @@ def opencv_lens(given: np.ndarray, fisheye: bool, where: str, tangential: bool =
         )
     distortion[: min(len(given), 8)] = given[:8]
     return distortion, "FULL_OPENCV" if distortion[4:].any() else "OPENCV" if distortion.any() else "PINHOLE"
+
+
+def require_lens(flat: np.ndarray, width: float | None, height: float | None, where: str) -> None:
+    """Refuse parameters (16,), see :data:`PARAMETER_NAMES`, and sizes that no camera has. None: a size is not stated.
+
+    Raises
+    ------
+    InputError
+        The message begins with ``where``.
+    """
+    if not np.isfinite(flat).all():
+        raise InputError("E-CAMERA-NOT-FINITE", f"{where}: a camera parameter is not a finite number; correct it")
+    if (far := np.abs(flat).max()) > FARTHEST:
+        raise InputError(
+            "E-CAMERA-TOO-FAR",
+            f"{where}: a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it",
+        )
+    if (flat[:2] <= 0).any():
+        raise InputError(
+            "E-CAMERA-FOCAL", f"{where}: focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed"
+        )
+    if max(flat[:2]) > MAX_FOCAL_RATIO * min(flat[:2]):
+        raise InputError(
+            "E-CAMERA-FOCAL",
+            f"{where}: focal lengths {flat[0]:g} and {flat[1]:g} px; not more than {MAX_FOCAL_RATIO:g} "
+            "times apart needed, pixels are nearly square",
+        )
+    for side in (width, height):
+        if side is not None and not (0 < side <= MAX_SIDE_PX and float(side).is_integer()):
+            raise InputError(
+                "E-CAMERA-SIZE", f"{where}: image of {width}×{height} px; whole numbers in 1…{MAX_SIDE_PX} needed"
+            )
+    if width and height and flat[:4].max() < LEAST_SHARE_OF_SIDE * max(width, height):
+        raise InputError(
+            "E-CAMERA-FOCAL",
+            f"{where}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}) of an image "
+            f"of {width:g}×{height:g} px; px needed: are they mm, or shares of a side?",
+        )
 
 
 def intrinsic_basis(colmap_model: str) -> np.ndarray:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import MYPY, Array, freeze, frozen
+from stcal.geometry.arrays import MYPY, Array, Brief, freeze, frozen
 
 Order = Literal["wxyz", "xyzw"]
 """Order of a quaternion's components. For tables ``wxyz`` : as the columns are named; ``xyzw`` : x, y, z, w in the
@@ -236,8 +236,8 @@ class Similarity(_ByValue):
         return NotImplemented
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Poses(_ByValue):
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Poses(_ByValue, Brief):
     """A stack of m transforms a_from_b.
 
     Parameters
@@ -283,7 +283,7 @@ class Poses(_ByValue):
             Another shape; or a matrix that is not finite, left-handed, scaled or transposed, named by its number.
         """
         rigid = []
-        for number, matrix in enumerate(np.asarray(matrices, float), 1):
+        for number, matrix in enumerate(frozen(matrices, (None, None, None), "poses", finite=False), 1):
             try:
                 rigid.append(Rigid.from_matrix(matrix))
             except InputError as error:

@@ -8,6 +8,7 @@ from .data.views import Views as Views
 from .data.views import pairs_of_views as pairs_of_views
 from .methods.evolution import EvolutionOptions as EvolutionOptions
 from .methods.noise import Noise as Noise
+from .pipeline import handeye as handeye
 from .plan import NextPoses as NextPoses
 from .plan import plan_poses as plan_poses
 from .result import HandEye as HandEye
@@ -16,7 +17,6 @@ from .rig.solve import RigOptions as RigOptions
 from .rig.solve import handeye_rig as handeye_rig
 from .solve import METHODS as METHODS
 from .solve import HandEyeOptions as HandEyeOptions
-from .solve import handeye as handeye
 from .validate import Compared as Compared
 from .validate import HeldOutMotions as HeldOutMotions
 from .validate import HeldOutPoses as HeldOutPoses

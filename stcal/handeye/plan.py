@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
@@ -27,8 +27,8 @@ ABOUT = 0.25
 camera."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class NextPoses:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class NextPoses(Brief):
     """The k poses to take next, in order.
 
     Parameters
@@ -54,6 +54,7 @@ class NextPoses:
         object.__setattr__(self, "turn_rad", frozen(self.turn_rad, (k,), "turns"))
 
 
+@require_arguments
 def plan_poses(
     pairs: HandEyePoses,
     result: HandEye,

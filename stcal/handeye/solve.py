@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import require_fields
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop, Motions, Setup, poses_with_log
@@ -95,6 +96,14 @@ class HandEyeOptions:
     evolution: EvolutionOptions = field(default_factory=EvolutionOptions)
     camera: CameraPrior | None = None
     arm: ArmModel | None = None
+
+    def __post_init__(self):
+        require_fields(self, "hand-eye")
+
+    @property
+    def names_unknowns(self) -> bool:
+        """True if the options name what is solved for, so that no way of solving is left to choose."""
+        return bool(self.intrinsics or self.with_scale or self.four_dof or self.arm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

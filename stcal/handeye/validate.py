@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.cross_validation import repeated_splits
 from stcal.errors import DegenerateError, InputError, StcalError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
@@ -29,8 +29,8 @@ LEAST_LEFT = 3
 """Least number of poses that must remain to solve with."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldOutPoses:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class HeldOutPoses(Brief):
     """Errors on held-out poses, in s splits of k poses. One row of an array is one split.
 
     Parameters
@@ -77,8 +77,8 @@ class HeldOutPoses:
         return {name: float(getattr(self, name)[mask].mean()) for name in names if getattr(self, name) is not None}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Compared:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Compared(Brief):
     """Result and errors of one method in a comparison.
 
     Parameters
@@ -99,6 +99,7 @@ class Compared:
     reason: str = ""
 
 
+@require_arguments
 def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int = 0) -> np.ndarray:
     """Draws the poses to hold out: at random, in rounds, each of which holds out every pose about once.
 
@@ -132,6 +133,7 @@ def splits(count: int, held_out: int | None = None, repeats: int = 15, seed: int
     return repeated_splits(count, k, repeats, np.random.default_rng(seed))
 
 
+@require_arguments
 @one_thread()
 def cross_validate(
     pairs: HandEyePoses,
@@ -299,6 +301,7 @@ def better_setup(pairs: HandEyePoses, setup: Setup, options: HandEyeOptions, row
     )
 
 
+@require_arguments
 @one_thread()
 def compare(
     pairs: HandEyePoses,
@@ -457,8 +460,8 @@ def widened_by_scatter(result: HandEye, held_out: HeldOutPoses) -> HandEye:
     return replace(result.widened(factor), notes=(*result.notes, *scatter_notes(factor, "both")))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldOutMotions:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class HeldOutMotions(Brief):
     """Errors of the last k motions, predicted by the solution from the poses before them: Jin et al., eqs. 24–26.
 
     Parameters
@@ -500,6 +503,7 @@ def motion_errors(mount_from_camera: Rigid, motions: Motions) -> np.ndarray:
     return np.column_stack([np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)])
 
 
+@require_arguments
 @one_thread()
 def predict_motions(
     pairs: HandEyePoses,

@@ -101,6 +101,15 @@ NEVER_READ = (".csv", ".json", ".html", ".pdf", ".svg")
 and COLMAP's models and databases from folders."""
 
 
+def unwritable(path: Path, error: OSError) -> InputError:
+    """Return the error of a file that cannot be written."""
+    return InputError(
+        "E-OUTPUT-UNWRITABLE",
+        f"{path}: cannot be written: {error.strerror or error}; check the folder's space and rights, or give another "
+        "place",
+    )
+
+
 def save(path: Path, content: str | bytes) -> None:
     """Write a file atomically; a missing folder is made.
 
@@ -115,11 +124,7 @@ def save(path: Path, content: str | bytes) -> None:
         partial.write_bytes(content.encode("utf-8", "backslashreplace") if isinstance(content, str) else content)
         os.replace(partial, path)
     except OSError as error:
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE",
-            f"{path}: cannot be written: {error.strerror or error}; check the folder's space and rights, or give "
-            "another place",
-        ) from error
+        raise unwritable(path, error) from error
     finally:
         with suppress(OSError):  # if the folder's path is a file, there is nothing to remove
             partial.unlink(missing_ok=True)

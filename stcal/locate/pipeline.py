@@ -10,7 +10,7 @@ import numpy as np
 from stcal.boards.design import TagLayout
 from stcal.boards.tags import other_dictionaries
 from stcal.errors import InputError, StcalError
-from stcal.geometry.arrays import Brief
+from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model
@@ -53,6 +53,7 @@ class LocateOptions:
     workers: int | None = None
 
     def __post_init__(self):
+        require_fields(self, "locate", workers=1)
         if self.method not in ("joint", "patent"):
             raise InputError("E-OPTION-METHOD", f"method {self.method!r}: joint or patent needed")
         if not self.moved_px > 0:
@@ -92,9 +93,10 @@ class Located(Brief):
         return self.tags.name
 
 
+@require_arguments
 def run(
     scenes: Sequence[SceneFiles],
-    layout: TargetLayout,
+    layout: TargetLayout | TagLayout,
     camera: Camera | CameraModel,
     options: LocateOptions | None = None,
 ) -> Iterator[Located]:
@@ -104,7 +106,7 @@ def run(
     ----------
     scenes : sequence of SceneFiles
         Scenes from :func:`~stcal.locate.find_scenes`.
-    layout : TargetLayout
+    layout : TargetLayout or TagLayout
         The target.
     camera : Camera
         The camera that took the exposures.
@@ -118,10 +120,12 @@ def run(
         ends the run.
     """
     options, model = options or LocateOptions(), camera_model(camera)
+    layout = TargetLayout.of(layout) if isinstance(layout, TagLayout) else layout
     for files, tags in zip(scenes, read_scenes(scenes, layout, options.workers), strict=True):
         yield _named(locate_scene(tags, layout, model, options), layout, partial(_first_image, tags, files))
 
 
+@require_arguments
 def locate_image(
     image: np.ndarray,
     layout: TargetLayout | TagLayout,

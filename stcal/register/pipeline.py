@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import frozen, require_arguments
 from stcal.io.table import FARTHEST
 from stcal.parallel import one_thread
 from stcal.register.core.covariance import covariance_of, shifted_too, sigma_within
@@ -41,6 +42,7 @@ SUSPICIOUS_SIGMA = 0.05
 frame is tried. Both are met long before a mirrored frame is found; the trial costs time only."""
 
 
+@require_arguments
 @one_thread()
 def register(
     xyz_a: ArrayLike,
@@ -170,7 +172,7 @@ def register(
 
 
 def _checked(xyz_a, xyz_b, model: str, method: str, threshold_mm: float | None, weights, covariances) -> Problem:
-    a, b = np.asarray(xyz_a, float), np.asarray(xyz_b, float)
+    a, b = (frozen(xyz, None, f"points of {name}", finite=False) for name, xyz in (("a", xyz_a), ("b", xyz_b)))
     if a.ndim != 2 or a.shape[1:] != (3,) or a.shape != b.shape:
         raise InputError(
             "E-ARRAY-SHAPE", f"registration: points of shapes {a.shape} and {b.shape}; (n, 3) twice needed"

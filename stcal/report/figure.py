@@ -11,6 +11,8 @@ from typing import Literal
 
 import numpy as np
 
+from stcal.io import files
+
 # The palette of Okabe & Ito (2008), darkened where it would be faint on white; then shades for many groups.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b8559a", "#3d9bd1", "#c98a00", "#5b3f8c", "#555555", "#8c2d04", "#00606b")
 INK, FAINT = "#333333", "#d5d9de"
@@ -80,12 +82,13 @@ def uri(figure) -> str:
 
 
 def save(figure, path: Path) -> None:
-    """Save a figure as PNG or SVG, by the file's suffix, and make its folder.
+    """Save a figure as PNG or SVG, by the file's suffix, and make its folder; all of it, or nothing.
 
     In SVG, text stays text: files are small, and changes of them are readable.
     """
     import matplotlib
 
-    path.parent.mkdir(parents=True, exist_ok=True)
+    stream, kind = io.BytesIO(), path.suffix[1:]
     with matplotlib.rc_context({"svg.hashsalt": "stcal", "svg.fonttype": "none"}):
-        figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+        figure.savefig(stream, format=kind, dpi=150, metadata={"Date": None} if kind == "svg" else None)
+    files.save(path, stream.getvalue())

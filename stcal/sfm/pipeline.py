@@ -14,6 +14,7 @@ from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, scale_reference, with_drawn_size
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, camera_prior, model_of, refinable
 from stcal.io.cameras.photograph import camera_of_photograph
@@ -70,6 +71,7 @@ OwnCheck = Callable[[RunResult], Check]
 """A check of a caller's own."""
 
 
+@require_arguments
 @one_thread()
 def run(
     images: Images,

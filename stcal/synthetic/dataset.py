@@ -12,6 +12,7 @@ from pydantic import Field
 from stcal.boards.file import save_run_board
 from stcal.boards.target import save_body
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.io.cameras.write import save_camera
 from stcal.io.json import ByFace, ByGroup, ByImage, ByLabel, Pair, Part, Points, Pose, ResultFile, Vector3
 from stcal.labels import BOARD, Label
@@ -124,6 +125,7 @@ def _circles(scene: Scene, group: str, image: int) -> dict[str, TrueCircle]:
     }
 
 
+@require_arguments
 def render_all(
     scene: Scene, options: RenderOptions | None = None, workers: int | None = None
 ) -> dict[str, list[np.ndarray]]:
@@ -161,6 +163,7 @@ def render_all(
 IMAGE_FORMATS = ("jpg", "png")
 
 
+@require_arguments
 def write_dataset(
     folder: str | Path,
     scene: Scene,

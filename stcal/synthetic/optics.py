@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_fields
 from stcal.geometry.camera import Camera
 
 SHARP_PX = 0.01
@@ -48,6 +49,7 @@ class ThinLens:
     focus_mm: float
 
     def __post_init__(self):
+        require_fields(self, "lens")
         for name in ("f_number", "focal_mm", "focus_mm"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InputError(

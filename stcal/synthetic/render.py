@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull
 
 from stcal.design import Polarity
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
@@ -303,6 +304,7 @@ class RenderOptions:
     rim_mm: float = 0.0
 
     def __post_init__(self):
+        require_fields(self, "rendering", seed=0)
         for name in ("noise", "blur_px", "vignetting", "gradient", "spread", "exposure"):
             if getattr(self, name) < 0:
                 raise InputError(
@@ -312,8 +314,6 @@ class RenderOptions:
             raise InputError("E-SIMULATE-OPTIONS", f"rendering: bit depth {self.bit_depth}, 8 or 16 needed")
         if self.reflectance is not None and not 0 <= self.reflectance <= 1:
             raise InputError("E-SIMULATE-OPTIONS", f"rendering: reflectance {self.reflectance:g}, 0 to 1 needed")
-        if not np.isfinite(self.rim_mm):
-            raise InputError("E-SIMULATE-OPTIONS", f"rendering: rim_mm {self.rim_mm:g}, a finite number needed")
 
 
 def check_lens(scene: Scene, lens: ThinLens | None) -> None:

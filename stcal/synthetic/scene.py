@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
 from stcal.geometry.camera import FISHEYE, Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
@@ -76,6 +76,17 @@ class SceneOptions:
     one_board: bool = False
 
     def __post_init__(self):
+        require_fields(
+            self,
+            "scene",
+            seed=0,
+            focal_px=1,
+            centre_sigma=0,
+            circle_sigma_mm=0,
+            face_shift_mm=0,
+            face_turn_deg=0,
+            margin_mm=0,
+        )
         for name in ("width", "height", "images_per_group", "distance_mm", "spread_deg"):
             if getattr(self, name) <= 0:
                 raise InputError("E-SIMULATE-OPTIONS", f"scene: {name} {getattr(self, name)}, a positive number needed")
@@ -108,8 +119,8 @@ class Group:
         object.__setattr__(self, "board_circles_target", frozen(self.board_circles_target, (None, 3), "board circles"))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Scene(Brief):
     """Truth of a simulated measurement.
 
     Parameters
@@ -140,6 +151,9 @@ class Scene:
     seed: int
     margin_mm: float = FACE_MARGIN_MM
 
+    def __post_init__(self):
+        require_fields(self, "scene", seed=0, margin_mm=0)
+
     @property
     def reference_face(self) -> str:
         """Id of the face whose frame is the target frame."""
@@ -158,6 +172,7 @@ class Scene:
         return self.groups[group].target_from_board @ _board_rectangle(self.board)
 
 
+@require_arguments
 def make_scene(
     options: SceneOptions | None = None,
     target: TargetDesign | None = None,

@@ -27,8 +27,10 @@ LONGEST_S = 60.0
 """Of processor time; three times as much by the clock, as others may have the processor."""
 MOST_BYTES = 2 << 30
 LONGEST_PRINTED = 4 << 20
-CODES = (0, 2, 3)
+CODES = (0, 2, 3, 4)
 """That a command ends with by itself."""
+FAILED_CHECKS = 4
+"""Of a run whose results are written, and not to be used."""
 KINDS = (
     *("traceback", "crash", "hang", "memory", "exit code", "input changed"),
     *("earlier result lost", "earlier run lost", "broken result"),
@@ -272,7 +274,7 @@ def _left(call: Call, written: Path, code: int, before: dict, after: dict) -> It
                 yield "broken result", f"{name}: {reason}, exit code {code}"
         elif code == 0:
             yield "broken result", f"{name} was not written, exit code 0"
-    for place in call.folders if code else ():
+    for place in call.folders if code not in (0, FAILED_CHECKS) else ():
         for path, old in before.items():
             own = path.startswith(str(written / place)) and _entry(path, written / place) in RUN_ENTRIES
             if own and after.get(path) != old:

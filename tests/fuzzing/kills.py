@@ -4,10 +4,12 @@ import contextlib
 import os
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,7 +32,7 @@ from tests.fuzzing.judged import (
 )
 from tests.fuzzing.mutations import pick
 
-ENDED = {signal.SIGKILL: (-9, 0.5), signal.SIGINT: (130, 2.0), signal.SIGTERM: (143, 2.0)}
+ENDED = {signal.SIGKILL: (-9, 2.0), signal.SIGINT: (130, 2.0), signal.SIGTERM: (143, 2.0)}
 """Exit code, and within which time, s."""
 STARTING_S = 0.3
 """Until then Python itself may be loading, and no program answers a signal yet."""
@@ -38,6 +40,8 @@ LOADED_S = 1.0
 """Time that Python and the libraries take before any work."""
 LARGEST_FILE = (100, 300_000)
 MEMORY = (500 << 20, 900 << 20)
+DISK_BYTES = 256 << 20
+FILLER = "filler"
 STREAM = 10_000_000
 """Keeps the random numbers of kills from those of cases."""
 _SEEN_BELOW = ("not one line", "broken result", "earlier run lost")
@@ -54,16 +58,20 @@ def killed(stock: Path, folder: Path, seed: int, number: int) -> Judged:
     two = replace(call, words=call.words.replace("--workers 1", "--workers 2"))
     lay_out(stock, folder, call, earlier=True)
     before = hashes(folder)
-    kind = pick(rng, [*ENDED, "full disk", "little memory"])
+    kind = pick(rng, [*ENDED, "full disk", "little memory", "file limit falls", "disk fills"])
     if isinstance(kind, signal.Signals):
         moment = float(rng.uniform(0, LOADED_S + 1.5 * call.seconds))
         said = f"{kind.name} after {moment:.2f} s"
         outcome, found = _ended(two, folder, kind, moment)
     else:
-        limit = int(np.exp(rng.uniform(*np.log(LARGEST_FILE if kind == "full disk" else MEMORY))))
-        said = f"{kind}, {limit} bytes"
-        outcome = _limited(call, folder, kind, limit)
-        found = []
+        limit = int(np.exp(rng.uniform(*np.log(MEMORY if kind == "little memory" else LARGEST_FILE))))
+        said, found = f"{kind}, {limit} bytes", []
+        if kind in ("full disk", "little memory"):
+            outcome = _limited(call, folder, kind, limit)
+        else:
+            moment = float(rng.uniform(0, LOADED_S + 1.5 * call.seconds))
+            said += f" after {moment:.2f} s"
+            outcome = _short_of_room(two, folder, kind, limit, moment)
     after = [f for f in failures(call, folder, outcome, before, refused=False) if f[0] not in ("exit code", "noise")]
     found += [] if kind in ENDED else [("exit code", str(outcome.code))] * (outcome.code not in CODES)
     found += [f for f in after if f[0] != "memory" and not (kind in ENDED and f[0] in _SEEN_BELOW)]
@@ -72,10 +80,16 @@ def killed(stock: Path, folder: Path, seed: int, number: int) -> Judged:
     return Judged(f"k{number}", f"{call.command}: {said}", tuple(found), outcome.code, outcome.seconds, call.command)
 
 
-def _start(call: Call, folder: Path, limits: list[tuple[int, int]]) -> subprocess.Popen:
+def start_program(
+    call: Call, folder: Path, limits: Sequence[tuple[int, int]] = (), closed: Sequence[int] = ()
+) -> subprocess.Popen:
+    """Start a program for a call. ``limits`` : resources and how much of each; ``closed`` : numbers of its streams."""
+
     def limited() -> None:
         for what, most in limits:
             resource.setrlimit(what, (most, most))
+        for number in closed:
+            os.close(number)
 
     words = [*PROGRAM, *call.arguments(folder / IN, folder / OUT)]
     root = str(Path(__file__).resolve().parents[2])
@@ -85,7 +99,7 @@ def _start(call: Call, folder: Path, limits: list[tuple[int, int]]) -> subproces
     )
 
 
-def _outcome(process: subprocess.Popen, start: float) -> Outcome:
+def outcome_of(process: subprocess.Popen, start: float) -> Outcome:
     try:
         out, err = process.communicate(timeout=3 * LONGEST_S)
         trace = ""
@@ -100,17 +114,67 @@ def _outcome(process: subprocess.Popen, start: float) -> Outcome:
 def _limited(call: Call, folder: Path, kind: str, limit: int) -> Outcome:
     what = resource.RLIMIT_FSIZE if kind == "full disk" else resource.RLIMIT_AS
     start = time.monotonic()
-    return _outcome(_start(call, folder, [(what, limit)]), start)
+    return outcome_of(start_program(call, folder, [(what, limit)]), start)
+
+
+def _short_of_room(call: Call, folder: Path, kind: str, limit: int, moment: float) -> Outcome:
+    """The outcome of a call whose files may not grow beyond ``limit`` from a moment on, or whose disk has no more left.
+
+    What stands on the small disk is copied to where it is judged; without the right to mount one, files are limited.
+    """
+    written = folder / OUT
+    if kind == "disk fills" and _mounted(written):
+        try:
+            process, start = start_program(call, folder), time.monotonic()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(moment)
+            _fill(written, limit)
+            outcome = outcome_of(process, start)
+            (written / FILLER).unlink()
+            shutil.copytree(written, folder / "saved", symlinks=True)
+        finally:
+            subprocess.run(["umount", "-l", written], check=True)
+        shutil.rmtree(written)
+        (folder / "saved").rename(written)
+        return outcome
+    process, start = start_program(call, folder), time.monotonic()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(moment)
+    for each in [*_of_session(process.pid), *([process.pid] if process.returncode is None else [])]:
+        with contextlib.suppress(ProcessLookupError):
+            resource.prlimit(each, resource.RLIMIT_FSIZE, (limit, limit))
+    return outcome_of(process, start)
+
+
+def _mounted(folder: Path) -> bool:
+    """Puts a small disk in a folder's place, with what the folder holds; returns whether that is permitted."""
+    kept = folder.with_name("kept")
+    folder.rename(kept)
+    folder.mkdir()
+    words = ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", folder]
+    if shutil.which("mount") is None or subprocess.run(words, capture_output=True, check=False).returncode:
+        folder.rmdir()
+        kept.rename(folder)
+        return False
+    shutil.copytree(kept, folder, symlinks=True, dirs_exist_ok=True)
+    shutil.rmtree(kept)
+    return True
+
+
+def _fill(disk: Path, left: int) -> None:
+    """Fills a disk up to so many bytes."""
+    with open(disk / FILLER, "wb") as stream, contextlib.suppress(OSError):
+        os.posix_fallocate(stream.fileno(), 0, max(1, shutil.disk_usage(disk).free - left))
 
 
 def _ended(call: Call, folder: Path, number: signal.Signals, moment: float) -> tuple[Outcome, list[tuple[str, str]]]:
-    process, found = _start(call, folder, []), []
+    process, found = start_program(call, folder), []
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(moment)
     done = process.returncode is not None
     start = time.monotonic()
     process.send_signal(number)
-    outcome = _outcome(process, start)
+    outcome = outcome_of(process, start)
     code, within = ENDED[number]
     if done or outcome.code in CODES or (moment < STARTING_S and outcome.code == -number):
         return outcome, found

@@ -24,10 +24,14 @@ MOST_MEMORY = 8 << 30
 
 
 def perform(stock: Path, folder: Path, seed: int, name: str) -> Judged:
-    """The case of this name: ``c12`` a spoiled input, ``k3`` a kill, ``o7`` an option, ``v5`` a valid call, else a
-    mistake."""
+    """The case of this name: ``c12`` a spoiled input, ``k3`` a kill, ``s4`` kept files, ``d6`` closed streams, ``o7``
+    an option, ``v5`` a valid call, else a mistake."""
+    from tests.fuzzing.kept import closed, of_kept
     from tests.fuzzing.kills import killed
 
+    for letter, judge in (("s", of_kept), ("d", closed)):
+        if name[0] == letter and name[1:].isdigit():
+            return judge(stock, folder, seed, int(name[1:]))
     if name[0] == "c" and name[1:].isdigit():
         return judged(stock, folder, seed, int(name[1:]))
     if name[0] == "k" and name[1:].isdigit():

@@ -9,8 +9,9 @@ import pytest
 
 from stcal.cli.main import main
 from stcal.geometry.rigid import Poses
-from stcal.handeye import HandEyeOptions, cross_validate, handeye, splits
+from stcal.handeye import HandEyeOptions, cross_validate, splits
 from stcal.handeye.data.pairs import SETUPS
+from stcal.handeye.solve import handeye
 from stcal.robot import forward, load_robot
 from stcal.robot.kinematics.file import save_robot
 from stcal.workflows.handeye.arm import Arm

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses
-from stcal.handeye import HandEyeOptions, handeye
+from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.stream import Timed
 from stcal.handeye.judge.remarks import Grave, SizeDoubt
 from stcal.handeye.report.outcome import judged
+from stcal.handeye.solve import handeye
 from stcal.workflows.handeye.calibrate import Splits, calibrate
 from stcal.workflows.handeye.inputs import HandEyeInput
 from stcal.workflows.handeye.offset import lag_tried

@@ -11,13 +11,14 @@ from scipy.spatial.transform import Rotation
 from stcal.errors import DegenerateError, InputError, StcalError
 from stcal.geometry.least_squares import perturbed
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye import HandEyeOptions, HandEyePoses, handeye
+from stcal.handeye import HandEyeOptions, HandEyePoses
 from stcal.handeye.data.pairs import Loop
 from stcal.handeye.data.views import View, Views, pairs_of_views
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.judge.remarks import of_size
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods.noise import Noise
+from stcal.handeye.solve import handeye
 from stcal.io.quaternions import INVERTED
 from stcal.workflows.handeye.inputs import HandEyeInput, without_flips
 from tests.outcome import fails_with

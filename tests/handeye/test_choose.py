@@ -8,9 +8,9 @@ import pytest
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses
-from stcal.handeye import HandEyeOptions, Noise, Views, handeye, pairs_of_views, splits
+from stcal.handeye import HandEyeOptions, Noise, Views, pairs_of_views, splits
 from stcal.handeye.choose import BY_POSES, BY_VIEWS, CLOSED_FORMS, Candidate, choose
-from stcal.handeye.solve import solved
+from stcal.handeye.solve import handeye, solved
 from stcal.io.cameras.model import camera_prior
 from tests.levels import sampled
 from tests.support.handeye import CAMERA, simulated, simulated_views

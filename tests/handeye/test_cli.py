@@ -409,7 +409,7 @@ def test_exports_that_cannot_be_are_refused(command, tmp_path, monkeypatch, word
         (("--sigma-px", 0.1), "--sigma-px, --sigma-board-mm: only with images"),
         (("--parent", "tool0"), "--parent, --child, --camera-frame: only with --ros, --urdf or --export of a ROS form"),
         (("--sigma-robot-mm", 1000, "--sigma-robot-deg", 1), "0 to 10° and 100 mm possible"),
-        (("--sigma-robot-mm", "inf", "--sigma-robot-deg", 1), "0 to 10° and 100 mm possible"),
+        (("--sigma-robot-mm", "inf", "--sigma-robot-deg", 1), "robot_mm inf: a finite number"),
         (
             ("--sigma-robot-mm", 0, "--sigma-robot-deg", 0.1, "--sigma-camera-mm", 0, "--sigma-camera-deg", 0.1),
             "σ_trans of robot and camera are both 0; one of them must err",

@@ -7,7 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Poses
-from stcal.handeye import HandEyeOptions, HandEyePoses, handeye
+from stcal.handeye import HandEyeOptions, HandEyePoses
+from stcal.handeye.solve import handeye
 from tests.outcome import fails_with
 from tests.support.handeye import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, disturbed
 

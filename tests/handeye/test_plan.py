@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses
-from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, handeye, plan_poses
+from stcal.handeye import HandEyeOptions, HandEyePoses, Noise, plan_poses
 from stcal.handeye.data.pairs import SETUPS, Loop
 from stcal.handeye.plan import judged_at, worst_sigma
+from stcal.handeye.solve import handeye
 from tests.outcome import fails_with
 from tests.support.handeye import CAMERA, board_corners, disturbed, simulated
 

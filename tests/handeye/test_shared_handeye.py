@@ -12,7 +12,8 @@ import yaml
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Poses
-from stcal.handeye import HandEyeOptions, View, Views, cross_validate, handeye, pairs_of_views, splits
+from stcal.handeye import HandEyeOptions, View, Views, cross_validate, pairs_of_views, splits
+from stcal.handeye.solve import handeye
 from stcal.io.cameras.model import camera_prior
 
 MEAN_MM = 0.75

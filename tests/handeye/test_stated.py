@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from stcal.handeye import HandEyeOptions, Noise, handeye, splits
+from stcal.handeye import HandEyeOptions, Noise, splits
+from stcal.handeye.solve import handeye
 from stcal.handeye.validate import better_setup
 from tests.levels import sampled
 from tests.support.handeye import simulated, simulated_views

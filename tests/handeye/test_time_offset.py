@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from stcal.geometry.rigid import Poses
-from stcal.handeye import handeye
+from stcal.handeye.solve import handeye
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from tests.outcome import fails_with
 from tests.support.handeye_stream import StreamTruth, simulated_stream

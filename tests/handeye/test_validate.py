@@ -14,12 +14,12 @@ from stcal.handeye import (
     Noise,
     compare,
     cross_validate,
-    handeye,
     motion_errors,
     predict_motions,
     splits,
 )
 from stcal.handeye.data.pairs import Loop, Motions
+from stcal.handeye.solve import handeye
 from stcal.handeye.validate import predicted, scatter, widened_by_scatter
 from tests.outcome import fails_with
 from tests.support.handeye import simulated, simulated_views

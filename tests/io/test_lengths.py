@@ -96,7 +96,7 @@ def test_a_robot_without_links_comes_back(tmp_path):
 
 def test_a_layout_of_tiny_tags_comes_back(tmp_path):
     tags = (("DICT_APRILTAG_36h11", 0),)
-    layout = TargetLayout("tiny", tags, square(0.5)[None], np.eye(8) * 1e-8, 0)
+    layout = TargetLayout("tiny", tags, square(0.5)[None], np.eye(8) * 1e-8, 0, unusual_size=True)
     assert load_layout(written(tmp_path, layout_toml(layout))).corners_mm[0, 1, 0] == pytest.approx(0.25)
 
 

@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from stcal.cli.main import MESSAGE_CHARACTERS
+from stcal.io import cache as io_cache
 from stcal.io.files import require_written
 from tests.commands import CALLS, COMMANDS, options_of
+from tests.fuzzing import kept
 from tests.fuzzing.cases import BRIEF_S, Judged, chosen, judged
 from tests.fuzzing.judged import EARLIER, OUT, Outcome, failures, hashes, in_process, lay_out
 from tests.fuzzing.mistakes import MISTAKES, call_of
 from tests.fuzzing.mutations import BY_SUFFIX
-from tests.fuzzing.pool import mistaken, went_through
+from tests.fuzzing.pool import mistaken, perform, went_through
 from tests.levels import sampled
 
 pytestmark = pytest.mark.slow
@@ -64,6 +66,35 @@ def test_the_cases_are_of_every_command_but_long_ones():
 @pytest.mark.parametrize("part", sampled(range(PARTS), kept=IN_SAMPLE))
 def test_whatever_comes_in_is_judged(stock, tmp_path, part):
     assert len(spoiled(stock, tmp_path / "case", range(part, CASES, PARTS))) == CASES // PARTS
+
+
+@pytest.mark.parametrize(("kind", "number"), sampled([("s", n) for n in range(24)] + [("d", n) for n in range(8)]))
+def test_kept_files_and_closed_streams(stock, tmp_path, kind, number):
+    found = perform(stock, tmp_path / "case", SEED, f"{kind}{number}")
+    assert (found.said, found.failures) == (found.said, ())
+
+
+class _Equal(bytes):
+    def __eq__(self, _):
+        return True
+
+    __hash__ = bytes.__hash__
+
+
+ALL_ARE_EQUAL = _Equal()
+
+
+@pytest.mark.slow
+def test_a_cache_that_is_believed_is_seen(stock, tmp_path, monkeypatch):
+    """A run that takes an edited file for what it kept has another answer."""
+    monkeypatch.setattr(kept, "SPOILED", (kept._edited,))
+    monkeypatch.setattr(
+        kept, "CALLS", [call for call in CALLS if call.command == "sfm run" and "~run" in call.words][:1]
+    )
+    monkeypatch.setattr(kept, "_kept", lambda folder: sorted(folder.glob("cache/[0-9a-f]*.npz")))
+    assert kept.of_kept(stock, tmp_path / "case", SEED, 0).failures == ()
+    monkeypatch.setattr(io_cache, "_digest", lambda _: ALL_ARE_EQUAL)
+    assert [kind for kind, _ in kept.of_kept(stock, tmp_path / "case", SEED, 0).failures] == ["silent wrong"]
 
 
 QUICK = [

@@ -33,6 +33,23 @@ def test_while_libraries_load(number, said, code):
     assert ended(process, number) == (code, [said])
 
 
+@pytest.mark.parametrize(("number", "said", "code"), ENDS)
+def test_where_python_forgets_exceptions_a_signal_is_sent_again(number, said, code):
+    """In a finaliser, whose exceptions Python prints and forgets."""
+    begin = (
+        "import signal, sys, time, typer, weakref; from stcal.cli import entry, main\n"
+        "class A: pass\n"
+        "def command():\n"
+        "    a = A()\n"
+        f"    kept = weakref.ref(a, lambda _: signal.raise_signal({int(number)}))\n"
+        "    del a\n"
+        "    time.sleep(30)\n"
+        "main.app = typer.Typer(); main.app.command()(command); sys.argv[1:] = []; entry.main()"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", begin], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr.splitlines()) == (code, [said])
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_after_the_answer_changes_no_exit_code(number):
     """While Python ends itself; the results are in place."""

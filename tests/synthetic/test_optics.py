@@ -225,7 +225,7 @@ def test_refusals(scene):
         ThinLens(0.0, 24.0, 900.0)
     with fails_with("E-SIMULATE-OPTIONS … 20 mm … 24 mm"):
         ThinLens(4.0, 24.0, 20.0)
-    with fails_with("E-SIMULATE-OPTIONS … rim_mm"):
+    with fails_with("E-FIELD-TYPE … rim_mm"):
         RenderOptions(rim_mm=float("nan"))
     with fails_with("E-SIMULATE-OPTIONS … 100 mm … at most 20"):
         check_lens(scene, ThinLens(2.0, 24.0, 100.0))

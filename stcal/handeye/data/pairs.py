@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, skew
 from stcal.io.table import LENGTHS, Table, read_table
 
@@ -23,8 +23,8 @@ LengthUnit = Literal["mm", "m", "cm", "um", "in"]
 """Units of translations."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HandEyePoses:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class HandEyePoses(Brief):
     """m pairs of poses of one robot, one camera and one board.
 
     Parameters
@@ -52,6 +52,7 @@ class HandEyePoses:
     where: str = "poses"
 
     def __post_init__(self):
+        require_fields(self, "poses")
         m = len(self.base_from_flange)
         if len(self.camera_from_board) != m:
             raise InputError(
@@ -94,7 +95,7 @@ class HandEyePoses:
                 sides.append(Poses(matrices.rotation, factor * matrices.translation))
                 continue
             rigid = []
-            for i, matrix in enumerate(np.asarray(matrices, float)):
+            for i, matrix in enumerate(frozen(matrices, None, f"{where}: {side}", finite=False)):
                 name = names[i] if i < len(names) else f"pose {i + 1}"
                 try:
                     rigid.append(Rigid.from_matrix(matrix))

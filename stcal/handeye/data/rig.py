@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_fields
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import HandEyePoses, Setup
 from stcal.handeye.data.views import Views, pairs_of_views
@@ -17,8 +17,8 @@ from stcal.io.design import Name
 from stcal.io.toml import Strict, load_toml
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RigCamera:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class RigCamera(Brief):
     """Observations of one camera of a rig.
 
     Parameters
@@ -42,6 +42,7 @@ class RigCamera:
     prior: CameraPrior | None = None
 
     def __post_init__(self):
+        require_fields(self, "camera of a rig")
         object.__setattr__(self, "rows", frozen(self.rows, (len(self.views),), "rows", int))
         if len(self.images) != len(self.views):
             raise InputError(
@@ -62,8 +63,8 @@ class RigCamera:
         return replace(self, views=self.views[rows], rows=self.rows[rows], images=images)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RigPoses:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class RigPoses(Brief):
     """Cameras on one flange, or in one base, that saw one board from the poses of one robot.
 
     Parameters
@@ -89,6 +90,7 @@ class RigPoses:
     where: str = "rig"
 
     def __post_init__(self):
+        require_fields(self, "rig")
         m = len(self.base_from_flange)
         names = tuple(self.names) or tuple(f"pose {i}" for i in range(1, m + 1))
         object.__setattr__(self, "names", names)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import Minimum, NormalEquations, minimise, perturbed
 from stcal.geometry.plane import camera_from_plane, fit_homography
@@ -18,8 +18,8 @@ SAME_COSINE, APART = 1 - 1e-9, 0.02
 view's extent. Only the start of the pose depends on them."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class View(Brief):
     """Corners of the board in one image.
 
     Parameters
@@ -71,8 +71,8 @@ class View:
         return np.linalg.inv(np.linalg.cholesky(self.covariance))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Views:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Views(Brief):
     """One view for each pose of the flange, all by one camera.
 
     Parameters
@@ -85,6 +85,9 @@ class Views:
 
     camera: Camera
     views: tuple[View, ...]
+
+    def __post_init__(self):
+        require_fields(self, "views")
 
     def __len__(self) -> int:
         return len(self.views)
@@ -126,6 +129,7 @@ def resect(views: Views, names: tuple[str, ...]) -> Resection:
     return Resection(Poses.of(poses), covariance, float(np.sqrt(variance)))
 
 
+@require_arguments
 def pairs_of_views(
     base_from_flange: Poses, views: Views, names: tuple[str, ...] = (), where: str = "views"
 ) -> HandEyePoses:

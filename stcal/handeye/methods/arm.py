@@ -1,7 +1,7 @@
 """An arm whose parameters are solved for together with X and Z: the motion of its flange by these parameters."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,6 +16,7 @@ PARTS = ("arm_rad", "arm_mm")
 """Groups of σ of the parameters about the arm's file: directions of axes, and places of axes."""
 
 
+@runtime_checkable
 class ArmModel(Protocol):
     """An arm with k parameters and m joint vectors. The parameters are small motions of the axes, 0 where the arm is as
     its file says."""

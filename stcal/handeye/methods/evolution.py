@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_fields
 from stcal.geometry.least_squares import NormalEquations, minimise, perturbed
 from stcal.geometry.rigid import Rigid, skew
 from stcal.handeye.data.pairs import Motions
@@ -31,6 +32,7 @@ class Bounds:
     centre: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
 
     def __post_init__(self):
+        require_fields(self, "differential evolution")
         if not (0 < self.half_width < np.inf and np.isfinite(self.centre or 0).all()):
             raise InputError(
                 "E-EVOLUTION-OPTIONS",
@@ -69,6 +71,7 @@ class EvolutionOptions:
     seed: int = 0
 
     def __post_init__(self):
+        require_fields(self, "differential evolution", seed=0)
         if not (
             4 <= self.population <= MOST
             and 0 <= self.generations <= MOST

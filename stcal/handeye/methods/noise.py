@@ -7,6 +7,7 @@ from operator import add
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_fields
 from stcal.geometry.least_squares import minimise
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.robust import robust_sigma
@@ -57,6 +58,7 @@ class Noise:
     board_mm: float | None = None
 
     def __post_init__(self):
+        require_fields(self, "noise")
         for side in ("robot", "camera"):
             pair = getattr(self, f"{side}_rad"), getattr(self, f"{side}_mm")
             if (pair[0] is None) != (pair[1] is None):

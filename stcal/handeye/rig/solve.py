@@ -6,7 +6,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from stcal.errors import DegenerateError, InputError, StcalError
-from stcal.geometry.arrays import Brief, frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import Loop, Setup
 from stcal.handeye.data.rig import RigPoses
@@ -158,6 +158,9 @@ class RigOptions:
     with_scale: bool = False
     symmetries: tuple[Rigid, ...] = ()
 
+    def __post_init__(self):
+        require_fields(self, "rig")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _First:
@@ -170,6 +173,7 @@ class _First:
     notes: tuple[str, ...]
 
 
+@require_arguments
 @one_thread()
 def handeye_rig(given: RigPoses, setup: Setup = "eye-in-hand", options: RigOptions | None = None) -> Rig:
     """Returns the poses of several cameras on one flange, or in one base, from one adjustment of all their corners.

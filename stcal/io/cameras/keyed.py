@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError, InputNote
-from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN
+from stcal.geometry.camera import COLMAP_PIXEL_ORIGIN, MAX_SIDE_PX
 from stcal.io.cameras.foreign import SQUARE, ForeignLens, of_kalibr, of_opencv, of_parts, one_of
 from stcal.io.cameras.keys import CONTAINERS, ROLES, is_neutral, leaves, numbers_of, plain, require_known, role_of
-from stcal.io.cameras.model import EQUIDISTANT, MAX_SIDE_PX, CameraModel, camera_from_opencv, camera_model
+from stcal.io.cameras.model import EQUIDISTANT, CameraModel, camera_from_opencv, camera_model
 from stcal.io.cameras.several import NEAR, cameras_of, is_fundamental, shallow
 
 RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

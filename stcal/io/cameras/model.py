@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_fields
 from stcal.geometry.camera import (
     COLMAP_LAYOUT,
     COLMAP_PIXEL_ORIGIN,
@@ -17,20 +18,15 @@ from stcal.geometry.camera import (
     Camera,
     intrinsic_basis,
     opencv_lens,
+    require_lens,
 )
 from stcal.io.files import save
 
 SIGMA, CORRELATION = "# SIGMA[]", "# CORRELATION[]"
 """Beginnings of the comments of ``cameras.txt`` that state the uncertainty of its parameters."""
 
-MAX_FOCAL_RATIO = 10.0
-"""Largest ratio between fx and fy; anamorphic lenses have 2."""
 SQUARE_WITHIN = 1e-6
 """Largest deviation from 1 of the correlation of a parameter with itself."""
-FARTHEST = 1e12
-"""Largest value of any parameter, whose square does not overflow."""
-MAX_SIDE_PX = 1_000_000
-"""Longest image side that a camera file may state, px."""
 
 EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt")
 """Names of ``distortion_model`` for OpenCV's fisheye."""
@@ -87,10 +83,21 @@ def model_of(camera: Camera, source: str = "camera") -> CameraModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPrior:
-    """A prior of the intrinsics: ``covariance`` (q, q) of the parameters of ``colmap_model``, in its order."""
+    """A prior of the intrinsics, as :func:`stcal.camera_prior` returns it.
+
+    Parameters
+    ----------
+    colmap_model : str
+        COLMAP's name of the lens's model.
+    covariance : (q, q) array
+        Covariance of the model's parameters, in its order.
+    """
 
     colmap_model: str
     covariance: np.ndarray
+
+    def __post_init__(self):
+        require_fields(self, "prior of the camera")
 
 
 WITHOUT_DISTORTION = ("SIMPLE_PINHOLE", "PINHOLE")
@@ -106,7 +113,18 @@ PRIOR_TANGENTIAL = 1e-3
 
 
 def camera_prior(camera: Camera) -> CameraPrior:
-    """Return a prior of the intrinsics, with the covariance of the camera file or else of an old calibration."""
+    """Return a prior of the intrinsics, with the covariance of the camera or else of an old calibration.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera, from :func:`stcal.load_camera` or :meth:`stcal.Camera.from_opencv`.
+
+    Returns
+    -------
+    CameraPrior
+        Prior for :class:`stcal.handeye.HandEyeOptions` and :class:`stcal.handeye.RigCamera`.
+    """
     if camera.covariance is not None:
         return CameraPrior(camera.colmap_model, camera.covariance)
     radial = np.maximum(PRIOR_RADIAL, 0.1 * np.abs(camera.distortion))
@@ -156,30 +174,7 @@ AT_CORNER = 0.02
 
 def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path) -> CameraModel:
     flat = np.pad(flat, (0, len(PARAMETER_NAMES) - len(flat)))
-    if not np.isfinite(flat).all():
-        raise InputError(
-            "E-CAMERA-NOT-FINITE", f"camera file {path}: a camera parameter is not a finite number; correct it"
-        )
-    if (far := np.abs(flat).max()) > FARTHEST:
-        raise InputError(
-            "E-CAMERA-TOO-FAR",
-            f"camera file {path}: a camera parameter of {far:g}, up to {FARTHEST:g} possible; correct it",
-        )
-    if (flat[:2] <= 0).any():
-        raise InputError(
-            "E-CAMERA-FOCAL", f"camera file {path}: focal length {flat[0]:g}, {flat[1]:g} px; positive numbers needed"
-        )
-    if max(flat[:2]) > MAX_FOCAL_RATIO * min(flat[:2]):
-        raise InputError(
-            "E-CAMERA-FOCAL",
-            f"camera file {path}: focal lengths {flat[0]:g} and {flat[1]:g} px; not more than {MAX_FOCAL_RATIO:g} "
-            "times apart needed, pixels are nearly square",
-        )
-    for side in (width, height):
-        if side is not None and not (0 < side <= MAX_SIDE_PX and float(side).is_integer()):
-            raise InputError(
-                "E-CAMERA-SIZE", f"camera file {path}: image side {side:g} px; a whole number in 1…{MAX_SIDE_PX} needed"
-            )
+    require_lens(flat, width, height, f"camera file {path}")
     longer = max(width, height) if width and height else 2 * float(flat[2:4].max())
     if flat[:2].max() < max(LEAST_FOCAL[FISHEYE in colmap_model] * longer, LEAST_FOCAL_PX):
         size = f" of an image of {width:g}×{height:g} px" if width and height else ""

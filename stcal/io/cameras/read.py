@@ -12,11 +12,12 @@ import numpy as np
 import yaml
 
 from stcal.errors import InputError
-from stcal.geometry.camera import COLMAP_MODELS, Camera, parameter_names
+from stcal.geometry.arrays import require_arguments
+from stcal.geometry.camera import COLMAP_MODELS, MAX_SIDE_PX, Camera, parameter_names
 from stcal.io.cameras import forms, matlab, metashape
 from stcal.io.cameras.foreign import ForeignLens, numbered, of_colmap, of_database, one_of
 from stcal.io.cameras.keyed import from_keys
-from stcal.io.cameras.model import CORRELATION, MAX_SIDE_PX, SIGMA, SQUARE_WITHIN, CameraModel, model_of
+from stcal.io.cameras.model import CORRELATION, SIGMA, SQUARE_WITHIN, CameraModel, model_of
 from stcal.io.cameras.photograph import is_photograph
 from stcal.io.cameras.texts import values_of, values_of_archive
 from stcal.io.covariance import Rows, require_covariance
@@ -72,6 +73,7 @@ def camera_model(camera: str | Path | Camera | CameraModel) -> CameraModel:
     return model_of(camera) if isinstance(camera, Camera) else camera
 
 
+@require_arguments
 def load_camera(path: str | Path, name: str = "", size: tuple[int, int] | None = None) -> Camera:
     """Load a camera from a file of any supported kind, which is recognised by the content.
 

@@ -6,6 +6,7 @@ from typing import cast
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.forms import SUFFIXES, WRITERS, CameraForm, name_to_write, written
 from stcal.io.cameras.read import read_camera
@@ -17,6 +18,7 @@ ACROSS = 9
 """Number of points across the image, and down it, by which cameras are compared."""
 
 
+@require_arguments
 def save_camera(path: str | Path, camera: Camera, form: CameraForm | None = None, name: str = "") -> tuple[str, ...]:
     """Save a camera to a file of this or another program, and require that it is read as the same camera.
 

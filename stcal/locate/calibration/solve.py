@@ -11,6 +11,7 @@ from stcal.boards.design import BoardView
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
+from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import minimise
 from stcal.geometry.normal_equations import Reduction, reduce
@@ -298,8 +299,8 @@ MIN_IMAGES = 2
 MIN_BOARD_POINTS = 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CalibratedLayout:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class CalibratedLayout(Brief):
     """Result of a target's calibration.
 
     Parameters
@@ -336,6 +337,7 @@ class CalibratedLayout:
     left_out: tuple[str, ...]
 
 
+@require_arguments
 @one_thread()
 def calibrate(
     plan: LayoutPlan,
@@ -493,6 +495,7 @@ def _collected(plan, images, seen, start, adjusted: AdjustedLayout, left_out) ->
         origin,
         adjusted.sigma_px,
         adjusted.tag_sigma_px,
+        plan.unusual_size,
     )
     obj_from_board = Rigid(np.block([[turn, np.zeros((2, 1))], [np.zeros((1, 2)), 1.0]]), np.append(shift, 0.0))
     first_turn, first_shift = obj_from_plane(start[origin])

@@ -12,6 +12,7 @@ from pydantic import Field
 import stcal
 from stcal.boards.tags import Tags, find_tags
 from stcal.errors import InputError
+from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.io.device import DARK, SATURATED, Source, checked_name, png
 from stcal.io.files import json_text, real_place, save
 from stcal.io.images import SUFFIXES, TOP_GROUP, USUAL, ImageFile, decode, find_images, grey_8bit, image_file
@@ -19,8 +20,8 @@ from stcal.io.json import Part, ResultFile, require_result_written
 from stcal.locate.data.layout import TargetLayout
 
 
-@dataclass(frozen=True, slots=True)
-class SceneFiles:
+@dataclass(frozen=True, slots=True, repr=False)
+class SceneFiles(Brief):
     """The exposures of one scene, not yet read.
 
     Parameters
@@ -36,6 +37,9 @@ class SceneFiles:
     name: str
     files: tuple[ImageFile, ...]
     skipped: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        require_fields(self, "scene")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +93,7 @@ def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
     return np.geomspace(shortest, longest, count)
 
 
+@require_arguments
 def find_scenes(path: str | Path) -> list[SceneFiles]:
     """Finds the scenes in a folder.
 

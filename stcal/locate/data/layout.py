@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.design import UNIT_SQUARE
+from stcal.boards.design import UNIT_SQUARE, require_tags
 from stcal.boards.design import TagLayout as TagLayout
 from stcal.boards.dictionaries import known_tags
 from stcal.boards.file import TagsFile, load_tags, require_sizes
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_fields
 from stcal.io.files import require_written
 from stcal.io.toml import toml_string
 from stcal.lengths import side, stated_unusual
@@ -21,8 +21,8 @@ WRITTEN_MM = 1e-6
 """Largest difference of a written corner, mm: its last decimal."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LayoutPlan:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LayoutPlan(Brief):
     """Nominal target, for its calibration.
 
     Parameters
@@ -37,6 +37,8 @@ class LayoutPlan:
         Row of the tag whose middle is the origin of {obj}.
     corners_mm : (n, 4, 2) array
         Nominal corners in the plane of the target, NaN if a place is not given.
+    unusual_size : bool
+        Whether sides that no hardware has in mm are meant as they stand.
     """
 
     name: str
@@ -44,13 +46,19 @@ class LayoutPlan:
     size_mm: np.ndarray
     origin: int
     corners_mm: np.ndarray
+    unusual_size: bool = False
 
     def __post_init__(self):
+        require_fields(self, "target layout", origin=0)
         object.__setattr__(self, "tags", known_tags(self.tags, "target layout"))
+        for name, shape in (("size_mm", ()), ("corners_mm", (4, 2))):
+            values = frozen(getattr(self, name), (len(self.tags), *shape), f"target layout: {name}", finite=False)
+            object.__setattr__(self, name, values)
+        require_tags(self.tags, self.corners_mm, self.unusual_size, "target layout")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TargetLayout:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class TargetLayout(Brief):
     """Target with known corners.
 
     {obj} : origin in the middle of the tag in row ``origin``, X along its upper edge, Y down, Z into the target.
@@ -70,6 +78,8 @@ class TargetLayout:
     sigma_px, tag_sigma_px : float
         σ due to print, lens and flatness, in addition to the measured σ of a corner: of each corner by itself, and of
         the four corners of a tag together. Estimated from the residuals of the calibration.
+    unusual_size : bool
+        Whether sides that no hardware has in mm are meant as they stand.
     """
 
     name: str
@@ -79,18 +89,22 @@ class TargetLayout:
     origin: int
     sigma_px: float = 0.0
     tag_sigma_px: float = 0.0
+    unusual_size: bool = False
 
     def __post_init__(self):
+        require_fields(self, "target layout", origin=0, sigma_px=0, tag_sigma_px=0)
         n = len(self.tags)
         object.__setattr__(self, "tags", known_tags(self.tags, "target layout"))
         object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (n, 4, 2), "tags' corners"))
         object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (8 * n, 8 * n), "corners' covariance"))
+        require_tags(self.tags, self.corners_mm, self.unusual_size, "target layout")
 
     @classmethod
     def of(cls, layout: TagLayout, name: str = "") -> "TargetLayout":
         """Returns tags with known places as a target. The middle of the first tag is the origin of {obj}."""
         corners = _in_obj(layout.corners_mm, 0)
-        return cls(name, layout.tags, corners, layout.sigma_mm**2 * np.eye(corners.size), 0)
+        covariance = layout.sigma_mm**2 * np.eye(corners.size)
+        return cls(name, layout.tags, corners, covariance, 0, unusual_size=layout.unusual_size)
 
     def dictionaries(self) -> tuple[str, ...]:
         """Returns each dictionary of the tags once."""
@@ -157,7 +171,8 @@ def load_layout(path: str | Path) -> TargetLayout:
     if stated is None:
         corners = _in_obj(corners, plan.origin)
     covariance = data.sigma_mm**2 * np.eye(corners.size) if stated is None else _without_rounding(stated)
-    return TargetLayout(plan.name, plan.tags, corners, covariance, plan.origin, data.sigma_px, data.tag_sigma_px)
+    sigmas_px = data.sigma_px, data.tag_sigma_px
+    return TargetLayout(plan.name, plan.tags, corners, covariance, plan.origin, *sigmas_px, data.unusual_size)
 
 
 def layout_toml(layout: TargetLayout, comments: Sequence[str] = ()) -> str:
@@ -226,7 +241,8 @@ def _plan(data: TagsFile, where: str) -> LayoutPlan:
                 )
             corners[row] = place
     size = np.array([np.nan if tag.size_mm is None else tag.size_mm for tag in data.tag])
-    return LayoutPlan(data.name, tuple((tag.dictionary, tag.id) for tag in data.tag), size, ids.index(origin), corners)
+    tags = tuple((tag.dictionary, tag.id) for tag in data.tag)
+    return LayoutPlan(data.name, tags, size, ids.index(origin), corners, data.unusual_size)
 
 
 def _in_obj(corners: np.ndarray, origin: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from stcal.boards.edges import corners_by_edges
 from stcal.errors import DegenerateError
 from stcal.geometry import least_squares
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import (
     Minima,
@@ -158,8 +158,8 @@ START_PX = 2.0
 """Scale of the loss that selects a start, in px: typical error of one tag's pose at the other tags."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SeenTags:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class SeenTags(Brief):
     """Corners of a layout's tags in one scene.
 
     Parameters
@@ -180,8 +180,8 @@ class SeenTags:
     edge_sigma_px: np.ndarray
 
     def __post_init__(self):
+        object.__setattr__(self, "rows", frozen(self.rows, (None,), "rows", int))
         k = len(self.rows)
-        object.__setattr__(self, "rows", frozen(self.rows, (k,), "rows", int))
         object.__setattr__(self, "corners_px", frozen(self.corners_px, (k, 4, 2), "tags' corners"))
         object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (k, 8, 8), "corners' covariances"))
         object.__setattr__(self, "edge_sigma_px", frozen(self.edge_sigma_px, (k,), "edges' σ"))
@@ -194,8 +194,8 @@ class SeenTags:
         return SeenTags(self.rows[keep], self.corners_px[keep], self.covariance_px2[keep], self.edge_sigma_px[keep])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ObjPose(ImageFit):
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ObjPose(ImageFit, Brief):
     """Pose of the target in one scene.
 
     Parameters
@@ -248,6 +248,7 @@ class ObjPose(ImageFit):
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
 
 
+@require_arguments
 def locate(
     seen: SeenTags, layout: TargetLayout, camera: Camera, prior: CameraPrior | None = None, where: str = "scene"
 ) -> ObjPose:

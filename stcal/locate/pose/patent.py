@@ -11,6 +11,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import PlanePoses, poses_of_plane
 from stcal.geometry.rigid import Rigid
@@ -49,6 +50,7 @@ class PatentOptions:
     min_error_ratio: float = 2.0
 
     def __post_init__(self):
+        require_fields(self, "patent", min_det_j=0)
         if not (0 <= self.area_share < 1 and self.max_error_px > 0 and self.min_error_ratio >= 1):
             raise InputError(
                 "E-OPTION-RANGE",
@@ -81,8 +83,8 @@ class PatentExposure:
     det_j: float | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PatentPose:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class PatentPose(Brief):
     """Result of the patent's method for one scene.
 
     Parameters

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.stats import chi2 as chi_square
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.plane import deciding_delta
 from stcal.geometry.rigid import Poses
 from stcal.locate.pose.estimate import ObjPose, covering_both
@@ -50,6 +51,7 @@ class VerdictOptions:
     max_sigma_mm: float | None = None
 
     def __post_init__(self):
+        require_fields(self, "verdict", min_foreshortening=0, equal_deg=0)
         odds = all(0 < value < 1 for value in (self.max_p, self.flip_odds))
         if not (odds and self.sigma_margin >= 1 and self.min_tags >= 1):
             raise InputError(
@@ -85,8 +87,8 @@ class PoseCheck:
         return f"{self.name} {self.value:.3g}{self.unit}, {limit}{self.unit} needed"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Verdict(Brief):
     """Verdict on whether a pose may be used.
 
     Parameters

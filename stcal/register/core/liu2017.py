@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import require_fields
 from stcal.geometry.rigid import Affine
 from stcal.parallel import one_thread
 
@@ -56,6 +57,7 @@ class Liu2017Options:
     tries: int = 1000
 
     def __post_init__(self):
+        require_fields(self, "liu2017")
         if self.sample < 4:
             raise InputError(
                 "E-LIU-OPTIONS", f"liu2017: samples of {self.sample} points, 4 or more needed for twelve parameters"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, freeze
+from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, require_fields
 from stcal.io.covariance import OF_POINT, first_fault
 from stcal.io.table import LENGTHS, Table, read_table
 from stcal.register.core.models import Model, Transform, fit, rounding_mm, squares, whitened
@@ -19,8 +19,8 @@ COVARIANCE = tuple(f"cov_{a}_{b}" for i, a in enumerate(AXES) for b in AXES[i:])
 KINDS = "weight, sigma_mm, or cov_x_x … cov_z_z"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pairs:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Pairs(Brief):
     """Pairs of points of two frames from a file, with weights, covariances or neither.
 
     Parameters
@@ -50,6 +50,7 @@ class Pairs:
     covariances: np.ndarray | None = None
 
     def __post_init__(self):
+        require_fields(self, "point pairs")
         n = len(self.lines)
         freeze(self, "xyz_a", (n, 3), "points of a")
         freeze(self, "xyz_b", (n, 3), "points of b")
@@ -63,6 +64,7 @@ class Pairs:
         return len(self.lines)
 
 
+@require_arguments
 def read_pairs(path: str | Path | Table) -> Pairs:
     """Reads ``ax_mm, ay_mm, az_mm, bx_mm, by_mm, bz_mm`` and the stated noise (form: ``data_layout.md``).
 

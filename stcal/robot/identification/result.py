@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, Brief, freeze, require_choices
+from stcal.geometry.arrays import Array, Brief, freeze, require_fields
 from stcal.io.files import require_written
 from stcal.robot.identification.adjustment import (
     Solution,
@@ -84,7 +84,7 @@ class IdentifyOptions:
     adjust: Adjusted = "all"
 
     def __post_init__(self):
-        require_choices(self, "identification")
+        require_fields(self, "identification", folds=0, repeats=1, seed=0)
         for name, value, most in (("sigma_mm", self.sigma_mm, 1e3), ("sigma_rad", self.sigma_rad, 1.0)):
             if value is not None and not 1e-12 <= value <= most:
                 raise InputError("E-OPTION-RANGE", f"{name} is {value:g}; a number above 0, up to {most:g}, needed")

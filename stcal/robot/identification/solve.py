@@ -7,6 +7,7 @@ import numpy as np
 
 from stcal.cross_validation import dealt
 from stcal.errors import DegenerateError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import skew
 from stcal.geometry.robust import huber_weights
 from stcal.parallel import one_thread
@@ -77,6 +78,7 @@ REPEATS, FEW_ROWS = 5, 300
 more."""
 
 
+@require_arguments
 @one_thread()
 def identify(robot: Robot, data: Measurements, options: IdentifyOptions | None = None) -> Identified:
     """Identify the axes, base and tools of ``robot`` from ``data``.

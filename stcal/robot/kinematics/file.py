@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import require_written, save
 from stcal.io.table import LEVER_MM, pose_values
@@ -107,6 +108,7 @@ class _RobotFile(Sized):
     elasticity: _ElasticityFile | None = None
 
 
+@require_arguments
 def load_robot(path: str | Path) -> Robot:
     """Read a robot file.
 
@@ -290,6 +292,7 @@ def _numbers(values: np.ndarray) -> str:
     return f"[{', '.join(_number(value) for value in values)}]"
 
 
+@require_arguments
 def save_robot(path: str | Path, robot: Robot, comments: Sequence[str] = ()) -> None:
     """Write a robot file, complete or not at all.
 

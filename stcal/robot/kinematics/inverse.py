@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from scipy.stats import qmc
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.model import Robot
@@ -190,8 +190,8 @@ REACHED, ORIENTATION, SINGULAR_POSE = "reached", "orientation", "singular"
 LIMIT, UNREACHABLE = "limit", "unreachable"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Inverse:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Inverse(Brief):
     """Joint vectors found for m poses.
 
     ``q`` : (m, n) values of the controller, rad or mm, always within the limits; where the pose is not reached, those
@@ -222,6 +222,7 @@ class Inverse:
         return np.array([s in (REACHED, SINGULAR_POSE, ORIENTATION) for s in self.status], bool)
 
 
+@require_arguments
 def inverse(
     robot: Robot, poses: Poses, near: ArrayLike | None = None, tool: str = "", payload_kg: float | None = None
 ) -> Inverse:
@@ -286,6 +287,7 @@ def inverse(
     return _finished(problem, poses, q, ok, beyond)
 
 
+@require_arguments
 def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     """Returns all joint vectors within the limits that bring the tool to ``pose``, one for each branch.
 

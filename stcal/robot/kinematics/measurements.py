@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Array, freeze, frozen
+from stcal.geometry.arrays import Array, Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Order, Poses
 from stcal.io.table import ANGLES, LENGTHS, Table, read_table
 from stcal.robot.kinematics.conditions import (
@@ -35,8 +35,8 @@ FARTHEST = {"mm": 1e7, "rad": 100 * 2 * np.pi}
 """Largest possible length and joint value: 10 km and a hundred turns."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Measurements:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Measurements(Brief):
     """Measurements of an instrument at m joint vectors: poses, positions, or distances between positions.
 
     Parameters
@@ -90,8 +90,9 @@ class Measurements:
     conditions: Conditions = USUAL
 
     def __post_init__(self):
+        require_fields(self, "measurements")
+        freeze(self, "q", (None, None), "joint values")
         m = len(self.q)
-        freeze(self, "q", (m, None), "joint values")
         object.__setattr__(self, "stations", self.stations or ("",) * m)
         shapes = {"positions": (3,), "rotations": (3, 3), "covariance": (6, 6), "common": (6, None)}
         for name, shape in shapes.items():
@@ -99,6 +100,7 @@ class Measurements:
                 freeze(self, name, (m, *shape), name)
         if self.distances is not None:
             freeze(self, "distances", (m,), "distances")
+        if self.from_row is not None:
             freeze(self, "from_row", (m,), "rows", int)
 
     @classmethod

@@ -3,19 +3,22 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen, require_choices
+from stcal.geometry.arrays import Brief, frozen, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.lengths import LEAST_LINK_MM, MOST_LINK_MM, Length, require_millimetres
 from stcal.robot.kinematics.conditions import loaded
 
 Convention = Literal["standard", "modified"]
 JointType = Literal["revolute", "prismatic"]
+MOST_RAD = 2 * np.pi + 1e-6
+"""Largest angle of a row, beside the joint's: one that is larger is taken to be in degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +62,13 @@ class DHRow:
     def __post_init__(self):
         for name in ("a", "alpha", "d", "theta", "beta"):
             value = getattr(self, name)
-            if isinstance(value, str) or not math.isfinite(value):
+            if not isinstance(value, Real) or not math.isfinite(value):
                 raise InputError("E-ROBOT-ROW", f"row: {name} is {value!r}; a finite number needed")
+            if name in ("alpha", "theta", "beta") and abs(float(value)) > MOST_RAD:
+                raise InputError(
+                    "E-ANGLE-UNIT",
+                    f"row: {name} is {value:g} rad, a turn is 6.28; if angles are degrees, convert them: np.radians",
+                )
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +96,7 @@ class Joint:
     fixed: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def __post_init__(self):
-        require_choices(self, "joint")
+        require_fields(self, "joint")
         if not self.lower < self.upper:
             raise InputError(
                 "E-ROBOT-LIMITS",
@@ -200,8 +208,8 @@ class Tree:
         return tuple(reversed(found))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Robot:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Robot(Brief):
     """An arm of n joints, one after the other, or a tree of such arms.
 
     Parameters
@@ -246,13 +254,13 @@ class Robot:
     unusual_size: bool = False
 
     def __post_init__(self):
-        require_choices(self, f"robot {self.name}")
-        for kind, parts in ((DHRow, self.rows), (Joint, self.joints), (Rigid, self.tools.values())):
-            for part in parts:
+        for kind, parts in ((DHRow, self.rows), (Joint, self.joints)):
+            for part in parts if isinstance(parts, Sequence) else (parts,):
                 if not isinstance(part, kind):
                     raise InputError(
                         "E-ROBOT-ENTRIES", f"robot {self.name}: {part!r} is no {kind.__name__}; one of that type needed"
                     )
+        require_fields(self, f"robot {self.name}")
         n = len(self.rows)
         if len(self.joints) != n or n == 0:
             raise InputError(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.files import SETTINGS_BYTES, read_bytes
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
@@ -41,8 +42,8 @@ SAME_MM, SAME_RAD = 1e-9, 1e-12
 """Largest difference between the poses of the Denavit–Hartenberg rows and those of the URDF's joints."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class UrdfRobot:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class UrdfRobot(Brief):
     """A robot of a URDF.
 
     Parameters
@@ -78,6 +79,7 @@ class UrdfJoint:
     mimics: str
 
 
+@require_arguments
 def load_urdf(
     path: str | Path, from_link: str = "", to_link: str | Sequence[str] = "", convention: Convention = "standard"
 ) -> UrdfRobot:

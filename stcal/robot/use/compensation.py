@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.table import pose_values, read_table
@@ -117,8 +118,8 @@ MEANING = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Compensated:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Compensated(Brief):
     """The commanded poses with the corrected values for the controller.
 
     Parameters
@@ -231,6 +232,7 @@ def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple
     return identified, with_own, notes
 
 
+@require_arguments
 @one_thread()
 def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | None = None) -> Compensated:
     """Returns joint values for the commanded poses, by the identified robot and by the nominal one.

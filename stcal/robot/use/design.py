@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Array, freeze, require_choices
+from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, require_fields
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.table import POSE, pose_cells, pose_values, read_table, require_pose_table_written
@@ -43,8 +43,8 @@ TEST_POSES = 200
 """Number of random poses at which the identified robot's position is predicted."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class PoseDesign:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class PoseDesign(Brief):
     """The chosen poses, compared with random sets of poses.
 
     Parameters
@@ -115,7 +115,7 @@ class DesignOptions:
     tool: str = ""
 
     def __post_init__(self):
-        require_choices(self, "design")
+        require_fields(self, "design", seed=0)
         if self.count < 1 or self.candidates <= self.count:
             raise InputError(
                 "E-DESIGN-OPTIONS",
@@ -137,6 +137,7 @@ class DesignOptions:
             )
 
 
+@require_arguments
 @one_thread()
 def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
     """Chooses poses for the identification of ``robot``, the same for the same seed.

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import freeze
+from stcal.geometry.arrays import Brief, freeze, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.io.quaternions import EXPLAINS, READINGS
 from stcal.io.table import LENGTHS, UNIT_WORDS, Table, read_table
@@ -25,8 +25,8 @@ NAMES = ("pose", "image", "name", "scene", PAYLOAD)
 """Columns that name a pose. They are copied to the result if they exist."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Targets:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Targets(Brief):
     """Target poses, one for each row of a file; given by joint values if the file has no poses.
 
     Parameters
@@ -59,6 +59,7 @@ class Targets:
     conditions: Conditions = USUAL
 
     def __post_init__(self):
+        require_fields(self, "targets")
         if self.q is not None:
             freeze(self, "q", (len(self), None), "joint values")
 

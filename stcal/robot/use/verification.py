@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen
 from stcal.io.table import Table, read_table
 from stcal.robot.kinematics.conditions import unread
 from stcal.robot.kinematics.measurements import within
@@ -88,8 +88,8 @@ class SetResult:
         return {"mean": self.mean_mm, "std": self.std_mm, "max": self.max_mm, "all pairs RMS": self.pairs_rms_mm}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Verification:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Verification(Brief):
     """Distance errors of several sets of measurements, over the poses that all sets have.
 
     ``poses`` : names, the first being the one that distances start from; ``sets`` : in order of the file; ``missing`` :

@@ -7,6 +7,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, MappingError
+from stcal.geometry.arrays import Brief
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
@@ -55,8 +56,8 @@ class SigmaFactors:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Calibration:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Calibration(Brief):
     """The calibrated target, and what it rests on.
 
     ``target`` : the result; ``scales`` : by group; ``faces`` : faces of the single groups; ``joint`` : joint adjustment

@@ -7,6 +7,7 @@ import numpy as np
 
 from stcal.design import TargetDesign
 from stcal.errors import MappingError
+from stcal.geometry.arrays import Brief
 from stcal.geometry.least_squares import UNKEPT, NormalEquations, minimise
 from stcal.geometry.rigid import Rigid, skew
 from stcal.labels import CircleLabel
@@ -31,8 +32,8 @@ class FaceChain:
     rotation_rad: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CalibratedTarget:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class CalibratedTarget(Brief):
     """Result of the calibration: poses of the faces and centres of the circles in the target frame.
 
     ``target_from_face`` : by face; ``circles`` : label → (3,) mm in the target frame; ``target_from_group`` : by group,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import require_choices
+from stcal.geometry.arrays import require_fields
 from stcal.io.toml import LEAST
 from stcal.sfm.adjust.faces import FrameKind
 
@@ -41,7 +41,7 @@ class AdjustOptions:
     refine_camera: bool = False
 
     def __post_init__(self):
-        require_choices(self, "options")
+        require_fields(self, "options")
         if self.flatness_mm is not None and not LEAST <= self.flatness_mm <= MOST_FLATNESS_MM:
             raise InputError(
                 "E-OPTION-RANGE",

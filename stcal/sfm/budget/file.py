@@ -314,8 +314,7 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
         )
     elif is_refused(run):
         notes.insert(0, f"may the run be used? {run.report['judgement']['use']} No uncertainty of it is given")
-    if faults := verified.faults():
-        notes.append(f"the run's folder is not as the run left it: {'; '.join(faults)}")
+    notes += verified.said()
     notes.append(
         "the reference face's frame is the target frame and carries no uncertainty; what its own circles do not know "
         "is in the other faces"

@@ -9,6 +9,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DegenerateError, DetectionError, InputError, StcalError
+from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.camera import COLMAP_MODELS, Camera
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import ImageFile, Skipped, find_images, require_common_size
@@ -56,8 +57,8 @@ OUTLIER_WEIGHT = 0.5
 CORNERS = ("top left", "top right", "bottom left", "bottom right")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraCalibration:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class CameraCalibration(Brief):
     """Result of calibrating one camera.
 
     ``intrinsics`` : with covariance; ``views`` : views used; ``skipped`` : files and images without a board, and why;
@@ -77,6 +78,7 @@ class CameraCalibration:
     candidates: tuple[Candidate, ...] = ()
 
 
+@require_arguments
 @one_thread()
 def calibrate_camera(
     images: str | Path,

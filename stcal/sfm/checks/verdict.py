@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import fdtrc
 
+from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.robust import ratio_limit
 from stcal.sfm.report.checks import ORDER
 from stcal.sfm.report.judgement import CAUSE, GENERAL
@@ -49,8 +50,8 @@ class Measured:
         return f"{self.value:.3g}{unit}{limit}"
 
 
-@dataclass(frozen=True, slots=True)
-class Check:
+@dataclass(frozen=True, slots=True, repr=False)
+class Check(Brief):
     """Result of a check.
 
     Parameters
@@ -81,6 +82,9 @@ class Check:
     tested: int
     names: tuple[str, ...]
     remedy: str
+
+    def __post_init__(self):
+        require_fields(self, f"check {self.key}", tested=0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,6 +117,9 @@ class Trial:
     redundancy: float = KNOWN
     ratio: bool = False
 
+    def __post_init__(self):
+        require_fields(self, f"trial {self.name}", statistic=0, freedom=1, redundancy=0)
+
     def limit(self, count: int) -> float | None:
         """Returns the value beyond which one of ``count`` values is suspicious."""
         if self.statistic <= 0:
@@ -122,6 +129,7 @@ class Trial:
         return float(self.value**grown) if self.ratio else abs(self.value) * grown
 
 
+@require_arguments
 def judge(key: str, title: str, trials: Sequence[Trial], what: str, remedy: str, worst: Verdict = "failed") -> Check:
     """Returns the check with its verdict over all trials.
 

@@ -13,8 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stcal.boards.design import CornerBoard
+from stcal.boards.file import run_board_of
+from stcal.boards.target import body_of
 from stcal.design import BoardDesign, TargetDesign
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
+from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.read import camera_model
 from stcal.io.images import grey_of
 from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import Centres, ImageObservations
@@ -136,11 +141,12 @@ class Detection:
             ax.annotate(str(label), (x, y), (3, 3), textcoords="offset points", fontsize=6, color="tab:red")
 
 
+@require_arguments
 def detect_circles(
     image: np.ndarray,
-    camera: Camera,
-    target: TargetDesign,
-    board: BoardDesign | None = None,
+    camera: Camera | CameraModel | str | Path,
+    target: TargetDesign | str | Path,
+    board: BoardDesign | str | Path | None = None,
     options: EllipseOptions | None = None,
 ) -> Detection:
     """Returns the labelled circles of one image.
@@ -152,11 +158,11 @@ def detect_circles(
     image : (height, width) or (height, width, 3) array
         Grey or RGB, 8 or 16 bit, of the camera's size.
     camera : Camera
-        The camera that took the image.
+        The camera that took the image, or its file.
     target : TargetDesign
-        Design of the target.
+        Design of the target, or its file.
     board : BoardDesign, optional
-        The dot board, if it may be in view.
+        The dot board, if it may be in view, or its file.
     options : EllipseOptions, optional
         Options of the search; the defaults if None.
 
@@ -170,7 +176,10 @@ def detect_circles(
     InputError
         The array is no image, or not of the camera's size.
     """
-    found = detect_image(grey_of(image, "image"), camera, target, board, options or EllipseOptions())
+    grey = grey_of(image, "image")
+    camera, target = camera_model(camera).sized(grey.shape[1], grey.shape[0]), body_of(target)
+    board = None if board is None else run_board_of(board)
+    found = detect_image(grey, camera, target, board, options or EllipseOptions())
     circles = target.with_faces(printed=False)
     focal_px = float(np.sqrt(camera.focal.prod()))
     labelled, _ = label_groups([[("image", "", found)]], circles, board, focal_px)[0]

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError, InputError, MappingError
+from stcal.geometry.arrays import require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
@@ -40,6 +41,7 @@ class PairOptions:
     max_angle_rad: float | None = None
 
     def __post_init__(self):
+        require_fields(self, "options")
         if self.max_angle_rad is not None and not 0 < self.max_angle_rad <= np.pi:
             raise InputError(
                 "E-OPTION-RANGE",

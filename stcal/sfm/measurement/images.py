@@ -11,7 +11,7 @@ import numpy as np
 from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import ConvergenceError, DetectionError, StcalError
-from stcal.geometry.arrays import Brief, frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel, CameraPrior
 from stcal.io.cameras.read import camera_model, read_camera
@@ -54,6 +54,9 @@ class MeasureOptions:
     ellipses: EllipseOptions = field(default_factory=EllipseOptions)
     workers: int | None = None
 
+    def __post_init__(self):
+        require_fields(self, "options", workers=1)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredImage:
@@ -87,6 +90,7 @@ class MeasureResult(Brief):
         object.__setattr__(self, "common", frozen(self.common, (len(self.images), 6, None), "common errors"))
 
 
+@require_arguments
 @one_thread()
 def measure(
     images: str | Path,

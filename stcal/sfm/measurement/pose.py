@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import DegenerateError, DetectionError, InputError, StcalError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_fields
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import Minima, PoseStack, block_diagonal
 from stcal.geometry.plane import (
@@ -162,6 +162,7 @@ class PoseOptions:
     sigma_factor: float | None = None
 
     def __post_init__(self):
+        require_fields(self, "options")
         factor = 1.0 if self.sigma_factor is None else self.sigma_factor
         if not (0 < self.flip_odds < 1 and self.sigma_margin >= 1 and np.isfinite(factor) and factor > 0):
             raise InputError(
@@ -175,8 +176,8 @@ class PoseOptions:
         return deciding_delta(self.flip_odds, self.sigma_margin, chi2_per_dof)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TargetPose(ImageFit):
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class TargetPose(ImageFit, Brief):
     """The pose of the target in one image.
 
     ``camera_from_target`` ; ``covariance`` : (6, 6), rad and mm, left perturbation in the camera frame, R' = exp(w) R,

@@ -36,6 +36,8 @@ CONNECTIONS, CONNECTIONS_EACH = 256, 64
 """Number of connections in all, and from one address. A new one takes the place of the one that is idle longest."""
 HELD_BYTES = 256_000_000
 """Bytes of images that are received, wait or are measured; two images at least. Beyond, the stalest uploads end."""
+NEWCOMERS = 50_000_000
+"""Rate at which all connections that never got an answer are read together while other clients send images, bytes/s."""
 HEAD_BYTES, HEAD_FIELDS = 32_768, 100
 CHUNK_BYTES = 65_536
 CROWDED_S = 1.0
@@ -103,7 +105,7 @@ class MeasureServer:
         self.left = 0
         self.threads = ThreadPoolExecutor(service.most_waiting + 4)  # more than may wait, so that refusals do not
         self._open: dict[_Connection, None] = {}
-        self._held = 0
+        self._held, self._read_until = 0, 0.0
         self._ended = threading.Event()
         self._stop: Callable[[], object] | None = None
         family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
@@ -192,6 +194,14 @@ class MeasureServer:
                 raise _Refused(BUSY, reason, "E-SERVICE-BUSY")
             stalest.refuse_at_once(reason)
 
+    def pause_s(self, connection: "_Connection", count: int) -> float:
+        """Returns how long to wait before more is read from a connection that has sent so many bytes."""
+        if connection.known or not self.service.beside_others(connection.client):
+            return 0.0
+        now = time.monotonic()
+        self._read_until = max(self._read_until, now) + count / NEWCOMERS
+        return self._read_until - now
+
     def release(self, connection: "_Connection") -> None:
         """Counts the bytes of a connection as no longer held."""
         self._held -= connection.held
@@ -212,9 +222,19 @@ class _Connection:
         self.complete, self.held, self.left, self.ended = False, 0, False, False
         self._answers, self._last, self._method = 0, time.monotonic(), b""
 
+    @property
+    def known(self) -> bool:
+        """Whether it has got an answer."""
+        return self._answers > 0
+
+    @property
+    def client(self) -> str:
+        """Who sends: this connection, or all of one address that never got an answer."""
+        return f"{self.address} {id(self)}" if self.known else self.address
+
     def staleness(self) -> tuple[bool, float]:
         """Returns a sort key: those that never got an answer first, then by the time of their last byte."""
-        return self._answers > 0, self._last
+        return self.known, self._last
 
     def abort(self) -> None:
         """Ends the connection at once."""
@@ -295,6 +315,7 @@ class _Connection:
         while isinstance(event := await self._event(), h11.Data):
             self.server.hold(self, len(event.data))
             parts.append(bytes(event.data))
+            await asyncio.sleep(self.server.pause_s(self, len(event.data)))
         if not isinstance(event, h11.EndOfMessage):
             raise EOFError
         return b"".join(parts)
@@ -302,12 +323,13 @@ class _Connection:
     async def _measured(self, data: bytes, asked: dict[str, str]) -> Answer | None:
         """Returns the answer to an image; None if the client goes away while the image waits."""
         named = asked.get("name", "image"), asked.get("sequence", "")
-        work = asyncio.get_running_loop().run_in_executor(
-            self.server.threads, self.server.service.answer, data, *named, lambda: self.left
-        )
-        if self.left:
-            return await work
         watch = asyncio.ensure_future(self.reader.read(CHUNK_BYTES))
+        if not self.known and self.server.service.beside_others(self.client):  # many send and leave at once
+            await asyncio.wait((watch,), timeout=LOOK_S)
+            self.left = watch.done() and (watch.exception() is not None or not watch.result())
+        work = asyncio.get_running_loop().run_in_executor(
+            self.server.threads, self.server.service.answer, data, *named, lambda: self.left, self.client
+        )
         await asyncio.wait((work, watch), return_when=asyncio.FIRST_COMPLETED)
         watch.cancel()  # without effect if it is done
         await asyncio.wait((watch,))

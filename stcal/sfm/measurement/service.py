@@ -2,7 +2,8 @@
 
 import json
 import threading
-from collections import OrderedDict
+import time
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, CancelledError
 from dataclasses import dataclass, field, replace
@@ -25,6 +26,8 @@ SEQUENCES = 1024
 """Number of sequences followed at a time. With more, the least recent is forgotten, and searched as a whole again."""
 WAITING = 8
 """Number of images that may wait for each process, those of a sequence included. More are refused."""
+OTHERS_S = 10.0
+"""Time for which a client that has sent an image counts as another one beside whom none may have all processes, s."""
 LONGEST_NAME = 255
 DONE, NO_POSE, REFUSED, FAILED, BUSY = 200, 422, 400, 500, 503
 """Status codes of HTTP."""
@@ -62,7 +65,8 @@ class MeasureService:
     """Answers images with poses, by several processes.
 
     Each image goes to the process with the fewest waiting images, together with the previous poses of its sequence.
-    Images of a sequence are measured in the order in which they came.
+    Images of a sequence are measured in the order in which they came. Beside others no client has images in all
+    processes: those that it sends more wait behind its own, so that an image of another one finds a process free.
 
     ``setting`` : target and camera; ``workers`` : number of processes.
     """
@@ -70,7 +74,8 @@ class MeasureService:
     def __init__(self, setting: Setting, workers: int):
         named = replace(setting, camera=replace(setting.camera, source=Path(setting.camera.source).name))
         self._processes = [OwnProcess(_begin, named) for _ in range(workers)]
-        self._waiting, self._inside = [0] * workers, 0
+        self._waiting, self._inside = [Counter[str]() for _ in range(workers)], 0
+        self._seen: dict[str, float] = {}
         self._sequences: OrderedDict[str, _Sequence] = OrderedDict()
         self._guard = threading.Lock()
 
@@ -85,7 +90,12 @@ class MeasureService:
         return WAITING * len(self._processes)
 
     def answer(
-        self, data: bytes, name: str = "image", sequence: str = "", left: Callable[[], bool] | None = None
+        self,
+        data: bytes,
+        name: str = "image",
+        sequence: str = "",
+        left: Callable[[], bool] | None = None,
+        client: str = "",
     ) -> Answer | None:
         """Returns the answer to one image.
 
@@ -95,6 +105,7 @@ class MeasureService:
         name : name of the image, for the answer
         sequence : name of the sequence whose next image it is; empty for a single image
         left : returns whether the client has gone, so that an image that still waits need not be measured
+        client : who sends it; beside others none has all processes
 
         Returns
         -------
@@ -117,13 +128,13 @@ class MeasureService:
             self._inside += 1
         try:
             if not sequence:
-                return self._measured(data, name, (), left)[0]
+                return self._measured(data, name, (), left, client)[0]
             state = self._sequence(sequence)
             while not state.turn.acquire(timeout=LOOK_S):
                 if left is not None and left():
                     return None
             try:
-                answer, state.recent = self._measured(data, name, state.recent, left)
+                answer, state.recent = self._measured(data, name, state.recent, left, client)
             finally:
                 state.turn.release()
             return answer
@@ -144,12 +155,26 @@ class MeasureService:
                 self._sequences.popitem(last=False)
             return state
 
+    def beside_others(self, client: str) -> bool:
+        """Returns whether others than this client have sent images lately."""
+        now = time.monotonic()
+        return any(now - at < OTHERS_S for each, at in list(self._seen.items()) if each != client)
+
+    def _place(self, client: str) -> int:
+        """Returns the process for an image of a client."""
+        now = time.monotonic()
+        self._seen = {each: at for each, at in self._seen.items() if now - at < OTHERS_S} | {client: now}
+        places = range(len(self._waiting))
+        own = [place for place in places if self._waiting[place][client]]
+        among = own if own and len(own) >= len(places) - 1 and self.beside_others(client) else places
+        return min(among, key=lambda place: self._waiting[place].total())
+
     def _measured(
-        self, data: bytes, name: str, recent: tuple[Rigid, ...], left: Callable[[], bool] | None
+        self, data: bytes, name: str, recent: tuple[Rigid, ...], left: Callable[[], bool] | None, client: str
     ) -> tuple[Answer | None, tuple[Rigid, ...]]:
         with self._guard:
-            place = min(range(len(self._waiting)), key=self._waiting.__getitem__)
-            self._waiting[place] += 1
+            place = self._place(client)
+            self._waiting[place][client] += 1
         cancelling = {} if left is None else {"given_up": left}
         try:
             return self._processes[place].call(_answer, data, name, recent, **cancelling)
@@ -160,7 +185,7 @@ class MeasureService:
             return refusal(FAILED, "E-WORKER-DIED", reason), recent
         finally:
             with self._guard:
-                self._waiting[place] -= 1
+                self._waiting[place][client] -= 1
 
 
 @dataclass(slots=True, eq=False)

@@ -11,7 +11,7 @@ from stcal.boards.target import load_body
 from stcal.design import TargetDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.align import align_rigid
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
 from stcal.io.covariance import Rows, require_covariance
@@ -26,8 +26,8 @@ by far more."""
 SAME_RADIUS_MM = 1e-6
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TargetCircles:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class TargetCircles(Brief):
     """The c circles of a calibrated target, target frame, mm.
 
     ``labels`` ; ``xyz`` : (c, 3) centres; ``radius`` : (c,); ``covariance`` : (3c, 3c) joint covariance of all centres,
@@ -93,6 +93,7 @@ class TargetCircles:
         return cls(labels, xyz, np.array([radius[label] for label in labels]), covariance, sigma_factor, notes, design)
 
 
+@require_arguments
 def read_target(path: str | Path, design: TargetDesign | str | Path) -> TargetCircles:
     """Reads a ``faces.json`` and checks that it belongs to this design.
 

@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 
 from stcal.errors import DegenerateError
+from stcal.geometry.arrays import Brief, require_arguments
 from stcal.parallel import Progress, kept_processes, one_thread, run_briefly
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.equations import rows_of_view
@@ -25,7 +27,7 @@ from stcal.sfm.planning.forecast import (
 )
 from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.planning.views import PlannedView, candidates, known_scene
-from stcal.sfm.runs.saved import SavedRun, adjusted_run
+from stcal.sfm.runs.saved import SavedRun, adjusted_run, load_run
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 from stcal.synthetic.scene import Group, Scene, group_name
 
@@ -63,8 +65,8 @@ class NewGroup:
     sigma_mm: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Advice:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Advice(Brief):
     """Further photographs, and what each of them would improve.
 
     ``now`` : forecast of the run as it is; ``shares`` : of its variance, by face and source; ``choices`` : views, each
@@ -91,8 +93,8 @@ class Advice:
         return self.shares[self.now.worst()[0]].get("board", 0.0) > BOARD_DOMINATES
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Known:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Known(Brief):
     """A finished run as input of a forecast: models in mm, target frame, with the σ of the run's adjustment."""
 
     models: tuple[MetricModel, ...]
@@ -140,14 +142,16 @@ def doubts(run: SavedRun) -> str:
     return ""
 
 
+@require_arguments
 @one_thread()
-def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Advice:
+def advise(known: Known | SavedRun | str | Path, count: int = 5, progress: Progress | None = None) -> Advice:
     """Returns the views that lower the σ of the worst face most, one after the other, and new groups of as many images.
 
     Parameters
     ----------
-    known : Known
-        The geometry of a finished run, see :func:`stcal.sfm.planning.advise.known_of`.
+    known : SavedRun, str or Path
+        A finished run, by its folder or as :func:`stcal.sfm.load_run` returns it; or its geometry, by
+        :func:`known_of`.
     count : int
         Number of views to choose, each in addition to those before it.
     progress : callable, optional
@@ -158,6 +162,10 @@ def advise(known: Known, count: int = 5, progress: Progress | None = None) -> Ad
     Advice
         The views, with the worst face and its σ (mm) after each; the present σ and their sources.
     """
+    if isinstance(known, str | Path):
+        known = load_run(known)
+    if isinstance(known, SavedRun):
+        known = known_of(known)
     setup = known.setup
     photographs = photographs_of(known.models, setup.board, setup.camera, setup.prior)
     now = forecast(known.models, setup, photographs=photographs)

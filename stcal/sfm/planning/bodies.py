@@ -10,6 +10,7 @@ from stcal.design import FaceDesign, KnownDistance, ScaleReference, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import camera_prior, refinable
+from stcal.io.cameras.read import camera_model
 from stcal.labels import CircleLabel, Label
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.chain import CalibratedTarget
@@ -98,7 +99,7 @@ def _remedy(what: str, options: PlanOptions, target: TargetDesign) -> Remedy:
 
 def _planned(options: PlanOptions, target: TargetDesign) -> tuple[BodyScene, MetricModel, Setup]:
     """Returns the photographs of a plan: scene, model with the σ of its corners, and input of a forecast."""
-    file = options.camera
+    file = None if options.camera is None else camera_model(options.camera)
     camera = body_camera(options.width) if file is None else file.calibrated(0, 0)
     shape = BodyOptions(options.images, options.distance_mm, seed=options.seed, pose_sigma_mm=0, pose_sigma_deg=0)
     scene = make_body_scene(target, camera, shape)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import ellipe, ellipk
 
 from stcal.design import POINT_RADIUS_MM, BoardDesign, ScaleReference, TargetDesign
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import frozen, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.io.cameras.model import CameraPrior
@@ -59,6 +59,9 @@ class CentreNoise:
     narrow_px: float = 0.0
     floor_px: float = 0.0
     corner_px: float = CORNER_SIGMA_PX
+
+    def __post_init__(self):
+        require_fields(self, "noise of centres", edge=0, narrow_px=0, floor_px=0, corner_px=0)
 
     @classmethod
     def expected(cls) -> "CentreNoise":

@@ -8,10 +8,12 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel, camera_prior, refinable
+from stcal.io.cameras.read import camera_model
 from stcal.parallel import one_thread
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.data.model import MetricModel
@@ -39,8 +41,8 @@ FINE_DOTS, MAX_CENTRES = 500, 450_000
 """Largest number of dots in all images, for boards of more than ``FINE_DOTS`` dots: about a minute and 0.8 GB."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlanOptions:
+@dataclass(frozen=True, slots=True, repr=False)
+class PlanOptions(Brief):
     """The plan of a session.
 
     Parameters
@@ -53,7 +55,7 @@ class PlanOptions:
         Distance of the cameras from the target, mm.
     width : int
         Width of the images, px; 3:2 images of a 24 mm lens, if no ``camera`` is given.
-    camera : CameraModel, optional
+    camera : Camera, optional
         Camera, whose file must state the image size.
     groups : tuple of pairs of str, optional
         Pairs of face ids; the pairs of the design if None.
@@ -78,7 +80,7 @@ class PlanOptions:
     spread_deg: float = 40.0
     distance_mm: float = 1000.0
     width: int = 5184
-    camera: CameraModel | None = None
+    camera: Camera | CameraModel | None = None
     groups: tuple[tuple[str, str], ...] | None = None
     noise: CentreNoise = field(default_factory=CentreNoise.expected)
     one_board: bool = True
@@ -87,13 +89,15 @@ class PlanOptions:
     margin_mm: float = FACE_MARGIN_MM
 
     def __post_init__(self):
+        require_fields(self, "plan", spread_deg=0, distance_mm=0, width=1, seed=0, margin_mm=0)
         if self.images < MIN_IMAGES:
             raise InputError(
                 "E-OPTION-RANGE", f"plan: {self.images} images in each group, {MIN_IMAGES} needed; plan for more"
             )
-        if self.camera is not None and not (self.camera.width and self.camera.height):
+        model = None if self.camera is None else camera_model(self.camera)
+        if model is not None and not (model.width and model.height):
             raise InputError(
-                "E-CAMERA-SIZE", f"plan: camera file {self.camera.source} states no image size; add it to the file"
+                "E-CAMERA-SIZE", f"plan: camera file {model.source} states no image size; add it to the file"
             )
 
 
@@ -109,8 +113,8 @@ class Remedy:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Plan(Brief):
     """A plan with its forecast and remedies.
 
     ``observations`` : number of centres; ``centre_sigma_px`` : RMS of their σ; ``aperture_mm`` : see
@@ -145,6 +149,7 @@ def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ..
     return tuple(pair_of_name[name] for name in names)
 
 
+@require_arguments
 @one_thread()
 def plan(
     options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal: dict[str, Rigid] | None = None
@@ -238,7 +243,7 @@ def widest_aperture_mm(models: Sequence[MetricModel], camera: Camera) -> float:
 
 def _scene(options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal) -> Scene:
     """Returns the scene with the nominal geometry, in which nothing is misplaced."""
-    file = options.camera
+    file = None if options.camera is None else camera_model(options.camera)
     height = round(options.width * 2 / 3)
     shape = SceneOptions(
         seed=options.seed,

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import warnings
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
@@ -9,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from stcal.errors import DegenerateError, InputError
+from stcal.errors import DegenerateError, InputError, InputNote
 from stcal.geometry.align import align_rigid
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import TABLE_BYTES, read_bytes
@@ -168,7 +169,9 @@ def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) 
             turns += [np.rot90(grid), np.rot90(grid, 3)] if grid.shape[0] == grid.shape[1] else []
             counts = [_count(measured, group.images, turn) for turn in turns]
             total += min(counts, key=lambda c: (c[0], -c[1]))
-    except (OSError, KeyError, ValueError, TypeError, IndexError, InputError):
+    except (OSError, KeyError, ValueError, TypeError, IndexError, InputError) as error:
+        reason = getattr(error, "strerror", None) or "damaged"
+        warnings.warn(f"{path}: {reason}: the labels are not compared with the truth", InputNote, stacklevel=2)
         return None
     if not total.any():
         return None

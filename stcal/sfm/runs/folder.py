@@ -18,7 +18,18 @@ from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.write import save_camera
-from stcal.io.files import BOARD, CAMERA, REFINED_CAMERA, RUN_MARKER, TABLE_BYTES, TARGET, json_text, read_bytes, save
+from stcal.io.files import (
+    BOARD,
+    CAMERA,
+    REFINED_CAMERA,
+    REPORT_PDF,
+    RUN_MARKER,
+    TABLE_BYTES,
+    TARGET,
+    json_text,
+    read_bytes,
+    save,
+)
 from stcal.io.json import checked, read_json
 from stcal.parallel import Progress
 from stcal.report.page import pdf_of, require_pdf
@@ -37,6 +48,7 @@ from stcal.sfm.runs.report import ReportFile
 from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.saved import SavedRun
 from stcal.sfm.runs.transaction import RunFolder, added_results, complete_interrupted
+from stcal.sfm.runs.verify import verify
 
 LONGEST_NAME = 200
 """Largest number of bytes of an image's name in the name of its overlay. File systems take 255, including the suffix
@@ -143,18 +155,20 @@ class ReportAgain:
     """Result of :func:`report_again`.
 
     ``files`` : page and PDF that were written; ``gone`` : number of overlays that the folder no longer holds, so that
-    the page lacks them.
+    the page lacks them; ``notes`` : on files that are not as the run left them.
     """
 
     files: tuple[Path, ...]
     gone: int
+    notes: tuple[str, ...] = ()
 
     def text(self) -> str:
         """Returns the text for the terminal."""
         warnings = (
             [f"{self.gone} overlays are no longer in the folder: the report is without them"] if self.gone else []
         )
-        return "\n".join([*warnings, *(f"report: {path}" for path in self.files)])
+        notes = (f"note: {note}" for note in self.notes)
+        return "\n".join([*warnings, *notes, *(f"report: {path}" for path in self.files)])
 
 
 def report_again(run: Path, pdf: bool, out: Path | None = None) -> ReportAgain:
@@ -182,13 +196,18 @@ def report_again(run: Path, pdf: bool, out: Path | None = None) -> ReportAgain:
         )
     if pdf:
         require_pdf()
+    complete_interrupted(run)
+    try:
+        notes = tuple(verify(run).said(but=("report.html", REPORT_PDF)))
+    except InputError as error:
+        if error.code != "E-RUN-UNFINISHED":  # without hashes nothing can be compared
+            raise
+        notes = ()
     if out is not None:
-        complete_interrupted(run)
-        files, gone = _page_and_pdf(run, pdf, out)
-        return ReportAgain(files, gone)
+        return ReportAgain(*_page_and_pdf(run, pdf, out), notes)
     with added_results(run) as stage:
         files, gone = _page_and_pdf(run, pdf, stage / "report.html")
-    return ReportAgain(tuple(run / path.name for path in files), gone)
+    return ReportAgain(tuple(run / path.name for path in files), gone, notes)
 
 
 def _page_and_pdf(run: Path, pdf: bool, out: Path) -> tuple[tuple[Path, ...], int]:

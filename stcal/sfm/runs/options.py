@@ -7,7 +7,8 @@ from typing import Literal
 
 from stcal.design import TargetDesign
 from stcal.errors import InputError
-from stcal.geometry.arrays import require_choices
+from stcal.geometry.arrays import require_fields
+from stcal.io.toml import LEAST
 from stcal.sfm.adjust.faces import FrameKind
 from stcal.sfm.adjust.options import FLATNESS_MM, AdjustOptions, Solve
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -84,7 +85,7 @@ class RunOptions:
     bayer: Literal["", "RGGB", "BGGR", "GRBG", "GBRG"] = ""
 
     def __post_init__(self):
-        require_choices(self, "options")
+        require_fields(self, "options", workers=1, flatness_mm=LEAST)
 
     def adjustment(self, target: TargetDesign) -> AdjustOptions:
         """Returns the options of the adjustment, with every default decided.

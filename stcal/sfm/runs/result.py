@@ -11,6 +11,7 @@ from pydantic import Field
 
 from stcal.design import BoardDesign, TargetDesign, faces_of_known_shape, known_distances
 from stcal.errors import InputError
+from stcal.geometry.arrays import Brief
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
@@ -77,8 +78,8 @@ class Comparison(Part):
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ImageResult:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ImageResult(Brief):
     """An image that the result rests on.
 
     Parameters

@@ -14,7 +14,7 @@ from stcal.boards.file import load_run_board
 from stcal.boards.target import load_body
 from stcal.design import BoardDesign, TargetDesign, scale_reference
 from stcal.errors import InputError, StcalError
-from stcal.geometry.arrays import Brief, frozen
+from stcal.geometry.arrays import Brief, frozen, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior, camera_prior
@@ -133,6 +133,7 @@ class SavedRun(Brief):
         return Camera.of(camera, self.camera.colmap_model)
 
 
+@require_arguments
 def load_run(folder: str | Path) -> SavedRun:
     """Reads a finished run.
 
@@ -256,9 +257,8 @@ def _labels(path: Path, names: list[tuple[str, str, int]], camera: Camera, known
         if unknown or len(set(labels)) < len(labels):
             raise ValueError(f"image {name}: {f'no circle {unknown[0]}' if unknown else 'a label twice'}")
         columns = ("x_px", "y_px", "corrected_x_px", "corrected_y_px", *COVARIANCE)
-        values = frozen(
-            [[row[column] for column in columns] for row in image_rows] or np.zeros((0, 7)), (None, 7), name
-        )
+        texts = [[row[column] for column in columns] for row in image_rows]
+        values = frozen(np.array(texts or np.zeros((0, 7)), float), (None, 7), name)
         covariance = values[:, [4, 5, 5, 6]].reshape(-1, 2, 2)
         fault = first_fault(covariance, OF_PIXEL, definite=True)
         if fault is not None:

@@ -1,6 +1,6 @@
 """Verification that a run's folder holds what the run wrote: ``verify``."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -26,6 +26,7 @@ NO_RESULTS = (CACHE, UNFINISHED, ADDED, READY)
 OWN = (*RESULTS, *(f"database.db{side}" for side in DATABASE_SIDES))
 """Entries of the folder in which a foreign file would be taken for a result, or would change one."""
 AGAIN = "run it again"
+FAULTS = ("missing", "changed", "added")
 
 
 class VerifyFile(ResultFile):
@@ -42,9 +43,16 @@ class VerifyFile(ResultFile):
     beside: list[str] = Field(description="that lie beside the results; nothing is wrong with these")
     whole: bool = Field(description="whether nothing is missing, changed or added")
 
+    def said(self, but: Collection[str] = ()) -> list[str]:
+        """Returns one note if files of the run are missing, changed or added, for results that are made of all files
+        ``but`` some."""
+        kinds = {kind: [name for name in getattr(self, kind) if name not in but] for kind in FAULTS}
+        faults = self.model_copy(update=kinds).faults()
+        return [f"the run's folder is not as the run left it: {'; '.join(faults)}"] if any(kinds.values()) else []
+
     def faults(self) -> list[str]:
         """Returns the faults, one clause each; none for a whole run of this version."""
-        kinds = {"missing": self.missing, "changed": self.changed, "added": self.added}
+        kinds = {kind: getattr(self, kind) for kind in FAULTS}
         clauses = [
             f"{len(names)} {kind} ({names[0]}{' …' * (len(names) > 1)})" for kind, names in kinds.items() if names
         ]

@@ -8,11 +8,12 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order, Poses, Rigid
-from stcal.handeye import HandEyeOptions, handeye
+from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.formats.record import require_each_once
 from stcal.handeye.data.pairs import SIDES, read_side
 from stcal.handeye.data.robot_poses import RobotPoses
 from stcal.handeye.report.outcome import ArmFound, Outcome
+from stcal.handeye.solve import handeye
 from stcal.handeye.validate import cross_validate, widened_by_scatter
 from stcal.io.cameras.model import CameraPrior
 from stcal.io.table import read_table

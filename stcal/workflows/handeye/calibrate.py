@@ -6,19 +6,19 @@ from functools import partial
 
 import numpy as np
 
-from stcal.errors import DegenerateError, StcalError
-from stcal.handeye import HandEyeOptions, handeye
-from stcal.handeye.choose import choose
+from stcal.errors import StcalError
+from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.pairs import Setup
 from stcal.handeye.judge.remarks import Grave
 from stcal.handeye.judge.symmetry import repair
+from stcal.handeye.pipeline import Validated, validated
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.result import HandEye
+from stcal.handeye.solve import handeye
 from stcal.handeye.validate import (
     LEAST_LEFT,
     better_setup,
     compare,
-    cross_validate,
     predict_motions,
     splits,
     widened_by_scatter,
@@ -105,34 +105,19 @@ def _outcome(
     pairs, views = given.pairs, given.views
     if options.camera is None:
         options = replace(options, camera=given.prior)
-    asked = None if method in (ALL, AUTO) else method
-    compared, held_out, notes, rows = (), None, (), np.zeros((0, 0), int)
-    choice = None
+    compared, rows = (), np.zeros((0, 0), int)
     if validation.repeats and (validation.held_out or len(pairs) > LEAST_LEFT):
         rows = splits(len(pairs), validation.held_out, validation.repeats, validation.seed)
-    if method == AUTO and len(rows):
-        prior, done = given.prior if views is not None else None, partial(progress, "held out")
-        try:
-            choice = choose(pairs, setup, views, options, prior, rows, validation.workers, done)
-        except DegenerateError as error:
-            notes = (f"no errors on poses held out: {error}",)
-    if choice is not None:
-        options = choice.chosen.options(options, prior)
-        result, held_out, asked = choice.result, choice.held_out, choice.chosen.method
-    else:
-        result = handeye(pairs, setup, asked, views, options)
     if method == ALL:
-        done = partial(progress, "methods")
+        result, done = handeye(pairs, setup, None, views, options), partial(progress, "methods")
         compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=done)
         held_out = next(comparison.held_out for comparison in compared if comparison.method == result.method)
-    elif len(rows) and choice is None and not notes:
-        done = partial(progress, "held out")
-        try:
-            held_out = cross_validate(pairs, setup, asked, views, options, rows, validation.workers, done)
-        except DegenerateError as error:
-            notes = (f"no errors on poses held out: {error}",)
-    if held_out is not None and choice is None:  # a choice is widened when it is made, with its rivals
-        result = widened_by_scatter(result, held_out)
+        found = Validated(result if held_out is None else widened_by_scatter(result, held_out), held_out, options)
+    else:
+        prior, done = given.prior if views is not None else None, partial(progress, "held out")
+        asked, spread = None if method == AUTO else method, (rows, validation.workers, done)
+        found = validated(pairs, setup, asked, views, options, prior, *spread, choosing=method == AUTO)
+    result, options, notes = found.result, found.options, found.notes
     if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
         notes = (*notes, meant)
     notes = (*notes, *_of_setup(given, setup, result))
@@ -150,7 +135,7 @@ def _outcome(
     outcome = Outcome(
         given.where,
         result,
-        held_out,
+        found.held_out,
         compared,
         given.pitch_mm,
         model,
@@ -158,7 +143,7 @@ def _outcome(
         given.left_out,
         notes,
         motions,
-        choice,
+        found.choice,
         understood=given.understood,
         unit_mm=given.unit_mm,
         pairs=pairs,

@@ -9,7 +9,7 @@ import numpy as np
 from stcal.boards.several import load_boards
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Order, Poses, Rigid
-from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, handeye, pairs_of_views, read_poses
+from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
 from stcal.handeye.data.pairs import SETUPS, Loop, Setup
@@ -18,6 +18,7 @@ from stcal.handeye.data.stream import Timed
 from stcal.handeye.judge.flips import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.methods import closed_form
+from stcal.handeye.solve import handeye
 from stcal.io.cameras.model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images

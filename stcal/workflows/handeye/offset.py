@@ -8,13 +8,14 @@ import numpy as np
 
 from stcal.errors import InputError, StcalError
 from stcal.geometry.normal_equations import generalised_inverse
-from stcal.handeye import HandEyeOptions, handeye
+from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.data.stream import LONGEST_S, Stream, Timed
 from stcal.handeye.judge.remarks import Grave, SizeDoubt
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.result import HandEye
+from stcal.handeye.solve import handeye
 from stcal.handeye.time_offset import TimeOffset, estimate_offset
 from stcal.parallel import one_thread
 from stcal.workflows.handeye.inputs import HandEyeInput

@@ -7,9 +7,10 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
-from stcal.handeye import HandEyeOptions, NextPoses, handeye, plan_poses
+from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
 from stcal.handeye.data.pairs import Setup
 from stcal.handeye.result import HandEye
+from stcal.handeye.solve import handeye
 from stcal.parallel import one_thread
 from stcal.robot import Robot, inverse
 from stcal.robot.kinematics.inverse import REACHED

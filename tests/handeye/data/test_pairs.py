@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye import HandEyePoses, handeye, read_poses
+from stcal.handeye import HandEyePoses, read_poses
 from stcal.handeye.data.pairs import inverse_covariance
+from stcal.handeye.solve import handeye
 from stcal.io.table import COVARIANCE
 from tests.outcome import fails_with
 from tests.support.handeye import disturbed, simulated

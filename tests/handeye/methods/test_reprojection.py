@@ -5,10 +5,11 @@ import pytest
 
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye import HandEyeOptions, Noise, View, Views, handeye, pairs_of_views
+from stcal.handeye import HandEyeOptions, Noise, View, Views, pairs_of_views
 from stcal.handeye.data.pairs import Loop
 from stcal.handeye.methods.bundle import RigBundle, RigCorners
 from stcal.handeye.methods.reprojection import problem
+from stcal.handeye.solve import handeye
 from stcal.io.cameras.model import camera_prior
 from tests.handeye.derivatives import assert_derivatives
 from tests.outcome import fails_with

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye import HandEyeOptions, handeye
+from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.views import View, Views, pairs_of_views
 from stcal.handeye.report.figures import (
     MOST_NAMED,
@@ -21,6 +21,7 @@ from stcal.handeye.report.figures import (
 )
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.report.page import outcome_report
+from stcal.handeye.solve import handeye
 from tests.support.handeye import simulated, simulated_views
 
 MOST_BYTES = 3_000_000

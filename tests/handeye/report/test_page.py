@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from stcal.geometry.camera import Camera
-from stcal.handeye import HandEyeOptions, handeye
+from stcal.handeye import HandEyeOptions
 from stcal.handeye.report.file import HandEyeFile
 from stcal.handeye.report.outcome import Outcome
 from stcal.handeye.report.page import outcome_report
-from stcal.handeye.solve import FACTORS
+from stcal.handeye.solve import FACTORS, handeye
 from stcal.handeye.validate import Compared, compare, cross_validate, splits
 from stcal.io.cameras.model import camera_prior
 from stcal.io.files import json_text

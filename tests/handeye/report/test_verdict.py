@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye import HandEyeOptions, handeye
+from stcal.handeye import HandEyeOptions
 from stcal.handeye.judge.remarks import Aside, Grave
 from stcal.handeye.report.outcome import Outcome, judged, share_of_variance
+from stcal.handeye.solve import handeye
 from stcal.handeye.validate import cross_validate, splits
 from tests.support.handeye import simulated
 

@@ -2,6 +2,7 @@
 
 import base64
 import csv
+import errno
 import importlib
 import json
 import re
@@ -268,6 +269,31 @@ def test_photographs_that_are_gone_are_said(small_run, tmp_path):
         f"{len(saved.report['scene']['cameras'])} photographs are no longer in {tmp_path / 'gone'}, "
         f"{saved.report['scene']['cameras'][0]['image']} first: left out"
     ]
+
+
+def test_a_recording_that_no_disk_takes_leaves_nothing(small_run, tmp_path, monkeypatch):
+    """The chunk after the first one does not go in; Rerun's own writer would try for ever."""
+
+    def full(_, path) -> list[str]:
+        path.write_bytes(b"RRF2")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("stcal.sfm.interop.export.write_rrd", full)
+    with fails_with("E-OUTPUT-UNWRITABLE … box.rrd … No space left"):
+        export_run(small_run, tmp_path / "box.rrd")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_recording_is_written_by_parts_as_far_as_there_is_room(small_run, tmp_path):
+    """In a process whose files may not grow: Rerun's own writer said nothing, or tried for ever."""
+    code = (
+        "import resource, signal, sys; from stcal.sfm.interop.export import export_run; from pathlib import Path\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (200_000,) * 2)\n"
+        f"export_run(Path({str(small_run)!r}), Path({str(tmp_path / 'box.rrd')!r}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    assert "cannot be written: File too large" in done.stderr.splitlines()[-1]
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("form", "library", "extra"), [("dxf", "ezdxf", "cad"), ("rerun", "rerun", "rerun")])

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import zlib
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 
 import cv2
@@ -23,12 +23,14 @@ from stcal.sfm.measurement.report import poses_file
 from stcal.sfm.measurement.serve import (
     CONNECTIONS_EACH,
     DONE,
+    NEWCOMERS,
     WAITING,
     Answer,
     MeasureServer,
     MeasureService,
     ServeOptions,
     Setting,
+    _Connection,
     counts_text,
 )
 from stcal.sfm.measurement.target import read_target
@@ -278,6 +280,9 @@ class Waiting:
         while not self._turn.acquire(timeout=0.01):
             if given_up():
                 raise CancelledError
+        if given_up():
+            self._turn.release()
+            raise CancelledError
         self.go.wait(PATIENCE_S)
         self.names.append(name)
         self._turn.release()
@@ -285,6 +290,64 @@ class Waiting:
 
     def close(self):
         self.go.set()
+
+
+def test_beside_others_no_client_has_all_processes(known):
+    """Alone it has; with another one about, what it sends more waits behind its own."""
+    service = MeasureService(Setting(*known), 3)
+    service._processes = processes = [Waiting() for _ in range(3)]
+
+    def inside(count: int):
+        until(lambda: sum(each.total() for each in service._waiting) == count)
+
+    with ThreadPoolExecutor(20) as clients:
+        jobs = [clients.submit(service.answer, b"x", str(i), client="greedy") for i in range(3)]
+        inside(3)
+        assert [each["greedy"] for each in service._waiting] == [1, 1, 1]
+        for process in processes:
+            process.go.set()
+        wait(jobs)
+        for process in processes:
+            process.go.clear()
+        jobs = [clients.submit(service.answer, b"x", "first", client="other")]
+        inside(1)
+        jobs += [clients.submit(service.answer, b"x", str(i), client="greedy") for i in range(6)]
+        inside(7)
+        assert sorted(each["greedy"] for each in service._waiting) == [0, 3, 3]
+        assert [each["greedy"] for each in service._waiting if each["other"]] == [0]
+        for process in processes:
+            process.go.set()
+        assert {job.result().code for job in jobs} == {200}
+
+
+def test_newcomers_are_read_at_a_rate_beside_others(known):
+    with held(known) as (server, process):
+        process.go.set()
+        newcomer = _Connection(server, None, FakeWriter())
+        assert server.pause_s(newcomer, NEWCOMERS) == 0
+        server.service.answer(b"x", client="another one")
+        first, second = (server.pause_s(newcomer, NEWCOMERS // 10) for _ in range(2))
+        assert first == pytest.approx(0.1, abs=0.02)
+        assert second == pytest.approx(0.2, abs=0.02)
+        newcomer._answers = 1
+        assert server.pause_s(newcomer, NEWCOMERS) == 0
+
+
+class FakeWriter:
+    def get_extra_info(self, _):
+        return "10.0.0.1", 5
+
+
+def test_who_sends_an_image_and_leaves_at_once_has_none_measured_beside_others(known):
+    """Also where a process is free, which would begin at once."""
+    with held(known) as (server, process):
+        process.go.set()
+        server.service.answer(b"x", "other", client="another one")
+        for i in range(3):
+            sent(server, UPLOAD.format(i, 1), b"x").close()
+        until(lambda: server.left == 3)
+        assert process.names == ["other"]
+        assert post(server, b"y", "?name=last") == (200, {"bytes": 1})
 
 
 @contextmanager

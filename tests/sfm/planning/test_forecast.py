@@ -11,15 +11,16 @@ from scipy.special import ndtr
 from scipy.stats import chi2
 
 from stcal.design import reference_board, reference_target
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.model import CameraModel, CameraPrior
+from stcal.io.cameras.model import CameraModel, CameraPrior, model_of
 from stcal.sfm.adjust import equations
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjust_jointly, covariance_of
 from stcal.sfm.adjust.uncertainty import derivatives
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.detect.defocus import RESPONSE
-from stcal.sfm.planning import views
+from stcal.sfm.planning import bodies, session, views
 from stcal.sfm.planning.advise import Known, advise, known_of
 from stcal.sfm.planning.forecast import (
     BLUR_PX,
@@ -39,6 +40,7 @@ from stcal.sfm.planning.session import PlanOptions, widest_aperture_mm
 from stcal.sfm.planning.session import plan as make_plan
 from stcal.sfm.planning.views import PlannedView, candidates, known_scene
 from stcal.sfm.runs.saved import load_run
+from stcal.synthetic.designs import tag_cube
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene, nominal_target_from_face, second_design
 from tests.outcome import fails_with
 from tests.shared import own_copy
@@ -350,6 +352,31 @@ def test_advise_of_a_run_starts_from_its_own_sigma(small_run):
     for face, covariance in now.face_covariance.items():
         # Huber's weights of the few long residuals make the difference.
         assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(stated[face])), rel=0.03)
+
+
+def test_advise_takes_a_run_and_its_folder(small_run, monkeypatch):
+    """As :func:`stcal.sfm.load_run` returns it; what is chosen is tested with the geometry."""
+    seen = []
+
+    def stop(models, *_, **__):
+        seen.append([len(model.images) for model in models])
+        raise KeyError
+
+    monkeypatch.setattr("stcal.sfm.planning.advise.forecast", stop)
+    for given in (load_run(small_run), small_run, str(small_run)):
+        with pytest.raises(KeyError):
+            advise(given, 1)
+    assert seen == [seen[0]] * 3
+    assert len(seen[0]) > 1
+
+
+def test_a_plan_takes_a_camera_as_its_file():
+    camera = Camera(2592, 1728, [2600, 2600], [1295, 863], [0.1, 0, 0, 0, 0, 0, 0, 0])
+    target, board, cube = reference_target(), reference_board(), tag_cube(50.0)
+    for given in (camera, model_of(camera)):
+        assert session._scene(PlanOptions(images=2, camera=given), target, board, None).camera.same_as(camera)
+        near = PlanOptions(images=20, distance_mm=300.0, camera=given)
+        assert bodies._planned(near, cube)[0].camera.same_as(camera)
 
 
 def test_advice_holds_the_sigma_of_estimated_rims(small_run):

@@ -1,15 +1,17 @@
 """What ``compare`` and ``measure`` take of a ``faces.json``: no other format, no other unit, no matrix that is none."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 
 from stcal.design import reference_target
-from stcal.errors import InputError
+from stcal.errors import InputError, InputNote
 from stcal.sfm.measurement.target import read_target
 from stcal.sfm.report.compare import compare
 from tests.outcome import fails_with
+from tests.shared import own_copy
 
 COVARIANCE = "target_from_face_covariance"
 
@@ -84,3 +86,15 @@ def test_a_run_of_another_size_is_compared(small_run, small_dataset, tmp_path, f
     other.write_text(json.dumps(scaled(json.loads((small_run / "faces.json").read_text()), factor)))
     worst = compare(other, small_dataset / "truth.json").worst.translation_um
     assert (worst > 1000) == (factor != 1.0)
+
+
+def test_labels_that_cannot_be_compared_are_said(small_run, small_dataset, tmp_path):
+    """A run without its table of detections, or with a damaged one."""
+    run = own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
+    assert compare(run, small_dataset / "truth.json").labels is not None
+    (run / "detections.csv").write_text("image,label\n12/IMG_1000.jpg,1:a\n")
+    with pytest.warns(InputNote, match="detections.csv: damaged: the labels are not compared"):
+        assert compare(run, small_dataset / "truth.json").labels is None
+    (run / "detections.csv").unlink()
+    with pytest.warns(InputNote, match="detections.csv: No such file or directory: the labels are not compared"):
+        compare(run, small_dataset / "truth.json")

@@ -38,6 +38,15 @@ def test_the_same_files_make_the_same_page(own, small_run, stcal_sfm, monkeypatc
     assert verify(own).whole
 
 
+def test_files_that_the_run_did_not_leave_so_are_said(own, stcal_sfm):
+    """Fewer lines of the table of centres, of which the page draws residuals."""
+    lines = (own / "labels.csv").read_text().splitlines(keepends=True)
+    (own / "labels.csv").write_text("".join(lines[: len(lines) // 2]))
+    code, out, _ = stcal_sfm("report", own)
+    assert code == 0
+    assert out.startswith("note: the run's folder is not as the run left it: 1 changed (labels.csv)\n")
+
+
 @pytest.mark.slow
 def test_a_pdf_goes_with_the_page_that_it_was_made_of(own, stcal_sfm, monkeypatch):
     monkeypatch.setattr(folder, "pdf_of", lambda page: b"%PDF")

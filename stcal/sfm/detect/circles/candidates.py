@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from stcal.design import Polarity
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import frozen, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography, fit_homographies, homography_jacobian
 from stcal.io.images import percentiles, shrunk
@@ -65,6 +65,7 @@ class EllipseOptions:
     min_contrast: float = 0.08
 
     def __post_init__(self):
+        require_fields(self, "options")
         for name, (low, high) in OPTION_RANGES.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:

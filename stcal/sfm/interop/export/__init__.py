@@ -7,7 +7,7 @@ from pathlib import Path
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Poses
-from stcal.io.files import save
+from stcal.io.files import save, unwritable
 from stcal.io.poses.static import Static, read_messages, read_ros1_launch, read_ros2_launch
 from stcal.io.table import require_poses_written
 from stcal.sfm.interop.export import solids, tables, viewers
@@ -96,6 +96,8 @@ def export_run(run: str | Path, path: str | Path, form: str = "", name: str = RO
     try:
         notes = write_rrd(content, partial)
         os.replace(partial, path)
+    except OSError as error:
+        raise unwritable(path, error) from error
     finally:
         partial.unlink(missing_ok=True)
     return ExportedRun(path, form, content, notes)

@@ -3,6 +3,7 @@
 import base64
 import json
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -211,7 +212,8 @@ APPLICATION = "stcal"
 def write_rrd(content: Content, path: Path) -> list[str]:
     """Writes a recording of Rerun, and returns notes on photographs that it lacks.
 
-    JPEG and PNG photographs are copied as they are. Each is a step of the time line ``photograph``.
+    JPEG and PNG photographs are copied as they are. Each is a step of the time line ``photograph``. The file is written
+    here: Rerun's own writer tries for ever where the disk is full.
 
     Raises InputError if ``stereo-target-calibration[rerun]`` is not installed.
     """
@@ -222,7 +224,7 @@ def write_rrd(content: Content, path: Path) -> list[str]:
             "E-EXTRA-MISSING", "Rerun: needs rerun-sdk; install stereo-target-calibration[rerun]"
         ) from error
     recording = rr.RecordingStream(APPLICATION, recording_id=f"{APPLICATION}-{content.run.folder.name}")
-    recording.save(path)
+    stream = recording.binary_stream()
     factor = exaggeration(content)
     root = f"world/{_part(content.root)}"
     about = [*content.said(), f"ellipsoids: sigma, {factor:g} times as large"]
@@ -257,13 +259,14 @@ def write_rrd(content: Content, path: Path) -> list[str]:
             recording.log(f"{entity}/sigma", ellipsoids, static=True)
     for group, dots in content.boards.items():
         recording.log(f"world/board/{_part(group)}", rr.Points3D(dots, colors=BOARD_RGB, radii=1.0), static=True)
-    missing = _photographs(content, recording, rr)
-    recording.flush()
+    with open(path, "wb") as file:
+        missing = _photographs(content, recording, rr, lambda: file.write(stream.read() or b""))
     recording.disconnect()
     return missing
 
 
-def _photographs(content: Content, recording, rr) -> list[str]:
+def _photographs(content: Content, recording, rr, write: Callable[[], object]) -> list[str]:
+    """Adds the photographs. ``write`` : called after each, writes what has been added, so that memory holds one."""
     files = {}
     if content.run.images.is_dir():
         with mosaic_of(content.run.options.bayer):
@@ -303,6 +306,8 @@ def _photographs(content: Content, recording, rr) -> list[str]:
         else:
             picture = rr.EncodedImage(contents=file.read(), media_type=MEDIA[suffix])
             recording.log(f"{entity}/image", picture)
+        write()
+    write()
     lines = []
     if missing:
         lines.append(f"{len(missing)} photographs are no longer in {content.run.images}, {missing[0]} first: left out")

@@ -1,0 +1,174 @@
+"""Hand-eye calibration as a whole: a way of solving, and σ that hold for poses that it has not seen."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import require_arguments
+from stcal.geometry.rigid import Poses
+from stcal.handeye import solve
+from stcal.handeye.choose import Choice, choose
+from stcal.handeye.data.pairs import HandEyePoses, LengthUnit, Setup
+from stcal.handeye.data.views import Views
+from stcal.handeye.result import HandEye
+from stcal.handeye.solve import HandEyeOptions
+from stcal.handeye.validate import LEAST_LEFT, HeldOutPoses, cross_validate, splits, widened_by_scatter
+from stcal.io.cameras.model import CameraPrior
+from stcal.parallel import one_thread
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Validated:
+    """A result with its errors on poses held out.
+
+    ``held_out`` : errors, None where too few poses would be left; ``options`` : those of the way that was taken;
+    ``choice`` : all ways that were tried, where nobody named one; ``notes`` : why errors are missing.
+    """
+
+    result: HandEye
+    held_out: HeldOutPoses | None
+    options: HandEyeOptions
+    choice: Choice | None = None
+    notes: tuple[str, ...] = ()
+
+
+def validated(
+    pairs: HandEyePoses,
+    setup: Setup,
+    method: str | None,
+    views: Views | None,
+    options: HandEyeOptions,
+    prior: CameraPrior | None,
+    rows: np.ndarray,
+    workers: int | None = 1,
+    progress: Callable[[int, int], None] = lambda *_: None,
+    choosing: bool = False,
+) -> Validated:
+    """Returns the result of a method, or of the way that predicts best, with σ that hold for poses held out.
+
+    ``prior`` : prior of the intrinsics, where they may be solved for; ``rows`` : (s, k) poses to hold out in each
+    split, none if s is 0; ``choosing`` : whether to choose among all ways of solving
+
+    Raises
+    ------
+    StcalError
+        As :func:`stcal.handeye.handeye`.
+    """
+    notes: tuple[str, ...] = ()
+    if choosing and len(rows):
+        try:
+            choice = choose(pairs, setup, views, options, prior, rows, workers, progress)
+            return Validated(choice.result, choice.held_out, choice.chosen.options(options, prior), choice)
+        except DegenerateError as error:
+            notes = (f"no errors on poses held out: {error}",)
+    result = solve.handeye(pairs, setup, method, views, options)
+    if not len(rows) or notes:
+        return Validated(result, None, options, notes=notes)
+    try:
+        held_out = cross_validate(pairs, setup, method, views, options, rows, workers, progress)
+    except DegenerateError as error:
+        return Validated(result, None, options, notes=(f"no errors on poses held out: {error}",))
+    return Validated(widened_by_scatter(result, held_out), held_out, options)
+
+
+@overload
+def handeye(
+    pairs: HandEyePoses,
+    camera_from_board: Setup = "eye-in-hand",
+    method: str | None = None,
+    views: Views | None = None,
+    options: HandEyeOptions | None = None,
+    *,
+    setup: Setup | None = None,
+) -> HandEye: ...
+@overload
+def handeye(
+    base_from_flange: Poses | ArrayLike,
+    camera_from_board: Poses | ArrayLike,
+    method: str | None = None,
+    views: Views | None = None,
+    options: HandEyeOptions | None = None,
+    *,
+    setup: Setup,
+    unit: LengthUnit = "mm",
+) -> HandEye: ...
+@require_arguments
+@one_thread()
+def handeye(
+    base_from_flange: Any = None,
+    camera_from_board: Any = None,
+    method: str | None = None,
+    views: Views | None = None,
+    options: HandEyeOptions | None = None,
+    *,
+    setup: Setup | None = None,
+    unit: LengthUnit = "mm",
+    pairs: HandEyePoses | None = None,
+) -> HandEye:
+    """Returns where the camera is on the flange, or in the robot's base frame: the answer of ``stcal handeye``.
+
+    σ hold for poses that the result has not seen: they are widened by the scatter of results without some poses, and
+    where another way of solving predicts as well and answers otherwise.
+
+    Parameters
+    ----------
+    base_from_flange : Poses or (m, 4, 4) array
+        At least three poses, rotated about two axes that are not parallel.
+    camera_from_board : Poses or (m, 4, 4) array
+        The pose of the board in the camera in each of them. After ``pairs``, the setup may stand here.
+    method : str, optional
+        One of :data:`METHODS`. If None, the way that predicts poses held out best, among all methods, with the board's
+        size as stated or solved for; ``reprojection`` with views, else ``pose``, where ``options`` name unknowns.
+    views : Views, optional
+        The corners from which the poses were computed. ``reprojection`` adjusts them; with ``pose`` they carry the
+        camera's errors into σ.
+    options : HandEyeOptions, optional
+        Known errors of robot and camera, and further unknowns; the defaults if None.
+    setup : {"eye-in-hand", "eye-to-hand"}
+        ``eye-in-hand``: the camera on the flange, also if None; ``eye-to-hand``: the board on the flange.
+    unit : {"mm", "m", "cm", "um", "in"}
+        Unit of translations.
+    pairs : HandEyePoses
+        Pairs of poses in place of the first two, also as the first argument; see :func:`~stcal.handeye.read_poses`,
+        :func:`~stcal.handeye.pairs_of_views`.
+
+    Returns
+    -------
+    HandEye
+        X and Z with covariances, residuals, outliers, and notes on anything doubtful.
+
+    Raises
+    ------
+    InputError
+        The method or setup is unknown, ``reprojection`` has no views, or the poses follow another convention.
+    DegenerateError
+        The poses do not determine the answer; the message says which motion is missing.
+    ConvergenceError
+        The method fails on these poses.
+
+    Examples
+    --------
+    >>> pairs = read_poses("poses.csv")  # doctest: +SKIP
+    >>> found = handeye(pairs, setup="eye-in-hand")  # doctest: +SKIP
+    >>> found.flange_from_camera @ [0, 0, 500]  # a point half a metre before the camera  # doctest: +SKIP
+    """
+    if isinstance(base_from_flange, HandEyePoses):
+        pairs, base_from_flange = base_from_flange, None
+    asked = setup or "eye-in-hand"
+    if pairs is not None:
+        asked = setup or camera_from_board or "eye-in-hand"
+        if unit != "mm":
+            raise InputError("E-OPTION-CONFLICT", f"hand-eye: unit {unit!r} of pairs of poses, which are in mm already")
+    elif base_from_flange is None or camera_from_board is None or isinstance(camera_from_board, str):
+        raise InputError("E-POSES-COUNT", "hand-eye: poses of the flange alone; give camera_from_board of each, too")
+    else:
+        pairs = HandEyePoses.from_matrices(base_from_flange, camera_from_board, unit=unit)
+    options = options or HandEyeOptions()
+    rows = splits(len(pairs)) if len(pairs) > LEAST_LEFT else np.zeros((0, 0), int)
+    prior = None if views is None else options.camera
+    choosing = method is None and not options.names_unknowns
+    return validated(pairs, asked, method, views, options, prior, rows, choosing=choosing).result

@@ -1,0 +1,78 @@
+"""The answer of :func:`stcal.handeye.handeye`: that of the command, from pairs of poses and from matrices."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from stcal import handeye
+from stcal.cli.main import main
+from stcal.geometry.rigid import Poses
+from stcal.io.table import POSE, pose_cells
+from tests.outcome import ended, fails_with
+from tests.support.handeye import FLANGE_FROM_CAMERA, simulated
+
+NOISE = {"robot": (2e-4, 0.1), "camera": (5e-4, 0.2)}
+
+
+@pytest.fixture
+def pairs():
+    return simulated(np.random.default_rng(7), 8, **NOISE).pairs
+
+
+def metres(poses: Poses) -> np.ndarray:
+    return poses.matrix() * np.array([[1, 1, 1, 1e-3]] * 3 + [[1, 1, 1, 1]])
+
+
+@pytest.mark.parametrize("method", [None, "pose"])
+def test_the_answer_is_that_of_the_command(pairs, method, tmp_path, monkeypatch, capsys):
+    """To the last digits of the file: result, method and σ, which poses held out widen here."""
+    path, out = tmp_path / "poses.csv", tmp_path / "result.json"
+    sides = pairs.base_from_flange, pairs.camera_from_board
+    names = [f"{side}_{column}" for side in ("base_from_flange", "camera_from_board") for column in POSE]
+    rows = [[cell for pose in row for cell in pose_cells(pose)] for row in zip(*sides, strict=True)]
+    path.write_text("\n".join(",".join(line) for line in [names, *rows]) + "\n")
+    words = ["stcal", "handeye", path, "--out", out, *(["--method", method] if method else [])]
+    monkeypatch.setattr(sys, "argv", [str(word) for word in words])
+    assert ended(main, capsys)[0] == 0
+    said, found = json.loads(out.read_text()), handeye.handeye(pairs, method=method)
+    assert said["method"] == found.method
+    np.testing.assert_allclose(said["flange_from_camera"], found.mount_from_camera.matrix(), atol=1e-6)
+    np.testing.assert_allclose(said["covariance"], found.covariance, rtol=1e-3)
+
+
+def test_sigma_holds_for_poses_held_out(pairs):
+    """Of eight poses, results without some of them scatter by more than the adjustment's own σ."""
+    own = handeye.compare(pairs, methods=("pose",))[0].result
+    assert handeye.handeye(pairs, method="pose").covariance[3, 3] > 1.05 * own.covariance[3, 3]
+
+
+def test_matrices_in_metres_are_pairs_of_poses(pairs):
+    found = handeye.handeye(
+        metres(pairs.base_from_flange), metres(pairs.camera_from_board), setup="eye-in-hand", unit="m", method="pose"
+    )
+    same = handeye.handeye(pairs, "eye-in-hand", "pose")
+    assert handeye.handeye(pairs=pairs, method="pose").mount_from_camera == same.mount_from_camera
+    np.testing.assert_allclose(found.mount_from_camera.matrix(), same.mount_from_camera.matrix(), atol=1e-9)
+    off = found.mount_from_camera.translation - FLANGE_FROM_CAMERA.translation
+    assert np.linalg.norm(off) < 1.0  # noise of 0.2 mm an axis
+    mixed = handeye.handeye(
+        pairs.base_from_flange, pairs.camera_from_board.matrix(), setup="eye-in-hand", method="pose"
+    )
+    np.testing.assert_allclose(mixed.covariance, same.covariance)
+
+
+def test_options_that_name_unknowns_leave_no_choice(pairs):
+    found = handeye.handeye(pairs, options=handeye.HandEyeOptions(with_scale=True))
+    assert found.method == "pose"
+    assert found.sigma_scale is not None
+
+
+def test_what_is_no_pairs_of_poses_is_refused(pairs):
+    with fails_with("E-POSES-COUNT … camera_from_board"):
+        handeye.handeye(pairs.base_from_flange, setup="eye-in-hand")
+    with fails_with("E-OPTION-CONFLICT … unit 'm'"):
+        handeye.handeye(pairs, unit="m")
+    with fails_with("E-OPTION-VALUE … unit 'feet'"):
+        handeye.handeye(pairs.base_from_flange, pairs.camera_from_board, setup="eye-in-hand", unit="feet")
