@@ -52,7 +52,7 @@ from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
 from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.solve import solve_body, solve_groups, ungrouped, unseen_board, usable_groups
+from stcal.sfm.runs.solve import solve_body, solve_groups, ungrouped, unknown_face_notes, unseen_board, usable_groups
 from stcal.sfm.runs.transaction import MarkerFile, RunFolder, frames_folder, require_ours, run_folder
 
 IN_MEMORY = "images in memory"
@@ -501,6 +501,7 @@ def _solved(
         chains=measure_chains(calibration.faces, calibration.target),
         notes=(
             *(ungrouped(labelled) if board.rows else ()),
+            *unknown_face_notes({image.file.group for image in detection.images}, target),
             *unusable,
             *unsolved,
             *calibration.notes,

@@ -132,8 +132,28 @@ class RunOptions:
         if self.board_only:
             return []
         ids = [face.id for face in target.faces]
-        named = [set(self.expect_faces)] if self.expect_faces else [_faces_in_name(name, ids) for name in groups]
+        if self.expect_faces:
+            return [face for face in ids if face in self.expect_faces]
+        groups = list(groups)
+        named = [_faces_in_name(name, [*ids, *unknown_faces(groups, target)]) for name in groups]
         return [face for face in ids if all(named) and any(face in faces for faces in named)]
+
+
+def unknown_faces(groups: Iterable[str], target: TargetDesign) -> dict[str, str]:
+    """Returns what seem to be faces that the target does not have, with the group that each is named in.
+
+    Where one group is named after two faces, another name of two words or letters, of which one is a face, names
+    another one beside it.
+    """
+    ids, groups = [face.id for face in target.faces], list(groups)
+    found: dict[str, str] = {}
+    for group in groups if any(_faces_in_name(name, ids) for name in groups) else ():
+        words = re.split("[-_+ ]", group)
+        parts = words if len(words) > 1 else list(group)
+        others = [part for part in parts if part not in ids]
+        if len(parts) == 2 and len(others) == 1 and not _faces_in_name(others[0], ids):
+            found.setdefault(others[0], group)
+    return found
 
 
 def _faces_in_name(group: str, ids: Sequence[str]) -> set[str]:

@@ -27,7 +27,7 @@ from stcal.sfm.mapping.incremental import left_out, map_group
 from stcal.sfm.mapping.pairs import ImageGraph, PairOptions, PairScore, rank_pairs
 from stcal.sfm.mapping.placed import BY_FACES, PlacedBody, model_of_body, pair_of_model
 from stcal.sfm.report.judgement import LEFT_OUT_WHOLE
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.options import RunOptions, unknown_faces
 
 CACHE_VERSION = 7
 SHOW_MORE = "show two faces of it at once, or one by more corners"
@@ -115,6 +115,16 @@ def ungrouped(labelled: Sequence[LabelledImage]) -> list[str]:
     return [
         f"assumed: {len(images)} images that lie in no folder of a group are one group, in which only the camera "
         f"moved{remark}; put the images of each setting of target and board into a folder of its own, IMAGES/<group>/"
+    ]
+
+
+def unknown_face_notes(groups: Iterable[str], target: TargetDesign) -> list[str]:
+    """Returns notes on faces that groups are named after and the target does not have."""
+    known = ", ".join(face.id for face in target.faces)
+    return [
+        f"group {group} seems to be named after face {face}, which the target does not have (faces {known}): add it to "
+        "target.toml, or rename the folder"
+        for face, group in unknown_faces(groups, target).items()
     ]
 
 

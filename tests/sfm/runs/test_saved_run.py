@@ -15,7 +15,7 @@ from stcal.errors import InputError
 from stcal.sfm import run
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.pairs import PairOptions
-from stcal.sfm.runs.options import RunOptions
+from stcal.sfm.runs.options import RunOptions, unknown_faces
 from stcal.sfm.runs.saved import load_run
 from stcal.sfm.runs.transaction import MarkerFile, run_folder
 from tests.outcome import INPUT, assert_error, fails_with
@@ -146,9 +146,10 @@ def test_options_that_are_all_other_than_the_defaults(small_run, tmp_path, monke
     [
         (("12", "14"), (), ["1", "2", "4"]),
         (("1-2", "4_1"), (), ["1", "2", "4"]),
-        (("12", "far"), (), []),
         (("1", "2"), (), []),  # numbers of groups, most likely
-        (("12", "16"), (), []),
+        (("12", "16"), (), ["1", "2"]),
+        (("12", "far"), (), []),
+        (("12", "1-far"), (), ["1", "2"]),
         (("12",), ("5", "3"), ["3", "5"]),
         ((".",), ("1",), ["1"]),
     ],
@@ -363,3 +364,18 @@ def test_the_error_is_one_of_input(own_run):
     (own_run / "labels.csv").unlink()
     with pytest.raises(InputError):
         load_run(own_run)
+
+
+@pytest.mark.parametrize(
+    ("groups", "unknown"),
+    [
+        (("12", "16", "36"), {"6": "16"}),
+        (("1-2", "left-1"), {"left": "left-1"}),
+        (("1_a", "1_b"), {}),  # no name of two faces tells that names are those of faces
+        (("12", "12_2", "31"), {}),
+        (("12", "far", "2024"), {}),
+        ((".",), {}),
+    ],
+)
+def test_faces_that_groups_name_and_the_design_has_not(groups, unknown):
+    assert unknown_faces(groups, reference_target()) == unknown
