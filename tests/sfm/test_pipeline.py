@@ -56,7 +56,7 @@ def test_a_result_shows_itself_in_a_line_and_in_a_notebook(small_result):
     text, page = repr(small_result), small_result._repr_html_()
     assert len(text) < 500
     assert "\n" not in text
-    assert small_result.judgement.use in text
+    assert small_result.judgement.use.removesuffix(".") in text
     reference = small_result.target.reference_face
     for face in small_result.target.target_from_face:
         assert f"{face}, {'reference' if face == reference else ''}" in text

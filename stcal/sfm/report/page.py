@@ -167,7 +167,7 @@ def _answer(report: dict, colours: dict[str, str], views: list[tuple[str, str, s
             [("target", "Target"), ("all", "With boards and cameras")],
         ),
         "In the target frame. Axes of the face frames: x red, y green, z blue; the name of a face stands at the end "
-        "of its normal",
+        "of its Z",
         legend(colours, "Groups:"),
     ]
     use = []
@@ -372,10 +372,11 @@ def _faces_in_detail(report: dict) -> list[Block]:
         for face, chains in report["chains"].items()
         for way in chains
     ]
-    over = [("", 1), ("X axis of the face", 3), ("Y axis of the face", 3), ("Z axis: outward normal", 3), ("", 1)]
+    over = [("", 1), ("X axis of the face", 3), ("Y axis of the face", 3), ("Z axis: the normal", 3), ("", 1)]
     heads = ["<Face", "<Way", "<By groups", "Position off (µm)", "Rotation off (mdeg)"]
     return [
-        "The axes of each face in the target frame: the columns of its rotation matrix",
+        "The axes of each face in the target frame: the columns of its rotation matrix. Z points out of the body on faces "
+        "of circles, and into it on faces of boards and tags, as their own frames do",
         Table(["<Face"] + ["x", "y", "z"] * 3 + ["Angle to datum (°)"], axes, over),
         columns(
             [

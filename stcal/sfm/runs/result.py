@@ -212,27 +212,28 @@ class RunResult:
     def __repr__(self) -> str:
         faces = "; ".join(", ".join(row) for row in self._summary())
         place = f" in {self.out}" if self.out else ""
-        return f"<RunResult{place}: {self._verdict()}; face, σ µm, σ mdeg: {faces or 'no face'}>"
+        verdict = self._verdict().removesuffix(".")
+        return f"<RunResult{place}: {verdict}; face, largest σ along an axis µm, about one mdeg: {faces or 'no face'}>"
 
     def _repr_html_(self) -> str:
         """Returns verdict, faces and σ as HTML, which notebooks show."""
         rows = [f"<tr><td>{'</td><td>'.join(map(escape, row))}</td></tr>" for row in self._summary()]
-        head = "<tr><th>face</th><th>σ µm</th><th>σ mdeg</th></tr>"
+        head = "<tr><th>face</th><th>largest σ along an axis, µm</th><th>about an axis, mdeg</th></tr>"
         return f"<p>{escape(self._verdict())}</p><table>{head}{''.join(rows)}</table>"
 
     def _verdict(self) -> str:
         return "not judged" if self.judgement is None else f"may I use it? {self.judgement.use}"
 
     def _summary(self) -> list[tuple[str, str, str]]:
-        """Returns each face with the length of σ of its place and of its rotation over the three axes."""
+        """Returns each face with its largest σ along an axis and about one."""
         rows = []
         for face in self.target.target_from_face:
             covariance = self.target.face_covariance.get(face)
             if face == self.target.reference_face or covariance is None:
                 rows.append((face, "reference" if face == self.target.reference_face else "", ""))
                 continue
-            rotation, place = (float(np.sqrt(np.trace(covariance[part, part]))) for part in (slice(3), slice(3, 6)))
-            rows.append((face, f"{1e3 * place:.2f}", f"{1e3 * np.degrees(rotation):.2f}"))
+            sigma = np.sqrt(np.diag(covariance))
+            rows.append((face, f"{1e3 * sigma[3:].max():.1f}", f"{1e3 * np.degrees(sigma[:3].max()):.2f}"))
         return rows
 
     def circles(self) -> TargetCircles:
