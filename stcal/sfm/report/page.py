@@ -375,8 +375,8 @@ def _faces_in_detail(report: dict) -> list[Block]:
     over = [("", 1), ("X axis of the face", 3), ("Y axis of the face", 3), ("Z axis: the normal", 3), ("", 1)]
     heads = ["<Face", "<Way", "<By groups", "Position off (µm)", "Rotation off (mdeg)"]
     return [
-        "The axes of each face in the target frame: the columns of its rotation matrix. Z points out of the body on faces "
-        "of circles, and into it on faces of boards and tags, as their own frames do",
+        "The axes of each face in the target frame: the columns of its rotation matrix. Z points out of the body on "
+        "faces of circles, and into it on faces of boards and tags, as their own frames do",
         Table(["<Face"] + ["x", "y", "z"] * 3 + ["Angle to datum (°)"], axes, over),
         columns(
             [
