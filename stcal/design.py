@@ -184,6 +184,12 @@ class TargetDesign(Brief):
         """True if a face is a board or has tags."""
         return any(face.printed is not None for face in self.faces)
 
+    @property
+    def points(self) -> Literal["circles", "corners", "points"]:
+        """What the faces have: circles, corners where all are boards and tags, or points where they have both."""
+        kinds = {face.printed is None for face in self.faces}
+        return "points" if len(kinds) > 1 else "circles" if True in kinds else "corners"
+
     def printed_ids(self) -> frozenset[str]:
         """Returns the ids of the faces that are boards or have tags."""
         return frozenset(face.id for face in self.faces if face.printed is not None)

@@ -222,9 +222,10 @@ def forecast_table(forecast: Forecast, shares: dict[str, dict[str, float]]) -> l
     rows = ForecastPart.of(forecast, shares).faces
     circles = {face: f"{row.worst_circle} {row.worst_circle_sigma_um:.2f}" for face, row in rows.items()}
     wide, worst = max([4, *map(len, rows)]), max([8, *map(len, circles.values())])
+    point = "point" if any("print" in own for own in shares.values()) else "circle"
     axes = " ".join(f"{name:>5}" for name in ("x", "y", "z", "all", "x", "y", "z"))
     lines = [
-        f"{'face':>{wide}} {'σ position µm':^23} {'σ rotation mdeg':^17}  {'circle':<{worst}}  share of",
+        f"{'face':>{wide}} {'σ position µm':^23} {'σ rotation mdeg':^17}  {point:<{worst}}  share of",
         f"{'':>{wide}} {axes}  {'worst µm':<{worst}}  variance",
     ]
     for face, row in rows.items():

@@ -31,7 +31,7 @@ def run_text(result: RunResult) -> str:
     """Returns the result of a run: groups, what was left out, faces with σ, and checks that did not pass."""
     lines = [*_skipped(result.detection.skipped)]
     for solution in result.solutions:
-        lines += _group(solution, result.calibration.scales[solution.model.group])
+        lines += _group(solution, result.calibration.scales[solution.model.group], result.target_design.points)
     lines += result.notes
     lines += _noted(result.labelled)
     lines += [*_scale_of_target(result), *_found_camera(result)]
@@ -195,14 +195,14 @@ def _noted(labelled: Sequence[LabelledImage]) -> Iterator[str]:
         yield f"something was left out in {', '.join(others[:NAMED])}{surplus} too; the report says what and why"
 
 
-def _group(solution: GroupSolution, scale: Scale) -> Iterator[str]:
+def _group(solution: GroupSolution, scale: Scale, points: str) -> Iterator[str]:
     pair = solution.pairs[0]
     of_scale = {"board": "board", "faces": "printed faces", "distances": "known distances", "drawing": "drawing"}[
         scale.source
     ]
     name = "all images together" if solution.model.group == TOP_GROUP else f"group {solution.model.group}"
     yield (
-        f"{name}: {len(solution.model.images)} images, {len(solution.model.labels)} circles, "
+        f"{name}: {len(solution.model.images)} images, {len(solution.model.labels)} {points}, "
         f"initial pair {Path(pair.first).name} – {Path(pair.second).name} at "
         f"{np.degrees(pair.median_angle_rad):.0f}°, {of_scale} {1e3 * scale.rms_mm():.1f} µm RMS"
     )
