@@ -82,8 +82,10 @@ def against_stated(budget: Budget, path: Path, columns: Path | None = None) -> L
     uncertainty of the lengths. Without ``sigma_mm`` they are taken as exact. ``columns`` : map of the columns, see
     :func:`~stcal.io.poses.columns.read_mapped`.
 
-    Raises InputError if the file is not a table of lengths, a circle is not in the run, or a length or σ is invalid.
+    Raises InputError if the file is not a table of lengths, a circle is not in the run, a length or σ is invalid, or
+    the size of the run is not known.
     """
+    _require_size(budget)
     table = table_of(path, columns, WHAT)
     ends = list(zip(table.text("from"), table.text("to"), strict=True))
     length = table.quantity("length", LENGTHS)
@@ -118,8 +120,10 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     The lengths are the longest distances of every two faces, and within each face, between circles that both runs have.
     ``boards`` : the boards of the two runs.
 
-    Raises InputError if the runs have no two circles of the target in common.
+    Raises InputError if the runs have no two circles of the target in common, or the size of one is not known.
     """
+    _require_size(budget)
+    _require_size(other)
     common = [label for label in budget.joint.labels if label in set(other.joint.labels)]
     rows, other_rows = (_places(calibration.joint, common) for calibration in (budget, other))
     pairs = longest_of(common, budget.joint.xyz_model[rows])
@@ -143,6 +147,15 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     return LengthTest(str(folder), tuple(tested), (note,) if _same(*boards) else ())
 
 
+def _require_size(budget: Budget) -> None:
+    if not budget.conditions.size_known:
+        raise InputError(
+            "E-BUDGET-NO-SIZE",
+            "nothing of known size was in view of a run, and only its shape is known: its lengths cannot be compared; "
+            "state one of the lengths with [[scale]] in target.toml, and run again",
+        )
+
+
 def _places(joint: JointResult, labels: Sequence[CircleLabel]) -> list[int]:
     places = {label: i for i, label in enumerate(joint.labels)}
     return [places[label] for label in circle_labels(labels)]
@@ -159,4 +172,4 @@ def _measured(budget: Budget, i: int, j: int, without: Sequence[str] = ()) -> tu
     variance = sum(
         float(measurand.covariance(source, 0.0)[0, 0]) for source in budget.sources if source.key not in without
     )
-    return float(measurand.length_mm or 0.0) * (1 + budget.correction), float(np.sqrt(variance))
+    return float(measurand.length_mm or 0.0) * (1 + budget.conditions.correction), float(np.sqrt(variance))

@@ -98,8 +98,11 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, b
 
 def test_command(stcal_sfm, small_run, budget, tmp_path):
     path, out = lengths_csv(tmp_path / "lengths.csv", budget, 1.5), tmp_path / "budget.json"
-    code, text, _ = stcal_sfm("budget", small_run, "--check-lengths", path, "--lengths", small_run, "--json", out)
-    assert code == 0
+    code, text, error = stcal_sfm("budget", small_run, "--check-lengths", path, "--lengths", small_run, "--json", out)
+    assert code == 4
+    assert f"length test against {path}: differs; results are written" in error
+    words = ("--check-lengths", path, "--no-strict", "--quiet")
+    assert stcal_sfm("budget", small_run, *words) == (0, "", "")
     assert f"length test against {path}: differs: 4 of 4" in text
     assert (
         "differs: 4 of 4 lengths beyond U, where 1 in 22 is by chance; largest |E_n| 1.50, which reaches 1.27" in text

@@ -25,7 +25,11 @@ def test_page_and_pdf(stcal_sfm, small_run, tmp_path, monkeypatch):
     assert row is not None
     assert re.findall(r"<td>([\d.]+)</td>", row[1]) == combined
     assert "by +40.0 ppm" in html
-    assert "Lengths and positions hold at 20 °C, with a correction of +40.0 ppm" in html
+    assert "hold at the temperature at which the target was photographed, with a correction of +40.0 ppm" in html
+    assert "<h1>Certificate of calibration and uncertainty budget: " in html
+    expanded = next(line for line in text.splitlines() if line.startswith("expanded uncertainty")).split()[6:]
+    assert len(expanded) == 3
+    assert all(len(value.replace(".", "").strip("0")) <= 2 for value in expanded), expanded
     assert text.index("position of face") < text.index("distance of circles")
     assert "agrees: all 10 lengths within U" in html
     assert re.search(r"SHA-256 of faces.json</th><td[^>]*>[0-9a-f]{64}<", html)
