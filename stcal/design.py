@@ -57,8 +57,8 @@ class FaceDesign:
     sigma_mm : float, optional
         σ of a point's place in the plane about the design if the design is what the face was made by, as print is; None
         if the design only names the points.
-    size_sigma : float
-        Relative σ of the printed size.
+    size_sigma, edge_share : float
+        Relative σ of the printed size, and the share of its variance that is due to the edges of tags.
     of_tags : bool
         Whether the corners are those of tags, four by four, whose edges light and ink move.
 
@@ -82,6 +82,7 @@ class FaceDesign:
     sigma_mm: float | None = None
     size_sigma: float = 0.0
     of_tags: bool = False
+    edge_share: float = 0.0
 
     def __post_init__(self):
         freeze(self, "xy_mm", (len(self.ids), 2), f"face {self.id}: circles")

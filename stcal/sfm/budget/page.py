@@ -148,9 +148,10 @@ def budget_report(file: BudgetFile) -> Document:
                     f"The final adjustment was made again from the run's files; σ₀ = {file.sigma0:.3f} with "
                     f"{file.redundancy} degrees of freedom, by which all σ are multiplied: the σ₀ of the run's "
                     "report, but 1 where it is smaller, as small residuals make no σ smaller than stated. The "
-                    "covariance of each kind of observation goes through the adjustment's inverse to the circles and to the frames of the faces (JCGM 100, 5.1.2); "
-                    "coverage is by 100 000 draws (JCGM 101). Not in it: radii of circles and dots, a shift of "
-                    "centres that all views share, and whatever fails a check of the run",
+                    "covariance of each kind of observation goes through the adjustment's inverse to the circles and "
+                    "to the frames of the faces (JCGM 100, 5.1.2); coverage is by 100 000 draws (JCGM 101). Not in "
+                    "it: radii of circles and dots, a shift of centres that all views share, and whatever fails a "
+                    "check of the run",
                     Table(["<Of", "<"], hashes, css="text facts"),
                 ],
             ),

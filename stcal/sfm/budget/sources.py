@@ -178,9 +178,12 @@ def _own_size(found: Contributions, board: BoardDesign) -> Iterator[Source]:
         within = max(face.sigma_mm or 0.0 for face in faces) * found.joint.print_factor * factor
         words = f"sigma_mm of target.toml × {found.joint.print_factor * factor:.2f}, in the plane; off it --flatness"
         yield Source("print", "print of faces", "B", "stated", words, 1e3 * within, "µm", found.covariance_mm2[PRINT])
-        sigma = max(face.size_sigma for face in faces)
-        stated: Origin = "stated" if sigma else "not stated"
-        words = "size_sigma_mm, and what moves the edges of tags" if sigma else "no size_sigma_mm; taken as exact"
+        largest = max(faces, key=lambda face: face.size_sigma)
+        sigma, by_statement = largest.size_sigma, largest.size_sigma > 0 and largest.edge_share < 1
+        stated: Origin = "stated" if by_statement else "assumed" if sigma else "not stated"
+        words = "no size_sigma_mm" + ("; what moves the edges of all tags alike" if sigma else "; taken as exact")
+        if by_statement:
+            words = "size_sigma_mm" + (", and what moves the edges of all tags alike" if largest.edge_share else "")
         ppm = 1e6 * sigma if sigma else None
         yield Source("print_size", "size of print", "B", stated, words, ppm, "ppm", found.covariance_mm2[SIZES])
     if known := known_distances(board):
