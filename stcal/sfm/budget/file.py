@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 import stcal
+from stcal.design import StatedSize
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import RUN_MARKER
 from stcal.io.json import ByName, Finite, Part, ResultFile
@@ -353,6 +354,8 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
         )
     elif is_refused(run):
         notes.insert(0, f"may the run be used? {run.report['judgement']['use']} No uncertainty of it is given")
+    if not run.board_design.rows and budget.statement.board != StatedSize():
+        notes.append("no board was in view: what is stated of [board] is not used")
     if faults := verified.faults():
         notes.append(f"the run's folder is not as the run left it: {'; '.join(faults)}")
     notes.append(

@@ -18,6 +18,7 @@ from stcal.io.table import LENGTHS
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, distance, longest_of
+from stcal.sfm.budget.sources import reference_temperature_c
 
 WHAT = "lengths"
 BY_CHANCE = 2 * float(norm.sf(COVERAGE_FACTOR))
@@ -111,6 +112,11 @@ def against_stated(budget: Budget, path: Path, columns: Path | None = None) -> L
         expanded = COVERAGE_FACTOR * float(np.hypot(standard, sigma_mm))
         tested.append(Length((joint.labels[i], joint.labels[j]), measured, float(value), expanded))
     notes = () if known else (f"{path} states no sigma_mm: its lengths are taken as exact",)
+    if budget.conditions.temperature_c != reference_temperature_c(budget.statement.target):
+        notes += (
+            f"{path} must state lengths for the temperature at which the target was photographed: those of the run are "
+            "not corrected to another",
+        )
     return LengthTest(str(path), tuple(tested), notes)
 
 

@@ -155,7 +155,11 @@ def budget_report(file: BudgetFile) -> Document:
                     Table(["<Of", "<"], hashes, css="text facts"),
                 ],
             ),
-            Section("Signature", [Table(["<", "<"], [[name, ""] for name in SIGNED], css="text facts")]),
+            *(
+                [Section("Signature", [Table(["<", "<"], [[name, ""] for name in SIGNED], css="text facts")])]
+                if certifies(file)
+                else []
+            ),
         ],
         banner=[
             Table(["<Field", "<"], [[name, value or NONE] for name, value in file.fields.items()], css="text facts")
@@ -163,11 +167,15 @@ def budget_report(file: BudgetFile) -> Document:
     )
 
 
+def certifies(file: BudgetFile) -> bool:
+    """Returns whether the page is a certificate: sizes are known, and nothing says that the run must not be used."""
+    return file.usable and file.size_known and all(test.agrees for test in file.length_tests)
+
+
 def title_of(file: BudgetFile) -> str:
-    """Returns the title: a certificate only where sizes are known and nothing says that the run must not be used."""
-    differs = any(test.agrees is False for test in file.length_tests)
-    certifies = file.usable and file.size_known and not differs
-    return f"{'Certificate of calibration and uncertainty' if certifies else 'Uncertainty'} budget: {file.run.target}"
+    """Returns the title, which calls the page a certificate only if it is one."""
+    kind = "Certificate of calibration and uncertainty" if certifies(file) else "Uncertainty"
+    return f"{kind} budget: {file.run.target}"
 
 
 def _what_u_is(file: BudgetFile) -> str:

@@ -184,6 +184,7 @@ def test_without_a_known_size_nothing_in_mm_is_certified(saved, plain, tmp_path)
     text = budget_report(file).text()
     page = budget_report(file).page()
     assert "Certificate" not in page
+    assert "Signature" not in page
     assert "only the shape is known" in page
     for shown in (text, page):
         assert "hold at" not in shown
@@ -285,6 +286,8 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     ("content", "words"),
     [
         ("[board]\npitch_sigma_ppm = -1\n", "board.pitch_sigma_ppm: -1:"),
+        ("[target]\nexpansion_ppm_per_k = 0.000023\n", "in ppm/K, so that 2.3e-05 1/K is 23;"),
+        ("[board]\nexpansion_sigma_ppm_per_k = 1e-6\n", "in ppm/K, so that 1e-06 1/K is 1;"),
         ("[target]\npitch_sigma_ppm = 1\n", "target.pitch_sigma_ppm: unknown key"),
         ("[fields]\noperator = 3\n", "fields.operator: 3:"),
         ("operator = 'x'\n", "operator: unknown key"),

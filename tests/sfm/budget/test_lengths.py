@@ -48,7 +48,10 @@ def test_errors_over_their_uncertainty(budget, tmp_path, off_u, rows, beyond, ag
     assert [each.e_n for each in found.lengths] == pytest.approx([off_u] * rows, abs=1e-5)
     assert (found.beyond, found.agrees) == (beyond, agrees)
     assert found.limit == pytest.approx({1: 1.0, 4: 1.2655}[rows], abs=1e-3)
-    assert found.notes == ()
+    (note,) = found.notes  # no temperature is stated
+    assert "must state lengths for the temperature at which the target was photographed" in note
+    at_20 = replace(budget, conditions=replace(budget.conditions, temperature_c=20.0))
+    assert against_stated(at_20, tmp_path / "lengths.csv").notes == ()
 
 
 def test_a_table_of_another_program_is_read_by_its_columns(budget, tmp_path):
@@ -70,7 +73,7 @@ def test_lengths_without_sigma_are_exact(budget, tmp_path):
     path = lengths_csv(tmp_path / "lengths.csv", budget, 0.9, sigma_mm=0.0, head="from,to,length_mm")
     found = against_stated(budget, path)
     assert [each.e_n for each in found.lengths] == pytest.approx([0.9] * 4, abs=1e-5)
-    assert found.notes == (f"{path} states no sigma_mm: its lengths are taken as exact",)
+    assert found.notes[0] == f"{path} states no sigma_mm: its lengths are taken as exact"
 
 
 def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, budget, tmp_path):
