@@ -82,7 +82,7 @@ def budget_report(file: BudgetFile) -> Document:
         for face, e in faces.items()
     ]
     inputs = [
-        [each.title, NONE if each.sigma is None else f"{each.sigma:.3g} {each.unit}", *_origin(each)]
+        [each.title, NONE if each.sigma is None else f"{float(f'{each.sigma:.3g}'):g} {each.unit}", *_origin(each)]
         for each in file.sources
     ]
     stated = [[each.body, each.key, f"{each.value:g}", each.origin] for each in file.stated]
