@@ -150,7 +150,13 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
         "are off is in both alike, cannot be seen here, and is not in U of the differences; a length from elsewhere "
         "(--check-lengths) shows it"
     )
-    return LengthTest(str(folder), tuple(tested), (note,) if _same(*boards) else ())
+    notes = (note,) if _same(*boards) else ()
+    if budget.conditions.temperature_c != other.conditions.temperature_c:
+        notes += (
+            "the lengths of the two calibrations hold at different temperatures; state expansion and temperature of "
+            "board and target for both",
+        )
+    return LengthTest(str(folder), tuple(tested), notes)
 
 
 def _require_size(budget: Budget) -> None:

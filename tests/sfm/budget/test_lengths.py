@@ -97,6 +97,10 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, b
     assert other.lengths[0].expanded_mm == pytest.approx(wanted, rel=2e-3)
     assert other.notes == ()
     assert "board_pitch" in SHARED
+    at_20 = replace(budget, conditions=replace(budget.conditions, temperature_c=20.0))
+    mixed = against_run(budget, at_20, saved.folder, (saved.board_design, saved.board_design))
+    assert len(mixed.notes) == 2
+    assert "hold at different temperatures" in mixed.notes[1]
 
 
 def test_command(stcal_sfm, small_run, budget, tmp_path):
