@@ -58,8 +58,8 @@ class FaceDesign(Brief):
     sigma_mm : float, optional
         σ of a point's place in the plane about the design if the design is what the face was made by, as print is; None
         if the design only names the points.
-    size_sigma : float
-        Relative σ of the printed size.
+    size_sigma, edge_share : float
+        Relative σ of the printed size, and the share of its variance that is due to the edges of tags.
     of_tags : bool
         Whether the corners are those of tags, four by four, whose edges light and ink move.
 
@@ -83,6 +83,7 @@ class FaceDesign(Brief):
     sigma_mm: float | None = None
     size_sigma: float = 0.0
     of_tags: bool = False
+    edge_share: float = 0.0
 
     def __post_init__(self):
         require_fields(self, f"face {self.id}", sigma_mm=0, size_sigma=0)

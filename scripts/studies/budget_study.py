@@ -35,7 +35,7 @@ from stcal.sfm.adjust.joint import JointResult, adjusted
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.uncertainty import contributions_of, derivatives
 from stcal.sfm.budget.combine import Budget, budget
-from stcal.sfm.budget.sources import FIELDS, Statement, correction
+from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
@@ -201,7 +201,7 @@ def errors(
         camera: Camera = case.camera
         joint = adjusted(weighed, case.board, camera, case.flatness_mm, case.prior, common=stated.common).result()
     true = np.array([draw.circles[label] for label in joint.labels])
-    away = in_place(joint.xyz_model * (1 + correction(case.statement)), true) - true
+    away = in_place(joint.xyz_model * (1 + conditions_of(case.statement, case.board).correction), true) - true
     return [row.measurand.jacobian @ away.ravel() for row in stated.budget.rows]
 
 

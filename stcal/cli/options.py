@@ -67,6 +67,12 @@ Exclude = Annotated[
     Opt(metavar="IMAGE"),
 ]
 Strict = Annotated[bool, "End with exit code 4 where a check has failed; results are written all the same."]
+StrictByDefault = Annotated[
+    bool,
+    "End with exit code 4 where the answer is no, or with 0 all the same; results are written.",
+    Opt("--strict/--no-strict"),
+]
+"""Option of the commands that say whether a run may be used."""
 Overwrite = Annotated[bool, "Replace output files that are there.", Opt("--overwrite")]
 """Option of every command that writes a file."""
 Quiet = Annotated[bool, "Say nothing but warnings and errors.", Opt("--quiet -q")]
@@ -218,6 +224,16 @@ def require_passed(strict: bool, failed: Sequence[str], report: Path | None = No
         raise ChecksFailed(
             "E-CHECKS-FAILED",
             f"--strict: failed: {', '.join(failed[:2])}{others}; results are written, do not use them{where}",
+        )
+
+
+def require_usable(strict: bool, reasons: Sequence[str], page: Path | None = None) -> None:
+    """Raises :class:`ChecksFailed` with the reasons why a result must not be used, unless ``--no-strict`` was given."""
+    if strict and reasons:
+        where = f"; see {page}" if page else ""
+        raise ChecksFailed(
+            "E-CHECKS-FAILED",
+            f"{'; '.join(reasons)}; results are written, do not use them, or end with 0 by --no-strict{where}",
         )
 
 

@@ -142,7 +142,18 @@ class _CornerFile(Strict):
 
 
 Ppm = Annotated[float, Field(ge=0, le=1e5, allow_inf_nan=False, strict=True)]
-Expansion = Annotated[float, Field(ge=-100, le=1000, allow_inf_nan=False, strict=True)]
+LEAST_PPM = 1e-3
+"""Smallest expansion in ppm/K that anyone can state: less is one in 1/K, which is 3e-4 at most."""
+
+
+def _in_ppm(value: float) -> float:
+    if 0 < abs(value) < LEAST_PPM:
+        raise ValueError(f"in ppm/K, so that {value:g} 1/K is {1e6 * value:g}; 0 or at least {LEAST_PPM:g} needed")
+    return value
+
+
+Expansion = Annotated[float, Field(ge=-100, le=1000, allow_inf_nan=False, strict=True), AfterValidator(_in_ppm)]
+ExpansionSigma = Annotated[Ppm, AfterValidator(_in_ppm)]
 Celsius = Annotated[float, Field(ge=-273.15, le=2000, allow_inf_nan=False, strict=True)]
 Kelvin = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False, strict=True)]
 
@@ -151,7 +162,7 @@ class SizeEntry(Strict):
     """The keys of :class:`StatedSize` without the pitch, for any body."""
 
     expansion_ppm_per_k: Expansion | None = None
-    expansion_sigma_ppm_per_k: Ppm | None = None
+    expansion_sigma_ppm_per_k: ExpansionSigma | None = None
     temperature_c: Celsius | None = None
     temperature_sigma_k: Kelvin | None = None
     reference_temperature_c: Celsius | None = None

@@ -25,6 +25,14 @@ def number(value: float | None, digits: int) -> str:
     return fixed(value, digits)
 
 
+def significant(value: float | None, digits: int = 2) -> str:
+    """Return a number with so many significant digits, as uncertainties are stated (JCGM 100:2008, 7.2.6)."""
+    if not value or not math.isfinite(value):
+        return number(value, digits)
+    decimals = digits - 1 - int(f"{value:.{digits - 1}e}".partition("e")[2])
+    return number(round(value, decimals), max(decimals, 0))
+
+
 def cells(row: dict, spec: str) -> list:
     """Return the values of a row that ``spec`` names, in words ``key``, or ``key:digits`` for numbers."""
     keys = [word.partition(":") for word in spec.split()]

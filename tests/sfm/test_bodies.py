@@ -10,7 +10,7 @@ from PIL import Image
 
 from stcal.boards.faces import shift_by_curves
 from stcal.boards.target import body_toml, load_body
-from stcal.design import KnownDistance, reference_target, scale_reference, with_drawn_size
+from stcal.design import KnownDistance, StatedSize, reference_target, scale_reference, with_drawn_size
 from stcal.drawing.net import net_parts
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
@@ -22,8 +22,9 @@ from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.joint import adjusted
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import refine
-from stcal.sfm.adjust.scale import find_scale
+from stcal.sfm.adjust.scale import find_scale, with_edge_sigma
 from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, PRINT, SIZES, contributions_of
+from stcal.sfm.budget.sources import sources_of, statement_of
 from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -245,6 +246,26 @@ def test_contributions_of_a_body_add_up_to_its_covariance():
     total = sum(found.covariance_mm2.values())
     np.testing.assert_allclose(total, found.joint.covariance_mm2, atol=1e-8 * np.abs(total).max())
     assert all(np.trace(found.covariance_mm2[kind]) > 0 for kind in (PRINT, SIZES, DISTANCES, INTRINSICS))
+    assert size_row(found, board) == ("stated", "size_sigma_mm")
+    seen = with_edge_sigma(board, images)
+    assert size_row(found, seen) == ("stated", "size_sigma_mm, and what moves the edges of all tags alike")
+    drawn = scale_reference(None, tag_cube(60))
+    assert size_row(found, drawn) == ("not stated", "no size_sigma_mm; taken as exact")
+    edges = with_edge_sigma(drawn, images)
+    assert size_row(found, edges) == ("assumed", "no size_sigma_mm; what moves the edges of all tags alike")
+    for face, own, both in zip(drawn.faces, edges.faces, seen.faces, strict=True):
+        stated = target.face(face.id).size_sigma
+        assert both.size_sigma == pytest.approx(np.hypot(stated, own.size_sigma))
+        assert both.edge_share == pytest.approx((own.size_sigma / both.size_sigma) ** 2)
+        assert (face.edge_share, own.edge_share) == (0.0, 1.0)
+
+
+def size_row(found, board) -> tuple[str, str]:
+    """Origin and words of the row of the printed size in a budget."""
+    rows = sources_of(found, None, board, 0.02, True, statement_of(StatedSize()), False)
+    (row,) = [row for row in rows if row.key == "print_size"]
+    assert not [row for row in rows if row.key.startswith("target_")]  # a size of the target itself does not expand
+    return row.origin, row.words
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stcal.cli.options import JsonFile, ReportFile, Run
+from stcal.cli.options import JsonFile, ReportFile, Run, StrictByDefault, require_usable
 from stcal.cli.terminal import say, write, write_if
 from stcal.errors import InputError
 from stcal.io.files import keep_apart
@@ -35,11 +35,12 @@ def budget(
     page: ReportFile = None,
     pdf: Annotated[bool, "Also write the page as PDF, beside it (needs the extra `pdf`)."] = False,
     out: JsonFile = None,
+    strict: StrictByDefault = True,
 ) -> None:
     """Compute the uncertainty budget of faces and of the target's longest distances (GUM), each contribution apart."""
     from stcal.report.page import pdf_of
     from stcal.sfm.budget.combine import budget_of_run
-    from stcal.sfm.budget.file import BudgetFile
+    from stcal.sfm.budget.file import BudgetFile, refusals
     from stcal.sfm.budget.lengths import against_run, against_stated
     from stcal.sfm.budget.page import budget_report
     from stcal.sfm.budget.sources import statement_of
@@ -57,18 +58,19 @@ def budget(
             "E-OPTION-NEEDS",
             f"--lengths-statement {lengths_statement}: of a second calibration; give it with --lengths",
         )
-    computed, tests = budget_of_run(saved, stated), []
+    computed, tests, others = budget_of_run(saved, stated), [], []
     if check_lengths is not None:
         tests.append(against_stated(computed, check_lengths, columns))
     if lengths is not None:
         second = load_run(lengths)
+        others.append(second)
         statement_of_second = statement_of(second.board_design.stated, lengths_statement or statement)
         tests.append(
             against_run(
                 computed, budget_of_run(second, statement_of_second), lengths, (saved.board_design, second.board_design)
             )
         )
-    file = BudgetFile.of(computed, saved, verify(run), tests)
+    file = BudgetFile.of(computed, saved, verify(run), tests, *others)
     document = budget_report(file)
     say(document.text())
     write_if(out, lambda: file, "as JSON")
@@ -77,6 +79,7 @@ def budget(
         write(page, html, "report")
         if pdf:
             write(page.with_suffix(".pdf"), pdf_of(html), "PDF")
+    require_usable(strict, refusals([saved, *others], file.length_tests), page)
 
 
 def _require_pdf(page: Path | None, run: Path) -> None:

@@ -8,7 +8,7 @@ import typer
 from stcal.cli import options as shared
 from stcal.cli.declare import WRITES, Opt
 from stcal.cli.terminal import StageProgress, print_each, say, verbose, write_if
-from stcal.errors import ChecksFailed, InputError
+from stcal.errors import InputError
 from stcal.io.files import keep_apart
 
 app = typer.Typer()
@@ -86,11 +86,7 @@ def run(
         "after, such as 12, if not given.",
         Opt(metavar="FACES"),
     ] = None,
-    strict: Annotated[
-        bool,
-        "End with exit code 4 where the answer is no, or with 0 all the same; results are written.",
-        Opt("--strict/--no-strict"),
-    ] = True,
+    strict: shared.StrictByDefault = True,
     min_diameter: shared.MinDiameter = None,
     max_diameter: shared.MaxDiameter = 450.0,
     workers: shared.Workers = None,
@@ -129,12 +125,9 @@ def run(
         say("\n".join(found_lines(result.labelled)))
     say(run_text(result))
     has_faces = bool(result.target.target_from_face)  # a run of the board alone has none, and was asked for none
-    if strict and has_faces and result.judgement is not None and result.judgement.verdict == "no":
-        raise ChecksFailed(
-            "E-CHECKS-FAILED",
-            f"may I use it? {result.judgement.use.removesuffix('.')}; results are written, do not use them, or end "
-            f"with 0 by --no-strict; see {out / 'report.html'}",
-        )
+    if has_faces and result.judgement is not None and result.judgement.verdict == "no":
+        reason = f"may I use it? {result.judgement.use.removesuffix('.')}"
+        shared.require_usable(strict, [reason], out / "report.html")
 
 
 @app.command()

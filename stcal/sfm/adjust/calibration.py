@@ -16,12 +16,12 @@ from stcal.labels import CircleLabel, DotLabel, Label
 from stcal.parallel import Progress, counted
 from stcal.sfm.adjust.chain import CalibratedTarget, chain_faces, chain_singly, unlinked_faces
 from stcal.sfm.adjust.faces import FaceInGroup, FrameKind, faces_of_group, missing_frame_circles
-from stcal.sfm.adjust.joint import EXACTLY, NEAR, SETTLED_PX, JointResult, adjusted
+from stcal.sfm.adjust.joint import EXACTLY, NEAR, SETTLED_PX, Adjusted, JointResult, adjusted
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.adjust.scale import Scale, find_scale
-from stcal.sfm.adjust.uncertainty import calibrated_target
+from stcal.sfm.adjust.uncertainty import CIRCLES, calibrated_target, centre_sigma_px
 from stcal.sfm.data.model import GroupModel, M, MetricModel, WorldModel
 
 JOINT_ROUNDS = 2
@@ -65,7 +65,8 @@ class Calibration(Brief):
     ``models`` : models that the result rests on, mm, target frame, without groups that are not linked to it;
     ``camera`` : refined camera if it was refined, else the given one; ``notes`` : faces without a frame and the
     reasons, and an adjustment that did not settle; ``rim_mm`` : heights of the rims behind which circles lie, if the
-    result is of the luminous surface, empty if it is of what is seen; ``rim_sigma_mm`` : σ of all of them together.
+    result is of the luminous surface, empty if it is of what is seen; ``rim_sigma_mm`` : σ of all of them together;
+    ``circle_sigma_px`` : σ of the centres of the target's circles and corners in the joint adjustment, RMS per axis.
     """
 
     target: CalibratedTarget
@@ -78,6 +79,7 @@ class Calibration(Brief):
     notes: tuple[str, ...]
     rim_mm: Mapping[CircleLabel, float] = field(default_factory=dict)
     rim_sigma_mm: float = 0.0
+    circle_sigma_px: float | None = None
 
 
 def calibrate(
@@ -121,11 +123,13 @@ def calibrate(
         raise MappingError(error.code, "; ".join([str(error), *notes])) from error
     factors = image_sigma_factors(models, camera, target.printed_ids())
     metric = [_placed(m, scales[m.group], calibrated) for m in models if m.group in calibrated.target_from_group]
-    joint = None
+    joint, circle_sigma_px = None, None
     step(None)
     if joint_rounds:
-        joint, factors = _adjust_all(metric, factors, camera, target, board, options, prior, step)
-        calibrated = calibrated_target(joint, calibrated, target, options.frame)
+        state, factors = _adjust_all(metric, factors, camera, target, board, options, prior, step)
+        joint = state.result()
+        calibrated = calibrated_target(joint, calibrated, target, options.frame, state)
+        circle_sigma_px = joint.sigma_scale * centre_sigma_px(state.blocks, CIRCLES)
         step(None)
         metric = [m.moved(calibrated.target_from_group[m.group]) for m in joint.models]
         camera = joint.camera
@@ -139,6 +143,7 @@ def calibrate(
         models=tuple(metric),
         camera=camera,
         notes=tuple(notes),
+        circle_sigma_px=circle_sigma_px,
     )
 
 
@@ -195,6 +200,7 @@ def on_luminous_surface(
         + rim_covariance_mm2(joint, calibration.target.target_from_face, rim_mm, sigma_mm),
     )
     surface = calibrated_target(moved, calibration.target, target, frame)
+    surface = replace(surface, position_sources_mm=calibration.target.position_sources_mm)
     models = tuple(m.moved(surface.target_from_group[m.group]) for m in joint.models)
     return replace(calibration, target=surface, models=models, rim_mm=dict(rim_mm), rim_sigma_mm=sigma_mm)
 
@@ -277,8 +283,9 @@ def _joint_rounds(options: AdjustOptions, prior: CameraPrior | None) -> int:
 
 def _adjust_all(
     models: list[MetricModel], factors: SigmaFactors, camera: Camera, target, board, options: AdjustOptions, prior, step
-) -> tuple[JointResult, SigmaFactors]:
-    """Runs the joint adjustments from the chained result; returns the last one and the factors on the centres' σ.
+) -> tuple[Adjusted, SigmaFactors]:
+    """Runs the joint adjustments from the chained result; returns the state of the last one and the factors on the
+    centres' σ.
 
     The eccentricity is computed anew before each adjustment. With refined intrinsics the factors are computed anew,
     too: a wrong camera causes residuals of its own.
@@ -300,7 +307,7 @@ def _adjust_all(
         if prior is not None:
             unscaled = [replace(m, covariance_px2=c) for m, c in zip(models, covariances, strict=True)]
             factors = image_sigma_factors([adjust(m, current) for m in unscaled], current, target.printed_ids())
-    return state.result(), factors
+    return state, factors
 
 
 def image_sigma_factors(models: Sequence[GroupModel], camera: Camera, printed: Iterable[str] = ()) -> SigmaFactors:

@@ -40,8 +40,9 @@ class CalibratedTarget(Brief):
     pose of its metric frame; ``face_covariance`` : 6×6 by face (rotation rad, translation mm; perturbation in the
     target frame about the face's origin); ``circle_covariance`` : 3×3 mm² by label; ``distance_sigma_mm`` : σ of the
     distance between the origins of two faces; ``scale_sigma`` : relative σ of all lengths together;
-    ``covariance_mm2`` : joint covariance (3c, 3c) of all circles, target frame, in their order. Covariances and σ are
-    empty or None if none was computed.
+    ``covariance_mm2`` : joint covariance (3c, 3c) of all circles, target frame, in their order;
+    ``position_sources_mm`` : by face and kind of observation, what it contributes to σ of x, y, z, (3,). Covariances
+    and σ are empty or None if none was computed.
     """
 
     reference_face: str
@@ -53,6 +54,7 @@ class CalibratedTarget(Brief):
     distance_sigma_mm: dict[tuple[str, str], float] = field(default_factory=dict)
     scale_sigma: float | None = None
     covariance_mm2: np.ndarray | None = None
+    position_sources_mm: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
 
 
 def chain_faces(faces: Sequence[FaceInGroup], target: TargetDesign, reference: str) -> CalibratedTarget:

@@ -173,7 +173,9 @@ def with_edge_sigma(board: BoardDesign, observations: Sequence[ImageObservations
     faces = []
     for face in board.faces:
         moved = 2 * EDGE_SIGMA_PX / float(np.median(lengths[face.id])) if face.id in lengths else 0.0
-        faces.append(replace(face, size_sigma=float(np.hypot(face.size_sigma, moved))))
+        variance = face.size_sigma**2 + moved**2
+        share = moved**2 / variance if variance else 0.0
+        faces.append(replace(face, size_sigma=float(np.sqrt(variance)), edge_share=share))
     return replace(board, faces=tuple(faces))
 
 

@@ -91,11 +91,16 @@ class Derivatives:
 
 
 def calibrated_target(
-    result: JointResult, start: CalibratedTarget, target: TargetDesign, kind: FrameKind
+    result: JointResult,
+    start: CalibratedTarget,
+    target: TargetDesign,
+    kind: FrameKind,
+    state: Adjusted | None = None,
 ) -> CalibratedTarget:
     """Returns faces and circles of the adjusted target in the target frame, with their marginal covariances.
 
-    ``start`` gives the reference face and the side to which each face looks.
+    ``start`` gives the reference face and the side to which each face looks; ``state`` : of the adjustment, from which
+    follows what each kind of observation contributes to the positions; None for no such contributions.
     """
     target_derivatives = derivatives(result, start, target, kind)
     return CalibratedTarget(
@@ -110,7 +115,22 @@ def calibrated_target(
         distance_sigma_mm=target_derivatives.distance_sigma_mm(result.covariance_mm2),
         scale_sigma=scale_sigma(result.xyz_model, result.covariance_mm2),
         covariance_mm2=target_derivatives.all_circles_covariance(result.covariance_mm2),
+        position_sources_mm=_position_sources_mm(state, result.sigma_scale, target_derivatives) if state else {},
     )
+
+
+def _position_sources_mm(state: Adjusted, scale: float, own: Derivatives) -> dict[str, dict[str, np.ndarray]]:
+    """Returns, by face and kind of observation, what the kind contributes to σ of the face's x, y, z, (3,) mm."""
+    positions = np.concatenate([jacobian[3:] for jacobian in own.faces.values()])
+    covariance = _parts_of(state, positions.T).covariance
+    return {
+        face: {
+            kind: scale * np.sqrt(np.maximum(np.diag(matrix)[3 * i : 3 * i + 3], 0.0))
+            for kind, matrix in covariance.items()
+            if matrix.any()
+        }
+        for i, face in enumerate(own.faces)
+    }
 
 
 def scale_sigma(xyz_model: np.ndarray, covariance_mm2: np.ndarray) -> float:
@@ -276,12 +296,38 @@ class Contributions:
 
 def contributions_of(state: Adjusted) -> Contributions:
     """Splits the covariance at the minimum of an adjustment into the contributions of the observations."""
-    blocks, shared, setting, joint = state.blocks, state.shared, state.setting, state.result()
+    joint, parts = state.result(), _parts_of(state)
+    variance = joint.sigma_scale**2
+    return Contributions(
+        joint,
+        {kind: variance * (matrix + matrix.T) / 2 for kind, matrix in parts.covariance.items()},
+        parts.by_scale,
+        parts.by_intrinsics,
+        {kind: joint.sigma_scale * centre_sigma_px(state.blocks, kind) for kind in (CIRCLES, DOTS)},
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Parts:
+    """What errors of the observations do to k quantities: ``covariance`` : (k, k) by kind, with the σ of the
+    observations; ``by_scale`` and ``by_intrinsics`` : (k,), (k, 16), as in :class:`Contributions`."""
+
+    covariance: dict[str, np.ndarray]
+    by_scale: np.ndarray
+    by_intrinsics: np.ndarray
+
+
+def _parts_of(state: Adjusted, quantities: np.ndarray | None = None) -> _Parts:
+    """Returns the parts for quantities with derivatives (3c, k) by the circles, or for the 3c coordinates if None."""
+    blocks, shared, setting = state.blocks, state.shared, state.setting
     normal, _, groups = normal_equations(blocks, shared, setting)
     c = shared.xyz_model.size
     inverse = constrained_inverse(normal, free_directions(len(normal), shared))[:, :c]
-    covariance = {kind: np.zeros((c, c)) for kind in OBSERVED}
-    by_scale, by_intrinsics = np.zeros(c), np.zeros((c, len(PARAMETER_NAMES)))
+    if quantities is not None:
+        inverse = inverse @ quantities
+    k = inverse.shape[1]
+    covariance = {kind: np.zeros((k, k)) for kind in OBSERVED}
+    by_scale, by_intrinsics = np.zeros(k), np.zeros((k, len(PARAMETER_NAMES)))
     fixed = shared.basis.shape[1] == 0
     for block, reduced in zip(blocks, groups, strict=True):
         group_answer = _Answer.of(block, reduced, inverse[setting.outer(block, shared)], shared)
@@ -297,7 +343,7 @@ def contributions_of(state: Adjusted) -> Contributions:
         covariance[BOARD] += rows.T @ rows
     covariance[INTRINSICS] += inverse[places.intrinsics].T @ setting.prior @ inverse[places.intrinsics]
     for members, across, plane_normal in planes(shared, setting):
-        heights = inverse[:c].reshape(-1, 3, c)[members]
+        heights = inverse[:c].reshape(-1, 3, k)[members]
         rows = across @ np.einsum("j,mjk->mk", plane_normal, heights) / setting.flatness_mm
         covariance[FLATNESS] += rows.T @ rows
     for shape in shapes(shared, setting):
@@ -308,14 +354,7 @@ def contributions_of(state: Adjusted) -> Contributions:
     for members, along, _, sigma in bars(shared, setting):
         row = along @ (inverse[3 * members[0] + np.arange(3)] - inverse[3 * members[1] + np.arange(3)]) / sigma
         covariance[DISTANCES] += np.outer(row, row)
-    variance = joint.sigma_scale**2
-    return Contributions(
-        joint,
-        {kind: variance * (matrix + matrix.T) / 2 for kind, matrix in covariance.items()},
-        by_scale,
-        by_intrinsics,
-        {kind: joint.sigma_scale * _centre_sigma_px(blocks, kind) for kind in (CIRCLES, DOTS)},
-    )
+    return _Parts(covariance, by_scale, by_intrinsics)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -380,7 +419,7 @@ class _Answer:
         return rows.reshape(3 * len(turned), -1) / block.sigma_mm
 
 
-def _centre_sigma_px(blocks: Sequence[Block], kind: str) -> float:
+def centre_sigma_px(blocks: Sequence[Block], kind: str) -> float:
     """Returns the RMS of the centres' σ per axis, as used for the weights."""
     square = np.concatenate(
         [

@@ -14,7 +14,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.adjust.uncertainty import Contributions, Derivatives, contributions_of, derivatives
-from stcal.sfm.budget.sources import Source, Statement, correction, sources_of, statement_of
+from stcal.sfm.budget.sources import Conditions, Source, Statement, conditions_of, sources_of, statement_of
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.runs.saved import SavedRun, adjusted_run
 
@@ -93,7 +93,7 @@ class View:
 class Budget:
     """The uncertainty budget of a run.
 
-    ``correction`` : relative correction of lengths for the stated expansion. It is not applied to the run's result.
+    ``conditions`` : for which lengths hold. Their correction is not applied to the run's result.
     """
 
     joint: JointResult
@@ -102,7 +102,7 @@ class Budget:
     rows: tuple[Row, ...]
     views: tuple[View, ...]
     statement: Statement
-    correction: float
+    conditions: Conditions
 
     def of_kind(self, kind: Kind) -> list[Row]:
         """Returns the rows of one kind."""
@@ -177,7 +177,7 @@ def budget(
         for measurand in measurands(found.joint, own, reference_face)
     ]
     views = tuple(_view(model) for model in found.joint.models)
-    return Budget(found.joint, reference_face, sources, tuple(rows), views, statement, correction(statement))
+    return Budget(found.joint, reference_face, sources, tuple(rows), views, statement, conditions_of(statement, board))
 
 
 def _placed(own: Derivatives) -> Source:

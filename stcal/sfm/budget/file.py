@@ -9,13 +9,14 @@ import numpy as np
 from pydantic import Field
 
 import stcal
+from stcal.design import StatedSize
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import RUN_MARKER
 from stcal.io.json import ByName, Finite, Part, ResultFile
 from stcal.report.text import join
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, Row
 from stcal.sfm.budget.lengths import LengthTest
-from stcal.sfm.budget.sources import Source, reference_temperature_c
+from stcal.sfm.budget.sources import Source
 from stcal.sfm.report.judgement import invalidated
 from stcal.sfm.runs.saved import SavedRun
 from stcal.sfm.runs.verify import VerifyFile
@@ -39,7 +40,7 @@ class SourceRow(Part):
     key: str
     title: str
     evaluation: Literal["A", "B"]
-    origin: Literal["estimated", "stated", "assumed", "not stated"]
+    origin: Literal["estimated", "stated", "assumed", "not stated", "not known"]
     sigma: float | None
     unit: str
     words: str
@@ -63,10 +64,10 @@ class Uncertainty(Part):
 
 
 class FaceUncertainty(Part):
-    position_mm: list[float]
+    position_mm: list[float] | None
     rotation_vector_deg: list[float]
-    position_um: Uncertainty
-    position_xyz_um: list[float]
+    position_um: Uncertainty | None
+    position_xyz_um: list[float] | None
     rotation_mdeg: Uncertainty
     rotation_xyz_mdeg: list[float]
 
@@ -90,7 +91,7 @@ class LengthRow(Part):
     measured_mm: float
     reference_mm: float
     error_um: float
-    expanded_um: float
+    expanded_um: float | None
     e_n: Finite
 
 
@@ -99,31 +100,31 @@ class LengthTestPart(Part):
 
     reference: str
     lengths: list[LengthRow]
-    beyond: int
+    beyond: int | None
     limit: float
-    agrees: bool
+    agrees: bool | None
     notes: list[str]
 
     @classmethod
-    def of(cls, test: LengthTest) -> "LengthTestPart":
-        """Returns the part of the file for a test."""
+    def of(cls, test: LengthTest, refused: bool = False) -> "LengthTestPart":
+        """Returns the part of the file for a test. ``refused`` : True if a run must not be used, so that no U holds."""
         rows = [
             LengthRow(
                 circles=list(length.circles),
                 measured_mm=length.measured_mm,
                 reference_mm=length.reference_mm,
                 error_um=MICRO * length.error_mm,
-                expanded_um=MICRO * length.expanded_mm,
-                e_n=length.e_n,
+                expanded_um=None if refused else MICRO * length.expanded_mm,
+                e_n=None if refused else length.e_n,
             )
             for length in test.lengths
         ]
         return cls(
             reference=test.reference,
             lengths=rows,
-            beyond=test.beyond,
+            beyond=None if refused else test.beyond,
             limit=test.limit,
-            agrees=test.agrees,
+            agrees=None if refused else test.agrees,
             notes=list(test.notes),
         )
 
@@ -143,10 +144,20 @@ class BudgetFile(ResultFile):
     )
     reference_face: str = Field(description="its frame is the target frame, and has no uncertainty")
     use: str = Field(description='the run\'s own answer to "May I use it?"; empty where an older run has none')
-    reference_temperature_c: float = Field(
-        description="of the target: the temperature for which corrected lengths and positions hold, 20 °C (ISO 1) "
-        "unless stated otherwise"
+    usable: bool = Field(
+        description="false where that answer is no or a check has failed: no uncertainty is given, `faces` and "
+        "`distances` are empty"
     )
+    size_known: bool = Field(
+        description="false where nothing of known size was in view: only the shape is known, positions and their "
+        "uncertainties are null, and there are no `distances`"
+    )
+    reference_temperature_c: float | None = Field(
+        description="of the target: the temperature for which corrected lengths and positions hold, null where it is "
+        "not known; 20 °C (ISO 1) unless stated otherwise, or that of the photographs where the expansion of board or "
+        "target is not stated"
+    )
+    holds: str = Field(description="the same in words, and why; empty where `usable` is false")
     coverage_factor: float = Field(description="k of the expanded uncertainties")
     sigma0: float = Field(
         description="residuals of the adjustment over the σ of all observations, 1 where they are smaller; scales these"
@@ -157,14 +168,16 @@ class BudgetFile(ResultFile):
     )
     sources: list[SourceRow] = Field(
         description="inputs: `key`, `title`; `evaluation` of type A or B (JCGM 100, 4.2, 4.3); `origin`: `estimated` "
-        "from this run, `stated` by the user, `assumed` where none is stated, or `not stated`: taken as exact; "
+        "from this run, `stated` by the user, `assumed` where none is stated, `not stated`: taken as exact, or `not "
+        "known`: of a size that nothing tells; "
         "standard uncertainty `sigma` in `unit`, null where it is not one number; `words` on where it comes from"
     )
     stated: list[StatedRow] = Field(
         description="sizes and temperatures: `body`, `key`, `value`, and the file of `origin`"
     )
-    correction_ppm: float = Field(
-        description="by which lengths of the run are to be enlarged for the stated expansion; the run did not apply it"
+    correction_ppm: float | None = Field(
+        description="by which lengths of the run are to be enlarged for the stated expansion; the run did not apply "
+        "it; null where the size is not known"
     )
     faces: dict[ByName, FaceUncertainty] = Field(
         description="against the reference face: `position_mm`, x, y, z of the face's origin in the target frame, with "
@@ -173,7 +186,7 @@ class BudgetFile(ResultFile):
         "`rotation_mdeg` likewise, each with `contributions` by key of the source, `sensitivities` (contribution over "
         "`sigma` of the source), combined `standard` and `expanded` uncertainty, `coverage` of the latter by "
         "simulation, and effective `degrees_of_freedom`, null for infinitely many; combined standard "
-        "uncertainties of x, y, z: `position_xyz_um`, `rotation_xyz_mdeg`"
+        "uncertainties of x, y, z: `position_xyz_um`, `rotation_xyz_mdeg`; all of positions null without a known size"
     )
     distances: list[DistanceUncertainty] = Field(
         description="the longest between two faces' `circles`: `length_mm` of the run, `corrected_mm` with "
@@ -184,19 +197,27 @@ class BudgetFile(ResultFile):
         description="with `--check-lengths` and `--lengths`: `reference` (file or run); `lengths` between `circles`: "
         "`measured_mm` (corrected) and `reference_mm`, length measurement error `error_um` (VDI/VDE 2634), U of both "
         "`expanded_um`, and `e_n`, the error over it (ISO 13528; null where both are exact); how many are `beyond` U, "
-        "the `limit` of the largest |E_n| for so many lengths, whether all `agrees`, and `notes`"
+        "the `limit` of the largest |E_n| for so many lengths, whether all `agrees`, and `notes`; U, `e_n`, `beyond` "
+        "and `agrees` null where a run must not be used"
     )
     notes: list[str] = Field(description="what is not in the combined uncertainty, or not known")
 
     @classmethod
-    def of(cls, budget: Budget, run: SavedRun, verified: VerifyFile, tests: Sequence[LengthTest] = ()) -> "BudgetFile":
-        """Returns the file of a run's budget. ``verified`` : state of the run's files."""
-        parts = [LengthTestPart.of(test) for test in tests]
+    def of(
+        cls, budget: Budget, run: SavedRun, verified: VerifyFile, tests: Sequence[LengthTest] = (), *others: SavedRun
+    ) -> "BudgetFile":
+        """Returns the file of a run's budget.
+
+        ``verified`` : state of the run's files; ``others`` : further runs that the tests compare it with.
+        """
+        refused = any(is_refused(each) for each in (run, *others))
+        parts = [LengthTestPart.of(test, refused) for test in tests]
         return cls.model_validate(_content(budget, run, verified) | {"length_tests": parts})
 
 
 def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, Any]:
-    stated = budget.statement
+    stated, conditions, refused = budget.statement, budget.conditions, is_refused(run)
+    without_lengths = refused or not conditions.size_known
     return {
         "format": "stcal budget 1",
         "version": stcal.__version__,
@@ -212,7 +233,10 @@ def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, A
         "fields": stated.fields,
         "reference_face": budget.reference_face,
         "use": (run.report.get("judgement") or {}).get("use", ""),
-        "reference_temperature_c": reference_temperature_c(stated.target),
+        "usable": not refused,
+        "size_known": conditions.size_known,
+        "reference_temperature_c": conditions.temperature_c,
+        "holds": "" if refused else conditions.words,
         "coverage_factor": COVERAGE_FACTOR,
         "sigma0": budget.joint.sigma_scale,
         "redundancy": budget.joint.redundancy,
@@ -227,9 +251,9 @@ def _content(budget: Budget, run: SavedRun, verified: VerifyFile) -> dict[str, A
             for key, value in asdict(size).items()
             if value is not None
         ],
-        "correction_ppm": PPM * budget.correction,
-        "faces": {} if is_refused(run) else _faces(budget, run.faces.poses()),
-        "distances": [] if is_refused(run) else [_distance(row, budget) for row in budget.of_kind("distance")],
+        "correction_ppm": PPM * conditions.correction if conditions.size_known else None,
+        "faces": {} if refused else _faces(budget, run.faces.poses()),
+        "distances": [] if without_lengths else [_distance(row, budget) for row in budget.of_kind("distance")],
         "notes": notes_of(budget, verified, run),
     }
 
@@ -243,11 +267,13 @@ def _faces(budget: Budget, target_from_face: Mapping[str, Rigid]) -> dict[str, d
     faces = {}
     for row in budget.of_kind("position"):
         rotation, pose = rotations[row.measurand.name], target_from_face[row.measurand.name]
+        known = budget.conditions.size_known
+        position = pose.translation * (1 + budget.conditions.correction)
         faces[row.measurand.name] = {
-            "position_mm": (pose.translation * (1 + budget.correction)).tolist(),
+            "position_mm": position.tolist() if known else None,
             "rotation_vector_deg": pose.as_scipy().as_rotvec(degrees=True).tolist(),
-            "position_um": _uncertainty(row, budget, MICRO),
-            "position_xyz_um": (MICRO * np.sqrt(np.diag(row.covariance))).tolist(),
+            "position_um": _uncertainty(row, budget, MICRO) if known else None,
+            "position_xyz_um": (MICRO * np.sqrt(np.diag(row.covariance))).tolist() if known else None,
             "rotation_mdeg": _uncertainty(rotation, budget, MILLIDEGREES),
             "rotation_xyz_mdeg": (MILLIDEGREES * np.sqrt(np.diag(rotation.covariance))).tolist(),
         }
@@ -260,7 +286,7 @@ def _distance(row: Row, budget: Budget) -> dict:
     return {
         "circles": list(row.measurand.circles),
         "length_mm": length,
-        "corrected_mm": length * (1 + budget.correction),
+        "corrected_mm": length * (1 + budget.conditions.correction),
         "distance_um": _uncertainty(row, budget, MICRO),
     }
 
@@ -290,6 +316,17 @@ def is_refused(run: SavedRun) -> bool:
     return bool(_failed(run)) or (run.report.get("judgement") or {}).get("verdict") == "no"
 
 
+def refusals(runs: Sequence[SavedRun], tests: Sequence[LengthTestPart]) -> list[str]:
+    """Returns why a budget must not be used, in words: the answer of each run, and length tests that differ."""
+    reasons = []
+    for run in runs:
+        if is_refused(run):
+            own = (run.report.get("judgement") or {}).get("use", "").removesuffix(".")
+            failed = "failed: " + "; ".join(check["title"] for check in _failed(run))
+            reasons.append(f"may run {run.folder} be used? {own if own.startswith('No') else failed}")
+    return reasons + [f"length test against {test.reference}: differs" for test in tests if test.agrees is False]
+
+
 def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
     """Returns notes on what a reader must know that no number shows."""
     unknown = [source.title for source in budget.sources if source.origin == "not stated"]
@@ -299,9 +336,12 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
             f"taken as exact, since nothing is stated of them: {', '.join(unknown)}; the uncertainties hold as far as "
             "these are"
         )
-    if budget.correction:
+    if not budget.conditions.size_known:
+        notes.insert(0, f"{budget.conditions.words}; lengths of the run are in the unit of the drawing")
+    elif budget.conditions.correction and not is_refused(run):
+        ppm = PPM * budget.conditions.correction
         notes.append(
-            f"for the stated expansion lengths of the run are to be changed by {PPM * budget.correction:+.1f} ppm; "
+            f"for the stated expansion lengths of the run are to be changed by {ppm:+.1f} ppm; "
             "this is not done in faces.json, and the expanded uncertainties hold for corrected lengths"
         )
     failed = _failed(run)
@@ -314,6 +354,8 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
         )
     elif is_refused(run):
         notes.insert(0, f"may the run be used? {run.report['judgement']['use']} No uncertainty of it is given")
+    if not run.board_design.rows and budget.statement.board != StatedSize():
+        notes.append("no board was in view: what is stated of [board] is not used")
     notes += verified.said()
     notes.append(
         "the reference face's frame is the target frame and carries no uncertainty; what its own circles do not know "

@@ -18,6 +18,7 @@ from stcal.io.table import LENGTHS
 from stcal.labels import CircleLabel, circle_labels
 from stcal.sfm.adjust.joint import JointResult
 from stcal.sfm.budget.combine import COVERAGE_FACTOR, Budget, distance, longest_of
+from stcal.sfm.budget.sources import reference_temperature_c
 
 WHAT = "lengths"
 BY_CHANCE = 2 * float(norm.sf(COVERAGE_FACTOR))
@@ -82,8 +83,10 @@ def against_stated(budget: Budget, path: Path, columns: Path | None = None) -> L
     uncertainty of the lengths. Without ``sigma_mm`` they are taken as exact. ``columns`` : map of the columns, see
     :func:`~stcal.io.poses.columns.read_mapped`.
 
-    Raises InputError if the file is not a table of lengths, a circle is not in the run, or a length or σ is invalid.
+    Raises InputError if the file is not a table of lengths, a circle is not in the run, a length or σ is invalid, or
+    the size of the run is not known.
     """
+    _require_size(budget)
     table = table_of(path, columns, WHAT)
     ends = list(zip(table.text("from"), table.text("to"), strict=True))
     length = table.quantity("length", LENGTHS)
@@ -109,6 +112,11 @@ def against_stated(budget: Budget, path: Path, columns: Path | None = None) -> L
         expanded = COVERAGE_FACTOR * float(np.hypot(standard, sigma_mm))
         tested.append(Length((joint.labels[i], joint.labels[j]), measured, float(value), expanded))
     notes = () if known else (f"{path} states no sigma_mm: its lengths are taken as exact",)
+    if budget.conditions.temperature_c != reference_temperature_c(budget.statement.target):
+        notes += (
+            f"{path} must state lengths for the temperature at which the target was photographed: those of the run are "
+            "not corrected to another",
+        )
     return LengthTest(str(path), tuple(tested), notes)
 
 
@@ -118,8 +126,10 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
     The lengths are the longest distances of every two faces, and within each face, between circles that both runs have.
     ``boards`` : the boards of the two runs.
 
-    Raises InputError if the runs have no two circles of the target in common.
+    Raises InputError if the runs have no two circles of the target in common, or the size of one is not known.
     """
+    _require_size(budget)
+    _require_size(other)
     common = [label for label in budget.joint.labels if label in set(other.joint.labels)]
     rows, other_rows = (_places(calibration.joint, common) for calibration in (budget, other))
     pairs = longest_of(common, budget.joint.xyz_model[rows])
@@ -140,7 +150,22 @@ def against_run(budget: Budget, other: Budget, folder: Path, boards: Sequence[Bo
         "are off is in both alike, cannot be seen here, and is not in U of the differences; a length from elsewhere "
         "(--check-lengths) shows it"
     )
-    return LengthTest(str(folder), tuple(tested), (note,) if _same(*boards) else ())
+    notes = (note,) if _same(*boards) else ()
+    if budget.conditions.temperature_c != other.conditions.temperature_c:
+        notes += (
+            "the lengths of the two calibrations hold at different temperatures; state expansion and temperature of "
+            "board and target for both",
+        )
+    return LengthTest(str(folder), tuple(tested), notes)
+
+
+def _require_size(budget: Budget) -> None:
+    if not budget.conditions.size_known:
+        raise InputError(
+            "E-BUDGET-NO-SIZE",
+            "nothing of known size was in view of a run, and only its shape is known: its lengths cannot be compared; "
+            "state one of the lengths with [[scale]] in target.toml, and run again",
+        )
 
 
 def _places(joint: JointResult, labels: Sequence[CircleLabel]) -> list[int]:
@@ -159,4 +184,4 @@ def _measured(budget: Budget, i: int, j: int, without: Sequence[str] = ()) -> tu
     variance = sum(
         float(measurand.covariance(source, 0.0)[0, 0]) for source in budget.sources if source.key not in without
     )
-    return float(measurand.length_mm or 0.0) * (1 + budget.correction), float(np.sqrt(variance))
+    return float(measurand.length_mm or 0.0) * (1 + budget.conditions.correction), float(np.sqrt(variance))

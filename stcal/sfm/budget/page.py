@@ -17,13 +17,15 @@ from stcal.report.document import (
     tiles,
 )
 from stcal.report.figure import COLOURS, calm, new_figure
-from stcal.report.text import NONE, number
+from stcal.report.text import NONE, number, significant
 from stcal.sfm.budget.file import BudgetFile, LengthTestPart, SourceRow, Uncertainty
 
 
 def verdict_of(test: LengthTestPart) -> str:
     """Returns the verdict of a length test in words."""
     count = len(test.lengths)
+    if test.beyond is None:
+        return f"not judged: {count} lengths with their errors, without U, which holds of no run that must not be used"
     largest = f"largest |E_n| {number(max(abs(e) for e in _known(test)), 2)}"
     if not test.beyond:
         return f"agrees: all {count} lengths within U, {largest}"
@@ -56,26 +58,31 @@ def budget_report(file: BudgetFile) -> Document:
     """Returns the report of ``budget``: expanded uncertainties, inputs, contributions, and tests of lengths."""
     faces, images = file.faces, sum(each.images for each in file.views)
     kinds = [
-        ("positions of faces, µm", {f"face {f}": each.position_um for f, each in faces.items()}),
+        ("positions of faces, µm", {f"face {f}": u for f, each in faces.items() if (u := each.position_um)}),
         ("rotations of faces, mdeg", {f"face {f}": each.rotation_mdeg for f, each in faces.items()}),
         ("longest distances, µm", {name_of(each.circles): each.distance_um for each in file.distances}),
     ]
     kinds = [(title, columns) for title, columns in kinds if columns]
     lengths = [
-        [name_of(e.circles), *(number(v, 4) for v in (e.length_mm, e.corrected_mm)), number(e.distance_um.expanded, 2)]
+        [
+            name_of(e.circles),
+            *(number(v, 4) for v in (e.length_mm, e.corrected_mm)),
+            significant(e.distance_um.expanded),
+        ]
         for e in file.distances
     ]
     k = file.coverage_factor
     positions = [
-        [face, *(number(v, 4) for v in e.position_mm), *(number(k * v, 2) for v in e.position_xyz_um)]
+        [face, *(number(v, 4) for v in e.position_mm), *(significant(k * v) for v in e.position_xyz_um)]
         for face, e in faces.items()
+        if e.position_mm is not None and e.position_xyz_um is not None
     ]
     rotations = [
-        [face, *(number(v, 4) for v in e.rotation_vector_deg), *(number(k * v, 2) for v in e.rotation_xyz_mdeg)]
+        [face, *(number(v, 4) for v in e.rotation_vector_deg), *(significant(k * v) for v in e.rotation_xyz_mdeg)]
         for face, e in faces.items()
     ]
     inputs = [
-        [each.title, NONE if each.sigma is None else f"{each.sigma:.3g} {each.unit}", *_origin(each)]
+        [each.title, NONE if each.sigma is None else f"{float(f'{each.sigma:.3g}'):g} {each.unit}", *_origin(each)]
         for each in file.sources
     ]
     stated = [[each.body, each.key, f"{each.value:g}", each.origin] for each in file.stated]
@@ -89,7 +96,7 @@ def budget_report(file: BudgetFile) -> Document:
         ["budget made by", f"stcal {file.version}"],
     ]
     return Document(
-        f"Uncertainty budget: {file.run.target}",
+        title_of(file),
         f"{file.run.folder}: {images} photographs in {len(file.views)} groups; faces against face "
         f"{file.reference_face}, the target frame",
         [
@@ -97,13 +104,10 @@ def budget_report(file: BudgetFile) -> Document:
                 "Result",
                 [
                     tiles(_headline(file)),
-                    f"U is the expanded uncertainty with k = {file.coverage_factor:g} (JCGM 100:2008, GUM): along one "
-                    f"axis {file.coverage_factor:g} times the σ that the run states, with what is stated of sizes and "
-                    "temperatures; in the tiles and under Contributions of x, y and z together, the root of their "
-                    "summed variances",
+                    *([_what_u_is(file)] if faces else []),
                     Notes(file.notes),
                     *([f"May the run be used? {file.use}"] if file.use else []),
-                    f"Lengths and positions hold at {file.reference_temperature_c:g} °C{_corrected(file)}",
+                    *([file.holds] if file.holds and file.size_known else []),
                     Table(_heads("position of face", "mm", "µm"), positions),
                     Table(_heads("rotation vector of face", "°", "mdeg"), rotations),
                     Table(["<distance of circles", "in the run, mm", "corrected, mm", "U, µm"], lengths),
@@ -142,14 +146,20 @@ def budget_report(file: BudgetFile) -> Document:
                 "What it rests on",
                 [
                     f"The final adjustment was made again from the run's files; σ₀ = {file.sigma0:.3f} with "
-                    f"{file.redundancy} degrees of freedom. The covariance of each kind of observation goes through "
-                    "the adjustment's inverse to the circles and to the frames of the faces (JCGM 100, 5.1.2); "
-                    "coverage is by 100 000 draws (JCGM 101). Not in it: radii of circles and dots, a shift of "
-                    "centres that all views share, and whatever fails a check of the run",
+                    f"{file.redundancy} degrees of freedom, by which all σ are multiplied: the σ₀ of the run's "
+                    "report, but 1 where it is smaller, as small residuals make no σ smaller than stated. The "
+                    "covariance of each kind of observation goes through the adjustment's inverse to the circles and "
+                    "to the frames of the faces (JCGM 100, 5.1.2); coverage is by 100 000 draws (JCGM 101). Not in "
+                    "it: radii of circles and dots, a shift of centres that all views share, and whatever fails a "
+                    "check of the run",
                     Table(["<Of", "<"], hashes, css="text facts"),
                 ],
             ),
-            Section("Signature", [Table(["<", "<"], [[name, ""] for name in SIGNED], css="text facts")]),
+            *(
+                [Section("Signature", [Table(["<", "<"], [[name, ""] for name in SIGNED], css="text facts")])]
+                if certifies(file)
+                else []
+            ),
         ],
         banner=[
             Table(["<Field", "<"], [[name, value or NONE] for name, value in file.fields.items()], css="text facts")
@@ -157,16 +167,29 @@ def budget_report(file: BudgetFile) -> Document:
     )
 
 
+def certifies(file: BudgetFile) -> bool:
+    """Returns whether the page is a certificate: sizes are known, and nothing says that the run must not be used."""
+    return file.usable and file.size_known and all(test.agrees for test in file.length_tests)
+
+
+def title_of(file: BudgetFile) -> str:
+    """Returns the title, which calls the page a certificate only if it is one."""
+    kind = "Certificate of calibration and uncertainty" if certifies(file) else "Uncertainty"
+    return f"{kind} budget: {file.run.target}"
+
+
+def _what_u_is(file: BudgetFile) -> str:
+    k = f"{file.coverage_factor:g}"
+    return (
+        f"U is the expanded uncertainty with k = {k} (JCGM 100:2008, GUM): along one axis {k} times the σ that the run "
+        "states, with what is stated of sizes and temperatures; in the tiles and under Contributions of x, y and z "
+        "together, the root of their summed variances"
+    )
+
+
 def _heads(of: str, unit: str, unit_of_u: str) -> list[str]:
     """Returns the heads of a table of vectors and of their expanded uncertainties."""
     return [f"<{of}", *(f"{axis}, {unit}" for axis in "xyz"), *(f"U of {axis}, {unit_of_u}" for axis in "xyz")]
-
-
-def _corrected(file: BudgetFile) -> str:
-    """Returns what the temperatures that were stated did to the lengths, for the end of a sentence."""
-    if file.correction_ppm:
-        return f", with a correction of {file.correction_ppm:+.1f} ppm for the stated expansion"
-    return ", as far as board and target were at it: no expansion that changes them is stated"
 
 
 def _origin(each: SourceRow) -> tuple[str, str, str]:
@@ -179,7 +202,9 @@ def _length_test(test: LengthTestPart) -> list[Block]:
         [
             name_of(length.circles),
             *(number(v, 4) for v in (length.measured_mm, length.reference_mm)),
-            *(number(v, 2) for v in (length.error_um, length.expanded_um, length.e_n)),
+            number(length.error_um, 2),
+            significant(length.expanded_um),
+            number(length.e_n, 2),
         ]
         for length in test.lengths
     ]
@@ -197,17 +222,20 @@ def _length_test(test: LengthTestPart) -> list[Block]:
 
 def _headline(file: BudgetFile) -> list[tuple[str, str, str]]:
     headline, faces = [], file.faces
+    positions = {face: each.position_um for face, each in faces.items() if each.position_um}
     if faces:
-        worst = max(faces, key=lambda face: faces[face].position_um.expanded)
-        worst_face = faces[worst]
-        headline = [
-            (number(worst_face.position_um.expanded, 1), "µm", f"U of the position of face {worst}, the worst"),
-            (number(worst_face.rotation_mdeg.expanded, 1), "mdeg", f"U of the rotation of face {worst}"),
-        ]
+        worst = max(faces, key=lambda face: (positions.get(face) or faces[face].rotation_mdeg).expanded)
+        if worst in positions:
+            caption = f"U of the position of face {worst}, the worst"
+            headline.append((significant(positions[worst].expanded), "µm", caption))
+        caption = f"U of the rotation of face {worst}{'' if positions else ', the worst'}"
+        headline.append((significant(faces[worst].rotation_mdeg.expanded), "mdeg", caption))
     if file.distances:
         longest = file.distances[0]
         caption = f"U of the longest distance, {number(longest.corrected_mm, 3)} mm"
-        headline.append((number(longest.distance_um.expanded, 1), "µm", caption))
+        headline.append((significant(longest.distance_um.expanded), "µm", caption))
+    if not file.size_known:
+        headline.append(("no", "size", "only the shape is known: no lengths and no positions in mm"))
     unknown = sum(source.origin == "not stated" for source in file.sources)
     return [*headline, (str(unknown), "", f"of {len(file.sources)} inputs not stated, taken as exact")]
 
@@ -226,7 +254,7 @@ def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Tab
         )
     for name, values in (
         ("combined standard uncertainty u", [number(u.standard, 2) for u in columns.values()]),
-        (f"expanded uncertainty U, k = {file.coverage_factor:g}", [number(u.expanded, 2) for u in columns.values()]),
+        (f"expanded uncertainty U, k = {file.coverage_factor:g}", [significant(u.expanded) for u in columns.values()]),
         ("coverage of U, simulated, %", [number(100 * u.coverage, 1) for u in columns.values()]),
         (
             "effective degrees of freedom",

@@ -96,7 +96,7 @@ def fields_of(given: Sequence[str]) -> dict[str, str]:
     return values
 
 
-Origin = Literal["estimated", "stated", "assumed", "not stated"]
+Origin = Literal["estimated", "stated", "assumed", "not stated", "not known"]
 PPM = 1e-6
 REFERENCE_C = 20.0
 """Reference temperature of ISO 1:2022, used unless another one is stated."""
@@ -166,7 +166,7 @@ def sources_of(
         ("board", statement.board, found.by_scale),
         ("target", statement.target, grown.ravel()),
     ):
-        if body == "target" or board.rows:
+        if board.rows:
             rows += _temperature(body, stated, effect, statement)
     return tuple(rows)
 
@@ -178,9 +178,12 @@ def _own_size(found: Contributions, board: BoardDesign) -> Iterator[Source]:
         within = max(face.sigma_mm or 0.0 for face in faces) * found.joint.print_factor * factor
         words = f"sigma_mm of target.toml × {found.joint.print_factor * factor:.2f}, in the plane; off it --flatness"
         yield Source("print", "print of faces", "B", "stated", words, 1e3 * within, "µm", found.covariance_mm2[PRINT])
-        sigma = max(face.size_sigma for face in faces)
-        stated: Origin = "stated" if sigma else "not stated"
-        words = "size_sigma_mm, and what moves the edges of tags" if sigma else "no size_sigma_mm; taken as exact"
+        largest = max(faces, key=lambda face: face.size_sigma)
+        sigma, by_statement = largest.size_sigma, largest.size_sigma > 0 and largest.edge_share < 1
+        stated: Origin = "stated" if by_statement else "assumed" if sigma else "not stated"
+        words = "no size_sigma_mm" + ("; what moves the edges of all tags alike" if sigma else "; taken as exact")
+        if by_statement:
+            words = "size_sigma_mm" + (", and what moves the edges of all tags alike" if largest.edge_share else "")
         ppm = 1e6 * sigma if sigma else None
         yield Source("print_size", "size of print", "B", stated, words, ppm, "ppm", found.covariance_mm2[SIZES])
     if known := known_distances(board):
@@ -188,8 +191,8 @@ def _own_size(found: Contributions, board: BoardDesign) -> Iterator[Source]:
         words = f"[[scale]] of target.toml, {len(known)} in all; the largest σ"
         covariance = found.covariance_mm2[DISTANCES]
         if known[0].drawn:
-            words = "nothing of known size was in view: lengths are those of the drawing, known up to scale"
-            yield Source("distances", "size", "B", "not stated", words, None, "µm", covariance)
+            words = "nothing of known size was in view: only the shape is known"
+            yield Source("distances", "size", "B", "not known", words, None, "µm", covariance)
             return
         yield Source("distances", "known distances", "B", "stated", words, sigma_um, "µm", covariance)
 
@@ -244,9 +247,10 @@ def _temperature(what: str, stated: StatedSize, effect: np.ndarray, statement: S
         ("expansion", f"{what}'s expansion", stated.expansion_sigma_ppm_per_k, warmer, "ppm/K"),
     ):
         name = "temperature_sigma_k" if key == "temperature" else "expansion_sigma_ppm_per_k"
+        needed = "expansion_ppm_per_k" if key == "temperature" else "temperature_c"
         if factor is None or sigma is None:
-            needed = ("expansion_ppm_per_k" if key == "temperature" else "temperature_c") if factor is None else name
-            yield Source(f"{what}_{key}", title, "B", "not stated", f"no {needed}", None, unit, zero)
+            absent = " and ".join([name] * (sigma is None) + [needed] * (factor is None))
+            yield Source(f"{what}_{key}", title, "B", "not stated", f"no {absent}", None, unit, zero)
         else:
             words = f"{name} of {statement.origin[what, name]}"
             covariance = (sigma * factor * PPM) ** 2 * np.outer(effect, effect)
@@ -263,15 +267,66 @@ def reference_temperature_c(stated: StatedSize) -> float:
     return REFERENCE_C if stated.reference_temperature_c is None else stated.reference_temperature_c
 
 
-def correction(statement: Statement) -> float:
-    """Returns the relative correction of lengths for the stated expansion.
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """The temperature for which lengths and positions hold, and what they are corrected by for that.
+
+    ``size_known`` : False if nothing of known size was in view; ``correction`` : relative, 0 for none;
+    ``temperature_c`` : of the target, None if it is not known; ``words`` : the same as a sentence without its stop.
+    """
+
+    size_known: bool
+    correction: float
+    temperature_c: float | None
+    words: str
+
+
+def conditions_of(statement: Statement, board: BoardDesign) -> Conditions:
+    """Returns the temperature for which lengths hold, and their correction for the stated expansion.
 
     The board's grid is larger than its file says by its expansion. The target is larger than at its own reference
-    temperature by its own expansion.
+    temperature by its own expansion. The second correction is made only with the first: it starts from the length at
+    the temperature of the photographs, which a board of unknown expansion does not tell. A size that is stated of the
+    target itself holds at its reference temperature (ISO 1), so that no expansion enters.
     """
-    total = 0.0
-    for sign, stated in ((1, statement.board), (-1, statement.target)):
-        warmer = warmer_k(stated)
-        if warmer is not None and stated.expansion_ppm_per_k is not None:
-            total += sign * stated.expansion_ppm_per_k * PPM * warmer
-    return total
+    target = statement.target
+    if any(known.drawn for known in known_distances(board)):
+        words = "Only the shape is known, as nothing of known size was in view: no length and no position holds in mm"
+        return Conditions(False, 0.0, None, words)
+    wanted = reference_temperature_c(target)
+    if not board.rows:
+        words = (
+            f"Lengths and positions hold at {wanted:g} °C, as the sizes stated of the target do (ISO 1); they are its "
+            "own, so that no expansion enters"
+        )
+        return Conditions(True, 0.0, wanted, words)
+    of_board, of_target = _growth(statement.board), _growth(target)
+    if of_board is not None and of_target is not None:
+        total = of_board - of_target
+        words = f", with a correction of {total / PPM:+.1f} ppm for the stated expansion" if total else ""
+        return Conditions(True, total, wanted, f"Lengths and positions hold at {wanted:g} °C{words}")
+    photographed = "the temperature at which the target was photographed"
+    if target.temperature_c is not None:
+        photographed = f"{target.temperature_c:g} °C, at which the target was photographed"
+    held = f"Lengths and positions hold at {photographed}"
+    if of_board is not None:
+        corrected = f", with a correction of {of_board / PPM:+.1f} ppm for the board's expansion" if of_board else ""
+        words = f"{held}{corrected}: expansion and temperature of the target are not both stated"
+        return Conditions(True, of_board, target.temperature_c, words)
+    words = (
+        f"{held}, as far as the board's grid had the size of its file there: its expansion and temperature are not "
+        "both stated"
+    )
+    if of_target is not None:
+        words += ", and without them the target's are not corrected for"
+    return Conditions(True, 0.0, target.temperature_c, words)
+
+
+def _growth(stated: StatedSize) -> float | None:
+    """Returns by what a body is larger, relatively, than at its reference temperature; None if it is not known."""
+    warmer = warmer_k(stated)
+    if 0.0 in (warmer, stated.expansion_ppm_per_k):
+        return 0.0
+    if warmer is None or stated.expansion_ppm_per_k is None:
+        return None
+    return stated.expansion_ppm_per_k * PPM * warmer

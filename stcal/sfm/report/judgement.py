@@ -20,8 +20,10 @@ CHANCE = "'Suspicious' happens by chance in one run in 1,000, 'failed' in one in
 TESTS_OF_CHANCE = 1000
 TAIL = 2.0
 """Ratio of a face's σ to the median of the others above which this face limits the result by itself."""
-SHARE_OF_SCALE = 0.5
-"""Share of the worst face's variance above which the board's σ limit the result, not the photographs."""
+PHOTOGRAPHS = ("circles", "dots")
+"""Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
+MORE = 4
+"""How many times the images the answer gives σ for."""
 QUESTIONS = {
     "use": "May I use it?",
     "quality": "How good is it?",
@@ -141,7 +143,7 @@ def invalidated(failed: Iterable[str]) -> list[str]:
 
 def without_sigma(report: dict) -> dict:
     """Returns the content of ``report.json`` without σ and distances of chains, which a failed run must not show."""
-    none = {"translation_sigma_um": None, "rotation_sigma_mdeg": None}
+    none = {"translation_sigma_um": None, "rotation_sigma_mdeg": None, "translation_sources_um": {}}
     return report | {
         "faces": {name: face | none for name, face in report["faces"].items()},
         "between_faces": [row | {"distance_sigma_um": None} for row in report["between_faces"]],
@@ -383,43 +385,78 @@ def _by_size(report: dict) -> _Cause | None:
 
 
 def _by_sigma(report: dict) -> _Cause:
-    """Returns the cause that the σ show: the board, one face, or the photographs as a whole."""
-    spread = {
-        name: math.hypot(*face["translation_sigma_um"])
-        for name, face in report["faces"].items()
-        if name != report["reference_face"] and face["translation_sigma_um"] is not None
-    }
+    """Returns the cause that the σ show, of the face and along the axis that "How good is it?" has."""
     if len(report["faces"]) == 1:
         return _Cause("There is one face only, which nothing links.", "Photograph it together with others.")
-    if not spread:
+    found = _largest(report, "translation_sigma_um")
+    if found is None:
         return _Cause("What limits it cannot be told without σ.", "Run it with --solve joint.")
-    worst = max(spread, key=lambda name: spread[name])
+    sigma, worst = found
     face = report["faces"][worst]
-    size = 1e-3 * (report["summary"]["scale_sigma_ppm"] or 0.0) * math.hypot(*face["translation_mm"])
-    if size**2 > SHARE_OF_SCALE * spread[worst] ** 2:
-        if "board" not in report["summary"].get("scale_from", ["board"]):
-            return _Cause(
-                f"The scale: σ of the size make {number(size, 1)} of the {number(spread[worst], 1)} µm of face "
-                f"{worst}.",
-                "More photographs hardly help: measure the print, and state size_sigma_mm, or a known distance.",
-            )
+    axis = face["translation_sigma_um"].index(sigma)
+    variance = {kind: values[axis] ** 2 for kind, values in face.get("translation_sources_um", {}).items()}
+    photographs = sum(variance.pop(kind, 0.0) for kind in PHOTOGRAPHS)
+    source = max(variance, key=lambda kind: variance[kind], default="")
+    of_all = f"% of the variance of face {worst} along {'xyz'[axis]} (σ {number(sigma, 1)} µm)"
+    if source and variance[source] > photographs:
+        name, remedy = _source(report, source)
+        return _Cause(f"{name}: {number(100 * variance[source] / sigma**2, 0)} {of_all}.", remedy)
+    others = [
+        max(row["translation_sigma_um"])
+        for name, row in report["faces"].items()
+        if name not in (worst, report["reference_face"]) and row["translation_sigma_um"] is not None
+    ]
+    if others and sigma > TAIL * median(others):
         return _Cause(
-            f"The board: σ of the size make {number(size, 1)} of the {number(spread[worst], 1)} µm of face {worst}.",
-            "More photographs hardly help: measure the board's dots, or take a better plate, and state its σ.",
-        )
-    others = [value for name, value in spread.items() if name != worst]
-    if others and spread[worst] > TAIL * median(others):
-        return _Cause(
-            f"Face {worst}: {number(spread[worst], 1)} µm where the others have {number(median(others), 1)} µm; "
-            f"{face['images']} images show it, of group {join(face['groups'])}.",
+            f"Face {worst}: {number(sigma, 1)} µm along {'xyz'[axis]}, where the others have "
+            f"{number(median(others), 1)} µm; {face['images']} images show it, of group {join(face['groups'])}.",
             f"Add images that show face {worst}; `stcal-sfm advise RUN` says from where.",
         )
-    summary = report["summary"]
+    return _by_images(report, sigma, photographs, of_all)
+
+
+def _by_images(report: dict, sigma: float, variance: float, of_all: str) -> _Cause:
+    """Returns the cause where the photographs limit the result. ``variance`` : due to them, of ``sigma``²; 0 if it is
+    not known."""
+    summary, advice = report["summary"], "`stcal-sfm advise RUN` says which do most."
+    if not variance:
+        return _Cause("What limits it is not in this report.", f"`stcal-sfm budget RUN` tells it, and {advice}")
+    centre = summary.get("circle_sigma_px")
+    of_centres = "" if centre is None else f", σ {number(centre, 4)} px"
+    fewer = math.sqrt(max(sigma**2 - variance * (1 - 1 / MORE), 0.0))
     return _Cause(
-        f"The centring of circles, {number(summary['residual_rms_px'], 4)} px in {summary['images_mapped']} images; no "
-        "face stands out, and the board does not limit it.",
-        "Nothing has to be done; four times the images would halve σ, and `stcal-sfm advise RUN` says which do most.",
+        f"The centring of circles{of_centres} in {summary['images_mapped']} images: "
+        f"{number(100 * variance / sigma**2, 0)} {of_all}; no face stands out.",
+        f"Nothing has to be done; four times the images would make {number(fewer, 1)} µm of these {number(sigma, 1)} "
+        f"µm, and {advice}",
     )
+
+
+def _source(report: dict, kind: str) -> tuple[str, str]:
+    """Returns the name of a source other than the photographs that limits the result, and its remedy."""
+    few = "More photographs help little: "
+    if kind == "sizes":
+        summary = report["summary"]
+        given = "distances" in summary.get("scale_from", [])
+        distance = f"state {'a longer or better known' if given else 'the'} distance of two points of the target"
+        if (summary.get("edge_share") or 0.0) > 0.5:
+            remedy = f"all edges may be off alike, which no residual shows; {distance} with [[scale]] in target.toml."
+            return "The size, by the edges of tags", few + remedy
+        remedy = f"measure it better than size_sigma_mm says, or {distance} with [[scale]] in target.toml."
+        return "The size of the print", few + remedy
+    remedies = {
+        "board": ("The places of the board's dots", "measure them, or take a better plate, and state sigma_mm in "
+                  "board.toml."),
+        "print": ("The places of the printed corners", "measure them, or take a better print, and state sigma_mm in "
+                  "target.toml."),
+        "distances": ("The known distances", "measure a longer one, or the same better, and state it with [[scale]] in "
+                      "target.toml."),
+        "flatness": ("The flatness of the faces", "measure it, and state it with --flatness."),
+        "intrinsics": ("The intrinsics", "calibrate the camera better (`stcal-sfm calibrate-camera`), and give that "
+                       "file."),
+    }  # fmt: skip
+    name, remedy = remedies[kind]
+    return name, few + remedy
 
 
 def _more(report: dict, verdict: Use) -> list[str]:

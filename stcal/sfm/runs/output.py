@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 
 import stcal
+from stcal.design import faces_of_known_shape
 from stcal.geometry.plane import fit_plane
 from stcal.labels import DotLabel
 from stcal.sfm.data.model import MIN_POINTS, GroupModel, ImageObservations
@@ -22,6 +23,7 @@ def report_of(result: RunResult) -> ReportFile:
     models, joint = _final_models(result), result.calibration.joint
     residual = {name: model.residuals_px(result.calibration.camera) for name, model in models.items()}
     all_residuals = np.concatenate(list(residual.values()))
+    printed = max(faces_of_known_shape(result.board_design), key=lambda face: face.size_sigma, default=None)
     return ReportFile.model_validate(
         {
             "format": "stcal report 1",
@@ -79,6 +81,9 @@ def report_of(result: RunResult) -> ReportFile:
                 "print_factor": joint.print_factor if joint and "faces" in result.scale_from() else None,
                 "bend_factor": joint.bend_factor if joint and "faces" in result.scale_from() else None,
                 "camera_given": result.camera_given,
+                "circle_sigma_px": result.calibration.circle_sigma_px,
+                "size_sigma_ppm": 1e6 * printed.size_sigma if printed else None,
+                "edge_share": printed.edge_share if printed else None,
             },
             "faces": {face: _face(result, face) for face in result.target.target_from_face},
             "between_faces": _between(result),
@@ -153,6 +158,9 @@ def _face(result: RunResult, face_id: str) -> dict:
         "angle_to_reference_deg": float(np.degrees(np.arccos(np.clip(pose.rotation[2, 2], -1, 1)))),
         "translation_sigma_um": None if sigma is None else MICRO * sigma[3:],
         "rotation_sigma_mdeg": None if sigma is None else MICRO * np.degrees(sigma[:3]),
+        "translation_sources_um": {
+            kind: MICRO * sigma_mm for kind, sigma_mm in result.target.position_sources_mm.get(face_id, {}).items()
+        },
         "circles": len(labels),
         "circles_of_design": len(result.target_design.face(face_id).ids),
         "plane_rms_um": MICRO * fit_plane(np.array([result.target.circles[label] for label in labels])).rms,

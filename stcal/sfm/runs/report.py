@@ -60,6 +60,9 @@ class Summary(Part):
     print_factor: float | None = None
     bend_factor: float | None = None
     camera_given: bool = True
+    circle_sigma_px: float | None = None
+    size_sigma_ppm: float | None = None
+    edge_share: float | None = None
 
 
 class FaceRow(Part):
@@ -68,6 +71,7 @@ class FaceRow(Part):
     angle_to_reference_deg: float
     translation_sigma_um: Vector3 | None
     rotation_sigma_mdeg: Vector3 | None
+    translation_sources_um: dict[str, Vector3] = Field(default={})
     circles: int
     circles_of_design: int
     plane_rms_um: float
@@ -263,12 +267,17 @@ class ReportFile(ResultFile):
         "where they are as seen; `dot_rim_mm` stated height of the rims before the board's dots, null without them; "
         "`scale_from` what the size rests on; `print_factor`, `bend_factor` by which corners "
         "of printed faces are off their design over their σ, in the plane and off it (null without such faces); "
-        "`camera_given` false where the camera was found from the photographs"
+        "`camera_given` false where the camera was found from the photographs; `circle_sigma_px` of the target's "
+        "circles and corners, RMS per axis (null without joint adjustment); `size_sigma_ppm` the largest σ of a "
+        "printed face's size, `edge_share` the share of its variance that is due to the edges of tags (null "
+        "without such faces)"
     )
     faces: dict[ByFace, FaceRow] = Field(
         description="`target_from_face`, `translation_mm`, `angle_to_reference_deg`, `translation_sigma_um` and "
-        "`rotation_sigma_mdeg` (x, y, z of the target frame; null with `chain`), `circles` of `circles_of_design`, "
-        "`plane_rms_um`, `groups`, `images`"
+        "`rotation_sigma_mdeg` (x, y, z of the target frame; null with `chain`), `translation_sources_um`: what each "
+        "kind of observation (`circles`, `dots` in the images, the `board`, `flatness`, adjusted `intrinsics`, "
+        "`print`, `sizes`, `distances`) contributes to the first (empty with `chain`), `circles` of "
+        "`circles_of_design`, `plane_rms_um`, `groups`, `images`"
     )
     between_faces: list[BetweenFaces] = Field(
         description="faces `a`, `b`, `distance_mm` of their origins and its σ `distance_sigma_um` (null with `chain`), "

@@ -6,9 +6,20 @@ import numpy as np
 import pytest
 
 from stcal.geometry.normal_equations import free_motions
+from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraPrior
+from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.joint import adjusted
-from stcal.sfm.adjust.uncertainty import DISTANCES, INTRINSICS, OBSERVED, PRINT, SIZES, contributions_of
+from stcal.sfm.adjust.uncertainty import (
+    DISTANCES,
+    INTRINSICS,
+    OBSERVED,
+    PRINT,
+    SIZES,
+    calibrated_target,
+    contributions_of,
+    derivatives,
+)
 from stcal.synthetic.scene import SceneOptions, make_scene
 
 FLATNESS_MM = 0.02
@@ -50,6 +61,26 @@ def test_the_parts_are_covariances_and_their_sum_is_the_adjustments_own(case, re
         assert least > -1e-9 * np.abs(whole).max(), kind
         assert (most > 1e-4 * np.abs(whole).max()) == (kind not in absent), kind
     np.testing.assert_allclose(sum(found.covariance_mm2.values()), whole, atol=1e-7 * np.abs(whole).max())
+
+
+def test_what_the_sources_contribute_to_a_position_adds_up_as_squares(case):
+    """It is what :func:`contributions_of` has of each kind, in the face's own frame."""
+    scene = case[1]
+    state = state_of(case, refined=True)
+    seen = {label.face for label in state.setting.labels}
+    poses = {face: pose for face, pose in scene.target_from_face.items() if face in seen}
+    start = CalibratedTarget("1", poses, scene.circles_target, dict.fromkeys(scene.groups, Rigid()))
+    joint, parts = state.result(), contributions_of(state).covariance_mm2
+    found = calibrated_target(joint, start, scene.target, "plane", state)
+    assert calibrated_target(joint, start, scene.target, "plane").position_sources_mm == {}
+    own = derivatives(joint, start, scene.target, "plane")
+    for face, sources in found.position_sources_mm.items():
+        variance = np.diag(found.face_covariance[face])[3:]
+        total = sum(sigma**2 for sigma in sources.values())
+        np.testing.assert_allclose(total, variance, rtol=1e-6, atol=1e-12)
+        for kind, sigma in sources.items():
+            expected = np.diag(own.faces[face][3:] @ parts[kind] @ own.faces[face][3:].T)
+            np.testing.assert_allclose(sigma**2, expected, rtol=1e-6, atol=1e-6 * variance.max() + 1e-12)
 
 
 @pytest.mark.parametrize("common", [0.0, 0.6])

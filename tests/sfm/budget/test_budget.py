@@ -7,12 +7,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stcal.design import StatedSize
+from stcal.design import KnownDistance, ScaleReference, StatedSize
+from stcal.errors import InputError
 from stcal.io.design import board_toml, load_board
 from stcal.sfm.budget.combine import budget_of_run, longest_of
-from stcal.sfm.budget.sources import FIELDS, correction, statement_of
+from stcal.sfm.budget.file import BudgetFile
+from stcal.sfm.budget.lengths import against_stated
+from stcal.sfm.budget.page import budget_report
+from stcal.sfm.budget.sources import FIELDS, Statement, conditions_of, statement_of
 from stcal.sfm.report.judgement import INVALIDATES
 from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.verify import verify
 from tests.outcome import INPUT, assert_error
 from tests.shared import own_copy
 
@@ -93,7 +98,7 @@ def test_what_is_stated_adds_its_part(saved, plain, stated):
     assert {origins[key] for key in ppm} == {"stated"}
     assert {each.origin for each in plain.sources if each.key in ppm} == {"not stated"}
     assert origins["circle_centres"] == "estimated"
-    assert found.correction == pytest.approx(1e-6 * (8 * 4 - 23 * 2))
+    assert found.conditions.correction == pytest.approx(1e-6 * (8 * 4 - 23 * 2))
 
 
 def test_rims_that_were_estimated_are_a_row(saved, plain):
@@ -119,7 +124,77 @@ def test_a_statement_goes_before_the_boards_own(saved, tmp_path):
     assert found.origin["board", "temperature_c"] == str(path)
     assert found.origin["board", "expansion_ppm_per_k"] == "board.toml"
     assert found.fields == dict.fromkeys(FIELDS, "") | {"operator": "B", "serial": "12"}
-    assert correction(found) == pytest.approx(32e-6)
+    conditions = conditions_of(found, saved.board_design)
+    assert (conditions.correction, conditions.temperature_c) == (pytest.approx(32e-6), None)
+
+
+WARM_BOARD = StatedSize(expansion_ppm_per_k=8.5, temperature_c=22.7)
+WARM_TARGET = StatedSize(expansion_ppm_per_k=23.0, temperature_c=22.4)
+
+
+@pytest.mark.parametrize(
+    ("board", "target", "ppm", "temperature_c", "words"),
+    [
+        (WARM_BOARD, WARM_TARGET, 22.95 - 55.2, 20.0, "at 20 °C, with a correction of -32.2 ppm"),
+        (WARM_BOARD, replace(WARM_TARGET, reference_temperature_c=22.0), 22.95 - 9.2, 22.0, "at 22 °C, with"),
+        (WARM_BOARD, StatedSize(), 22.95, None, "at which the target was photographed, with a correction of +22.9 ppm"),
+        (WARM_BOARD, StatedSize(temperature_c=22.4), 22.95, 22.4, "at 22.4 °C, at which the target was photographed"),
+        (WARM_BOARD, StatedSize(temperature_c=20.0), 22.95, 20.0, "at 20 °C, with a correction of +22.9 ppm"),
+        (StatedSize(temperature_c=20.0), WARM_TARGET, -55.2, 20.0, "at 20 °C, with a correction of -55.2 ppm"),
+        (StatedSize(expansion_ppm_per_k=0.0), WARM_TARGET, -55.2, 20.0, "at 20 °C, with a correction of -55.2 ppm"),
+        (StatedSize(), WARM_TARGET, 0.0, 22.4, "without them the target's are not corrected for"),
+        (StatedSize(), StatedSize(), 0.0, None, "as far as the board's grid had the size of its file there"),
+    ],
+)
+def test_lengths_hold_where_what_is_stated_leads(saved, board, target, ppm, temperature_c, words):
+    """A length at the temperature of the photographs needs the board's expansion, one at 20 °C the target's too."""
+    found = conditions_of(Statement(board, target, {}, {}), saved.board_design)
+    assert (found.correction, found.temperature_c) == (pytest.approx(1e-6 * ppm, abs=1e-12), temperature_c)
+    assert found.size_known
+    assert words in found.words
+
+
+def scale_of(*distances):
+    return ScaleReference(0, 0, 1.0, 0.25, "bright", 1.0, distances=distances)
+
+
+def test_a_size_of_the_target_itself_does_not_expand():
+    """No board was used: what is stated of one must not change a length."""
+    known = KnownDistance(replace_label("1", "1"), replace_label("1", "2"), 100.0, 0.01)
+    found = conditions_of(Statement(WARM_BOARD, WARM_TARGET, {}, {}), scale_of(known))
+    assert (found.size_known, found.correction, found.temperature_c) == (True, 0.0, 20.0)
+    drawn = conditions_of(Statement(WARM_BOARD, WARM_TARGET, {}, {}), scale_of(replace(known, drawn=True)))
+    assert (drawn.size_known, drawn.correction, drawn.temperature_c) == (False, 0.0, None)
+
+
+def test_without_a_known_size_nothing_in_mm_is_certified(saved, plain, tmp_path):
+    known = KnownDistance(replace_label("1", "1"), replace_label("1", "2"), 100.0, 0.01, drawn=True)
+    shape = replace(plain, conditions=conditions_of(plain.statement, scale_of(known)))
+    file = BudgetFile.of(shape, saved, verify(saved.folder))
+    assert (file.size_known, file.reference_temperature_c, file.correction_ppm, file.distances) == (
+        False,
+        None,
+        None,
+        [],
+    )
+    for face in file.faces.values():
+        assert (face.position_mm, face.position_um, face.position_xyz_um) == (None, None, None)
+        assert face.rotation_mdeg.expanded > 0
+    assert file.notes[0].startswith("Only the shape is known")
+    text = budget_report(file).text()
+    page = budget_report(file).page()
+    assert "Certificate" not in page
+    assert "Signature" not in page
+    assert "only the shape is known" in page
+    for shown in (text, page):
+        assert "hold at" not in shown
+        assert "position of face" not in shown
+        assert "longest distance" not in shown
+    path = tmp_path / "lengths.csv"
+    path.write_text("from,to,length_mm\n1:1,1:2,100\n")
+    with pytest.raises(InputError, match="only its shape is known") as error:
+        against_stated(shape, path)
+    assert error.value.code == "E-BUDGET-NO-SIZE"
 
 
 def test_a_board_file_keeps_what_is_stated(saved, tmp_path):
@@ -186,21 +261,33 @@ def test_a_failed_check_is_said(stcal_sfm, small_run, tmp_path):
     title = report["checks"][1]["title"]
     report["checks"][1]["verdict"] = "failed"
     (copy / "report.json").write_text(json.dumps(report))
-    code, text, _ = stcal_sfm("budget", copy)
-    assert code == 0
+    code, text, error = stcal_sfm("budget", copy)
+    assert (code, "--no-strict" in error) == (4, True)
+    assert title in error or "No" in error
     assert f"note: failed checks of the run: 1, first {title}; what they found is not among the inputs" in text
     assert f"{', '.join(INVALIDATES[report['checks'][1]['key']])} do not hold before it is put right" in text
     assert "expanded uncertainty U" not in text
     page, out = tmp_path / "budget.html", tmp_path / "budget.json"
-    assert stcal_sfm("budget", copy, "--report", page, "--json", out)[0] == 0
-    assert "do not hold before it is put right" in page.read_text()
-    assert json.loads(out.read_text())["faces"] == {}
+    lengths = tmp_path / "lengths.csv"
+    lengths.write_text("from,to,length_mm\n1:1,1:2,1000\n")
+    words = ("--check-lengths", lengths, "--report", page, "--json", out, "--no-strict", "--quiet")
+    assert stcal_sfm("budget", copy, *words) == (0, "", "")
+    html, file = page.read_text(), json.loads(out.read_text())
+    assert "do not hold before it is put right" in html
+    assert "Lengths and positions hold" not in text + html
+    assert "Certificate" not in html
+    assert (file["usable"], file["faces"], file["distances"], file["holds"]) == (False, {}, [], "")
+    (test,) = file["length_tests"]
+    assert (test["agrees"], test["beyond"], test["lengths"][0]["expanded_um"]) == (None, None, None)
+    assert "not judged: 1 lengths" in html
 
 
 @pytest.mark.parametrize(
     ("content", "words"),
     [
         ("[board]\npitch_sigma_ppm = -1\n", "board.pitch_sigma_ppm: -1:"),
+        ("[target]\nexpansion_ppm_per_k = 0.000023\n", "in ppm/K, so that 2.3e-05 1/K is 23;"),
+        ("[board]\nexpansion_sigma_ppm_per_k = 1e-6\n", "in ppm/K, so that 1e-06 1/K is 1;"),
         ("[target]\npitch_sigma_ppm = 1\n", "target.pitch_sigma_ppm: unknown key"),
         ("[fields]\noperator = 3\n", "fields.operator: 3:"),
         ("operator = 'x'\n", "operator: unknown key"),

@@ -48,7 +48,10 @@ def test_errors_over_their_uncertainty(budget, tmp_path, off_u, rows, beyond, ag
     assert [each.e_n for each in found.lengths] == pytest.approx([off_u] * rows, abs=1e-5)
     assert (found.beyond, found.agrees) == (beyond, agrees)
     assert found.limit == pytest.approx({1: 1.0, 4: 1.2655}[rows], abs=1e-3)
-    assert found.notes == ()
+    (note,) = found.notes  # no temperature is stated
+    assert "must state lengths for the temperature at which the target was photographed" in note
+    at_20 = replace(budget, conditions=replace(budget.conditions, temperature_c=20.0))
+    assert against_stated(at_20, tmp_path / "lengths.csv").notes == ()
 
 
 def test_a_table_of_another_program_is_read_by_its_columns(budget, tmp_path):
@@ -70,7 +73,7 @@ def test_lengths_without_sigma_are_exact(budget, tmp_path):
     path = lengths_csv(tmp_path / "lengths.csv", budget, 0.9, sigma_mm=0.0, head="from,to,length_mm")
     found = against_stated(budget, path)
     assert [each.e_n for each in found.lengths] == pytest.approx([0.9] * 4, abs=1e-5)
-    assert found.notes == (f"{path} states no sigma_mm: its lengths are taken as exact",)
+    assert found.notes[0] == f"{path} states no sigma_mm: its lengths are taken as exact"
 
 
 def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, budget, tmp_path):
@@ -94,12 +97,19 @@ def test_a_run_against_itself_differs_by_nothing_and_pitch_is_not_in_it(saved, b
     assert other.lengths[0].expanded_mm == pytest.approx(wanted, rel=2e-3)
     assert other.notes == ()
     assert "board_pitch" in SHARED
+    at_20 = replace(budget, conditions=replace(budget.conditions, temperature_c=20.0))
+    mixed = against_run(budget, at_20, saved.folder, (saved.board_design, saved.board_design))
+    assert len(mixed.notes) == 2
+    assert "hold at different temperatures" in mixed.notes[1]
 
 
 def test_command(stcal_sfm, small_run, budget, tmp_path):
     path, out = lengths_csv(tmp_path / "lengths.csv", budget, 1.5), tmp_path / "budget.json"
-    code, text, _ = stcal_sfm("budget", small_run, "--check-lengths", path, "--lengths", small_run, "--json", out)
-    assert code == 0
+    code, text, error = stcal_sfm("budget", small_run, "--check-lengths", path, "--lengths", small_run, "--json", out)
+    assert code == 4
+    assert f"length test against {path}: differs; results are written" in error
+    words = ("--check-lengths", path, "--no-strict", "--quiet")
+    assert stcal_sfm("budget", small_run, *words) == (0, "", "")
     assert f"length test against {path}: differs: 4 of 4" in text
     assert (
         "differs: 4 of 4 lengths beyond U, where 1 in 22 is by chance; largest |E_n| 1.50, which reaches 1.27" in text
