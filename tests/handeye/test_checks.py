@@ -191,6 +191,22 @@ def test_millimetres_that_are_called_metres_are_said_of_the_right_side(side, rol
         handeye(HandEyePoses(flange, board))
 
 
+@pytest.mark.parametrize("side", ["robot", "board", "both"])
+def test_radians_that_are_called_degrees_are_said(side):
+    truth = simulated(np.random.default_rng(10), 10, **NOISE)
+
+    def small(poses):
+        angles = Rotation.from_matrix(poses.rotation).as_euler("xyz")
+        return Poses(Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), poses.translation)
+
+    flange, board = truth.pairs.base_from_flange, truth.pairs.camera_from_board
+    flange = flange if side == "board" else small(flange)
+    board = board if side == "robot" else small(board)
+    said = "the robot and the board" if side == "both" else f"the {side}"
+    with pytest.raises(InputError, match=f"if the angles of {said} are radians, name their columns _rad; if not, pair"):
+        handeye(HandEyePoses(flange, board))
+
+
 def misread(poses):
     """x, y, z, w read as w, x, y, z."""
     return Poses.from_quaternions(poses.quaternions()[:, [1, 2, 3, 0]], poses.translation)

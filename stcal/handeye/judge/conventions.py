@@ -31,6 +31,8 @@ LOST = 0.25
 nothing in common."""
 NAMED = "name the columns so, or give --poses-are"
 NAMED_ORDER = "name the columns so, or reorder the numbers in other files"
+RADIANS_AS_DEGREES = np.radians(11.0)
+"""Largest rotation between two poses whose three angles, up to π each, were taken for degrees: 2 · √3 · 3.14°."""
 HALL_MM = 5e4
 """Distance from base to flange, or from camera to board, in mm, beyond which lengths are in too small a unit."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
@@ -77,12 +79,17 @@ def check_conventions(
         spread = _differ(loop)
         turn, shift = np.divide(_typical(loop, guess, True), spread)
         if max(turn, shift) > LOST:
-            pair = "pair each pose of the board with that of the flange at the same moment"
-            wording = "check the camera file" if by_images else "look for another convention of rotations"
+            remedy = "pair each pose of the board with that of the flange at the same moment"
+            if radians := _as_of_radians(loop, by_images):
+                remedy = f"if the angles of {radians} are radians, name their columns _rad; if not, {remedy}"
+            else:
+                remedy += (
+                    f", and {'check the camera file' if by_images else 'look for another convention of rotations'}"
+                )
             raise InputError(
                 "E-HANDEYE-CONVENTION",
                 f"{contradict}, where they spread over {np.degrees(spread[0]):.3g}° and {spread[1]:.3g} mm (RMS), as "
-                f"if the two sides had nothing in common; {pair}, and {wording}",
+                f"if the two sides had nothing in common; {remedy}",
             )
     behind = loop.camera_from_board.translation[:, 2] <= 0
     if behind.all():
@@ -166,6 +173,18 @@ def _other_units(loop: Loop, by_images: bool) -> dict[str, Loop]:
             replace(loop, stand_from_mount=scaled) if which == "robot" else replace(loop, camera_from_board=scaled)
         )
     return variants
+
+
+def _as_of_radians(loop: Loop, by_images: bool) -> str:
+    """Returns the sides whose rotations are as small as radians are that were taken for degrees, in words."""
+    sides = ("robot",) if by_images else ("robot", "board")
+    small = []
+    for side in sides:
+        rotation = _of_side(loop, side).rotation
+        cosines = (np.trace(rotation @ rotation[0].T, axis1=1, axis2=2) - 1) / 2
+        if np.arccos(np.clip(cosines, -1, 1)).max() < RADIANS_AS_DEGREES:
+            small.append(f"the {side}")
+    return " and ".join(small)
 
 
 def _of_side(loop: Loop, side: str) -> Poses:
