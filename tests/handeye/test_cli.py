@@ -556,3 +556,16 @@ def test_strict_ends_as_failed_where_use_is_advised_against(command, tmp_path):
     assert code == 4
     assert err.splitlines()[-1].startswith("error: --strict: failed: ")
     assert (tmp_path / "h.json").exists()
+
+
+def test_the_remedy_against_an_answer_not_to_use_stands_on_the_terminal(command, tmp_path):
+    """Both sides inverted, as after the wrong one of two pieces of advice."""
+    truth = simulated(np.random.default_rng(10), 12, **NOISE).pairs
+    sides = {name: getattr(truth, name).inverse() for name in ("base_from_flange", "camera_from_board")}
+    _, out, _ = command(write(tmp_path / "poses.csv", sides), "--method", "pose", "--out", tmp_path / "h.json")
+    verdict, remedy = (
+        next(line for line in out.splitlines() if line.startswith(word)) for word in ("verdict:", "what")
+    )
+    assert "do not use" in verdict
+    assert "flange_from_base" in remedy
+    assert "board_from_camera" in remedy

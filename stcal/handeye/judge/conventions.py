@@ -146,7 +146,7 @@ def _inverted_names(camera_from_board: Poses, by_images: bool) -> str:
         return robot
     in_front = [bool((poses.translation[:, 2] > 0).all()) for poses in (camera_from_board, camera_from_board.inverse())]
     if in_front[0] != in_front[1]:
-        return f"{robot}, since the board is in front of the camera as read" if in_front[0] else camera
+        return f"{robot} (the board is in front of the camera as read)" if in_front[0] else camera
     return f"{camera} or {robot}"
 
 

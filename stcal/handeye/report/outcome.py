@@ -151,6 +151,10 @@ class Verdict:
         """Returns the reasons against use of the calibration."""
         return [each.said for each in self.findings if each.word == BAD]
 
+    def remedies(self) -> list[str]:
+        """Returns what to do against the reasons that forbid to use the calibration, each once."""
+        return list(dict.fromkeys(each.remedy for each in self.findings if each.word == BAD and each.remedy))
+
     def sentence(self) -> str:
         """Returns the word and its reasons in one line."""
         return f"{self.word}: {'; '.join(each.said for each in self.reasons())}"

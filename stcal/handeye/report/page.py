@@ -204,8 +204,7 @@ CHANCE = (
 def verdict_blocks(found: Verdict) -> list[Block]:
     """Returns the verdict with its reasons and remedies."""
     reasons = [sentence(": ".join(filter(None, (finding.said, finding.remedy)))) for finding in found.reasons()]
-    remedies = dict.fromkeys(finding.remedy for finding in found.reasons() if finding.remedy and finding.word == BAD)
-    printed = [f"verdict: {found.sentence()}", *(f"what to do: {remedy}" for remedy in remedies)]
+    printed = [f"verdict: {found.sentence()}", *(f"what to do: {remedy}" for remedy in found.remedies())]
     return [Printed(printed), macro("judged", found.word, tone_of(found.word), reasons)]
 
 
