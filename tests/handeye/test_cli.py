@@ -563,9 +563,8 @@ def test_the_remedy_against_an_answer_not_to_use_stands_on_the_terminal(command,
     truth = simulated(np.random.default_rng(10), 12, **NOISE).pairs
     sides = {name: getattr(truth, name).inverse() for name in ("base_from_flange", "camera_from_board")}
     _, out, _ = command(write(tmp_path / "poses.csv", sides), "--method", "pose", "--out", tmp_path / "h.json")
-    verdict, remedy = (
-        next(line for line in out.splitlines() if line.startswith(word)) for word in ("verdict:", "what")
-    )
+    starts = ("verdict:", "what to do:")
+    verdict, remedy = (next(line for line in out.splitlines() if line.startswith(start)) for start in starts)
     assert "do not use" in verdict
     assert "flange_from_base" in remedy
     assert "board_from_camera" in remedy
