@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from stcal.errors import StcalError
+from stcal.geometry.camera import intrinsic_basis
+from stcal.geometry.normal_equations import generalised_inverse
 from stcal.handeye.data.pairs import HandEyePoses, Setup
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.symmetry import repair
@@ -27,12 +29,16 @@ from stcal.parallel import one_thread, run_parallel
 
 AS_GOOD = 1.0
 """Number of standard errors of the difference within which another candidate predicts as well as the chosen one."""
+SHOWN = 0.01
+"""Significance level at which the data must contradict a file before the file's content is solved for. An unknown that
+the data do not show costs more than it gains: the transform takes its σ, which errors on few poses held out hide."""
 BY_CHANCE = 0.3
 """Number of standard errors by which the best candidate must be ahead of those before it, which trust the files more
-and know their σ. It is less than the one of Breiman et al. ("Classification and Regression Trees", 1984): a candidate
-that is ahead by half a standard error is better two times in three."""
-WITHOUT_WEIGHTS = 0.7
-"""The same for closed forms against adjustments: they are many, so that one of them is more often ahead by chance."""
+and know their σ. It is less than the one of Breiman et al. ("Classification and Regression Trees", 1984), since what
+such a candidate solves for is also significant by itself (:data:`SHOWN`)."""
+WITHOUT_WEIGHTS = 2.0
+"""The same for closed forms against adjustments. Closed forms are many, so that one of them is often ahead by chance,
+and they know neither σ nor outliers; an adjustment is left only where its weights are clearly wrong."""
 TINY_MM = 1e-9
 """Least standard error of a difference: differences of exact data are rounding."""
 MANY_PERCENT = 99.5
@@ -119,11 +125,14 @@ class Choice:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Outcome:
     """``result`` of a candidate from all poses, its ``partial`` results without the poses of each split, and their
-    errors on these, ``error_mm`` (s, k)."""
+    errors on these, ``error_mm`` (s, k). ``shown`` : whether all poses contradict each file whose content is solved
+    for; ``shown_without`` : (s,) whether the poses besides those of each split do."""
 
     result: HandEye
     partial: tuple[HandEye, ...]
     error_mm: np.ndarray
+    shown: bool
+    shown_without: np.ndarray
 
 
 def _solved(
@@ -142,7 +151,26 @@ def _solved(
         deciding_error(part, pairs[out], None if views is None else views[out])
         for part, out in zip(partial, rows, strict=True)
     ]
-    return _Outcome(result, partial, np.array(errors))
+    share = 1 - rows.shape[1] / len(pairs)
+    shown_without = np.array([_shown(part, options, views, share) for part in partial])
+    return _Outcome(result, partial, np.array(errors), _shown(result, options, views), shown_without)
+
+
+def _shown(result: HandEye, options: HandEyeOptions, views: Views | None, share: float = 1.0) -> bool:
+    """True if the board's size and the intrinsics differ from their files by more than chance, where solved for.
+
+    ``share`` : share of the poses from which the result comes; its σ are those of all poses.
+    """
+    tests = []
+    if options.with_scale and result.sigma_scale:
+        tests.append((((result.scale - 1) / result.sigma_scale) ** 2, 1))
+    found = result.reprojection
+    if options.intrinsics is not None and views is not None and found is not None:
+        basis = intrinsic_basis(options.intrinsics.colmap_model)
+        off = basis.T @ (found.camera.parameters() - views.camera.parameters()) / basis.sum(0)
+        if found.camera_covariance is not None:
+            tests.append((float(off @ generalised_inverse(found.camera_covariance) @ off), len(off)))
+    return all(share * squared > chi2.ppf(1 - SHOWN, dof) for squared, dof in tests)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,12 +180,20 @@ class _Trial:
     outcomes: dict[Candidate, _Outcome]
     rows: np.ndarray
 
-    def best(self, but: np.ndarray | None = None) -> Candidate:
-        """Returns the first candidate that is not behind the best by more than chance, by all poses except ``but``."""
-        rows = self.rows if but is None else np.where(np.isin(self.rows, but), -1, self.rows)
+    def best(self, split: int | None = None) -> Candidate:
+        """Returns the first candidate that is not behind the best by more than chance, by all poses except those of the
+        ``split``.
+
+        Candidates that solve for what these poses do not show are left out.
+        """
+        rows = self.rows if split is None else np.where(np.isin(self.rows, self.rows[split]), -1, self.rows)
         if (rows < 0).all():  # a single split: no other poses were held out
             rows = self.rows
-        adjusted = [each for each in self.outcomes if each not in CLOSED_FORMS]
+        adjusted = [
+            each
+            for each, outcome in self.outcomes.items()
+            if each not in CLOSED_FORMS and (outcome.shown if split is None else outcome.shown_without[split])
+        ]
         closed = [each for each in self.outcomes if each in CLOSED_FORMS]
         chosen = self._first_of(adjusted or closed, rows)
         rival = self._first_of(closed, rows) if adjusted and closed else chosen
@@ -203,7 +239,8 @@ def choose(
 ) -> Choice:
     """Solves with camera and board as filed and with either as unknown, by poses, by corners and in closed form.
 
-    The errors on held-out poses decide: the 3-D error at the board if there are corners, else that of the board's
+    A candidate with unknown board or camera takes part where they differ from their files by more than chance. The
+    errors on held-out poses decide: the 3-D error at the board if there are corners, else that of the board's
     origin. Solutions without some poses are one step from the solution of all.
 
     Parameters
@@ -246,7 +283,7 @@ def choose(
     chosen = trial.best()
     errors_of_split = []
     for k, out in enumerate(rows):
-        part = trial.outcomes[trial.best(but=out)].partial[k]
+        part = trial.outcomes[trial.best(k)].partial[k]
         errors = predicted(part, pairs[out], None if views is None else views[out])
         errors_of_split.append(errors | {"mount_from_camera": part.mount_from_camera.matrix()})
     held_out = HeldOutPoses(
@@ -261,7 +298,9 @@ def choose(
         for each, outcome in trial.outcomes.items()
         if each != chosen and each not in CLOSED_FORMS and trial.as_good(each, chosen)
     }
-    result = widened_by_scatter(trial.outcomes[chosen].result, held_out)
+    # The scatter is that of one way of solving: where splits choose another, the answers jump, which no σ predicts.
+    own = np.array([part.mount_from_camera.matrix() for part in trial.outcomes[chosen].partial])
+    result = widened_by_scatter(trial.outcomes[chosen].result, replace(held_out, mount_from_camera=own))
     result, notes = _widened(result, chosen, rivals)
     measure = "translation_mm" if views is None else "board_mm"
     return Choice(tried, chosen, result, held_out, _sentence(tried, chosen, result, measure), notes)

@@ -142,6 +142,9 @@ def test_one_side_inverted_is_said(setup, side, method):
     with fails_with("E-HANDEYE-CONVENTION") as caught:
         handeye(HandEyePoses(flange, board), setup, method)
     assert setup not in str(caught.value)
+    inverted, sound = ("flange_from_base", "board_from_camera")[:: 1 if side == "robot" else -1]
+    assert inverted in str(caught.value)
+    assert sound not in str(caught.value)  # that advice would invert both sides
 
 
 def test_both_sides_inverted_put_the_board_behind_the_camera():
@@ -151,6 +154,7 @@ def test_both_sides_inverted_put_the_board_behind_the_camera():
     found = handeye(pairs)
     assert found.flange_from_camera.translation == pytest.approx(truth.stand_from_board.translation, abs=2)
     assert found.notes[0].startswith("the board lies behind the camera in all poses")
+    assert all(name in found.notes[0] for name in ("flange_from_base", "board_from_camera"))
 
 
 def test_one_board_behind_the_camera_is_named():
@@ -171,6 +175,35 @@ def test_metres_that_are_called_millimetres_are_said(side):
     else:
         board = Poses(board.rotation, board.translation / 1000)
     with pytest.raises(InputError, match=f"with the {side}'s lengths times 1000: if they are metres"):
+        handeye(HandEyePoses(flange, board))
+
+
+@pytest.mark.parametrize(("side", "role"), [("robot", "robot"), ("board", "camera")])
+def test_millimetres_that_are_called_metres_are_said_of_the_right_side(side, role):
+    truth = simulated(np.random.default_rng(10), 10, **NOISE)
+    flange, board = truth.pairs.base_from_flange, truth.pairs.camera_from_board
+    if side == "robot":
+        flange = Poses(flange.rotation, 1000 * flange.translation)
+    else:
+        board = Poses(board.rotation, 1000 * board.translation)
+    said = rf"by [\d.]+° and [\d.]+ mm with the {side}'s lengths divided by 1000: if they are mm, .*unit {role}=mm"
+    with pytest.raises(InputError, match=said):
+        handeye(HandEyePoses(flange, board))
+
+
+@pytest.mark.parametrize("side", ["robot", "board", "both"])
+def test_radians_that_are_called_degrees_are_said(side):
+    truth = simulated(np.random.default_rng(10), 10, **NOISE)
+
+    def small(poses):
+        angles = Rotation.from_matrix(poses.rotation).as_euler("xyz")
+        return Poses(Rotation.from_euler("xyz", angles, degrees=True).as_matrix(), poses.translation)
+
+    flange, board = truth.pairs.base_from_flange, truth.pairs.camera_from_board
+    flange = flange if side == "board" else small(flange)
+    board = board if side == "robot" else small(board)
+    said = "the robot and the board" if side == "both" else f"the {side}"
+    with pytest.raises(InputError, match=f"if the angles of {said} are radians, name their columns _rad; if not, pair"):
         handeye(HandEyePoses(flange, board))
 
 
@@ -221,7 +254,7 @@ def test_left_handed_poses_are_said(setup, axis, side):
 
 def test_poses_that_have_nothing_in_common_are_refused():
     pairs = simulated(np.random.default_rng(16), 12, **NOISE).pairs
-    with fails_with("E-HANDEYE-CONVENTION … pair each pose"):
+    with fails_with("E-HANDEYE-CONVENTION … spread over … pair each pose"):
         handeye(HandEyePoses(pairs.base_from_flange, pairs.camera_from_board[np.roll(np.arange(12), 1)]))
 
 

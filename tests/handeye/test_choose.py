@@ -83,6 +83,50 @@ def test_poses_alone_are_chosen_among_too(scale, name):
     assert found.held_out.rows.shape == (8, 4)
 
 
+def pairs_of_size(scale, seed, count=15):
+    """Poses in front of a board that is ``scale`` times as large as its file says."""
+    truth = simulated(np.random.default_rng(seed), count, "eye-in-hand", ROBOT, (5e-4, 0.2))
+    eye = truth.pairs.camera_from_board
+    return truth, replace(truth.pairs, camera_from_board=replace(eye, translation=eye.translation / scale))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", sampled((28, 32, 33, 34), kept=(28, 33)))
+def test_sound_poses_are_taken_as_filed(seed):
+    """Sets on whose poses held out the scale (28, 32) or a closed form (33, 34) is ahead, by chance."""
+    truth, pairs = pairs_of_size(1.0, seed)
+    found = choose(pairs, truth.setup, None, HandEyeOptions(), None, splits(15))
+    by_pose = solved(pairs, truth.setup, "pose", None, HandEyeOptions()).result
+    free = solved(pairs, truth.setup, "pose", None, HandEyeOptions(with_scale=True)).result
+    assert abs(free.scale - 1) < 2.5 * free.sigma_scale
+    assert found.chosen == Candidate("pose")
+    assert off_mm(found.result, truth) == pytest.approx(off_mm(by_pose, truth), abs=1e-9)
+    assert not [note for note in found.result.notes if "scatter" in note]
+    assert np.sqrt(found.result.covariance[3, 3] / by_pose.covariance[3, 3]) < 1.5
+
+
+@pytest.mark.parametrize("sigmas", [-4.0, -2.0, 2.0, 4.0])
+def test_a_size_is_solved_for_where_the_poses_show_it(sigmas):
+    """The same poses, with the size so many σ off its file; beyond 2.6 σ is 1 in 100 by chance."""
+    truth, pairs = pairs_of_size(1.0, 30)
+    free = solved(pairs, truth.setup, "pose", None, HandEyeOptions(with_scale=True)).result
+    scale = (1 + sigmas * free.sigma_scale) / free.scale
+    pairs = pairs_of_size(scale, 30)[1]
+    found = choose(pairs, truth.setup, None, HandEyeOptions(), None, splits(15))
+    assert found.chosen.scale == (abs(sigmas) > 2.6)
+
+
+@pytest.mark.slow
+def test_intrinsics_that_the_corners_do_not_show_are_not_solved_for(monkeypatch):
+    """Even where they predict far better; they are where the file's focal length is 2 % off."""
+    truth = simulated_views(np.random.default_rng(3), 10, "eye-in-hand", ROBOT, 0.1)
+    monkeypatch.setattr("stcal.handeye.choose.BY_VIEWS", (Candidate("reprojection"), Candidate("reprojection", True)))
+    monkeypatch.setattr("stcal.handeye.choose._Trial._first_of", lambda trial, candidates, rows: candidates[-1])
+    assert not chosen(truth).chosen.camera
+    focal = 1.02 * CAMERA.focal
+    assert chosen(truth, replace(CAMERA, focal=focal)).chosen.camera
+
+
 def test_one_split_is_enough():
     truth = simulated(np.random.default_rng(8), 6, "eye-in-hand", ROBOT)
     found = choose(truth.pairs, truth.setup, None, HandEyeOptions(), None, splits(6, None, 1))

@@ -223,7 +223,7 @@ def again(sides):
         (None, change(3, "0.2"), INPUT, ["line 5: quaternion of length", "is the order qw, qx, qy, qz?"]),
         (None, change(0, "nan"), INPUT, ["line 5: base_from_flange_x_mm is 'nan'"]),
         (None, change(1, ""), INPUT, ["line 5: base_from_flange_y_mm is ''"]),
-        (inverted, None, INPUT, ["contradict each other", "board_from_camera or flange_from_base"]),
+        (inverted, None, INPUT, ["contradict each other", "if these are board_from_camera, name"]),
         (in_metres, None, INPUT, ["if they are metres, name the columns _m"]),
     ],
 )
@@ -556,3 +556,15 @@ def test_strict_ends_as_failed_where_use_is_advised_against(command, tmp_path):
     assert code == 4
     assert err.splitlines()[-1].startswith("error: --strict: failed: ")
     assert (tmp_path / "h.json").exists()
+
+
+def test_the_remedy_against_an_answer_not_to_use_stands_on_the_terminal(command, tmp_path):
+    """Both sides inverted, as after the wrong one of two pieces of advice."""
+    truth = simulated(np.random.default_rng(10), 12, **NOISE).pairs
+    sides = {name: getattr(truth, name).inverse() for name in ("base_from_flange", "camera_from_board")}
+    _, out, _ = command(write(tmp_path / "poses.csv", sides), "--method", "pose", "--out", tmp_path / "h.json")
+    starts = ("verdict:", "what to do:")
+    verdict, remedy = (next(line for line in out.splitlines() if line.startswith(start)) for start in starts)
+    assert "do not use" in verdict
+    assert "flange_from_base" in remedy
+    assert "board_from_camera" in remedy

@@ -11,6 +11,7 @@ import numpy as np
 
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye.data.formats.record import FRAMES
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
 from stcal.handeye.judge.remarks import Grave
 from stcal.handeye.methods.closed_form import mean_pose
@@ -30,6 +31,10 @@ LOST = 0.25
 nothing in common."""
 NAMED = "name the columns so, or give --poses-are"
 NAMED_ORDER = "name the columns so, or reorder the numbers in other files"
+RADIANS_AS_DEGREES = np.radians(11.0)
+"""Largest rotation between two poses whose three angles, up to π each, were taken for degrees: 2 · √3 · 3.14°."""
+HALL_MM = 5e4
+"""Distance from base to flange, or from camera to board, in mm, beyond which lengths are in too small a unit."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
 Guess = Callable[[Loop, bool], tuple[Rigid, Rigid, float]]
 
@@ -71,19 +76,30 @@ def check_conventions(
             turn, shift = typical_of_variant[wording]
             than = f"by {np.degrees(turn):.2g}° and {shift:.2g} mm {wording}"
             notes = (Grave(f"the poses contradict each other by {size}, but {than}"),)
-        turn, shift = np.divide(_typical(loop, guess, True), _differ(loop))
+        spread = _differ(loop)
+        turn, shift = np.divide(_typical(loop, guess, True), spread)
         if max(turn, shift) > LOST:
-            pair = "pair each pose of the board with that of the flange at the same moment"
-            wording = "check the camera file" if by_images else "look for another convention of rotations"
+            remedy = "pair each pose of the board with that of the flange at the same moment"
+            if radians := _as_of_radians(loop, by_images):
+                remedy = f"if the angles of {radians} are radians, name their columns _rad; if not, {remedy}"
+            else:
+                remedy += (
+                    f", and {'check the camera file' if by_images else 'look for another convention of rotations'}"
+                )
             raise InputError(
                 "E-HANDEYE-CONVENTION",
-                f"{contradict}, {max(turn, shift):.0%} of what they differ by; {pair}, and {wording}",
+                f"{contradict}, where they spread over {np.degrees(spread[0]):.3g}° and {spread[1]:.3g} mm (RMS), as "
+                f"if the two sides had nothing in common; {remedy}",
             )
     behind = loop.camera_from_board.translation[:, 2] <= 0
     if behind.all():
+        robot, camera = (" in place of ".join(names) for names in FRAMES.values())
         return (
             *notes,
-            Grave(f"the board lies behind the camera in all poses: if these are board_from_camera, {NAMED}"),
+            Grave(
+                "the board lies behind the camera in all poses, as it does where both sides are inverted: turn both "
+                f"round, {robot} and {camera}, or the reverse, by --poses-are or the names of columns"
+            ),
         )
     if behind.any():
         return (*notes, f"the board lies behind the camera in {pairs.names[int(behind.argmax())]}: check its pose")
@@ -97,9 +113,7 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
     hand, eye = loop.stand_from_mount, loop.camera_from_board
     # A rotation by the mirror is absorbed by X and Z, so mirroring the robot is the same as mirroring the camera.
     mirrored = Poses(MIRROR @ eye.rotation @ MIRROR, eye.translation @ MIRROR)
-    named = "flange_from_base" if by_images else "board_from_camera or flange_from_base"
-    metres = "if they are metres, name the columns _m, or give --length-unit m"
-    size = "if the size in its file is in metres, correct that" if by_images else metres
+    named = _inverted_names(eye, by_images)
     states = "the robot states" if by_images else "robot or camera states"
     remedy = "change the signs of its y, qx and qz" + (
         "; or images are mirrored: use them as taken" if by_images else ""
@@ -108,12 +122,7 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
         f"{INVERTED}: if these are {named}, {NAMED}; if all are named rightly, the setup is {kind}": (
             replace(loop, camera_from_board=eye.inverse())
         ),
-        f"with the board's lengths times 1000: {size}": (
-            replace(loop, camera_from_board=Poses(eye.rotation, 1000 * eye.translation))
-        ),
-        f"with the robot's lengths times 1000: {metres}": (
-            replace(loop, stand_from_mount=Poses(hand.rotation, 1000 * hand.translation))
-        ),
+        **_other_units(loop, by_images),
         f"with one side mirrored: if {states} left-handed poses, {remedy}": replace(loop, camera_from_board=mirrored),
     }
     for reading in (*ORDERS, CONJUGATED):
@@ -127,6 +136,63 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
             variants[f"with the board's {one_side}"] = replace(loop, camera_from_board=board)
             variants[f"with all {both_sides}"] = replace(loop, stand_from_mount=robot, camera_from_board=board)
     return variants
+
+
+def _inverted_names(camera_from_board: Poses, by_images: bool) -> str:
+    """Returns the names that the poses of the inverted side should have. A board is in front of its camera, which tells
+    the side unless the poses have the board in front either way."""
+    robot, camera = FRAMES["robot"][1], FRAMES["camera"][1]
+    if by_images:
+        return robot
+    in_front = [bool((poses.translation[:, 2] > 0).all()) for poses in (camera_from_board, camera_from_board.inverse())]
+    if in_front[0] != in_front[1]:
+        return f"{robot} (the board is in front of the camera as read)" if in_front[0] else camera
+    return f"{camera} or {robot}"
+
+
+def _other_units(loop: Loop, by_images: bool) -> dict[str, Loop]:
+    """Returns the loop with either side's lengths in the other unit, by what to do.
+
+    Residuals show the ratio of the two units alone: lengths of metres that are taken for mm look like those of mm that
+    are taken for metres on the other side. Lengths beyond :data:`HALL_MM` tell which it is.
+    """
+    variants = {}
+    for side, other in (("robot", "board"), ("board", "robot")):
+        factor, which = 1000.0, side
+        remedy = "if they are metres, name the columns _m, or give --length-unit m"
+        if side == "board" and by_images:
+            remedy = "if the size in its file is in metres, correct that"
+        if _typical_length(_of_side(loop, other)) > HALL_MM:
+            factor, which = 1e-3, other
+            role = "robot" if other == "robot" else "camera"
+            remedy = f"if they are mm, name the columns _mm, or give --length-unit {role}=mm"
+        poses = _of_side(loop, which)
+        scaled = Poses(poses.rotation, factor * poses.translation)
+        times = "times" if factor > 1 else "divided by"
+        variants[f"with the {which}'s lengths {times} 1000: {remedy}"] = (
+            replace(loop, stand_from_mount=scaled) if which == "robot" else replace(loop, camera_from_board=scaled)
+        )
+    return variants
+
+
+def _as_of_radians(loop: Loop, by_images: bool) -> str:
+    """Returns the sides whose rotations are as small as radians are that were taken for degrees, in words."""
+    sides = ("robot",) if by_images else ("robot", "board")
+    small = []
+    for side in sides:
+        rotation = _of_side(loop, side).rotation
+        cosines = (np.trace(rotation @ rotation[0].T, axis1=1, axis2=2) - 1) / 2
+        if np.arccos(np.clip(cosines, -1, 1)).max() < RADIANS_AS_DEGREES:
+            small.append(f"the {side}")
+    return " and ".join(small)
+
+
+def _of_side(loop: Loop, side: str) -> Poses:
+    return loop.stand_from_mount if side == "robot" else loop.camera_from_board
+
+
+def _typical_length(poses: Poses) -> float:
+    return float(np.median(np.linalg.norm(poses.translation, axis=1)))
 
 
 def _read_as(reading: Reading, poses: Poses, inverted: bool = False) -> Poses:

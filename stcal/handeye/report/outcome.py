@@ -151,6 +151,10 @@ class Verdict:
         """Returns the reasons against use of the calibration."""
         return [each.said for each in self.findings if each.word == BAD]
 
+    def remedies(self) -> list[str]:
+        """Returns what to do against the reasons that forbid to use the calibration, each once."""
+        return list(dict.fromkeys(each.remedy for each in self.findings if each.word == BAD and each.remedy))
+
     def sentence(self) -> str:
         """Returns the word and its reasons in one line."""
         return f"{self.word}: {'; '.join(each.said for each in self.reasons())}"
@@ -236,8 +240,8 @@ def _of_share(outcome: Outcome) -> Finding | None:
     distance, sigma, shift = share
     share_of_transform, word = sigma**2 / (sigma**2 + shift**2), _word(sigma**2 / (sigma**2 + shift**2), HALF, MOST)
     said = (
-        f"{FRAMES[outcome.result.setup].camera} errs by {sigma:.2g} mm where the board was ({distance:.0f} mm away), a "
-        f"single pose by {shift:.2g} mm"
+        f"σ of {FRAMES[outcome.result.setup].camera} is {sigma:.2g} mm where the board was ({distance:.0f} mm away), "
+        f"the error of a single pose {shift:.2g} mm (RMS)"
     )
     remedy = "take more poses, and turn the flange more, about two axes" if word != GOOD else ""
     return Finding("σ of the transform", word, said, f"{share_of_transform:.0%} of the variance", f"{HALF:.0%}", remedy)

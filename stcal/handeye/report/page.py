@@ -204,7 +204,8 @@ CHANCE = (
 def verdict_blocks(found: Verdict) -> list[Block]:
     """Returns the verdict with its reasons and remedies."""
     reasons = [sentence(": ".join(filter(None, (finding.said, finding.remedy)))) for finding in found.reasons()]
-    return [Printed([f"verdict: {found.sentence()}"]), macro("judged", found.word, tone_of(found.word), reasons)]
+    printed = [f"verdict: {found.sentence()}", *(f"what to do: {remedy}" for remedy in found.remedies())]
+    return [Printed(printed), macro("judged", found.word, tone_of(found.word), reasons)]
 
 
 def findings_fold(found: Verdict) -> Block:

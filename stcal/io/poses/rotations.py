@@ -13,6 +13,8 @@ from stcal.io.quaternions import require_unit
 from stcal.io.table import ANGLES
 
 ROTATION_VECTOR = "rotvec"
+MOST_RADIANS = 4 * np.pi
+"""Largest angle or length of a rotation vector of a pose, in radians; programs that count turns stay below two."""
 QUATERNIONS = ("wxyz", "xyzw")
 ALIASES: dict[str, tuple[str, str]] = {
     "kuka-abc": ("ZYX", "deg"),
@@ -113,7 +115,7 @@ def rotations(
 
     ``by_axis`` : True if the columns are named by the axes x, y, z and not in the order of the rotations.
 
-    Raises InputError: values are not finite, or their unit is ambiguous.
+    Raises InputError: values are not finite, their unit is ambiguous, or they are too large for radians.
     """
     require_finite(values, places, where)
     unit, guessed, largest = convention.unit, False, float(np.abs(values).max(initial=0.0))
@@ -131,6 +133,12 @@ def rotations(
                 f"{convention.order}-rad or {convention.order}-deg, or name the columns _rad or _deg",
             )
         unit, guessed = "deg", True
+    if unit == "rad" and (largest := float(np.abs(values).max())) > MOST_RADIANS:
+        raise InputError(
+            "E-ANGLE-UNIT",
+            f"{where}: angles up to {largest:.4g} rad, a turn is 6.28; if they are degrees, name the columns _deg, or "
+            f"give --rotation {convention.order}-deg",
+        )
     angles = values * ANGLES[unit]
     words = f"{convention.words()}, {'degrees' if unit == 'deg' else 'radians'}{' by their size' if guessed else ''}"
     if convention.order == ROTATION_VECTOR:

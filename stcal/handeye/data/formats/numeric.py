@@ -270,6 +270,8 @@ NAMES = (
 NUMBERS = ("nr", "no", "number", "index", "id", "#")
 """Columns that name a row where no value occurs twice: elsewhere they number something else, such as the board."""
 _MESSAGE = re.compile(r"(?P<of>.*?)[./_]?(?:position|translation)[./_]x", re.IGNORECASE)
+_ELEMENT = re.compile(r"(?P<stem>[A-Za-z_]+?)_?(?P<row>[0-4])_?(?P<column>[0-4])")
+"""Column of one element of a matrix."""
 _STAMP = (("secs", "nsecs"), ("sec", "nanosec"))
 
 
@@ -398,6 +400,10 @@ def _of_messages(table: Table, messages: Sequence[_Message], names: tuple[str, .
 
 def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ...], statements: Said) -> Side | None:
     """Returns the poses in the columns that begin with a prefix; None where place or rotation is missing."""
+    matrices = _matrices(table, prefix)
+    if matrices is not None:
+        rotation, translation = of_matrices(matrices, places_of(table), table.where)
+        return Side(rotation, translation, places_of(table), MATRICES, None, frames, names)
     place = _place(table, prefix)
     if place is None:
         return None
@@ -407,6 +413,26 @@ def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ..
         return None
     covariance = table.pose_covariances(prefix)
     return Side(turned.rotation, at, places_of(table), turned.words, unit, frames, names, covariance=covariance)
+
+
+def _matrices(table: Table, prefix: str) -> np.ndarray | None:
+    """Returns the matrices (m, 4, 4) of columns that name row and column of each element; None where there are none.
+
+    Rows and columns count from 0 or from 1, as in m00 … m33, r11 … r44 or T_0_0; the row 0 0 0 1 may be missing.
+    """
+    by_stem: dict[str, dict[tuple[int, int], str]] = {}
+    for column in table.columns:
+        if column.startswith(prefix) and (element := _ELEMENT.fullmatch(column.removeprefix(prefix))):
+            by_stem.setdefault(element["stem"].lower(), {})[int(element["row"]), int(element["column"])] = column
+    for elements in by_stem.values():
+        first = min(min(place) for place in elements)
+        wanted = [(row, column) for row in range(first, first + 4) for column in range(first, first + 4)]
+        if set(elements) in (set(wanted), set(wanted[:THREE_ROWS])):
+            matrices = np.tile(np.eye(4).ravel(), (len(table), 1))
+            for i, place in enumerate(wanted[: len(elements)]):
+                matrices[:, i] = table.numbers(elements[place])
+            return matrices.reshape(-1, 4, 4)
+    return None
 
 
 def _place(table: Table, prefix: str) -> tuple[np.ndarray, Unit | None] | None:

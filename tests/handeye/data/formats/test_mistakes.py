@@ -400,3 +400,22 @@ def test_maps_of_columns(tmp_path):
     np.testing.assert_array_equal(found.pairs.base_from_flange.translation, GOOD[:, :3, 3])
     robot = read_robot_poses(table, statements=Said(columns=map_file))
     np.testing.assert_array_equal(robot.base_from_flange.translation, GOOD[:, :3, 3])
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "rows"),
+    [("m{}{}", 0, 4), ("r{}{}", 1, 4), ("T_{}_{}", 0, 4), ("base_from_flange_M{}{}", 1, 3)],
+)
+def test_matrices_under_a_header(tmp_path, name, first, rows):
+    header = [name.format(i + first, j + first) for i in range(rows) for j in range(4)]
+    table = [header, *(GOOD[:, :rows].reshape(len(GOOD), -1)).astype(str).tolist()]
+    (tmp_path / "robot.csv").write_text("\n".join(",".join(row) for row in table))
+    found = read_robot(tmp_path / "robot.csv", Said(length_unit="mm"))
+    assert matrices(found.poses) == pytest.approx(GOOD, abs=1e-9)
+
+
+def test_a_matrix_under_a_header_with_an_element_missing(tmp_path):
+    header = [f"m{i}{j}" for i in range(4) for j in range(4)][:15]
+    (tmp_path / "robot.csv").write_text(",".join(header) + "\n" + ",".join(["1"] * 15))
+    with pytest.raises(InputError, match="the header is 'm00,m01"):
+        read_robot_poses(tmp_path / "robot.csv", "wxyz", Said())
