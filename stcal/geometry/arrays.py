@@ -185,6 +185,11 @@ def require_arguments(function: Callable[P, R]) -> Callable[P, R]:
     return judged
 
 
+def _holds_text(values: object) -> bool:
+    """Return True if a text is among the values of nested lists."""
+    return isinstance(values, str) or (isinstance(values, list | tuple) and any(map(_holds_text, values)))
+
+
 def frozen(
     values: ArrayLike,
     shape: Shape | None = None,
@@ -214,6 +219,8 @@ def frozen(
     InputError
         If the shape differs, the values are no numbers, or a float array holds a value that is not finite.
     """
+    if dtype is not object and _holds_text(values):  # numpy would make all values as long as the longest text
+        raise InputError("E-ARRAY-TYPE", f"{what}: text among the values; real numbers needed")
     try:
         array = np.array(values)
     except ValueError as error:

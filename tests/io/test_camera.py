@@ -276,7 +276,7 @@ WRONG = {
     "a photograph": (b"\xff\xd8\xff\xe0\x00\x10JFIF", "E-CAMERA-UNREADABLE"),
     "UTF-16 without its mark": ("1 PINHOLE 10 10 1 1 1 1".encode("utf-16-le"), "E-CAMERA-UNREADABLE"),
     "COLMAP: two cameras": ("1 PINHOLE 9 9 1 1 1 1\n2 PINHOLE 9 9 1 1 1 1\n", "E-CAMERA-SEVERAL … 2 … 1, 2"),
-    "COLMAP: field of view": ("1 FOV 9 9 1 1 1 1 1", "E-CAMERA-MODEL … COLMAP's FOV … SIMPLE_"),
+    "COLMAP: field of view": ("1 FOV 90 90 60 60 45 45 1", "E-CAMERA-MODEL … COLMAP's FOV … SIMPLE_"),
     "COLMAP: too few": ("1 PINHOLE 9 9 1 1 1", "E-CAMERA-COEFFICIENTS … 3 … PINHOLE … 4"),
     "COLMAP: far too few": ("1 SIMPLE_PINHOLE 9 9 1", "E-CAMERA-COEFFICIENTS … 1 … SIMPLE_PINHOLE … 3"),
     "COLMAP: too many": ("1 SIMPLE_PINHOLE 9 9 1 1 1 1", "E-CAMERA-COEFFICIENTS … 4 … SIMPLE_PINHOLE … 3"),

@@ -119,12 +119,6 @@ def rotations(
     """
     require_finite(values, places, where)
     unit, guessed, largest = convention.unit, False, float(np.abs(values).max(initial=0.0))
-    if unit == "rad" and largest > MOST_RAD:
-        raise InputError(
-            "E-ROTATION-AMBIGUOUS",
-            f"{where}: angles up to {largest:.3g}, more than a turn in radians; of degrees give --rotation "
-            f"{convention.order}-deg, or name the columns _deg",
-        )
     if not unit:
         if largest <= MOST_RAD:
             raise InputError(
@@ -133,7 +127,7 @@ def rotations(
                 f"{convention.order}-rad or {convention.order}-deg, or name the columns _rad or _deg",
             )
         unit, guessed = "deg", True
-    if unit == "rad" and (largest := float(np.abs(values).max())) > MOST_RADIANS:
+    if unit == "rad" and largest > MOST_RADIANS:
         raise InputError(
             "E-ANGLE-UNIT",
             f"{where}: angles up to {largest:.4g} rad, a turn is 6.28; if they are degrees, name the columns _deg, or "

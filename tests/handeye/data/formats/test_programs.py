@@ -114,5 +114,5 @@ def test_quaternions_after_nanoseconds_have_an_open_order(tmp_path):
 
 def test_more_than_a_turn_in_radians_is_refused(tmp_path):
     (tmp_path / "p.csv").write_text("X,Y,Z,Rx,Ry,Rz\n100,200,300,10,20,30\n110,200,300,-10,20,35\n")
-    with fails_with("E-ROTATION-AMBIGUOUS … 35 … rotvec-deg"):
+    with fails_with("E-ANGLE-UNIT … 35 … rotvec-deg"):
         read_robot_poses(tmp_path / "p.csv", statements=Said.of_options(["robot=ur-rotvec"], [], [], None))
