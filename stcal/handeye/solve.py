@@ -146,27 +146,10 @@ def handeye(
     views: Views | None = None,
     options: HandEyeOptions | None = None,
 ) -> HandEye:
-    """Returns where the camera is on the flange, or in the robot's base frame.
+    """Returns the result of one method, with σ as its own residuals tell them.
 
-    Parameters
-    ----------
-    pairs : HandEyePoses
-        At least three, rotated about two axes that are not parallel; see :func:`~stcal.handeye.read_poses`,
-        :func:`~stcal.handeye.pairs_of_views`.
-    setup : str
-        ``eye-in-hand``: the camera on the flange; ``eye-to-hand``: the board on the flange.
-    method : str, optional
-        One of :data:`METHODS`; if None, ``reprojection`` with views, else ``pose``.
-    views : Views, optional
-        The corners from which ``pairs`` were computed. ``reprojection`` adjusts them; with ``pose`` they carry the
-        camera's errors into σ.
-    options : HandEyeOptions, optional
-        Known errors of robot and camera, and further unknowns; the defaults if None.
-
-    Returns
-    -------
-    HandEye
-        X and Z with covariances, residuals, outliers, and notes on anything doubtful.
+    The parameters are those of :func:`stcal.handeye.handeye`, which chooses a method where none is named and widens σ
+    by what poses held out show; here the method is ``reprojection`` with views, else ``pose``, if None.
 
     Raises
     ------
@@ -176,12 +159,6 @@ def handeye(
         The poses do not determine the answer; the message says which motion is missing.
     ConvergenceError
         The method fails on these poses.
-
-    Examples
-    --------
-    >>> pairs = read_poses("poses.csv")  # doctest: +SKIP
-    >>> found = handeye(pairs, "eye-in-hand")  # doctest: +SKIP
-    >>> found.flange_from_camera @ [0, 0, 500]  # a point half a metre before the camera  # doctest: +SKIP
     """
     return solved(pairs, setup, method, views, options).result
 
