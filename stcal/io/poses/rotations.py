@@ -41,7 +41,7 @@ LIKELY = {
 }
 """Suggestions for ``--rotation`` by the names of the columns."""
 MOST_RAD = 2 * np.pi * 1.01
-"""Largest angle that a rotation is stated by in radians: a turn."""
+"""Largest angle up to which numbers without a unit may be radians: a turn."""
 _ORDER = re.compile(r"[xyz]{3}|[XYZ]{3}")
 
 
