@@ -26,8 +26,7 @@ COMMANDS = {
     "types": f'NODE_OPTIONS="${{NODE_OPTIONS:-}} --max-semi-space-size=128" {PROGRAMS}/basedpyright',
     "site": f"{PYTHON} scripts/build_site.py",
     "wheel": "scripts/try_wheel",
-    # One process more than cores: some tests wait for a server, a folder or a signal.
-    "tests": f"{PYTHON} -m pytest -n {(os.cpu_count() or 1) + 1} --dist worksteal",
+    "tests": f"{PYTHON} -m pytest -n {os.cpu_count() or 1} --dist worksteal",
 }
 
 

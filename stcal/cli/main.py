@@ -134,7 +134,16 @@ def again(lost: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(lost)
         return
     signal.signal(signal.SIGTERM, _terminate)
-    threading.Timer(AGAIN_S, signal.raise_signal, (number,)).start()
+    threading.Timer(AGAIN_S, _send, (number,)).start()
+
+
+def _send(number: int) -> None:
+    """Sends this process a signal, to its main thread where the system can: that ends what it waits for."""
+    main_thread = threading.main_thread().ident
+    if sys.platform == "win32" or main_thread is None:
+        signal.raise_signal(number)
+    else:
+        signal.pthread_kill(main_thread, number)
 
 
 class _Terminated(BaseException):

@@ -76,6 +76,7 @@ def test_words_of_tabs_stand_on_them(target):
     assert turned == {True, False}
 
 
+@pytest.mark.slow
 def test_the_paper_for_a_whole_net_is_named(target, tmp_path):
     (tmp_path / "target.toml").write_text(target_toml(target))
     text = drawn_text(draw(tmp_path / "target.toml", tmp_path / "net.pdf", net=True))

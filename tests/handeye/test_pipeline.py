@@ -25,6 +25,7 @@ def metres(poses: Poses) -> np.ndarray:
     return poses.matrix() * np.array([[1, 1, 1, 1e-3]] * 3 + [[1, 1, 1, 1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [None, "pose"])
 def test_the_answer_is_that_of_the_command(pairs, method, tmp_path, monkeypatch, capsys):
     """To the last digits of the file: result, method and σ, which poses held out widen here."""
@@ -42,12 +43,14 @@ def test_the_answer_is_that_of_the_command(pairs, method, tmp_path, monkeypatch,
     np.testing.assert_allclose(said["covariance"], found.covariance, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_sigma_holds_for_poses_held_out(pairs):
     """Of eight poses, results without some of them scatter by more than the adjustment's own σ."""
     own = handeye.compare(pairs, methods=("pose",))[0].result
     assert handeye.handeye(pairs, method="pose").covariance[3, 3] > 1.05 * own.covariance[3, 3]
 
 
+@pytest.mark.slow
 def test_matrices_in_metres_are_pairs_of_poses(pairs):
     found = handeye.handeye(
         metres(pairs.base_from_flange), metres(pairs.camera_from_board), setup="eye-in-hand", unit="m", method="pose"

@@ -71,6 +71,7 @@ def two_cameras(each):
     return change
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OF_CAMERAS)
 def test_a_camera_of_several_is_asked_for_and_taken(call, monkeypatch, name):
     each = OF_CAMERAS[name]

@@ -35,7 +35,7 @@ def test_while_libraries_load(number, said, code):
 
 @pytest.mark.parametrize(("number", "said", "code"), ENDS)
 def test_where_python_forgets_exceptions_a_signal_is_sent_again(number, said, code):
-    """In a finaliser, whose exceptions Python prints and forgets."""
+    """In a finaliser, whose exceptions Python prints and forgets; what the command waits for ends."""
     begin = (
         "import signal, sys, time, typer, weakref; from stcal.cli import entry, main\n"
         "class A: pass\n"
@@ -46,7 +46,7 @@ def test_where_python_forgets_exceptions_a_signal_is_sent_again(number, said, co
         "    time.sleep(30)\n"
         "main.app = typer.Typer(); main.app.command()(command); sys.argv[1:] = []; entry.main()"
     )
-    done = subprocess.run([sys.executable, "-P", "-c", begin], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run([sys.executable, "-P", "-c", begin], capture_output=True, text=True, timeout=20, check=False)
     assert (done.returncode, done.stderr.splitlines()) == (code, [said])
 
 

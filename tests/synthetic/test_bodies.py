@@ -44,6 +44,7 @@ def charuco_plate() -> TargetDesign:
     return TargetDesign("two boards", "bright", tuple(faces))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [tag_cube(60.0, size_sigma_mm=0.1), charuco_plate()], ids=["tags", "charuco"])
 def test_print_is_off_by_what_the_truth_says(target):
     """Six times as far off as stated: 0.3 mm in the mean, a pixel and more; drawn corners are found to a tenth."""

@@ -75,6 +75,7 @@ def test_joint_values_prove_what_is_wrong(name, seed):
         assert says in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [arm, scara])
 @pytest.mark.parametrize("count", [1, 2, 30])
 @pytest.mark.parametrize("share", [0.02, 0.6])

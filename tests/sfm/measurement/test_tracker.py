@@ -88,6 +88,7 @@ def test_what_jumps_is_searched_and_found(film, frames, target, model):
         assert np.linalg.norm(pose.camera_from_target.translation - truth[i].translation) < 1
 
 
+@pytest.mark.slow
 def test_a_hidden_face_is_missed_by_name(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     seen = tracker.locate(frames[0])
