@@ -22,6 +22,7 @@ from concurrent.futures import (
     wait,
 )
 from contextvars import ContextVar
+from functools import cache
 from typing import TypeVar
 
 from stcal.errors import InputNote
@@ -62,6 +63,7 @@ def one_thread() -> Iterator[None]:
     try:
         from threadpoolctl import threadpool_limits  # takes 40 ms, which `stcal --version` need not wait for
 
+        reserve_buffers()
         with threadpool_limits(1):
             yield
     finally:
@@ -308,6 +310,19 @@ def _starting() -> Iterator[None]:
         finally:
             if undecided:  # the start of a process asks for the default method, which then could not be set any more
                 multiprocessing.set_start_method(None, force=True)
+
+
+@cache
+def reserve_buffers() -> None:
+    """Lets both libraries of linear algebra, NumPy's and SciPy's, take their working memory, which they keep.
+
+    OpenBLAS takes it at the first call that needs it. Where it then gets none, it ends the process, or tries for ever.
+    """
+    import numpy as np
+    import scipy.linalg
+
+    np.linalg.inv(np.eye(2))
+    scipy.linalg.cholesky(np.eye(2))
 
 
 def load_ahead(workers: int | None = None) -> None:

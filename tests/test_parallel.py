@@ -284,3 +284,20 @@ def test_a_request_to_end_while_processes_start_is_answered_after_it():
         assert answered == [signal.SIGTERM]
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limits of memory")
+def test_linear_algebra_takes_its_memory_before_there_is_none():
+    """OpenBLAS would end the process, or ask for ever."""
+    code = """
+import resource
+import numpy as np, scipy.linalg
+from stcal.parallel import one_thread
+with one_thread():
+    used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (16 << 20),) * 2)
+    square = np.eye(300) + 1
+    print(scipy.linalg.cholesky(square).shape, np.linalg.inv(square @ square).shape)
+"""
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=20, check=True)
+    assert done.stdout == "(300, 300) (300, 300)\n"
