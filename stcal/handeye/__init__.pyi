@@ -6,6 +6,8 @@ from .data.rig import RigPoses as RigPoses
 from .data.views import View as View
 from .data.views import Views as Views
 from .data.views import pairs_of_views as pairs_of_views
+from .judge.verdict import Finding as Finding
+from .judge.verdict import Verdict as Verdict
 from .methods.evolution import EvolutionOptions as EvolutionOptions
 from .methods.noise import Noise as Noise
 from .pipeline import handeye as handeye

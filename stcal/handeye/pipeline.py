@@ -1,7 +1,7 @@
 """Hand-eye calibration as a whole: a way of solving, and σ that hold for poses that it has not seen."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, overload
 
 import numpy as np
@@ -14,6 +14,7 @@ from stcal.handeye import solve
 from stcal.handeye.choose import Choice, choose
 from stcal.handeye.data.pairs import HandEyePoses, LengthUnit, Setup
 from stcal.handeye.data.views import Views
+from stcal.handeye.report.outcome import Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import HandEyeOptions
 from stcal.handeye.validate import LEAST_LEFT, HeldOutPoses, cross_validate, splits, widened_by_scatter
@@ -139,7 +140,7 @@ def handeye(
     Returns
     -------
     HandEye
-        X and Z with covariances, residuals, outliers, and notes on anything doubtful.
+        X and Z with covariances, residuals, outliers, notes on anything doubtful, and the verdict.
 
     Raises
     ------
@@ -171,4 +172,6 @@ def handeye(
     rows = splits(len(pairs)) if len(pairs) > LEAST_LEFT else np.zeros((0, 0), int)
     prior = None if views is None else options.camera
     choosing = method is None and not options.names_unknowns
-    return validated(pairs, asked, method, views, options, prior, rows, choosing=choosing).result
+    found = validated(pairs, asked, method, views, options, prior, rows, choosing=choosing)
+    outcome = Outcome("", found.result, found.held_out, notes=found.notes, choice=found.choice, pairs=pairs)
+    return replace(found.result, verdict=judged(outcome))

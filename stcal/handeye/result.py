@@ -9,6 +9,7 @@ from stcal.geometry.arrays import Brief, frozen
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
+from stcal.handeye.judge.verdict import Verdict
 from stcal.handeye.methods.reprojection import Reprojection
 
 
@@ -51,6 +52,9 @@ class HandEye(Brief):
         What the poses determine.
     notes : tuple of str
         Notes on the result, one line each.
+    verdict : Verdict, optional
+        Whether to use the result: its ``word`` is ``good``, ``use with care`` or ``do not use``, ``sentence()`` adds
+        the reasons, ``remedies()`` what to do. None of a single method's solution, which was not judged.
     """
 
     method: str
@@ -69,6 +73,7 @@ class HandEye(Brief):
     reprojection: Reprojection | None = None
     observability: Observability | None = None
     notes: tuple[str, ...] = ()
+    verdict: Verdict | None = None
 
     def __post_init__(self):
         m = len(self.names)

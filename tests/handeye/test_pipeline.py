@@ -41,6 +41,8 @@ def test_the_answer_is_that_of_the_command(pairs, method, tmp_path, monkeypatch,
     assert said["method"] == found.method
     np.testing.assert_allclose(said["flange_from_camera"], found.mount_from_camera.matrix(), atol=1e-6)
     np.testing.assert_allclose(said["covariance"], found.covariance, rtol=1e-3)
+    assert said["verdict"]["word"] == found.verdict.word
+    assert [finding["title"] for finding in said["verdict"]["findings"]] == [f.title for f in found.verdict.findings]
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
 import numpy as np
 from scipy.stats import f
@@ -14,6 +13,7 @@ from stcal.handeye.data.pairs import FRAMES, HandEyePoses
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.observability import COMMON_MM
 from stcal.handeye.judge.remarks import MANY, Aside, Grave
+from stcal.handeye.judge.verdict import BAD, CARE, GOOD, Finding, Verdict, Word
 from stcal.handeye.result import HandEye
 from stcal.handeye.rig.solve import Rig
 from stcal.handeye.rig.validate import RigHeldOut
@@ -103,8 +103,6 @@ class Outcome:
         return tuple(name for name, bad in zip(self.result.names, self.result.outliers, strict=True) if bad)
 
 
-Word = Literal["good", "use with care", "do not use"]
-GOOD, CARE, BAD = get_args(Word)
 SUSPICIOUS, FAILED = 1e-3, 1e-5
 """Significance levels of ``use with care`` and of ``do not use``."""
 HALF, MOST = 0.5, 0.9
@@ -117,47 +115,6 @@ WRONG_RAD, WRONG_SHARE = float(np.radians(4.0)), 0.04
 that were never calibrated and poses of single tags stay below half of these."""
 NOTHING_MM = 1e-6
 """Smallest RMS residual that is tested, in mm. Poses with smaller residuals have no errors."""
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """Verdict on one matter: ``said`` in words, ``value`` and its ``limit``, and the ``remedy``."""
-
-    title: str
-    word: Word
-    said: str
-    value: str = ""
-    limit: str = ""
-    remedy: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """Verdict on a calibration; ``findings`` in the order in which they were made."""
-
-    findings: tuple[Finding, ...]
-
-    @property
-    def word(self) -> Word:
-        """The worst word of all findings."""
-        return max(self.findings, key=lambda each: get_args(Word).index(each.word)).word
-
-    def reasons(self) -> list[Finding]:
-        """Returns the findings behind the word: all that are not good, the worst first; or all if all are good."""
-        doubts = [each for each in self.findings if each.word != GOOD]
-        return sorted(doubts, key=lambda each: each.word != BAD) or list(self.findings)
-
-    def failed(self) -> list[str]:
-        """Returns the reasons against use of the calibration."""
-        return [each.said for each in self.findings if each.word == BAD]
-
-    def remedies(self) -> list[str]:
-        """Returns what to do against the reasons that forbid to use the calibration, each once."""
-        return list(dict.fromkeys(each.remedy for each in self.findings if each.word == BAD and each.remedy))
-
-    def sentence(self) -> str:
-        """Returns the word and its reasons in one line."""
-        return f"{self.word}: {'; '.join(each.said for each in self.reasons())}"
 
 
 def judged(outcome: Outcome) -> Verdict:

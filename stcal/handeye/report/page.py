@@ -10,6 +10,7 @@ from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES
 from stcal.handeye.judge.observability import Observability
 from stcal.handeye.judge.remarks import Aside
+from stcal.handeye.judge.verdict import Verdict
 from stcal.handeye.report.figures import (
     BAD,
     GOOD,
@@ -23,7 +24,7 @@ from stcal.handeye.report.figures import (
     turns_between,
     turns_figure,
 )
-from stcal.handeye.report.outcome import ArmFound, Outcome, Verdict, judged
+from stcal.handeye.report.outcome import ArmFound, Outcome, judged
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import FACTORS
 from stcal.handeye.validate import Compared, HeldOutMotions
