@@ -86,16 +86,21 @@ def test_the_scene_turns(opened_page, turn):
 
 
 def test_something_is_drawn(opened_page):
-    """Beside the empty canvas: of the scene's colours each."""
-    opened_page.find_element(By.CSS_SELECTOR, ".turn button[value=all]").click()
-    drawn = opened_page.execute_script(
-        "const c = document.querySelector('.turn canvas');"
-        "const p = c.getContext('2d').getImageData(0, 0, c.width, c.height).data, found = new Set();"
-        "for (let i = 0; i < p.length; i += 4) if (p[i + 3] == 255) found.add(p[i] + ' ' + p[i + 1] + ' ' + p[i + 2]);"
-        "return [...found];"
-    )
+    """Beside the empty canvas: of the scene's colours each, of the target and of the whole scene."""
+    drawn = set()
+    for part in ("target", "all"):
+        opened_page.find_element(By.CSS_SELECTOR, f".turn button[value={part}]").click()
+        drawn |= set(
+            opened_page.execute_script(
+                "const c = document.querySelector('.turn canvas'), found = new Set();"
+                "const p = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
+                "for (let i = 0; i < p.length; i += 4)"
+                " if (p[i + 3] == 255) found.add(p[i] + ' ' + p[i + 1] + ' ' + p[i + 2]);"
+                "return [...found];"
+            )
+        )
     axes_and_group = {"193 39 45", "46 139 61", "36 87 168", "0 114 178", "0 0 0"}
-    assert axes_and_group <= set(drawn)
+    assert axes_and_group <= drawn
 
 
 def press(chrome, table: str, index: int) -> str:

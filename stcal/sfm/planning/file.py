@@ -256,9 +256,12 @@ def plan_text(plan: Plan, noise: str) -> str:
         "",
         f"{'what would help':<28} worst face µm",
     ]
-    reachable = [(r.sigma_mm, r.what) for r in plan.remedies if r.sigma_mm is not None]
-    for worst_mm, change in sorted(reachable, key=lambda item: item[0]):
-        lines.append(f"{change:<28} {MICRO * worst_mm:6.2f}   {100 * (worst_mm / sigma - 1):+.0f} %")
+    reachable = sorted((r.sigma_mm, r.what) for r in plan.remedies if r.sigma_mm is not None)
+    for worst_mm, change in reachable:
+        if worst_mm < (1 - LEAST_SHARE) * sigma:
+            lines.append(f"{change:<28} {MICRO * worst_mm:6.2f}   {100 * (worst_mm / sigma - 1):+.0f} %")
+    if useless := [change for worst_mm, change in reachable if worst_mm >= (1 - LEAST_SHARE) * sigma]:
+        lines.append(f"no help: {', '.join(useless)}")
     lines += [f"{r.what:<28}      –   {r.reason}" for r in plan.remedies if r.sigma_mm is None]
     lens = f"f/{USUAL_FOCAL_MM / plan.aperture_mm:.1f} of a {USUAL_FOCAL_MM:g} mm lens"
     lens = "focal length / f-number" if options.camera else lens

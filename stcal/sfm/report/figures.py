@@ -77,6 +77,41 @@ def image_bars(rows: list[dict], colours: dict[str, str]) -> str:
     return drawing.uri()
 
 
+LEAST_UPRIGHT = 0.5
+"""Length of the mean of the cameras' upward directions from which on the photographs say where up is."""
+
+
+def upright(report: dict) -> dict:
+    """Returns the report with target, boards and cameras turned as they stood, if the photographs were taken upright.
+
+    Else the target's Z is up.
+    """
+    from scipy.spatial.transform import Rotation
+
+    scene = report["scene"]
+    up = -np.mean([camera["axes"][1] for camera in scene["cameras"]] or [np.zeros(3)], axis=0)
+    if np.linalg.norm(up) < LEAST_UPRIGHT:
+        return report
+    turn = Rotation.align_vectors([[0, 0, 1]], [up])[0].as_matrix()
+    whole = np.eye(4)
+    whole[:3, :3] = turn
+
+    def turned(xyz) -> np.ndarray:
+        return np.asarray(xyz, float).reshape(-1, 3) @ turn.T
+
+    cameras = [
+        {**camera, "position_mm": turned(camera["position_mm"])[0], "axes": turned(camera["axes"])}
+        for camera in scene["cameras"]
+    ]
+    circles = {label: turned(xyz)[0] for label, xyz in scene["circles"].items()}
+    boards = {name: turned(xyz) for name, xyz in scene["boards"].items()}
+    faces = {
+        name: {**face, "target_from_face": whole @ np.array(face["target_from_face"])}
+        for name, face in report["faces"].items()
+    }
+    return {**report, "faces": faces, "scene": {**scene, "cameras": cameras, "circles": circles, "boards": boards}}
+
+
 def scene_view(scene: dict, camera: dict, colours: dict[str, str], azimuth: float) -> str:
     """Draws cameras, boards and the target's circles in the target frame."""
     target = np.array(list(scene["circles"].values()), float).reshape(-1, 3)
@@ -164,7 +199,7 @@ def space_parts(report: dict, colours: dict[str, str]) -> list[dict]:
         parts.append(_part("point", [xyz], "#000000", name=label, size=2.2, target=True))
     for group, dots in scene["boards"].items():
         parts += [_part("point", [xyz], colours.get(group, INK), size=1.2) for xyz in dots]
-        if dots:
+        if len(dots):
             parts.append(_part("text", [np.mean(dots, axis=0)], colours.get(group, INK), name=f"group {group}"))
     places = [view["position_mm"] for view in scene["cameras"]]
     everything = np.array([*scene["circles"].values(), *chain.from_iterable(scene["boards"].values()), *places])

@@ -13,7 +13,7 @@ from typing import Literal
 from pydantic import Field
 
 from stcal.io.json import Part
-from stcal.report.text import join, number
+from stcal.report.text import join, number, significant
 
 CHANCE = "'Suspicious' happens by chance in one run in 1,000, 'failed' in one in 100,000."
 """Text on the false alarms of one check; the limits are those of ``stcal.sfm.checks.verdict``."""
@@ -22,6 +22,8 @@ TAIL = 2.0
 """Ratio of a face's σ to the median of the others above which this face limits the result by itself."""
 PHOTOGRAPHS = ("circles", "dots")
 """Sources of ``translation_sources_um`` that more photographs make smaller, others hardly."""
+MOST_PPM = 1000.0
+"""Relative σ from which on it is stated in %."""
 MORE = 4
 """How many times the images the answer gives σ for."""
 QUESTIONS = {
@@ -305,7 +307,7 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
             f"{number(turned, 2)} mdeg off their mean."
         )
     size = report["summary"]["scale_sigma_ppm"]
-    scale = "" if size is None else f", the size to {number(size, 1)} ppm"
+    scale = "" if size is None else f", the size to {_relative(size)}"
     if "drawing" in report["summary"].get("scale_from", []):
         scale = ", in the unit of the drawing, and the size is not known"
     return (
@@ -313,6 +315,11 @@ def _quality(report: dict, position: tuple[float, str] | None, rotation: tuple[f
         f"and {number(rotation[0], 2)} mdeg (face {rotation[1]}) at worst, one σ along and about an axis{scale}; that "
         f"holds where {_premise(report)} as stated."
     )
+
+
+def _relative(ppm: float) -> str:
+    """Returns a relative σ in ppm, a large one in %."""
+    return f"{number(ppm, 1)} ppm" if ppm < MOST_PPM else f"{significant(1e-4 * ppm)} %"
 
 
 def _premise(report: dict) -> str:

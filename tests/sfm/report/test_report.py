@@ -2,17 +2,20 @@
 
 import base64
 import copy
+import json
 import re
 from html import unescape
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 from markupsafe import Markup
+from scipy.spatial.transform import Rotation
 
 from stcal.report.figure import round_below
 from stcal.report.page import environment
 from stcal.report.text import number
-from stcal.sfm.report.figures import FIRST_IMAGES, shown_overlays
+from stcal.sfm.report.figures import FIRST_IMAGES, shown_overlays, upright
 from stcal.sfm.report.page import _factor_in_words, report_html
 
 NASTY = 'a/<script>alert("1")</script>&$_.jpg'
@@ -429,3 +432,33 @@ def test_the_crosscheck_is_a_section_of_its_own():
     differing = Page(report_html(make() | {"crosscheck": crosscheck(["face <2> 5 µm"])}, OVERLAYS)).text
     assert "They differ: face <2> 5 µm." in differing
     assert "They agree." not in differing
+
+
+def test_the_picture_stands_as_the_cameras_did():
+    """Their upward direction is drawn up, unless they were turned to all sides; the report itself is as it was."""
+    report = make()
+    turn = Rotation.from_rotvec([1.0, -2.0, 0.3]).as_matrix()
+    report["scene"]["cameras"] = [
+        {
+            "image": str(k),
+            "group": "a",
+            "position_mm": 900 * -turn[2],
+            "axes": Rotation.from_rotvec(tilt * turn[2]).apply(turn),
+        }
+        for k, tilt in enumerate((-0.4, 0.1, 0.4))
+    ]
+    before = json.dumps(report["faces"])
+    drawn = upright(report)
+    up = -np.mean([camera["axes"][1] for camera in drawn["scene"]["cameras"]], axis=0)
+    np.testing.assert_allclose(up / np.linalg.norm(up), [0, 0, 1], atol=1e-9)
+    assert json.dumps(report["faces"]) == before
+    pose, shown = (np.array(each["faces"]["1"]["target_from_face"]) for each in (report, drawn))
+    circle = next(iter(report["scene"]["circles"]))
+    seen = [
+        np.linalg.inv(m) @ np.append(each["scene"]["circles"][circle], 1)
+        for m, each in ((pose, report), (shown, drawn))
+    ]
+    np.testing.assert_allclose(*seen, atol=1e-9)
+    for camera, angle in zip(report["scene"]["cameras"], (0, 2 * np.pi / 3, -2 * np.pi / 3), strict=True):
+        camera["axes"] = Rotation.from_rotvec(angle * turn[2]).apply(turn)
+    assert upright(report) is report
