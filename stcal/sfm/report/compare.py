@@ -64,6 +64,8 @@ class LabelCounts(Part):
     wrong: int
     found: int
     visible: int
+    images: int
+    images_of_truth: int
 
 
 class CompareFile(ResultFile):
@@ -83,7 +85,8 @@ class CompareFile(ResultFile):
     labels: LabelCounts | None = Field(
         None,
         description="where the truth lists images that the run has: `wrong` labels (of circles that the truth knows; "
-        "the board's numbers up to its symmetry), and `found` of the `visible` circles (`must_find`)",
+        "the board's numbers up to its symmetry), and `found` of the `visible` circles (`must_find`), in those "
+        "`images` of the `images_of_truth` that have labels",
     )
 
 
@@ -175,7 +178,9 @@ def _labels(path: Path, circles: Collection[str], groups: dict[str, TrueGroup]) 
         return None
     if not total.any():
         return None
-    return LabelCounts(**dict(zip(LabelCounts.model_fields, total.tolist(), strict=True)))
+    true = {name for group in groups.values() for name in group.images}
+    counts = [*total.tolist(), len(true & measured.keys()), len(true)]
+    return LabelCounts(**dict(zip(LabelCounts.model_fields, counts, strict=True)))
 
 
 def _columns(dots: np.ndarray) -> int:
@@ -248,6 +253,8 @@ def comparison_table(comparison: CompareFile) -> str:
     lines = text_table(rows, least=(6, 10, 10, 10, 8, 4, 10), gap=1)
     if n := comparison.labels:
         lines.append(f"labels: {n.wrong} wrong; {n.found} of {n.visible} visible circles found")
+        if n.images < n.images_of_truth:
+            lines[-1] += f" in the {n.images} of {n.images_of_truth} images that have labels"
     if comparison.missing:
         lines.append(f"not in the run: face {', '.join(comparison.missing)}")
     return "\n".join(lines)

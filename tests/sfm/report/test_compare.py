@@ -9,7 +9,7 @@ import pytest
 from stcal.design import reference_target
 from stcal.errors import InputError, InputNote
 from stcal.sfm.measurement.target import read_target
-from stcal.sfm.report.compare import compare
+from stcal.sfm.report.compare import compare, comparison_table
 from tests.outcome import fails_with
 from tests.shared import own_copy
 
@@ -98,3 +98,15 @@ def test_labels_that_cannot_be_compared_are_said(small_run, small_dataset, tmp_p
     (run / "detections.csv").unlink()
     with pytest.warns(InputNote, match="detections.csv: No such file or directory: the labels are not compared"):
         compare(run, small_dataset / "truth.json")
+
+
+def test_images_without_labels_are_counted(small_run, small_dataset, tmp_path):
+    run = own_copy(small_run, tmp_path / "run", ignore=shutil.ignore_patterns("cache"))
+    known = compare(run, small_dataset / "truth.json")
+    head, *rows = (run / "detections.csv").read_text().splitlines(keepends=True)
+    lost = rows[0].split(",")[0]
+    (run / "detections.csv").write_text("".join([head, *(row for row in rows if not row.startswith(f"{lost},"))]))
+    found = compare(run, small_dataset / "truth.json")
+    assert (found.labels.images, found.labels.images_of_truth) == (known.labels.images - 1, known.labels.images)
+    assert f"in the {found.labels.images} of {known.labels.images} images that have labels" in comparison_table(found)
+    assert "images that have labels" not in comparison_table(known)
