@@ -216,6 +216,7 @@ INPUTS = [
     RunOptions().ellipses,
     sfm.MeasureOptions(),
     sfm.MeasureOptions().pose,
+    sfm.Tolerances(),
     sfm.PlanOptions(),
     sfm.PlanOptions().noise,
     Trial("a", 1.0, "mm", 1.0, 1),
