@@ -14,6 +14,7 @@ from .design import FaceDesign as FaceDesign
 from .design import TargetDesign as TargetDesign
 from .design import reference_board as reference_board
 from .design import reference_target as reference_target
+from .drawing.draw import draw as draw
 from .errors import InputError as InputError
 from .errors import StcalError as StcalError
 from .geometry.camera import Camera as Camera

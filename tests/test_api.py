@@ -219,6 +219,7 @@ INPUTS = [
     sfm.Tolerances(),
     sfm.PlanOptions(),
     sfm.PlanOptions().noise,
+    sfm.DesignOptions((130.0, 120.0, 110.0)),
     Trial("a", 1.0, "mm", 1.0, 1),
     sfm.judge("key", "Title", [Trial("a", 1.0, "mm", 1.0, 1)], "faces", "nothing"),
     ROW,

@@ -47,15 +47,12 @@ def plan(
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import board_of
-    from stcal.sfm.planning.bodies import plan_body
+    from stcal.io.design import load_board
+    from stcal.sfm.planning.bodies import plan as planned
     from stcal.sfm.planning.file import PlanFile, plan_text
     from stcal.sfm.planning.noise import expected_noise, noise_of_run, stated_noise
-    from stcal.sfm.planning.nominal import nominal_poses
     from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
-    from stcal.sfm.planning.session import plan as planned
     from stcal.sfm.runs.options import RunOptions
-    from stcal.sfm.runs.saved import load_run
 
     design = body_of(target)
     printed = bool(design.with_faces(printed=True).faces)
@@ -69,8 +66,10 @@ def plan(
         )
     if noise is not None:
         centre_noise, source = stated_noise(noise)
+    elif run is not None:
+        centre_noise, source = noise_of_run(run), f"by size and tilt as in {run}"
     else:
-        centre_noise, source = noise_of_run(load_run(run)) if run else expected_noise(of_corners=printed)
+        centre_noise, source = expected_noise(of_corners=printed)
     options = PlanOptions(
         images,
         spread,
@@ -85,8 +84,7 @@ def plan(
         margin,
     )
     with shared.designs_told(target, board):
-        nominal = nominal_poses(design, faces)
-        result = plan_body(options, design, nominal) if printed else planned(options, design, board_of(board), nominal)
+        result = planned(options, design, load_board(board) if board else None, faces)
     say(plan_text(result, source))
     write_if(out, lambda: PlanFile.of_plan(result), "as JSON")
 

@@ -1,7 +1,6 @@
 """Content of ``report.json`` about a cross-check with the native COLMAP."""
 
 from dataclasses import asdict, dataclass, replace
-from numbers import Real
 
 import numpy as np
 from pydantic import Field
@@ -54,7 +53,7 @@ class Tolerances:
 
     def __post_init__(self):
         for name, value in asdict(self).items():
-            if isinstance(value, Real) and not 0 <= value < np.inf:
+            if isinstance(value, int | float) and not 0 <= value < np.inf:
                 raise InputError(
                     "E-OPTION-RANGE", f"tolerance {name} {value:g}: a number of 0 or more needed; give another"
                 )
