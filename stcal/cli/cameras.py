@@ -83,12 +83,12 @@ def compare(
     plot: PlotFile = None,
 ) -> None:
     """Compare two cameras: how many pixels apart they see the same ray, after the turn that brings them nearest."""
-    from stcal.io.cameras.difference import camera_difference
+    from stcal.io.cameras.difference import compare_cameras
     from stcal.report.camera import comparison_figure, comparison_text
     from stcal.report.figure import save
 
     first_lens, second_lens = _lens(first, name, size), _lens(second, name, size)
-    difference = camera_difference(first_lens, second_lens)
+    difference = compare_cameras(first_lens, second_lens)
     say("\n".join(comparison_text(difference)))
     if plot:
         save(comparison_figure(difference), plot)

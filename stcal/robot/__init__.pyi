@@ -21,6 +21,7 @@ from .use.compensation import Compensated as Compensated
 from .use.compensation import compensate as compensate
 from .use.design import DesignOptions as DesignOptions
 from .use.design import design as design
+from .use.evaluation import evaluate as evaluate
 from .use.targets import Targets as Targets
 from .use.targets import read_targets as read_targets
 from .use.verification import read_measured as read_measured

@@ -12,7 +12,7 @@ from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
-    from stcal.workflows.watch import Update
+    from stcal.workflows.growing import Update
 
 app = typer.Typer()
 
@@ -137,8 +137,8 @@ def watch(
     help most. RUN/report.html is kept up to date and reloads itself."""
     shared.load_ahead(workers)
     from stcal.sfm.runs.options import RunOptions
-    from stcal.workflows.watch import WatchOptions
-    from stcal.workflows.watch import watch as updates
+    from stcal.workflows.growing import WatchOptions
+    from stcal.workflows.growing import watch as updates
 
     run_options = RunOptions(
         refine_camera=refine_camera, ellipses=shared.ellipse_options(min_diameter, max_diameter), workers=workers
@@ -209,19 +209,20 @@ def capture(
     shared.load_ahead(workers)
     from stcal.io.device import OpenCVSource, SimulatedSource
     from stcal.sfm.runs.options import RunOptions
-    from stcal.workflows.capture import Trigger, photograph
-    from stcal.workflows.watch import Growing, WatchOptions
+    from stcal.workflows.growing import GrowingRun, WatchOptions
+    from stcal.workflows.photographs import Trigger
+    from stcal.workflows.photographs import capture as captured
 
     run_options = RunOptions(
         refine_camera=refine_camera, ellipses=shared.ellipse_options(min_diameter, max_diameter), workers=workers
     )
-    growing = Growing.of(images, camera, out, target, board, WatchOptions(views=views, run=run_options))
+    growing = GrowingRun.of(images, camera, out, target, board, WatchOptions(views=views, run=run_options))
     source = SimulatedSource(simulate, gain) if simulate else OpenCVSource(device, gain, exposure is not None)
     trigger = Trigger(count, every, sys.stdin, lambda text: (say(text), sys.stdout.flush()))
     try:
         say(f"{source.name}; report: {out / 'report.html'}")
         with shared.designs_told(target, board):
-            for photo in photograph(source, growing, group, exposure, settle, trigger.ready):
+            for photo in captured(source, growing, group, trigger.ready, exposure, settle):
                 say(f"taken {photo.name}: {photo.light()}")
                 _say_update(photo.update)
     finally:

@@ -7,6 +7,7 @@ from scipy.optimize import least_squares
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.align import align_rigid
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, parameter_names
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.foreign import ForeignLens
@@ -79,14 +80,29 @@ class SizedLens:
         return self.lens.determined(pixels)
 
 
-def camera_difference(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraDifference:
-    """Return the difference between two cameras over the image.
+@require_arguments
+def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraDifference:
+    """Return how many pixels apart two cameras see the same ray, after the turn that brings them nearest.
 
     Images that differ by a rotation of the camera count as equal: it acts like a shift of the principal point.
 
-    ``one``, ``two`` : cameras of the same image size. Of a lens with a region only this is compared.
+    Parameters
+    ----------
+    one, two : Camera
+        Cameras of the same image size. Of a lens with a region only this is compared.
 
-    Raises InputError: the image sizes differ. Raises DegenerateError: too few pixels have a ray in both cameras.
+    Returns
+    -------
+    CameraDifference
+        ``pixels`` (r, c, 2) of the first camera and offsets ``apart`` (r, c, 2) of the second, px;
+        ``second_from_first``, the turn.
+
+    Raises
+    ------
+    InputError
+        The image sizes differ.
+    DegenerateError
+        Too few pixels have a ray in both cameras.
     """
     if (one.width, one.height) != (two.width, two.height):
         raise InputError(
