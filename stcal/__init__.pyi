@@ -7,6 +7,7 @@ from . import sfm as sfm
 from . import synthetic as synthetic
 from . import workflows as workflows
 from .boards.file import load_board as load_board
+from .boards.file import load_flat_board as load_flat_board
 from .boards.file import save_board as save_board
 from .boards.target import load_target as load_target
 from .boards.target import save_target as save_target
