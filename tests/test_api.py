@@ -244,6 +244,8 @@ INPUTS = [
     SeenTags([0], np.zeros((1, 4, 2)), np.eye(8)[None], [0.1]),
     synthetic.SceneOptions(),
     synthetic.RenderOptions(),
+    synthetic.BodyOptions(),
+    synthetic.ThinLens(8.0, 24.0, 1000.0),
 ]
 
 

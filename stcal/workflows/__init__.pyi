@@ -1,3 +1,4 @@
+from .board_views import calibration_images as calibration_images
 from .calibrate_camera import calibrate_camera_by_corners as calibrate_camera_by_corners
 from .calibrate_camera import calibrate_rig as calibrate_rig
 from .from_photos.run import robot_from_photos as robot_from_photos
