@@ -23,6 +23,7 @@ from .geometry.camera import Camera as Camera
 from .geometry.rigid import Poses as Poses
 from .geometry.rigid import Rigid as Rigid
 from .io.cameras.difference import compare_cameras as compare_cameras
+from .io.cameras.difference import load_lens as load_lens
 from .io.cameras.model import CameraPrior as CameraPrior
 from .io.cameras.model import camera_prior as camera_prior
 from .io.cameras.read import load_camera as load_camera
