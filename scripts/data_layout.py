@@ -32,7 +32,7 @@ MODULES = (
     "stcal.sfm.camera.file",
     "stcal.sfm.planning.file",
     "stcal.sfm.budget.file",
-    "stcal.sfm.interop.crosscheck",
+    "stcal.sfm.interop.gates",
     "stcal.sfm.diagnose.findings",
     "stcal.handeye.report.file",
     "stcal.handeye.report.planned",

@@ -5,7 +5,9 @@ from . import register as register
 from . import robot as robot
 from . import sfm as sfm
 from . import synthetic as synthetic
+from . import workflows as workflows
 from .boards.file import load_board as load_board
+from .boards.file import load_flat_board as load_flat_board
 from .boards.file import save_board as save_board
 from .boards.target import load_target as load_target
 from .boards.target import save_target as save_target
@@ -14,14 +16,19 @@ from .design import FaceDesign as FaceDesign
 from .design import TargetDesign as TargetDesign
 from .design import reference_board as reference_board
 from .design import reference_target as reference_target
+from .drawing.draw import draw as draw
 from .errors import InputError as InputError
 from .errors import StcalError as StcalError
 from .geometry.camera import Camera as Camera
 from .geometry.rigid import Poses as Poses
 from .geometry.rigid import Rigid as Rigid
+from .io.cameras.difference import compare_cameras as compare_cameras
+from .io.cameras.difference import load_lens as load_lens
 from .io.cameras.model import CameraPrior as CameraPrior
 from .io.cameras.model import camera_prior as camera_prior
 from .io.cameras.read import load_camera as load_camera
 from .io.cameras.write import save_camera as save_camera
+from .io.device import OpenCVSource as OpenCVSource
+from .io.device import SimulatedSource as SimulatedSource
 
 __version__: str

@@ -31,7 +31,7 @@ from stcal.robot import DesignOptions, DHRow, IdentifyOptions, Joint, Robot
 from stcal.sfm import RunOptions, Trial
 from tests.outcome import fails_with
 
-SYSTEMS = ("sfm", "robot", "register", "handeye", "locate", "synthetic")
+SYSTEMS = ("sfm", "robot", "register", "handeye", "locate", "synthetic", "workflows")
 
 
 def public() -> dict[str, object]:
@@ -216,8 +216,10 @@ INPUTS = [
     RunOptions().ellipses,
     sfm.MeasureOptions(),
     sfm.MeasureOptions().pose,
+    sfm.Tolerances(),
     sfm.PlanOptions(),
     sfm.PlanOptions().noise,
+    sfm.DesignOptions((130.0, 120.0, 110.0)),
     Trial("a", 1.0, "mm", 1.0, 1),
     sfm.judge("key", "Title", [Trial("a", 1.0, "mm", 1.0, 1)], "faces", "nothing"),
     ROW,
@@ -242,6 +244,8 @@ INPUTS = [
     SeenTags([0], np.zeros((1, 4, 2)), np.eye(8)[None], [0.1]),
     synthetic.SceneOptions(),
     synthetic.RenderOptions(),
+    synthetic.BodyOptions(),
+    synthetic.ThinLens(8.0, 24.0, 1000.0),
 ]
 
 

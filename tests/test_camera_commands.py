@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from stcal.cli.cameras import app
 from stcal.geometry.camera import Camera
-from stcal.io.cameras.difference import camera_difference
+from stcal.io.cameras.difference import compare_cameras
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
 from tests.outcome import fails_with
@@ -62,12 +62,12 @@ def test_what_is_shown_is_the_cameras(folder):
 
 def test_a_principal_point_is_mostly_a_turn_and_a_focal_length_is_not():
     other = Camera(1280, 960, CAMERA.focal * 1.001, CAMERA.centre, CAMERA.distortion)
-    assert camera_difference(CAMERA, CAMERA).lengths().max() < 1e-9
-    found = camera_difference(CAMERA, other)
+    assert compare_cameras(CAMERA, CAMERA).lengths().max() < 1e-9
+    found = compare_cameras(CAMERA, other)
     # a thousandth of the way from the middle, to 720 px in the corner; p1, p2 and the turn take a part of it
     assert np.nanmax(found.lengths()) == pytest.approx(0.001 * np.hypot(640, 480), rel=0.1)
     shifted = Camera(1280, 960, CAMERA.focal, CAMERA.centre + np.array([5.0, 0.0]), CAMERA.distortion)
-    moved = camera_difference(CAMERA, shifted)
+    moved = compare_cameras(CAMERA, shifted)
     assert np.nanmax(moved.lengths()) < 2.5  # mostly a turn
     assert moved.second_from_first.angle_rad() == pytest.approx(5 / 900, rel=0.2)
 

@@ -35,7 +35,7 @@ from stcal.boards.file import load_flat_board
 from stcal.design import BoardDesign, reference_board
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
-from stcal.io.cameras.difference import camera_difference
+from stcal.io.cameras.difference import compare_cameras
 from stcal.io.cameras.model import CameraModel, camera_from_colmap
 from stcal.io.cameras.read import read_camera
 from stcal.io.design import board_of, target_of
@@ -219,7 +219,7 @@ def errors(camera: Camera | None, truth: Camera, views) -> tuple[float, float]:
     """px RMS over the image and within the hull of the dots."""
     if camera is None:
         return np.nan, np.nan
-    found = camera_difference(truth, camera)
+    found = compare_cameras(truth, camera)
     length = found.lengths()
     inside = Delaunay(np.concatenate([v.centre_px for v in views])).find_simplex(found.pixels) >= 0
     return float(np.sqrt(np.nanmean(length**2))), float(np.sqrt(np.nanmean(length[inside] ** 2)))

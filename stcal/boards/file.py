@@ -303,6 +303,16 @@ load_board, save_board = load_run_board, save_run_board
 def load_flat_board(path: str | Path) -> BoardDesign | FlatBoard:
     """Read a file of one board of any kind (form: ``data_layout.md``); without ``type`` it is a board of dots.
 
+    Parameters
+    ----------
+    path : str or Path
+        The file: TOML, or Kalibr's YAML.
+
+    Returns
+    -------
+    BoardDesign or another board design
+        Board frame, mm.
+
     Raises
     ------
     InputError

@@ -11,8 +11,7 @@ from stcal.cli.terminal import print_each, say
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
-    from stcal.geometry.camera import Camera
-    from stcal.io.cameras.difference import SizedLens
+    from stcal.io.cameras.difference import LoadedLens
 
 app = typer.Typer(
     name="stcal camera",
@@ -49,7 +48,7 @@ def convert(
     from stcal.io.cameras.write import form_of, save_camera
 
     kind = form_of(out, form)
-    camera = _camera(source, name, size)
+    camera = _lens(source, name, size).camera
     lost = save_camera(out, camera, kind, name)
     say(f"{source}: {camera.colmap_model}, {camera.width}×{camera.height} px; written as {kind}")
     print_each(f"note: not in {kind}", lost)
@@ -67,7 +66,7 @@ def show(
     from stcal.report.camera import distortion_figure, shown
     from stcal.report.figure import save
 
-    camera = _camera(source, name, size)
+    camera = _lens(source, name, size).camera
     say("\n".join(shown(camera)))
     if plot:
         save(distortion_figure(camera), plot)
@@ -83,44 +82,29 @@ def compare(
     plot: PlotFile = None,
 ) -> None:
     """Compare two cameras: how many pixels apart they see the same ray, after the turn that brings them nearest."""
-    from stcal.io.cameras.difference import camera_difference
+    from stcal.io.cameras.difference import compare_cameras
     from stcal.report.camera import comparison_figure, comparison_text
     from stcal.report.figure import save
 
     first_lens, second_lens = _lens(first, name, size), _lens(second, name, size)
-    difference = camera_difference(first_lens, second_lens)
+    difference = compare_cameras(first_lens.lens, second_lens.lens)
     say("\n".join(comparison_text(difference)))
     if plot:
         save(comparison_figure(difference), plot)
         say(f"picture: {plot}")
 
 
-def _camera(path: Path, name: str, size: str) -> "Camera":
-    from stcal.io.cameras.difference import SizedLens
-
-    lens = _lens(path, name, size)
-    return lens.near.camera if isinstance(lens, SizedLens) else lens
-
-
-def _lens(path: Path, name: str, size: str) -> "Camera | SizedLens":
-    """Return the camera of a file, or a lens of another model with the fit to it, whose quality is printed."""
-    from stcal.io.cameras.difference import SizedLens, fit_lens
-    from stcal.io.cameras.model import CameraModel
-    from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
-    from stcal.io.cameras.read import read_lens, sized_camera
+def _lens(path: Path, name: str, size: str) -> "LoadedLens":
+    """Returns the lens of a file, and prints the quality of a fit, or what EXIF says."""
+    from stcal.io.cameras.difference import SizedLens, load_lens
     from stcal.report.camera import exif_text, fitted_text
 
-    if is_photograph(path):
-        from_exif = camera_of_photograph(path)
-        print_each("note", [exif_text(from_exif.told)])
-        return from_exif.camera
-    lens = read_lens(path, name)
     sides = size.lower().split("x") if size else ["0", "0"]
     if len(sides) != 2 or not all(side.isdigit() for side in sides):
         raise InputError("E-OPTION-SIZE", f"--size {size}: two numbers with x between needed, such as 1920x1080")
-    width, height = lens.width or int(sides[0]), lens.height or int(sides[1])
-    if isinstance(lens, CameraModel) or not (width and height):
-        return sized_camera(lens, path, (width, height))
-    fitted = fit_lens(lens, width, height)
-    print_each("note", fitted_text(lens.called, fitted, lens.region is not None))
-    return SizedLens(lens, width, height, fitted)
+    found = load_lens(path, name, (int(sides[0]), int(sides[1])))
+    if isinstance(found.lens, SizedLens):
+        print_each("note", fitted_text(found.lens.lens.called, found.lens.near, found.lens.lens.region is not None))
+    elif found.told:
+        print_each("note", [exif_text(found.told)])
+    return found

@@ -57,9 +57,9 @@ def capture(
 ) -> None:
     """Take an exposure series with a camera of this machine, for run: SCENES/<scene>/<exposure>.png."""
     from stcal.io.device import OpenCVSource, SimulatedSource
-    from stcal.locate.data.exposures import Settings, capture, exposure_times, scene_folder
+    from stcal.locate.data.exposures import capture, exposure_times, scene_folder
 
-    settings, folder = Settings(gain, settle), scene_folder(out, scene)
+    folder = scene_folder(out, scene)
     exposures = exposure_times(shortest, longest, count)
     source = OpenCVSource(device, gain) if simulate is None else SimulatedSource(simulate, gain)
     try:
@@ -68,7 +68,8 @@ def capture(
             source,
             exposures.tolist(),
             folder,
-            settings,
+            gain,
+            settle,
             lambda row: say(
                 f"  {row.image}: exposure {row.exposure_set:g} set for {row.exposure:g}, "
                 f"{100 * row.saturated_share:.1f} % saturated, {100 * row.dark_share:.1f} % dark"

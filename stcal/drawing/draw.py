@@ -17,6 +17,7 @@ from stcal.drawing.parts import Part, board_parts, target_parts
 from stcal.drawing.shapes import said_mm
 from stcal.drawing.sheets import MOST_MM, PAPERS, Sheet, one_sheet, paper_sheets
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.io.files import save
 
 SUFFIXES = (".pdf", ".svg", ".dxf")
@@ -35,24 +36,50 @@ class Drawn:
     paper: str
 
 
+Design = TargetDesign | BoardDesign | FlatBoard | BoardSet
+
+
+@require_arguments
 def draw(
-    design: str | Path, path: str | Path, paper: str = "", margin_mm: float = MARGIN_MM, net: bool = False
+    design: Design | str | Path,
+    out: str | Path,
+    paper: str = "",
+    margin_mm: float = MARGIN_MM,
+    net: bool = False,
 ) -> Drawn:
-    """Draw a target or a board 1:1 to a file, whose suffix gives the form.
+    """Draw a target or a board 1:1 to a file, whose suffix gives the form: ``.pdf``, ``.svg`` or ``.dxf``.
 
-    ``design`` : a ``target.toml`` or a board file of any kind; ``paper`` : one of :data:`~stcal.drawing.sheets.PAPERS`,
-    or ``own``; if not given, A4 for PDF, ``own`` for SVG and DXF; ``margin_mm`` : distance from the outermost circles
-    to the edge of a plate, if the design has no outline; ``net`` : True unfolds the plates of a target into one plane,
-    by their outlines and rough poses.
+    Parameters
+    ----------
+    design : TargetDesign, board of any kind, or path
+        The design, or its ``target.toml`` or board file.
+    out : str or Path
+        File of the drawing; an earlier one is replaced.
+    paper : str
+        ``A5`` … ``A0``, ``Letter``, ``Legal``, ``Tabloid``, or ``own`` for pages as large as their content; if empty,
+        A4 for PDF and ``own`` for SVG and DXF.
+    margin_mm : float
+        Distance from the outermost circles to the edge of a plate without an outline, mm.
+    net : bool
+        Whether the plates of a target are unfolded into one plane, by their outlines and rough poses.
 
-    Raises InputError: the design cannot be read or drawn, the file has another suffix, or the paper does not suit the
-    form.
+    Returns
+    -------
+    Drawn
+        ``path``, the ``parts`` that are drawn, and the ``sheets``.
+
+    Raises
+    ------
+    InputError
+        The design cannot be read or drawn, the file has another suffix, or the paper does not suit the form.
     """
-    path = Path(path)
+    path = Path(out)
+    if margin_mm < 0:
+        raise InputError("E-OPTION-RANGE", f"draw: margin_mm {margin_mm:g}: 0 or more needed")
     paper = _paper(path, paper)
-    loaded = load_design(design)
+    name, loaded = (design, load_design(design)) if isinstance(design, str | Path) else (type(design).__name__, design)
     if net and not isinstance(loaded, TargetDesign):
-        raise InputError("E-DRAW-DESIGN", f"--net: {design} is a board; nets are of targets")
+        raise InputError("E-DRAW-DESIGN", f"--net: {name} is a board; nets are of targets")
     parts = net_parts(loaded) if net and isinstance(loaded, TargetDesign) else _parts(loaded, margin_mm)
     title = loaded.name if isinstance(loaded, TargetDesign) else parts[0].name if len(parts) == 1 else "boards"
     sheets = sheets_of(parts, paper, title, apart=path.suffix.lower() == ".pdf")
@@ -60,11 +87,11 @@ def draw(
     return Drawn(path, parts, sheets, paper)
 
 
-def _parts(what: TargetDesign | BoardDesign | FlatBoard | BoardSet, margin_mm: float) -> list[Part]:
+def _parts(what: Design, margin_mm: float) -> list[Part]:
     return target_parts(what, margin_mm) if isinstance(what, TargetDesign) else board_parts(what, margin_mm)
 
 
-def load_design(path: str | Path) -> TargetDesign | BoardDesign | FlatBoard | BoardSet:
+def load_design(path: str | Path) -> Design:
     """Read a target, or a board or boards of any kind."""
     if not Path(path).exists():
         raise InputError(

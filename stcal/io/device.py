@@ -8,7 +8,7 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -32,6 +32,7 @@ READINGS = 3
 """Number of frames that a driver may still have in its queue after the exposure was changed."""
 
 
+@runtime_checkable
 class Source(Protocol):
     """A device that takes images."""
 
@@ -52,10 +53,19 @@ class Source(Protocol):
 class OpenCVSource:
     """A camera of this machine.
 
-    ``device`` : number, or path such as ``/dev/video0``; ``gain`` : in the driver's unit; None leaves it unchanged;
-    ``by_hand`` : True if exposures are set manually, False for the camera's automatic exposure.
+    Parameters
+    ----------
+    device : str
+        Its number, or a path such as ``/dev/video0``.
+    gain : float, optional
+        Gain in the driver's unit; unchanged if None.
+    by_hand : bool
+        Whether exposures are set; else the camera chooses them.
 
-    Raises InputError: there is no such camera, or its driver accepts no gain.
+    Raises
+    ------
+    InputError
+        There is no such camera, or its driver accepts no gain.
     """
 
     def __init__(self, device: str, gain: float | None = None, by_hand: bool = True):
@@ -107,10 +117,19 @@ class OpenCVSource:
 class SimulatedSource:
     """A simulated camera that shows given images. They belong to exposure 1; brightness is proportional to exposure.
 
-    ``images`` : an image that is shown for ever, or a folder whose images are shown one after another, by name;
-    ``gain`` : factor on the brightness; 1 if None; ``seed`` : seed of the noise.
+    Parameters
+    ----------
+    images : str or Path
+        An image that is shown for ever, or a folder whose images are shown one after another, by name.
+    gain : float, optional
+        Factor on the brightness; 1 if None.
+    seed : int
+        Seed of the noise.
 
-    Raises InputError: there is no image, or one cannot be read.
+    Raises
+    ------
+    InputError
+        There is no image, or one cannot be read.
     """
 
     def __init__(self, images: str | Path, gain: float | None = None, seed: int = 0):

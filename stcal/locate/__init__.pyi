@@ -1,6 +1,8 @@
 from .calibration.solve import CalibratedLayout as CalibratedLayout
 from .calibration.solve import calibrate as calibrate
 from .data.exposures import SceneFiles as SceneFiles
+from .data.exposures import capture as capture
+from .data.exposures import exposure_times as exposure_times
 from .data.exposures import find_scenes as find_scenes
 from .data.layout import LayoutPlan as LayoutPlan
 from .data.layout import TagLayout as TagLayout

@@ -1,4 +1,5 @@
 from .axes.model import robot_from_sweeps as robot_from_sweeps
+from .export import robot_program as robot_program
 from .identification.result import Identified as Identified
 from .identification.result import IdentifyOptions as IdentifyOptions
 from .identification.solve import identify as identify
@@ -16,11 +17,13 @@ from .kinematics.model import Joint as Joint
 from .kinematics.model import Robot as Robot
 from .urdf.read import UrdfRobot as UrdfRobot
 from .urdf.read import load_urdf as load_urdf
+from .urdf.universal import load_universal as load_universal
 from .urdf.write import robot_urdf as robot_urdf
 from .use.compensation import Compensated as Compensated
 from .use.compensation import compensate as compensate
 from .use.design import DesignOptions as DesignOptions
 from .use.design import design as design
+from .use.evaluation import evaluate as evaluate
 from .use.targets import Targets as Targets
 from .use.targets import read_targets as read_targets
 from .use.verification import read_measured as read_measured

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.design import CornerBoard
 from stcal.boards.faces import why_unseen
 from stcal.boards.file import run_board_of as board_of
 from stcal.boards.target import body_of
@@ -31,7 +30,7 @@ from stcal.io.images import (
 from stcal.io.photographs.memory import files_of_arrays
 from stcal.io.photographs.video import AUTO, write_frames
 from stcal.labels import DotLabel
-from stcal.parallel import Progress, counted, kept_processes, one_thread
+from stcal.parallel import Progress, kept_processes, one_thread
 from stcal.sfm.adjust.calibration import Calibration, calibrate, calibrate_board, on_luminous_surface
 from stcal.sfm.adjust.chain import measure_chains
 from stcal.sfm.adjust.rims import MIN_VIEWS, find_rims
@@ -41,13 +40,13 @@ from stcal.sfm.camera.intrinsics import start_camera
 from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import by_group, detections_csv
-from stcal.sfm.detect.board_alone import is_board_alone, label_boards
-from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright, seen_by
-from stcal.sfm.detect.labels import LabelledImage, label_images, label_once
-from stcal.sfm.detect.published import PublishedPattern, detect_published
+from stcal.sfm.detect.board_alone import is_board_alone
+from stcal.sfm.detect.files import DetectionResult, seen_by
+from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.mapping.placed import LENS, PlacedBody, place_and_find_camera, place_with_camera, unknown_lens
+from stcal.sfm.runs.detection import DetectedImages, detected_images, labelled_images, require_dots
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
@@ -262,7 +261,8 @@ def _with_found_camera(
     """Finds the camera by the printed faces of the target, and labels the images with it."""
     printed = target.with_faces(printed=True)
     guesses = guessed_cameras(files[0])
-    detection, labelled = _labelled(files, model_of(guesses[0], PHOTOGRAPHS), folder, printed, None, options, progress)
+    start = model_of(guesses[0], PHOTOGRAPHS)
+    detection, labelled = detected_images(files, start, folder, printed, None, options, progress)
     _require_seen(files, labelled, target)
     observations = [image.observations for image in labelled]
     found = place_and_find_camera(observations, printed.faces, guesses).camera
@@ -305,7 +305,7 @@ def _camera_of_dots(
     def told(stage: str, done: int, total: int) -> None:
         progress(f"{stage} for the camera", done, total)
 
-    detection, _ = _labelled(files, model_of(start, PHOTOGRAPHS), folder, target, board, options, told)
+    detection, _ = detected_images(files, model_of(start, PHOTOGRAPHS), folder, target, board, options, told)
     found = camera_of_dots(files[0], detection, board, start, LENS).camera
     return model_of(unknown_lens(found), PHOTOGRAPHS)
 
@@ -383,20 +383,6 @@ def _require_for_printed(options: RunOptions) -> None:
         )
 
 
-def require_dots(board: BoardDesign | None, option: str) -> None:
-    """Refuses a board of corners for an option whose method finds dots.
-
-    Raises
-    ------
-    InputError
-        The board is one of corners; the message begins with the option.
-    """
-    if isinstance(board, CornerBoard):
-        raise InputError(
-            "E-OPTION-CONFLICT", f"{option}: finds boards of dots, and --board is one of squares or tags; leave it out"
-        )
-
-
 def _on_surface(result: RunResult) -> Calibration:
     """Returns the calibration, of the luminous surface if the circles' rims are stated or are to be estimated."""
     design, calibration = result.target_design, result.calibration
@@ -435,7 +421,7 @@ def _published(
         progress(f"{stage}, as published", done, total)
 
     try:
-        detection, labelled = _labelled(files, model, folder, target, board, published_options, told)
+        detection, labelled = detected_images(files, model, folder, target, board, published_options, told)
         return _solved(detection, labelled, model, folder, target, board, published_options, told)
     except StcalError as error:
         return error
@@ -528,71 +514,75 @@ def unlinked_notes(body: PlacedBody) -> list[str]:
     ]
 
 
-def detect(
+@require_arguments
+@one_thread()
+def detect_images(
+    images: Images,
+    camera: str | Path | Camera | CameraModel | None = None,
+    out: str | Path | None = None,
+    target: str | Path | TargetDesign | None = None,
+    board: str | Path | BoardDesign | None = None,
+    options: RunOptions | None = None,
+    progress: Progress | None = None,
+) -> DetectedImages:
+    """Detect and label the circles and corners of all images, as :func:`run` does at its beginning.
+
+    Parameters
+    ----------
+    images, camera, target, board, options, progress
+        As of :func:`run`, without videos. If ``camera`` is None, it is found by the dots of the board, or assumed: a
+        note says which.
+    out
+        Folder for ``detections.csv`` and an overlay picture of each image; nothing is written if None.
+
+    Returns
+    -------
+    DetectedImages
+        ``images`` has the labelled circles by name of the image, px; ``notes`` what was left out.
+
+    Raises
+    ------
+    InputError
+        An input cannot be used, or the folder holds a finished calibration.
+    """
+    if out is None:
+        with tempfile.TemporaryDirectory(prefix="stcal-detect-") as scratch:
+            return detect_images(images, camera, scratch, target, board, options, progress)
+    options, progress = options or RunOptions(), progress or (lambda *_: None)
+    target_design = body_of(target)
+    board_design = None if board is None and target_design.has_scale else board_of(board)
+    if (Path(out) / "faces.json").exists():
+        raise InputError(
+            "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
+        )
+    with mosaic_of(options.bayer) if options.bayer else nullcontext():
+        if isinstance(images, Mapping):
+            files, place = files_of_arrays(images, options.exclude), IN_MEMORY
+        else:
+            files, place = chosen_images(images, options.exclude), images
+    model = None if camera is None else camera_model(camera)
+    given = {"images": place, "--camera": camera, "--target": target, "--board": board}
+    with run_folder(out, MarkerFile.of(place, None), given) as folder:
+        return _detected(files, model, folder, target_design, board_design, options, progress)
+
+
+def _detected(
     files: ImageFiles,
-    camera: CameraModel | None,
+    model: CameraModel | None,
     folder: RunFolder,
     target: TargetDesign,
     board: BoardDesign | None,
     options: RunOptions,
     progress: Progress,
-) -> tuple[DetectionResult, list[LabelledImage], list[str]]:
-    """Detects and labels the images, and writes ``detections.csv`` and overlays into a claimed folder.
-
-    ``camera`` : None to find one by the dots of the board, or to assume one; the notes of the result say which.
-    """
+) -> DetectedImages:
+    """Detects and labels the images, and writes ``detections.csv`` and overlays into a claimed folder."""
     notes = []
-    if camera is None:
-        camera, told = _camera_for_a_look(files, folder, target, board, options, progress)
+    if model is None:
+        model, told = _camera_for_a_look(files, folder, target, board, options, progress)
         if target.with_faces(printed=False).faces:
-            notes.append(FOUND_BY_DOTS.format(camera.focal[0]) if told else ASSUMED)
-    detection, labelled = labelled_images(files, camera, folder, target, board, options, progress)
+            notes.append(FOUND_BY_DOTS.format(model.focal[0]) if told else ASSUMED)
+    detection, labelled = labelled_images(files, model, folder, target, board, options, progress)
     if unseen := _why_unseen(files, labelled, target):
         notes.append(unseen)
     with overlays_beside(detection, labelled, target, folder, progress):
-        return detection, labelled, notes
-
-
-def labelled_images(
-    files: ImageFiles,
-    camera: CameraModel,
-    folder: RunFolder,
-    target: TargetDesign,
-    board: BoardDesign | None,
-    options: RunOptions,
-    progress: Progress,
-) -> tuple[DetectionResult, list[LabelledImage]]:
-    """Detects and labels the images, and writes ``detections.csv`` into a claimed folder."""
-    detection, labelled = _labelled(files, camera, folder, target, board, options, progress)
-    save(folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
-    return detection, labelled
-
-
-def _labelled(
-    files: ImageFiles,
-    camera: CameraModel,
-    folder: RunFolder,
-    target: TargetDesign,
-    board: BoardDesign | None,
-    options: RunOptions,
-    progress: Progress,
-) -> tuple[DetectionResult, list[LabelledImage]]:
-    """Detects and labels the images by the rules that the options ask for."""
-    chosen, skipped = files
-    step = counted(progress, "detect", len(chosen))
-    dots = board if board is not None and board.rows else None
-    published = options.solve == "paper"
-    if published:
-        require_dots(dots, "--solve paper")
-        PublishedPattern.of(target)
-    detector = detect_published if published else None
-    detection = detect_files(
-        chosen, camera, target, dots, options.ellipses, folder.cache, options.workers, step, detector
-    )
-    detection = replace(detection, skipped=(*skipped, *detection.skipped))
-    require_upright(detection.images)
-    if dots is not None and (options.board_only or is_board_alone(detection)):
-        return detection, label_boards(detection, target, dots)
-    if published:
-        return detection, label_once(detection, target, dots)
-    return detection, label_images(detection, target, dots, options.ellipses, folder.cache, options.workers)
+        return DetectedImages(detection, tuple(labelled), tuple(notes))

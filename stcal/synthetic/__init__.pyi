@@ -1,5 +1,10 @@
+from .body import BodyOptions as BodyOptions
+from .body import body_camera as body_camera
+from .body import make_body_scene as make_body_scene
+from .body import write_body as write_body
 from .dataset import render_all as render_all
 from .dataset import write_dataset as write_dataset
+from .optics import ThinLens as ThinLens
 from .render import RenderOptions as RenderOptions
 from .scene import Scene as Scene
 from .scene import SceneOptions as SceneOptions

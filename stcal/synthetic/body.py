@@ -15,6 +15,7 @@ from stcal.boards.target import body_toml
 from stcal.design import FaceDesign, Polarity, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.align import align_rigid
+from stcal.geometry.arrays import require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import write_cameras_txt
@@ -45,10 +46,27 @@ TRIALS = 2000
 class BodyOptions:
     """Options of photographs of a body.
 
-    ``images`` ; ``distance_mm`` : of the camera from the middle of the body, to ± ``depth_share`` of it; ``noise`` :
-    fraction of full scale; ``blur_px`` ; ``seed`` ; ``pose_sigma_mm``, ``pose_sigma_deg`` : of the faces about their
-    rough poses; ``print_errors`` : factor on the σ that the design states of printed faces, and on the bends of
-    :data:`BEND_MM`; 0 for exact ones.
+    Parameters
+    ----------
+    images : int
+        Number of photographs.
+    distance_mm, depth_share : float
+        Distance of the camera from the middle of the body, mm, to ± this share of it.
+    noise : float
+        Standard deviation of the sensor noise, fraction of full scale.
+    blur_px : float
+        Sigma of the Gaussian point spread function, px.
+    seed : int
+        Seed of everything random.
+    pose_sigma_mm, pose_sigma_deg : float
+        σ of the faces about their rough poses, mm and degrees.
+    print_errors : float
+        Factor on the σ that the design states of printed faces, and on the bends of :data:`BEND_MM`; 0 for exact ones.
+
+    Raises
+    ------
+    InputError
+        A value is of another type, or out of range.
     """
 
     images: int = 24
@@ -60,6 +78,9 @@ class BodyOptions:
     pose_sigma_mm: float = 0.3
     pose_sigma_deg: float = 0.5
     print_errors: float = 0.0
+
+    def __post_init__(self):
+        require_fields(self, "body", images=1, noise=0, blur_px=0, seed=0, pose_sigma_mm=0, pose_sigma_deg=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,8 +118,19 @@ class BodyScene:
         return [face for face in self.target.faces if _looks_here(self, face, self.camera_from_target[image])]
 
 
+@require_arguments
 def body_camera(width: int) -> Camera:
-    """Returns a camera of medium focal length with a lens that distorts a little; images of 3:2."""
+    """Returns a camera of medium focal length with a lens that distorts a little.
+
+    Parameters
+    ----------
+    width : int
+        Width of its images of 3:2, px.
+
+    Returns
+    -------
+    Camera
+    """
     height = round(width * 2 / 3)
     focal = 1.1 * width
     distortion = np.array([-0.12, 0.05, 4e-4, -3e-4, 0, 0, 0, 0])
@@ -106,17 +138,32 @@ def body_camera(width: int) -> Camera:
     return Camera(width, height, np.full(2, focal), centre, distortion, False, "OPENCV")
 
 
-def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions) -> BodyScene:
+@require_arguments
+def make_body_scene(target: TargetDesign, camera: Camera, options: BodyOptions | None = None) -> BodyScene:
     """Returns a body with faces near their rough poses, in random poses in which it shows two faces at least.
 
     The last photographs show the faces that fewer than two of the others do.
+
+    Parameters
+    ----------
+    target : TargetDesign
+        Design of the body, with a rough pose of each face, mm.
+    camera : Camera
+        The camera before which it is held, such as :func:`stcal.synthetic.body_camera` returns.
+    options : BodyOptions, optional
+        The defaults if None.
+
+    Returns
+    -------
+    BodyScene
+        True poses ``target_from_face`` and ``camera_from_target``, mm.
 
     Raises
     ------
     InputError
         A face has no rough pose.
     """
-    rough = target.rough_poses()
+    options, rough = options or BodyOptions(), target.rough_poses()
     for face in target.faces:
         if face.id not in rough:
             raise InputError(
@@ -372,6 +419,7 @@ def body_truth(scene: BodyScene, image_format: str = "jpg") -> TruthFile:
     )
 
 
+@require_arguments
 def write_body(
     folder: str | Path,
     scene: BodyScene,
@@ -380,7 +428,27 @@ def write_body(
     workers: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
-    """Writes ``images/IMG_1000.jpg`` …, ``cameras.txt``, ``target.toml`` and ``truth.json``.
+    """Writes ``images/IMG_1000.jpg`` …, ``cameras.txt``, ``target.toml`` and ``truth.json`` of a body.
+
+    Parameters
+    ----------
+    folder : str or Path
+        New or empty folder.
+    scene : BodyScene
+        Of :func:`stcal.synthetic.make_body_scene`.
+    image_format : str
+        ``jpg`` or ``png``.
+    jpeg_quality : int
+        Quality of JPEG, up to 100.
+    workers : int, optional
+        Number of processes; one per core if None.
+    progress : callable, optional
+        Called with (done, total).
+
+    Returns
+    -------
+    list of Path
+        The images.
 
     Raises
     ------

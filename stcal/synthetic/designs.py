@@ -136,14 +136,27 @@ MIN_CELL_PX = 2.0
 """Width of a tag's cell below which its corners are several times less exact."""
 
 
-def tag_body(kind: Literal["cube", "dodecahedron"], size: str, dictionary: str, first_id: int) -> TargetDesign:
-    """Return a body of tags by its width between opposite faces, a text in mm.
+Body = Literal["cube", "dodecahedron"]
+
+
+def tag_body(kind: Body, size: str | float, dictionary: str, first_id: int) -> TargetDesign:
+    """Return a body of tags by its width between opposite faces, mm, which may be a text.
 
     Raises
     ------
     InputError
         The width is not a number above 0, or the dictionary or an id in it does not exist.
     """
+    width = width_of(size)
+    faces = 6 if kind == "cube" else 12
+    family = known_tags([(dictionary, first_id + face) for face in range(faces)], "--tags, --dictionary")[0][0]
+    if kind == "cube":
+        return tag_cube(width, family, first_id)
+    return tag_dodecahedron(width / DODECAHEDRON_WIDTH, family, first_id)
+
+
+def width_of(size: str | float) -> float:
+    """Return the width of a body, mm, which may be a text; errors as :func:`tag_body`."""
     try:
         width = float(size)
     except ValueError:
@@ -152,11 +165,7 @@ def tag_body(kind: Literal["cube", "dodecahedron"], size: str, dictionary: str, 
         raise InputError(
             "E-OPTION-VALUE", f"--size {size}: one width between opposite faces, mm, such as 60, needed with --tags"
         )
-    faces = 6 if kind == "cube" else 12
-    family = known_tags([(dictionary, first_id + face) for face in range(faces)], "--tags, --dictionary")[0][0]
-    if kind == "cube":
-        return tag_cube(width, family, first_id)
-    return tag_dodecahedron(width / DODECAHEDRON_WIDTH, family, first_id)
+    return width
 
 
 def made_text(target: TargetDesign, camera: Camera, distance_mm: float) -> str:

@@ -26,11 +26,13 @@ from stcal.boards.design import (
 from stcal.boards.tags import Tags, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.plane import camera_from_plane, fit_homography, refine_planar_pose
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.read import camera_model
 from stcal.io.image_jobs import run_on_images
 from stcal.io.images import (
     MAJORITY,
@@ -45,6 +47,7 @@ from stcal.io.images import (
 )
 from stcal.labels import DotLabel
 from stcal.locate.calibration.solve import CalibrationImages
+from stcal.parallel import Progress
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.data.patterns import pattern_of_board
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, find_ellipses
@@ -394,17 +397,41 @@ def _detect_board(
     return BoardDetection(file.name, (width, height), view, why, tags)
 
 
+@require_arguments
 def calibration_images(
-    folder: Path,
-    model: CameraModel,
+    images: str | Path,
+    camera: str | Path | Camera | CameraModel,
     board: Board,
     dictionaries: tuple[str, ...],
     workers: int | None = None,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Progress | None = None,
 ) -> CalibrationImages:
-    """Returns board and tags in all images of a folder; ``progress`` is called with (stage, done, total)."""
-    files, skipped = find_images(folder)
-    detections = detect_boards(files, model, board, dictionaries, workers, partial(progress, "images"))
+    """Returns a board and tags in one plane in photographs, from which :func:`stcal.locate.calibrate` finds the tags.
+
+    Parameters
+    ----------
+    images : str or Path
+        Folder of the photographs, and of folders of them.
+    camera : Camera
+        The camera that took them, or its file.
+    board : BoardDesign or another board design
+        The board, mm, of :func:`stcal.load_flat_board`.
+    dictionaries : tuple of str
+        Dictionaries of the tags.
+    workers : int, optional
+        Number of processes; one per core if None.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    CalibrationImages
+        ``views``, ``tags``, ``names``, ``camera`` and ``symmetries``, the arguments of :func:`stcal.locate.calibrate`;
+        ``left_out``, images that are not used, and why.
+    """
+    files, skipped = find_images(images)
+    told, model = progress or (lambda *_: None), camera_model(camera)
+    detections = detect_boards(files, model, board, dictionaries, workers, partial(told, "images"))
     names, views, tags = zip(*((image.name, image.view, image.tags) for image in detections.images), strict=True)
     left_out = tuple(
         f"{image.name}: {image.reason}" for image in (*skipped, *detections.skipped) if image.name not in names

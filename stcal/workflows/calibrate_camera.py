@@ -19,6 +19,7 @@ from stcal.boards.design import (
 )
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.forms import kalibr_chain
 from stcal.io.cameras.model import CameraModel, cameras_txt
@@ -41,7 +42,7 @@ from stcal.sfm.camera.calibrate import (
 from stcal.sfm.camera.checks import AUTO, foretold
 from stcal.sfm.camera.file import CalibrationFile, RigCalibrationFile
 from stcal.sfm.camera.intrinsics import Intrinsics, adjust_intrinsics, closed_form, start_camera
-from stcal.sfm.camera.rig import RigCalibration, calibrate_rig
+from stcal.sfm.camera.rig import RigCalibration, rig_of
 from stcal.sfm.data.model import ImageObservations
 from stcal.workflows.board_views import detect_boards, kind_of
 
@@ -55,6 +56,7 @@ LEAST_SHARE = 0.5
 """Smallest share of the corners of a view that are no gross errors; with fewer of them the view is not used."""
 
 
+@require_arguments
 @one_thread()
 def calibrate_camera_by_corners(
     images: str | Path,
@@ -63,15 +65,20 @@ def calibrate_camera_by_corners(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> CameraCalibration:
-    """Returns intrinsics from a folder of photographs that show a chessboard or a ChArUco board.
+    """Returns intrinsics from photographs of a chessboard, ChArUco board, AprilGrid, or asymmetric circles.
 
     Parameters
     ----------
-    images : folder of photographs, or of folders of them
-    board : the board, mm, with the σ of its corners
-    colmap_model : COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``
-    workers : number of processes; one per core if None
-    progress : called with (stage, done, total)
+    images : str or Path
+        Folder of photographs, or of folders of them.
+    board : board design
+        The board, mm, with the σ of its corners, of :func:`stcal.load_flat_board`.
+    colmap_model : str
+        COLMAP's camera model to adjust, such as ``OPENCV``, or ``auto``.
+    workers : int, optional
+        Number of processes; one per core if None.
+    progress : callable, optional
+        Called with (stage, done, total).
 
     Returns
     -------
@@ -247,24 +254,52 @@ class Models:
         return cls(model_of, common[0] if common else default)
 
 
-def calibrate_rig_from_photographs(
-    folder: Path,
+@require_arguments
+def calibrate_rig(
+    images: str | Path,
     target: TargetDesign,
     board: BoardDesign | FlatBoard,
-    models: Models,
+    colmap_model: str = "OPENCV",
+    models: Mapping[str, str] | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> RigCalibration:
-    """Calibrate each camera by itself, then all together.
+    """Returns the intrinsics of cameras that are fixed to each other, and where they sit, from photographs of a board.
 
-    ``folder`` : folder with a folder of photographs for each camera; images of one instant have the same name in all;
-    ``target``, ``board``, ``workers``, ``progress`` : as in :func:`calibrate_camera`; boards of corners are possible
-    too; ``models`` : COLMAP's models, or ``auto``.
+    Each camera is calibrated by itself, then all together.
 
-    Raises StcalError: one of its subclasses; the message names the camera.
+    Parameters
+    ----------
+    images : str or Path
+        Folder with a folder of photographs for each camera; those of one instant are named alike.
+    target : TargetDesign
+        Design of the target beside a board of dots, whose circles are not dots.
+    board : BoardDesign or another board design
+        The board, mm: dots, a chessboard or a ChArUco board.
+    colmap_model : str
+        COLMAP's camera model, or ``auto``.
+    models : dict of str, optional
+        Models of cameras that differ, by the name of their folder.
+    workers : int, optional
+        Number of processes; one per core if None.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    RigCalibration
+        ``names``, ``cameras`` with their calibration alone, and ``camera_from_first``, mm.
+
+    Raises
+    ------
+    InputError
+        The folder, a name, a model or the board cannot be used.
+    StcalError
+        A camera cannot be calibrated; the message names it.
     """
+    folder, own = Path(images), models or {}
     names = camera_names(folder)
-    unknown = [name for name in models.own if name not in names]
+    unknown = [name for name in own if name not in names]
     if unknown:
         raise InputError(
             "E-OPTION-VALUE", f"--model {unknown[0]}=…: no folder {unknown[0]} in {folder}; it has {', '.join(names)}"
@@ -277,7 +312,7 @@ def calibrate_rig_from_photographs(
     grid = board if isinstance(board, BoardDesign) else corner_grid(board)
     cameras: dict[str, CameraCalibration] = {}
     for name in names:
-        model = models.own.get(name, models.common)
+        model = own.get(name, colmap_model)
 
         def step(stage: str, done: int, total: int, name=name) -> None:
             if progress:
@@ -291,7 +326,7 @@ def calibrate_rig_from_photographs(
         except StcalError as error:
             raise type(error)(error.code, f"rig: {name}: {error}") from error
         cameras[name] = calibration
-    return calibrate_rig(cameras, grid, isinstance(board, CharucoDesign))
+    return rig_of(cameras, grid, isinstance(board, CharucoDesign))
 
 
 def camera_names(folder: Path) -> list[str]:

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+import stcal
 from stcal.boards.cells import outlines
 from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign
 from stcal.design import reference_board, reference_target
@@ -42,6 +43,15 @@ def assert_is_the_target(circles: dict[str, tuple[np.ndarray, float]]):
         xy = np.array([circles[label][0] for label in face.labels()])
         np.testing.assert_allclose(xy - xy[0], face.xy_mm - face.xy_mm[0], atol=DIGITS)
         np.testing.assert_allclose([circles[label][1] for label in face.labels()], face.radius_mm, atol=DIGITS)
+
+
+def test_a_design_is_drawn_like_its_file(files):
+    of_file, of_design = files / "of-file.svg", files / "of-design.svg"
+    draw(files / "target.toml", of_file)
+    assert stcal.draw(stcal.load_target(files / "target.toml"), of_design).path == of_design
+    assert of_design.read_bytes() == of_file.read_bytes()
+    with fails_with("E-OPTION-RANGE … -1"):
+        stcal.draw(files / "target.toml", of_design, margin_mm=-1.0)
 
 
 def test_svg_has_the_target_in_mm(files):

@@ -9,7 +9,7 @@ import pytest
 
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
-from stcal.io.cameras.difference import SizedLens, camera_difference, fit_lens
+from stcal.io.cameras.difference import SizedLens, compare_cameras, fit_lens
 from stcal.io.cameras.foreign import COLMAP_FOREIGN, ForeignLens
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera, read_lens
@@ -302,13 +302,13 @@ def test_lenses_are_compared_by_their_own_projections():
     pixels = np.random.default_rng(0).uniform([300, 200], [900, 600], (50, 2))
     np.testing.assert_allclose(lens.project(sized.rays(pixels)), pixels, atol=1e-6)
     for one, two in ((sized, camera), (camera, sized)):
-        found = camera_difference(one, two)
+        found = compare_cameras(one, two)
         assert np.nanmax(found.lengths()) < 1e-5
         assert 0.3 < np.isnan(found.lengths()).mean() < 0.8
     np.testing.assert_allclose(found.second_from_first.inverse().rotation, turn.rotation, atol=1e-7)
     longer = Camera(WIDTH, HEIGHT, camera.focal * 1.001, camera.centre, camera.distortion)
     # a thousandth of the way from the middle, of which a turn and the offset of the region take a part
-    assert 0.2 < np.nanmax(camera_difference(sized, longer).lengths()) < 0.7
+    assert 0.2 < np.nanmax(compare_cameras(sized, longer).lengths()) < 0.7
 
 
 def test_mrcals_region_is_read(tmp_path):
@@ -332,7 +332,7 @@ def test_mrcals_splined_example_is_fitted_and_compared_where_it_is_valid(shared_
     found = fit_lens(splined, 6016, 4016)
     assert found.rms_px < 1.16  # more parameters than a turn
     assert np.degrees(found.camera_from_lens.angle_rad()) > 1
-    difference = camera_difference(SizedLens(splined, 6016, 4016, found), opencv.sized(6016, 4016))
+    difference = compare_cameras(SizedLens(splined, 6016, 4016, found), opencv.sized(6016, 4016))
     lengths = difference.lengths()
     assert np.sqrt(np.nanmean(lengths**2)) == pytest.approx(1.16, abs=0.05)
     assert 0.6 < np.isfinite(lengths).mean() < 0.9

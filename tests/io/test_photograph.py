@@ -5,6 +5,7 @@ import pycolmap
 import pytest
 from PIL import ExifTags, Image
 
+import stcal
 from stcal.io.cameras.photograph import SIGMA_FOCAL, camera_of_photograph, is_photograph
 from tests.outcome import fails_with
 
@@ -43,6 +44,17 @@ def test_the_focal_length_is_that_of_exif(tmp_path, case, suffix):
     np.testing.assert_allclose(sigma[:2], SIGMA_FOCAL * focal_px, rtol=1e-3)
     assert np.linalg.eigvalsh(camera.covariance).min() > 0
     assert ("sensor of 24×16 mm" in camera_of_photograph(path).told) == ("FocalLength" in entries)
+
+
+def test_a_lens_is_loaded_from_a_photograph_too(tmp_path):
+    path = photograph(tmp_path / "p.jpg", FocalLengthIn35mmFilm=28)
+    found = stcal.load_lens(path)
+    assert found.camera.same_as(camera_of_photograph(path).camera)
+    assert (found.told, found.fitted) == (camera_of_photograph(path).told, None)
+    stcal.save_camera(tmp_path / "c.txt", found.camera, "colmap")
+    assert stcal.load_lens(tmp_path / "c.txt").camera.same_as(found.camera)
+    with fails_with("E-FIELD-TYPE … size"):
+        stcal.load_lens(path, size="1200x800")
 
 
 def test_colmap_finds_the_same(tmp_path):

@@ -214,7 +214,10 @@ def given(tmp_path, monkeypatch):
         with (tmp_path / "log.csv").open("w", newline="") as file:
             csv.writer(file).writerows([header, *rows])
         robot = mh80() if robot is None else robot
-        work.from_photos(tmp_path / images, None, None, None, tmp_path / "log.csv", robot, targets, key=key)
+        scene = make_scene(SceneOptions(images_per_group=2))
+        target = known_target(scene, NOISE_PX).measured(np.random.default_rng(1))
+        log, photographs = tmp_path / "log.csv", tmp_path / images
+        work.robot_from_photos(photographs, scene.camera, target, scene.target, log, robot, targets, key=key)
 
     return call
 

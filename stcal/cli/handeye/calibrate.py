@@ -160,10 +160,9 @@ def handeye(
     from stcal.handeye.report.page import outcome_report
     from stcal.io.files import require_same
     from stcal.robot import load_robot, save_robot
-    from stcal.workflows.handeye.calibrate import AUTO, Splits, calibrate
+    from stcal.workflows.handeye.calibrate import calibrate_handeye
     from stcal.workflows.handeye.inputs import dry_run as understood
-    from stcal.workflows.handeye.inputs import read_input, setup_of, without_flips
-    from stcal.workflows.handeye.offset import at_offset, with_offset
+    from stcal.workflows.handeye.inputs import read_handeye, without_flips
     from stcal.workflows.handeye.times import Timing
 
     robot, seen = (_radians(sigma_robot_deg), sigma_robot_mm), (_radians(sigma_camera_deg), sigma_camera_mm)
@@ -204,8 +203,24 @@ def handeye(
         say("\n".join(understood(pairs, poses, camera, board, quaternions, statements, timing, robot_model)))
         return
     with StageProgress() as progress:
-        inputs = read_input(
-            pairs, poses, camera, board, workers, progress, quaternions, statements, timing, robot_model
+        inputs = read_handeye(
+            pairs,
+            poses,
+            camera,
+            board,
+            setup=setup,
+            rotation=rotation or (),
+            length_unit=length_unit or (),
+            poses_are=poses_are or (),
+            quaternions=quaternions,
+            columns=statements.columns,
+            tolerance_s=time_tolerance,
+            image_times=image_times,
+            times_columns=times_columns,
+            time_offset=time_offset,
+            robot=robot_model,
+            workers=workers,
+            progress=progress,
         )
         for line in inputs.understood:
             say(line)
@@ -213,18 +228,22 @@ def handeye(
         options = HandEyeOptions(
             noise, inputs.prior if refine_camera else None, with_scale, inputs.symmetries, four_dof, evolution
         )
-        validation = Splits(splits, held_out, seed, workers, motions_held_out)
-        if method is None and not (refine_camera or with_scale or four_dof):
-            method = AUTO
-        chosen, offset = setup_of(statements, inputs.setup, inputs.where), None
-        if statements.setup:
-            inputs = replace(inputs, setup=chosen)
         if undo_flips:
-            inputs, undone = without_flips(inputs, chosen, options)
+            inputs, undone = without_flips(inputs, options)
             say(undone)
-        if time_offset:
-            inputs, options, offset = at_offset(inputs, chosen, options)
-        outcome = with_offset(calibrate(inputs, chosen, method, options, validation, progress, time_offset), offset)
+        outcome = calibrate_handeye(
+            inputs,
+            method,
+            options,
+            refine_camera=refine_camera,
+            time_offset=time_offset,
+            repeats=splits,
+            held_out=held_out,
+            seed=seed,
+            motions=motions_held_out,
+            workers=workers,
+            progress=progress,
+        )
     result = outcome.result
     document = outcome_report(outcome)
     say(document.text())

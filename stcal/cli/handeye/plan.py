@@ -41,18 +41,31 @@ def plan(
     from stcal.handeye.report.planned import planned_csv, planned_file, planned_report
     from stcal.io.table import require_pose_table_written
     from stcal.robot import load_robot
-    from stcal.workflows.handeye.inputs import read_input, setup_of
-    from stcal.workflows.handeye.plan import plan_next
+    from stcal.workflows.handeye.inputs import read_handeye
+    from stcal.workflows.handeye.plan import plan_handeye
 
     statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup)
     pairs = params.source_of(source, first, second, key, statements, quaternions, None, columns, columns_a)
     statements = replace(statements, columns=columns) if isinstance(pairs, Path) and pairs.is_dir() else statements
     robot = load_robot(robot_file) if robot_file else None
     with StageProgress() as progress:
-        inputs = read_input(pairs, poses, camera, board, workers, progress, quaternions, statements)
+        inputs = read_handeye(
+            pairs,
+            poses,
+            camera,
+            board,
+            setup=setup,
+            rotation=rotation or (),
+            length_unit=length_unit or (),
+            poses_are=poses_are or (),
+            quaternions=quaternions,
+            columns=statements.columns,
+            workers=workers,
+            progress=progress,
+        )
     for line in inputs.understood:
         say(line)
-    planned = plan_next(inputs, setup_of(statements, inputs.setup, inputs.where), count, robot, seed)
+    planned = plan_handeye(inputs, count, robot, seed)
     say(planned_report(planned.result, planned.poses, planned.joints).text())
     for name, reason in inputs.left_out:
         say(f"left out {name}: {reason}")

@@ -37,23 +37,37 @@ def rig(
     strict: shared.Strict = False,
 ) -> None:
     """Find where several cameras sit on one flange, or in one base, and in each other, from one adjustment."""
-    from stcal.handeye.data.formats.record import Said
     from stcal.handeye.data.rig import read_rig_file
     from stcal.handeye.report.file import HandEyeRigFile
     from stcal.handeye.report.outcome import rig_judged
     from stcal.handeye.report.rig_page import rig_report
-    from stcal.workflows.handeye.calibrate import Splits
-    from stcal.workflows.handeye.rig import calibrate_rig, read_rig
+    from stcal.workflows.handeye.rig import calibrate_handeye_rig, read_handeye_rig
 
     files = read_rig_file(rig_file)
     written = {"--out": out, "--json": json_file, "--report": report}
     keep_apart([(name, path) for name, path in written.items() if path], files.read())
-    statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], None)
     with StageProgress() as progress:
-        inputs = read_rig(files, workers, progress, quaternions, statements, time_tolerance)
+        inputs = read_handeye_rig(
+            files,
+            rotation=rotation or (),
+            length_unit=length_unit or (),
+            poses_are=poses_are or (),
+            quaternions=quaternions,
+            tolerance_s=time_tolerance,
+            workers=workers,
+            progress=progress,
+        )
         print_each("understood", inputs.understood)
-        validation = Splits(splits, held_out, seed, workers)
-        outcome = calibrate_rig(inputs, refine_camera, with_scale, validation, progress)
+        outcome = calibrate_handeye_rig(
+            inputs,
+            refine_camera,
+            with_scale,
+            repeats=splits,
+            held_out=held_out,
+            seed=seed,
+            workers=workers,
+            progress=progress,
+        )
     document = rig_report(outcome)
     say(document.text())
     for name, what, why in outcome.left_out():

@@ -46,7 +46,7 @@ def compensate(
 ) -> None:
     """Compute joint values that really reach commanded poses, beside the nominal ones."""
     from stcal.io.files import require_same
-    from stcal.robot.export import exported, require_form
+    from stcal.robot.export import require_form, robot_program
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import compensation as stage
     from stcal.robot.use.report import compensation_report
@@ -69,7 +69,7 @@ def compensate(
     write_if(json_file, lambda: stage.compensation_file(result, identified))
     write_if(report, document.page)
     for form, path in exports if result.found.usable.any() else ():
-        exported_file = exported(result, identified, form, path, export_as, pulses)
+        exported_file = robot_program(result, identified, form, path, export_as, pulses)
         write(path, exported_file.text)
         require_same(path, path.read_bytes, exported_file.text.encode())  # which gave the points back
         print_each("note", exported_file.notes)

@@ -1,18 +1,13 @@
 """Commands ``stcal robot init`` and ``convert``: robot files."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from stcal.cli.declare import Arg
 from stcal.cli.terminal import print_each, say, write
 from stcal.errors import InputError
 
-if TYPE_CHECKING:
-    from stcal.robot.kinematics.model import Convention, Robot
-
 XML = (".urdf", ".xml")
-LEAST_OFF_MM = 1e-3
-"""A micrometre: what angles of few digits round off."""
 
 
 ConventionName = Literal["standard", "modified"]
@@ -41,19 +36,20 @@ def convert(
     """Write a robot file as URDF, or the joints of a URDF or an arm of Universal Robots as a robot file."""
     from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
     from stcal.robot.urdf.read import load_urdf
+    from stcal.robot.urdf.universal import read_universal
     from stcal.robot.urdf.write import coupled, require_urdf_written, robot_urdf
 
     if out.suffix.lower() not in (*XML, ".toml"):
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
-    made = None if source.suffix.lower() in (*XML, ".toml") else _of_universal(source, nominal, convention)
+    made = None if source.suffix.lower() in (*XML, ".toml") else read_universal(source, nominal, convention)
     if made is None and nominal is not None:
         raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
     if made is not None:
         if from_link or to_link:
             raise InputError("E-OPTION-NEEDS", "--from-link, --to-link: only of a URDF that is read; leave them out")
-        robot, said = made
+        robot = made.robot
         say(f"robot {robot.name}: {len(robot.rows)} joints, of Universal Robots")
-        print_each(f"note: {source}", said)
+        print_each(f"note: {source}", made.notes)
         if out.suffix.lower() in XML:
             write(out, robot_urdf(robot))
             require_urdf_written(out, robot)
@@ -86,34 +82,6 @@ def convert(
         say("note: URDF has no coupling; its joint values are the coupling times the controller's, with wider limits")
     write(out, text)
     require_urdf_written(out, robot)
-
-
-def _of_universal(source: Path, nominal: Path | None, convention: "Convention") -> "tuple[Robot, list[str]] | None":
-    """The arm of a file of Universal Robots, with notes; None for any other file."""
-    from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
-    from stcal.robot.kinematics.file import load_robot
-    from stcal.robot.urdf.universal import is_conf, kinematics_content, robot_of_conf, robot_of_kinematics
-
-    try:
-        text = text_of(read_bytes(source, SETTINGS_BYTES))
-    except OSError as error:
-        raise InputError("E-FILE-UNREADABLE", f"{source}: {error.strerror or error}; check the path") from error
-    except UnicodeDecodeError:
-        return None
-    if is_conf(text):
-        robot = robot_of_conf(text, str(source), load_robot(nominal) if nominal else None, convention)
-        return robot, []
-    content = kinematics_content(text)
-    if content is None:
-        return None
-    if nominal is not None:
-        raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
-    robot, off_mm = robot_of_kinematics(content, str(source), convention)
-    said = (
-        "angles are read about turned axes, as ur_calibration computes them and the controller moves; a URDF with the "
-    )
-    said += f"same numbers takes them about fixed ones, and its flange is {off_mm:.2g} mm off at joint values of 0"
-    return robot, [said] if off_mm >= LEAST_OFF_MM else []
 
 
 def _is_xml(path: Path) -> bool:

@@ -41,12 +41,12 @@ def from_photos(
     from stcal.sfm.measurement.images import MeasureOptions
     from stcal.sfm.measurement.target import read_target
     from stcal.workflows.from_photos.result import files_of, require_files_written, story
-    from stcal.workflows.from_photos.run import from_photos
+    from stcal.workflows.from_photos.run import robot_from_photos
 
     require_new_folder(out, images)
     design = target_of(target)
     with StageProgress() as progress:
-        result = from_photos(
+        result = robot_from_photos(
             images,
             read_camera(camera),
             read_target(faces, design),

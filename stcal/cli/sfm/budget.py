@@ -39,47 +39,22 @@ def budget(
 ) -> None:
     """Compute the uncertainty budget of faces and of the target's longest distances (GUM), each contribution apart."""
     from stcal.report.page import pdf_of
-    from stcal.sfm.budget.combine import budget_of_run
-    from stcal.sfm.budget.file import BudgetFile, refusals
-    from stcal.sfm.budget.lengths import against_run, against_stated
-    from stcal.sfm.budget.page import budget_report
-    from stcal.sfm.budget.sources import statement_of
-    from stcal.sfm.runs.saved import load_run
-    from stcal.sfm.runs.verify import verify
+    from stcal.sfm.budget.of_run import uncertainty_budget
+    from stcal.sfm.budget.sources import fields_of
 
-    if columns is not None and check_lengths is None:
-        raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of lengths; give it with --check-lengths")
-    saved = load_run(run)
-    stated = statement_of(saved.board_design.stated, statement, field or ())
     if pdf:
         _require_pdf(page, run)
-    if lengths_statement is not None and lengths is None:
-        raise InputError(
-            "E-OPTION-NEEDS",
-            f"--lengths-statement {lengths_statement}: of a second calibration; give it with --lengths",
-        )
-    computed, tests, others = budget_of_run(saved, stated), [], []
-    if check_lengths is not None:
-        tests.append(against_stated(computed, check_lengths, columns))
-    if lengths is not None:
-        second = load_run(lengths)
-        others.append(second)
-        statement_of_second = statement_of(second.board_design.stated, lengths_statement or statement)
-        tests.append(
-            against_run(
-                computed, budget_of_run(second, statement_of_second), lengths, (saved.board_design, second.board_design)
-            )
-        )
-    file = BudgetFile.of(computed, saved, verify(run), tests, *others)
-    document = budget_report(file)
+    fields = fields_of(field or ())
+    result = uncertainty_budget(run, statement, fields, check_lengths, columns, lengths, lengths_statement)
+    document = result.document()
     say(document.text())
-    write_if(out, lambda: file, "as JSON")
+    write_if(out, lambda: result.file, "as JSON")
     if page:
         html = document.page()
         write(page, html, "report")
         if pdf:
             write(page.with_suffix(".pdf"), pdf_of(html), "PDF")
-    require_usable(strict, refusals([saved, *others], file.length_tests), page)
+    require_usable(strict, result.refusals, page)
 
 
 def _require_pdf(page: Path | None, run: Path) -> None:

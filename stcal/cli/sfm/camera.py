@@ -113,11 +113,11 @@ def _rig(images: Path, out: Path, target, board, models, json_file, report, work
     from stcal.io.files import require_new_folder, save_folder
     from stcal.sfm.camera.file import RigCalibrationFile
     from stcal.sfm.camera.report import rig_report
-    from stcal.workflows.calibrate_camera import calibrate_rig_from_photographs, files_of, require_rig_written
+    from stcal.workflows.calibrate_camera import calibrate_rig, files_of, require_rig_written
 
     require_new_folder(out, images)
     with StageProgress() as progress:
-        calibration = calibrate_rig_from_photographs(images, target, board, models, workers, progress)
+        calibration = calibrate_rig(images, target, board, models.common, models.own, workers, progress)
     files, missing = files_of(calibration)
     save_folder(out, files)
     require_rig_written(out, files, calibration)

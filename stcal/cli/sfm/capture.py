@@ -12,7 +12,7 @@ from stcal.cli.terminal import StageProgress, print_each, say, write_if
 from stcal.errors import InputError
 
 if TYPE_CHECKING:
-    from stcal.workflows.watch import Update
+    from stcal.workflows.growing import Update
 
 app = typer.Typer()
 
@@ -47,15 +47,12 @@ def plan(
     """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import board_of
-    from stcal.sfm.planning.bodies import plan_body
+    from stcal.io.design import load_board
+    from stcal.sfm.planning.bodies import plan as planned
     from stcal.sfm.planning.file import PlanFile, plan_text
     from stcal.sfm.planning.noise import expected_noise, noise_of_run, stated_noise
-    from stcal.sfm.planning.nominal import nominal_poses
     from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
-    from stcal.sfm.planning.session import plan as planned
     from stcal.sfm.runs.options import RunOptions
-    from stcal.sfm.runs.saved import load_run
 
     design = body_of(target)
     printed = bool(design.with_faces(printed=True).faces)
@@ -69,8 +66,10 @@ def plan(
         )
     if noise is not None:
         centre_noise, source = stated_noise(noise)
+    elif run is not None:
+        centre_noise, source = noise_of_run(run), f"by size and tilt as in {run}"
     else:
-        centre_noise, source = noise_of_run(load_run(run)) if run else expected_noise(of_corners=printed)
+        centre_noise, source = expected_noise(of_corners=printed)
     options = PlanOptions(
         images,
         spread,
@@ -85,8 +84,7 @@ def plan(
         margin,
     )
     with shared.designs_told(target, board):
-        nominal = nominal_poses(design, faces)
-        result = plan_body(options, design, nominal) if printed else planned(options, design, board_of(board), nominal)
+        result = planned(options, design, load_board(board) if board else None, faces)
     say(plan_text(result, source))
     write_if(out, lambda: PlanFile.of_plan(result), "as JSON")
 
@@ -139,8 +137,8 @@ def watch(
     help most. RUN/report.html is kept up to date and reloads itself."""
     shared.load_ahead(workers)
     from stcal.sfm.runs.options import RunOptions
-    from stcal.workflows.watch import WatchOptions
-    from stcal.workflows.watch import watch as updates
+    from stcal.workflows.growing import WatchOptions
+    from stcal.workflows.growing import watch as updates
 
     run_options = RunOptions(
         refine_camera=refine_camera, ellipses=shared.ellipse_options(min_diameter, max_diameter), workers=workers
@@ -211,19 +209,20 @@ def capture(
     shared.load_ahead(workers)
     from stcal.io.device import OpenCVSource, SimulatedSource
     from stcal.sfm.runs.options import RunOptions
-    from stcal.workflows.capture import Trigger, photograph
-    from stcal.workflows.watch import Growing, WatchOptions
+    from stcal.workflows.growing import GrowingRun, WatchOptions
+    from stcal.workflows.photographs import Trigger
+    from stcal.workflows.photographs import capture as captured
 
     run_options = RunOptions(
         refine_camera=refine_camera, ellipses=shared.ellipse_options(min_diameter, max_diameter), workers=workers
     )
-    growing = Growing.of(images, camera, out, target, board, WatchOptions(views=views, run=run_options))
+    growing = GrowingRun.of(images, camera, out, target, board, WatchOptions(views=views, run=run_options))
     source = SimulatedSource(simulate, gain) if simulate else OpenCVSource(device, gain, exposure is not None)
     trigger = Trigger(count, every, sys.stdin, lambda text: (say(text), sys.stdout.flush()))
     try:
         say(f"{source.name}; report: {out / 'report.html'}")
         with shared.designs_told(target, board):
-            for photo in photograph(source, growing, group, exposure, settle, trigger.ready):
+            for photo in captured(source, growing, group, trigger.ready, exposure, settle):
                 say(f"taken {photo.name}: {photo.light()}")
                 _say_update(photo.update)
     finally:

@@ -29,11 +29,8 @@ def export_database(
     """Copy the run's database for another version of COLMAP to open; ids, orders and values stay."""
     from stcal.sfm.interop.crosscheck import database_text
     from stcal.sfm.interop.export_database import export_database as export
-    from stcal.sfm.runs.saved import load_run
 
-    saved = load_run(run)
-    written = export(saved.database, out, schema, saved)
-    say(database_text(written))
+    say(database_text(export(run, out, schema)))
 
 
 @app.command(name="export-model")
@@ -46,8 +43,7 @@ def export_model(
     from stcal.sfm.interop.crosscheck import model_text
     from stcal.sfm.interop.export_model import export_model as export
 
-    written = export(run, out, kind)
-    say(model_text(written, kind))
+    say(model_text(export(run, out, kind), kind))
 
 
 @app.command(name="export")
@@ -96,16 +92,15 @@ def crosscheck(
     timeout: Annotated[float, "Stop the native mapper after this time for one group, s.", Opt(min=1, max=1e6)] = 600.0,
 ) -> None:
     """Map the same database with the native COLMAP and compare faces, circles and cameras, into the report."""
-    from stcal.sfm.interop.crosscheck import comparison_text, crosscheck_run
+    from stcal.sfm.interop.crosscheck import comparison_text
+    from stcal.sfm.interop.crosscheck import crosscheck as checked
     from stcal.sfm.runs.crosscheck import Tolerances
-    from stcal.sfm.runs.saved import load_run
 
     tolerances = Tolerances(
         tolerance_um, tolerance_mdeg, tolerance_um, camera_tolerance_um, camera_tolerance_mdeg, tolerance_sigma
     )
-    saved = load_run(run)
     with StageProgress() as progress:
-        check = crosscheck_run(saved, colmap, tolerances, timeout, progress)
+        check = checked(run, colmap, tolerances, timeout, progress, into_report=True)
     say(comparison_text(check))
     say(f"report: {run / 'report.html'}")
     if check.differences:
@@ -128,16 +123,15 @@ def faces(
 ) -> None:
     """Find scale and faces from a COLMAP model made or edited elsewhere; labels come by (image, keypoint)."""
     from stcal.sfm.interop.crosscheck import faces_text
-    from stcal.sfm.interop.external import calibrate_models, write_faces
+    from stcal.sfm.interop.external import calibrate_models
     from stcal.sfm.runs.saved import load_run
 
     if out is not None and not out.parent.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{out}: no folder {out.parent}; make it, or give another place with --out")
     saved = load_run(run)
-    calibration = calibrate_models(model, saved, solve)
+    calibration = calibrate_models(model, saved, solve, out)
     say(faces_text(calibration, saved))
     if out is not None:
-        write_faces(out, calibration, saved, solve)
         say(f"faces: {out}")
 
 
@@ -149,12 +143,11 @@ def pairs(
     out: JsonFile = None,
 ) -> None:
     """Rank the initial pairs, and show how each fares at every gate: ours, and COLMAP's as set and at its defaults."""
-    from stcal.sfm.interop.crosscheck import PairsFile
-    from stcal.sfm.interop.gates import limits_text, pairs_table, run_gates
+    from stcal.sfm.interop.gates import PairsFile, initial_pairs, limits_text, pairs_table
     from stcal.sfm.runs.saved import load_run
 
     saved = load_run(run)
-    gates_by_group = run_gates(saved, group)
+    gates_by_group = initial_pairs(saved, group)
     for name, rows in gates_by_group.items():
         images = len({image for row in rows for image in (row.score.first, row.score.second)})
         say(pairs_table(name, images, rows, len(rows) if everything else SHOWN_PAIRS), end="\n\n")
@@ -174,12 +167,10 @@ def doctor(
 ) -> None:
     """Explain every image and circle left out: the threshold that stopped it, its value, and what would let it in."""
     from stcal.sfm.diagnose import findings
-    from stcal.sfm.diagnose.doctor import diagnose
+    from stcal.sfm.diagnose.doctor import doctor as diagnosed
     from stcal.sfm.diagnose.findings import DoctorFile
-    from stcal.sfm.runs.saved import load_run
 
-    saved = load_run(run)
     with StageProgress() as progress:
-        diagnosis = diagnose(saved, images, workers, progress)
+        diagnosis = diagnosed(run, images, workers, progress)
     say(findings.table(diagnosis, None if everything else findings.MAX_LINES))
     write_if(out, lambda: DoctorFile.of(diagnosis), "as JSON")

@@ -1,10 +1,7 @@
 """Commands ``stcal-sfm draw`` and ``design``: targets and boards to be made."""
 
-import os
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -12,10 +9,6 @@ from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.options import MOST_SEED
 from stcal.cli.terminal import StageProgress, print_each, say
 from stcal.errors import InputError
-from stcal.io.files import BOARD, TARGET
-
-if TYPE_CHECKING:
-    from stcal.sfm.planning.session import PlanOptions
 
 app = typer.Typer()
 
@@ -88,72 +81,39 @@ def design(
     """Make a target for a box: circles on its sides that name each face with any three hidden; or a cube or
     dodecahedron of tags; and forecast its σ."""
     from stcal.io.cameras.read import read_camera
-    from stcal.io.design import load_board, save_design
     from stcal.sfm.detect.sightings import likeness_notes
     from stcal.sfm.make.box import faces_of, size_of
-    from stcal.sfm.make.design import MakeOptions, made_text, make_target
+    from stcal.sfm.make.design import DesignOptions, made_text
+    from stcal.sfm.make.target import design_tag_body, design_target
     from stcal.sfm.planning.file import plan_text
-    from stcal.sfm.planning.noise import expected_noise
-    from stcal.sfm.planning.session import PlanOptions, plan
+    from stcal.sfm.planning.session import PlanOptions
+    from stcal.synthetic.designs import made_text as body_text
+    from stcal.synthetic.designs import width_of
 
-    target_file, board_file = folder / TARGET, folder / BOARD
-    if os.path.lexists(target_file):
-        raise InputError("E-OUTPUT-EXISTS", f"{target_file}: exists; move it away, or give another folder")
-    if tags is not None:
-        if unfit := [
-            name
-            for name, given in {
-                "--faces": faces,
-                "--circles": circles != CIRCLES,
-                "--radius-mm": radius,
-                "--bright": bright,
-            }.items()
-            if given
-        ]:
-            raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of circles, not of --tags; leave it out")
-        model = read_camera(camera) if camera else None
-        planned = PlanOptions(images=images, distance_mm=distance, width=width, camera=model, seed=seed)
-        say(_tag_body(target_file, tags, size, (dictionary, first_id), planned))
-        return
-    if unfit := [
-        name for name, given in {"--dictionary": dictionary != DICTIONARY, "--first-id": first_id}.items() if given
-    ]:
+    of_circles = {"--faces": faces, "--circles": circles != CIRCLES, "--radius-mm": radius, "--bright": bright}
+    of_tags = {"--dictionary": dictionary != DICTIONARY, "--first-id": first_id}
+    if tags is not None and (unfit := [name for name, given in of_circles.items() if given]):
+        raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of circles, not of --tags; leave it out")
+    if tags is None and (unfit := [name for name, given in of_tags.items() if given]):
         raise InputError("E-OPTION-CONFLICT", f"{unfit[0]}: of tags, and there are none without --tags; add it")
-    board = load_board(board_file) if os.path.lexists(board_file) else None
     model = read_camera(camera) if camera else None
-    polarity = "bright" if bright else "dark"
-    options = MakeOptions(size_of(size), circles, radius, distance, width, model, polarity, seed, faces_of(faces))
-    with StageProgress() as progress:
-        product = make_target(options, partial(progress, "hide"))
-    target = product.pattern.target
-    noise, source = expected_noise()
-    planned = PlanOptions(images=images, distance_mm=distance, width=width, camera=model, noise=noise, seed=seed)
-    forecast = plan(planned, target, board or product.board, target.rough_poses())
-    save_design(target_file, target)
-    print_each("note", likeness_notes(target))
-    say(f"{made_text(product)}\n{target_file}")
-    if board is None:
-        save_design(board_file, product.board)
-        say(board_file)
-    say(f"\n{plan_text(forecast, source)}")
-
-
-def _tag_body(path: Path, kind: TagBody, size: str, tags: "tuple[str, int]", planned: "PlanOptions") -> str:
-    """Writes the file of a cube or dodecahedron of tags, and returns what it is and the forecast of its σ."""
-    from stcal.boards.target import save_body
-    from stcal.sfm.planning.bodies import plan_body
-    from stcal.sfm.planning.file import plan_text
-    from stcal.sfm.planning.noise import expected_noise
-    from stcal.synthetic.designs import made_text, tag_body
-
-    target = tag_body(kind, size, *tags)
-    noise, source = expected_noise(of_corners=True)
-    try:
-        forecast = plan_body(replace(planned, noise=noise), target, target.rough_poses())
-    except InputError as error:
-        if error.code != "E-PLAN-UNLINKED":
-            raise
-        save_body(path, target)
-        return f"{path}\nno forecast: {error}, --images {2 * planned.images} say"
-    save_body(path, target)
-    return f"{made_text(target, forecast.setup.camera, planned.distance_mm)}\n{path}\n\n{plan_text(forecast, source)}"
+    if tags is not None:
+        session = PlanOptions(images=images, distance_mm=distance, width=width, camera=model, seed=seed)
+        made = design_tag_body(tags, width_of(size), dictionary, first_id, session, folder)
+    else:
+        polarity = "bright" if bright else "dark"
+        sides, names = size_of(size), faces_of(faces)
+        options = DesignOptions(sides, circles, radius, distance, width, model, polarity, seed, names)
+        with StageProgress() as progress:
+            made = design_target(options, images, folder, progress)
+    if made.made is not None:
+        print_each("note", likeness_notes(made.target))
+        say(made_text(made.made))
+    elif made.forecast is not None:
+        say(body_text(made.target, made.forecast.setup.camera, distance))
+    for path in made.files:
+        say(path)
+    if made.forecast is not None:
+        say(f"\n{plan_text(made.forecast, made.source)}")
+    else:
+        say(f"no forecast: {made.reason}, --images {2 * images} say")

@@ -147,40 +147,20 @@ def detect(
 ) -> None:
     """Detect circles alone: detections.csv and an overlay picture of every image."""
     shared.load_ahead(workers)
-    from stcal.boards.file import run_board_of as board_of
-    from stcal.boards.target import body_of
-    from stcal.io.cameras.read import read_camera
-    from stcal.io.images import chosen_images
-    from stcal.sfm import pipeline
+    from stcal.sfm.pipeline import detect_images
     from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.text import detection_text
-    from stcal.sfm.runs.transaction import MarkerFile, run_folder
 
-    target_design = body_of(target)
-    board_design = None if board is None and target_design.has_scale else board_of(board)
     options = RunOptions(
         solve=solve,
         ellipses=shared.ellipse_options(min_diameter, max_diameter),
         workers=workers,
         exclude=tuple(exclude or ()),
     )
-    if (out / "faces.json").exists():
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
-        )
-    files = chosen_images(images, options.exclude)
-    model = None if camera is None else read_camera(camera)
-    inputs = {"images": images, "--camera": camera, "--target": target, "--board": board}
-    with (
-        shared.designs_told(target, board),
-        shared.handed_over(scheduler, send_images),
-        run_folder(out, MarkerFile.of(images, None), inputs) as folder,
-        StageProgress() as progress,
-    ):
-        found = pipeline.detect(files, model, folder, target_design, board_design, options, progress)
-    detection, labelled, notes = found
-    print_each("note", notes)
-    say(detection_text(detection, labelled))
+    with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as progress:
+        found = detect_images(images, camera, out, target, board, options, progress)
+    print_each("note", found.notes)
+    say(detection_text(found.detection, found.labelled))
     say(f"detections: {out / 'detections.csv'}\noverlays:   {out / 'overlays'}")
 
 

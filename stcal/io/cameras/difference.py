@@ -1,15 +1,20 @@
 """Difference between two cameras, and the fit of a supported camera model to a lens of another model."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
 from stcal.geometry.align import align_rigid
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import FISHEYE, WIDEST_RAD, Camera, intrinsic_basis, parameter_names
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.foreign import ForeignLens
+from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
+from stcal.io.cameras.read import read_lens, sized_camera
 
 CELLS = 24
 """Number of grid points along the shorter side of the image."""
@@ -79,14 +84,29 @@ class SizedLens:
         return self.lens.determined(pixels)
 
 
-def camera_difference(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraDifference:
-    """Return the difference between two cameras over the image.
+@require_arguments
+def compare_cameras(one: Camera | SizedLens, two: Camera | SizedLens) -> CameraDifference:
+    """Return how many pixels apart two cameras see the same ray, after the turn that brings them nearest.
 
     Images that differ by a rotation of the camera count as equal: it acts like a shift of the principal point.
 
-    ``one``, ``two`` : cameras of the same image size. Of a lens with a region only this is compared.
+    Parameters
+    ----------
+    one, two : Camera
+        Cameras of the same image size. Of a lens with a region only this is compared.
 
-    Raises InputError: the image sizes differ. Raises DegenerateError: too few pixels have a ray in both cameras.
+    Returns
+    -------
+    CameraDifference
+        ``pixels`` (r, c, 2) of the first camera and offsets ``apart`` (r, c, 2) of the second, px;
+        ``second_from_first``, the turn.
+
+    Raises
+    ------
+    InputError
+        The image sizes differ.
+    DegenerateError
+        Too few pixels have a ray in both cameras.
     """
     if (one.width, one.height) != (two.width, two.height):
         raise InputError(
@@ -175,6 +195,63 @@ class FittedLens:
     most_px: float
     share: float
     camera_from_lens: Rigid = field(default_factory=lambda: Rigid())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadedLens:
+    """The lens of a file.
+
+    ``lens`` : the camera, or a lens of another model over its image, as :func:`compare_cameras` takes it; ``told`` :
+    what a photograph's EXIF says of it, empty for a camera file.
+    """
+
+    lens: Camera | SizedLens
+    told: str = ""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera; of a lens of another model the one that was fitted to it."""
+        return self.lens.near.camera if isinstance(self.lens, SizedLens) else self.lens
+
+    @property
+    def fitted(self) -> "FittedLens | None":
+        """Quality of the fit, None where the file's model is supported."""
+        return self.lens.near if isinstance(self.lens, SizedLens) else None
+
+
+@require_arguments
+def load_lens(path: str | Path, name: str = "", size: tuple[int, int] | None = None) -> LoadedLens:
+    """Load a camera from a file also of a model that is not supported, to which one is fitted, or from EXIF.
+
+    Parameters
+    ----------
+    path : str or Path
+        Camera file as of :func:`stcal.load_camera`, of any model, or a photograph.
+    name : str
+        Name of the camera in a file of several, such as ``cam1``.
+    size : (int, int), optional
+        Width and height of the images, px, for a file that does not state them.
+
+    Returns
+    -------
+    LoadedLens
+        ``camera``, with the residuals ``fitted`` of a lens of another model, px.
+
+    Raises
+    ------
+    InputError
+        The file is missing or malformed, holds more than one camera, or no size is known.
+    ConvergenceError, DegenerateError
+        No supported model comes near the lens.
+    """
+    if is_photograph(path):
+        found = camera_of_photograph(path)
+        return LoadedLens(found.camera, found.told)
+    lens, (across, up) = read_lens(path, name), size or (0, 0)
+    width, height = lens.width or across, lens.height or up
+    if isinstance(lens, CameraModel) or not (width and height):
+        return LoadedLens(sized_camera(lens, path, (width, height)))
+    return LoadedLens(SizedLens(lens, width, height, fit_lens(lens, width, height)))
 
 
 def fit_lens(lens: ForeignLens, width: int, height: int) -> FittedLens:

@@ -79,10 +79,26 @@ CAPTURED = "capture.json"
 """Name of the file that ``capture`` writes beside the images of a scene."""
 
 
+@require_arguments
 def exposure_times(shortest: float, longest: float, count: int) -> np.ndarray:
-    """Returns ``count`` exposure times from ``shortest`` to ``longest`` in a geometric series, in their unit.
+    """Returns exposure times in a geometric series.
 
-    Raises InputError: times are not positive or not in order, or ``count`` does not fit them.
+    Parameters
+    ----------
+    shortest, longest : float
+        First and last exposure time, in any unit.
+    count : int
+        Number of exposure times.
+
+    Returns
+    -------
+    (count,) array
+        In the unit of the arguments.
+
+    Raises
+    ------
+    InputError
+        Times are not positive or not in order, or ``count`` does not fit them.
     """
     if not (0 < shortest <= longest < np.inf) or count < 1 or (count == 1 and shortest < longest):
         raise InputError(
@@ -177,21 +193,6 @@ class CaptureFile(ResultFile):
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Settings of a capture.
-
-    ``gain`` : gain to set, None to leave it; ``settle_s`` : time to wait after each change of exposure, s.
-    """
-
-    gain: float | None = None
-    settle_s: float = 0.3
-
-    def __post_init__(self):
-        if not 0 <= self.settle_s <= 60:
-            raise InputError("E-OPTION-RANGE", f"--settle-s {self.settle_s:g}: 0 to 60 s needed")
-
-
 def scene_folder(out: Path, scene: str) -> Path:
     """Returns the path of a new folder for a scene.
 
@@ -203,35 +204,50 @@ def scene_folder(out: Path, scene: str) -> Path:
     return folder
 
 
+@require_arguments
 def capture(
     source: Source,
     exposures: Sequence[float],
-    folder: Path,
-    settings: Settings,
+    folder: str | Path,
+    gain: float | None = None,
+    settle_s: float = 0.3,
     taken: Callable[[CapturedRow], None] | None = None,
 ) -> CaptureFile:
     """Takes an exposure series and writes ``<folder>/<exposure>.png`` and ``capture.json`` with the settings used.
 
     Parameters
     ----------
-    source : the camera
-    exposures : exposures in the unit of the camera's driver, from :func:`~stcal.locate.data.exposures.exposure_times`
-    folder : folder of the scene. It is created and written only after all images are taken.
-    settings : gain and settle time
-    taken : called with the row of each image
+    source : OpenCVSource or SimulatedSource
+        The camera; or anything else with a ``name`` and their methods.
+    exposures : sequence of float
+        Exposures in the unit of the camera's driver, as of :func:`stcal.locate.exposure_times`.
+    folder : str or Path
+        New folder of the scene. It is written only after all images are taken.
+    gain : float, optional
+        Gain that ``source`` was told, for ``capture.json``.
+    settle_s : float
+        Time that the camera is given after each change of exposure, s.
+    taken : callable, optional
+        Called with the row of each image.
 
     Returns
     -------
     CaptureFile
+        The exposures asked for and those set, and shares of saturated and dark pixels.
 
     Raises
     ------
     InputError
-        The camera refuses an exposure, or gives no image.
+        The camera refuses an exposure or gives no image, an exposure comes twice, or the folder exists.
     """
+    folder = Path(folder)
+    if not 0 <= settle_s <= 60:
+        raise InputError("E-OPTION-RANGE", f"--settle-s {settle_s:g}: 0 to 60 s needed")
+    if folder.exists():
+        raise InputError("E-OUTPUT-EXISTS", f"{folder}: exists; give another --scene")
     rows, images = [], []
     for exposure in exposures:
-        image, exposure_set = source.expose(float(exposure), settings.settle_s)
+        image, exposure_set = source.expose(float(exposure), settle_s)
         row = CapturedRow(
             image=f"{exposure:.6g}.png",
             exposure=float(exposure),
@@ -251,8 +267,8 @@ def capture(
         format="stcal capture 1",
         version=stcal.__version__,
         camera=source.name,
-        gain=settings.gain,
-        settle_s=settings.settle_s,
+        gain=gain,
+        settle_s=settle_s,
         exposures=rows,
     )
     folder.mkdir(parents=True)

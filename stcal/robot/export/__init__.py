@@ -9,6 +9,7 @@ import numpy as np
 
 import stcal
 from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.poses.columns import ascii_text, program_name
 from stcal.io.poses.controllers import MM_DIGITS, YASKAWA_MM_DIGITS
@@ -42,33 +43,47 @@ def require_form(form: str) -> None:
         raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
 
 
-def exported(
+@require_arguments
+def robot_program(
     result: Compensated,
     robot: Robot,
     form: str,
-    path: Path,
+    path: str | Path,
     wanted: As = "joints",
     pulses_per_deg: Sequence[float] | None = None,
 ) -> Exported:
-    """Returns the points that are reached, as a controller reads them.
+    """Returns the points that are reached as a file of a controller; nothing is written.
 
     Parameters
     ----------
-    result : compensated
-    robot : the robot whose joint values these are
-    form : one of :data:`~stcal.robot.export.files.FORMS`
-    path : the file. Controllers have its name, without its ending, inside the file too.
-    wanted : {"joints", "poses"}: joint values, or the poses that must be commanded to the controller, which knows the
-        nominal robot
-    pulses_per_deg : pulses per degree of each joint, for Yaskawa's joint values; without them its file has poses
+    result : Compensated
+        Joint values of :func:`stcal.robot.compensate`.
+    robot : Robot
+        The robot whose joint values these are.
+    form : {"yaskawa", "fanuc", "kuka", "abb", "ur"}
+        The controller.
+    path : str or Path
+        The file. Controllers have its name, without its ending, inside the file too.
+    wanted : {"joints", "poses"}
+        Joint values, or the poses that must be commanded to the controller, which knows the nominal robot.
+    pulses_per_deg : sequence of float, optional
+        Pulses per degree of each joint, for Yaskawa's joint values; without them its file has poses.
+
+    Returns
+    -------
+    Exported
+        ``text`` of the file, and ``notes`` on what it holds and lacks.
 
     Raises
     ------
     InputError
         An unknown form, no row that is reached, joints for which the controller has no place, poses without a nominal
         robot or of several tools, or a wrong number of pulses.
+    StcalError
+        The file does not give the points back.
     """
     require_form(form)
+    path = Path(path)
     where, controller = f"--export {form}={path}", FORMS[form]
     rows = np.flatnonzero(result.found.usable)
     if not len(rows):

@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -11,11 +12,14 @@ from pydantic import ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid
+from stcal.io.files import SETTINGS_BYTES, read_bytes, text_of
 from stcal.io.plain_yaml import load_yaml
 from stcal.io.poses.controllers import METRE_MM, from_roll_pitch_yaw
 from stcal.io.toml import Strict, validated
 from stcal.robot.kinematics.dh import robot_between
+from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.forward import fixed_values, forward
 from stcal.robot.kinematics.model import Convention, DHRow, Joint, Robot
 from stcal.robot.urdf.read import UrdfJoint, require_near, robot_of
@@ -23,6 +27,8 @@ from stcal.robot.urdf.read import UrdfJoint, require_near, robot_of
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 JOINTS = 6
 NAME = "ur"
+LEAST_OFF_MM = 1e-3
+"""A micrometre: what angles of few digits round off."""
 DELTAS = ("theta", "a", "d", "alpha")
 _LIST = re.compile(r"^\s*(?P<key>\w+)\s*=\s*\[(?P<values>[^\]]*)\]", re.MULTILINE)
 Number = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
@@ -154,3 +160,69 @@ def _six(lists: Mapping[str, str], key: str, where: str) -> np.ndarray:
     if values.shape != (JOINTS,) or not np.isfinite(values).all():
         raise InputError("E-ROBOT-ENTRIES", f"{where}: {key}: a list of six numbers needed; give the controller's file")
     return values
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UniversalRobot:
+    """An arm of Universal Robots: ``robot``, and ``notes`` on how its file was read."""
+
+    robot: Robot
+    notes: tuple[str, ...]
+
+
+@require_arguments
+def load_universal(
+    path: str | Path, nominal: Robot | str | Path | None = None, convention: Convention = "standard"
+) -> UniversalRobot:
+    """Returns the calibrated arm of Universal Robots of a file of ur_calibration (YAML), or of calibration.conf.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    nominal : Robot or path, optional
+        The arm to whose rows the deviations of a calibration.conf are added, if that does not state it.
+    convention : {"standard", "modified"}
+        Convention of the rows of Denavit and Hartenberg.
+
+    Returns
+    -------
+    UniversalRobot
+        ``robot``, mm and rad, from the controller's base.
+
+    Raises
+    ------
+    InputError
+        Another file, a value that is missing or no number, or ``nominal`` does not fit or is not needed.
+    """
+    found = read_universal(Path(path), nominal, convention)
+    if found is None:
+        raise InputError(
+            "E-ROBOT-FORM",
+            f"robot {path}: no calibration of Universal Robots; ur_calibration's YAML needed, or its calibration.conf",
+        )
+    return found
+
+
+def read_universal(path: Path, nominal: Robot | str | Path | None, convention: Convention) -> UniversalRobot | None:
+    """Returns what :func:`load_universal` does, None for any other file."""
+    try:
+        text = text_of(read_bytes(path, SETTINGS_BYTES))
+    except OSError as error:
+        raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error
+    except UnicodeDecodeError:
+        return None
+    if is_conf(text):
+        drawn = nominal if nominal is None or isinstance(nominal, Robot) else load_robot(nominal)
+        return UniversalRobot(robot_of_conf(text, str(path), drawn, convention), ())
+    content = kinematics_content(text)
+    if content is None:
+        return None
+    if nominal is not None:
+        raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
+    robot, off_mm = robot_of_kinematics(content, str(path), convention)
+    said = (
+        "angles are read about turned axes, as ur_calibration computes them and the controller moves; a URDF with the "
+        f"same numbers takes them about fixed ones, and its flange is {off_mm:.2g} mm off at joint values of 0"
+    )
+    return UniversalRobot(robot, (said,) if off_mm >= LEAST_OFF_MM else ())

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.stats import t as t_distribution
 
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid, skew
 from stcal.geometry.robust import length_limit, robust_sigma
 from stcal.robot.identification.adjustment import Weighting
@@ -137,15 +138,18 @@ class Evaluation:
         return int(self.seen.data.lines[self.seen.first[row]])
 
 
+@require_arguments
 def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "base-tool") -> Evaluation:
     """Returns the errors of robots at measurements, with base and tools fitted or not.
 
     Parameters
     ----------
-    robots : by the names that they are to have; mm, rad
-    data : joint values with what was measured there, in the instrument's frame
-    refit : {"none", "base", "tool", "base-tool"}: what is fitted by least squares with each robot's own axes; the rest
-        is as its file has it
+    robots : dict of Robot
+        Robots by the names that they are to have; mm, rad.
+    data : Measurements
+        Joint values with what was measured there, in the instrument's frame.
+    refit : {"none", "base", "tool", "base-tool"}
+        What is fitted by least squares with each robot's own axes; the rest is as its file has it.
 
     Returns
     -------

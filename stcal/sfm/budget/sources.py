@@ -1,6 +1,6 @@
 """Sources of uncertainty of a budget, and the conditions stated for them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
@@ -56,13 +56,13 @@ class Statement:
     fields: dict[str, str]
 
 
-def statement_of(own: StatedSize, path: Path | None = None, given: Sequence[str] = ()) -> Statement:
-    """Returns the statement of a run. The file overrides ``board.toml``, and NAME=VALUE overrides fields of the file.
+def statement_of(own: StatedSize, path: Path | None = None, given: Mapping[str, str] | None = None) -> Statement:
+    """Returns the statement of a run. The file overrides ``board.toml``, and ``given`` overrides fields of the file.
 
-    ``own`` : sizes that the run's ``board.toml`` states; ``path`` : file of ``--statement``; ``given`` : fields of
-    ``--field``, NAME=VALUE.
+    ``own`` : sizes that the run's ``board.toml`` states; ``path`` : file of ``--statement``; ``given`` : fields by
+    name.
 
-    Raises InputError if the file is not a statement, or a field has no ``=`` or is given twice.
+    Raises InputError if the file is not a statement, or a field is too long.
     """
     file = load_toml(path, StatementFile, "statement", "give a TOML file") if path else StatementFile()
     sizes, origin = {}, {}
@@ -74,12 +74,21 @@ def statement_of(own: StatedSize, path: Path | None = None, given: Sequence[str]
             if values[key] is None:
                 values[key], origin[body, key] = getattr(first, key), "board.toml"
         sizes[body] = StatedSize(**values)
-    named = dict.fromkeys(FIELDS, "") | file.fields | fields_of(given)
+    for name, value in (given or {}).items():
+        if not name or len(name) > 60 or len(value) > LONGEST:
+            raise InputError(
+                "E-OPTION-VALUE",
+                f"--field {name[:20]}: {len(f'{name}={value}')} characters; up to 60 for a name, {LONGEST} for a value",
+            )
+    named = dict.fromkeys(FIELDS, "") | file.fields | dict(given or {})
     return Statement(sizes["board"], sizes["target"], origin, named)
 
 
 def fields_of(given: Sequence[str]) -> dict[str, str]:
-    """Parses ``NAME=VALUE`` into a dictionary. Errors are those of :func:`statement_of`."""
+    """Parses ``NAME=VALUE`` into a dictionary.
+
+    Raises InputError if a text has no ``=``, or a name is given twice.
+    """
     values: dict[str, str] = {}
     for text in given:
         name, sign, value = (word.strip() for word in text.partition("="))
@@ -87,11 +96,6 @@ def fields_of(given: Sequence[str]) -> dict[str, str]:
             raise InputError("E-OPTION-VALUE", f"--field {text!r}: NAME=VALUE needed, such as operator='A. Smith'")
         if name in values:
             raise InputError("E-OPTION-REPEATED", f"--field {name}: given twice; give it once")
-        if len(name) > 60 or len(value) > LONGEST:
-            raise InputError(
-                "E-OPTION-VALUE",
-                f"--field {name[:20]}: {len(text)} characters; up to 60 for a name, {LONGEST} for a value",
-            )
         values[name] = value
     return values
 

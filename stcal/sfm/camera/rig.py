@@ -249,7 +249,7 @@ class RigCalibration:
 
 
 @one_thread()
-def calibrate_rig(cameras: Mapping[str, CameraCalibration], board: BoardDesign, unique: bool = False) -> RigCalibration:
+def rig_of(cameras: Mapping[str, CameraCalibration], board: BoardDesign, unique: bool = False) -> RigCalibration:
     """Adjusts the cameras of one rig together.
 
     Parameters

@@ -1,6 +1,6 @@
 """Why circles, faces or images of a run are missing."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,11 +10,12 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.align import align_rigid
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import IMAGE_BYTES, read_bytes
 from stcal.io.images import decode
-from stcal.parallel import run_in_order
+from stcal.parallel import Progress, run_in_order
 from stcal.sfm.data.model import MIN_POINTS, ImageObservations, MetricModel
 from stcal.sfm.data.patterns import Pattern, ideal_border, in_view, patterns_of
 from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -23,7 +24,7 @@ from stcal.sfm.diagnose.examine import CircleVerdict, Expected, OptionTrial, by_
 from stcal.sfm.diagnose.findings import WHOLE_PATTERN, Diagnosis, Finding, advice, in_order
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import read_model
-from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 
 MIN_MAPPED = 3
 """Least number of mapped circles that place the others of their plane."""
@@ -77,20 +78,39 @@ MIN_VIEWS = 2
 NOTHING_KNOWN = "is it sharp and well lit? "
 
 
-def diagnose(
-    run: SavedRun,
-    images: Path | None = None,
+@require_arguments
+def doctor(
+    run: AnyRun,
+    images: str | Path | None = None,
     workers: int | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Diagnosis:
-    """Finds what a run left out, and why.
+    """Finds every image and circle that a run left out, and why.
 
-    ``images`` : the folder of photographs, if it has moved since the run; ``progress`` : called with (stage, done,
-    total).
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    images : str or Path, optional
+        Folder of the photographs, if it has moved since the run.
+    workers : int, optional
+        Number of processes; one per core if None.
+    progress : callable, optional
+        Called with (stage, done, total).
 
-    Raises InputError if the run is damaged or of another version, or the folder of photographs does not exist.
+    Returns
+    -------
+    Diagnosis
+        ``findings``, the most useful to know first: what was left out, the threshold that stopped it, its value, and
+        what would let it in.
+
+    Raises
+    ------
+    InputError
+        The run is damaged or of another version, or the folder of photographs does not exist.
     """
-    if images is not None and not images.is_dir():
+    run = saved_run(run)
+    if images is not None and not Path(images).is_dir():
         raise InputError(
             "E-IMAGES-FOLDER", f"image folder {images}: not a folder; give the folder of the run's images with --images"
         )
@@ -102,7 +122,7 @@ def diagnose(
         files, circles = run.report["summary"]["files"], run.faces.circles
     except (KeyError, TypeError) as error:
         raise InputError("E-RUN-VERSION", f"run {run.folder}: of another version ({error}); run it again") from error
-    jobs = _jobs(run, images or run.images, models, circles)
+    jobs = _jobs(run, Path(images or run.images), models, circles)
     examined = run_in_order(_examine, [(job,) for job in jobs], workers, progress and partial(progress, "examine"))
     options = _try_options(run, jobs, examined, workers, progress)
     for job, (verdicts, problem) in zip(jobs, examined, strict=True):

@@ -1,17 +1,16 @@
 """Cross-check against the native COLMAP: same database, same initial pairs, same thresholds; result file and text."""
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from stcal.errors import InputError, MappingError
 from stcal.geometry.align import align_similarity
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.io.json import Part, ResultFile, read_json
+from stcal.io.json import read_json
 from stcal.parallel import Progress
 from stcal.report.text import number, text_table
 from stcal.sfm.adjust.calibration import Calibration, calibrate, on_luminous_surface, with_sigma
@@ -19,10 +18,10 @@ from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.network import free_network
 from stcal.sfm.adjust.refine import refine
 from stcal.sfm.interop.export import FORMS, ExportedRun
-from stcal.sfm.interop.export_database import Exported, export_database
+from stcal.sfm.interop.export_database import Exported, copy_database
 from stcal.sfm.interop.export_model import ExportedModel
 from stcal.sfm.interop.external import faces_from_models
-from stcal.sfm.interop.gates import MIN_INLIERS, Gate, GateVerdict, PairGates
+from stcal.sfm.interop.gates import MIN_INLIERS
 from stcal.sfm.interop.native import NativeColmap, find_colmap, map_natively, require_listable
 from stcal.sfm.interop.schema import schema_of_version
 from stcal.sfm.mapping.colmap import pycolmap
@@ -49,8 +48,7 @@ from stcal.sfm.runs.crosscheck import (
     allowed_text,
 )
 from stcal.sfm.runs.folder import require_report, write_report
-from stcal.sfm.runs.report import Number, PairRow
-from stcal.sfm.runs.saved import AGAIN, SavedRun
+from stcal.sfm.runs.saved import AGAIN, AnyRun, SavedRun, saved_run
 from stcal.sfm.runs.transaction import added_results
 
 MICRO = 1e3
@@ -65,37 +63,65 @@ RENAMED = {
 """Names of thresholds in older versions, and in pycolmap."""
 
 
-def crosscheck_run(
-    saved: SavedRun, colmap: Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress | None = None
+@require_arguments
+def crosscheck(
+    run: AnyRun,
+    colmap: str | Path | None = None,
+    tolerances: Tolerances = TOLERANCES,
+    timeout_s: float = 600.0,
+    progress: Progress | None = None,
+    into_report: bool = False,
 ) -> Crosscheck:
-    """Cross-checks a finished run with the native COLMAP and adds the comparison to its report.
+    """Maps the database of a run with the native COLMAP, and compares faces, circles and cameras.
 
-    Nothing else is written to the run's folder meanwhile.
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    colmap : str or Path, optional
+        The native program; ``colmap`` on the PATH if None.
+    tolerances : Tolerances
+        Largest differences that are accepted.
+    timeout_s : float
+        Time for one group after which the native mapper is stopped, s.
+    progress : callable, optional
+        Called with (stage, done, total).
+    into_report : bool
+        Whether the comparison is added to ``report.json`` and ``report.html`` in the run's folder; else nothing is
+        written.
+
+    Returns
+    -------
+    Crosscheck
+        ``differences`` beyond the tolerances, in words; those of ``mapping``, between the two programs, and of
+        ``result``, from the native models against the run; µm, millidegrees and σ.
+
+    Raises
+    ------
+    InputError
+        There is no native program, or no schema of its version is known; it cannot list a name; the database is not the
+        run's; or other results took the run's place meanwhile.
+    MappingError
+        The native program fails or hangs, or makes no model of a group, or one of another database.
     """
+    saved = saved_run(run)
+    if not into_report:
+        return _compared(saved, colmap, tolerances, timeout_s, progress)
     require_report(saved)  # before minutes of mapping
     with added_results(saved.folder) as stage:
         if read_json(saved.folder / "report.json", "", AGAIN) != saved.report:
             raise InputError(
                 "E-RUN-REPLACED", f"run {saved.folder}: other results took their place meanwhile; cross-check it again"
             )
-        check = crosscheck(saved, colmap, tolerances, timeout_s, progress)
+        check = _compared(saved, colmap, tolerances, timeout_s, progress)
         write_report(stage, judged(saved.report | {"crosscheck": check.model_dump()}), saved.folder)
     return check
 
 
-def crosscheck(
-    run: SavedRun,
-    colmap: Path | None = None,
-    tolerances: Tolerances = TOLERANCES,
-    timeout_s: float = 600.0,
-    progress: Callable[[str, int, int], None] | None = None,
+def _compared(
+    run: SavedRun, colmap: str | Path | None, tolerances: Tolerances, timeout_s: float, progress: Progress | None
 ) -> Crosscheck:
-    """Maps the run's database with the native program and returns the comparison, ``crosscheck`` of ``report.json``.
-
-    Raises InputError if there is no native program or no schema of its version is known, it cannot list a name, or the
-    database is not the run's. Raises MappingError if the native program fails, hangs, makes no model of a group, or
-    makes a model of another database.
-    """
+    """Returns the comparison, ``crosscheck`` of ``report.json``."""
     progress = progress or (lambda *_: None)
     native = find_colmap(colmap)
     schema = schema_of_version(native.version)
@@ -105,8 +131,8 @@ def crosscheck(
     groups = run.groups()
     with tempfile.TemporaryDirectory(prefix="stcal-crosscheck-") as scratch:
         folder = Path(scratch)
-        export_database(run.database, folder / "native.db", schema, run)
-        export_database(run.database, folder / "ours.db", "4.2", run)
+        copy_database(run.database, folder / "native.db", schema, run)
+        copy_database(run.database, folder / "ours.db", "4.2", run)
         for index, (name, group) in enumerate(groups.items()):
             progress("crosscheck", index, len(groups))
             names = [image.name for image in group]
@@ -452,86 +478,6 @@ def _exceeded(row: FaceDifference, tolerances: Tolerances, sigma: float) -> list
         (row.sigmas, sigma, "σ"),
     )
     return [f"{limit:g} {unit}" for v, limit, unit in limits if v is not None and limit is not None and v > limit]
-
-
-class GateRow(Part):
-    gate: str
-    value: Number | str
-    limit: Number | None
-    passed: bool
-
-
-class GatesRow(Part):
-    relaxations: int | None
-    gates: list[GateRow]
-
-
-class RankedPair(PairRow):
-    ranking: list[GateRow] = Field(
-        description="our own gates: `labels`, `min_angle_deg`, `in_front`, `max_angle_deg`; only the first where it "
-        "fails: `gate`, `value`, `limit`, `passed`"
-    )
-    as_set: GatesRow = Field(
-        description="COLMAP with the options of `run`. `relaxations`: 0: the pair passes; n: after COLMAP has halved "
-        "limits n times, in turn that of the inliers and that of the angle, which it does up to twice each while "
-        "images stay out; null: never. `gates`: `gate`, `value`, `limit`, `passed`, at the limits not yet relaxed"
-    )
-    defaults: GatesRow = Field(
-        description="COLMAP with its own options: `relaxations` and `gates` with `gate`, `value`, `limit`, `passed`"
-    )
-
-
-class GroupOfPairs(Part):
-    name: str
-    pairs: list[RankedPair] = Field(
-        description="as in `report.json`: `first`, `second`, `shared`, `median_angle_deg`, `in_front`, `forward`, "
-        "`verdict`; with"
-    )
-
-
-class PairsFile(ResultFile):
-    """The JSON file of ``pairs``."""
-
-    format: Literal["stcal pairs 1"] = Field(description="the file's form and its version")
-    groups: list[GroupOfPairs] = Field(description="`name` of the group, and its pairs")
-
-    @classmethod
-    def of(cls, groups: Mapping[str, Sequence[PairGates]]) -> "PairsFile":
-        """Returns the file of the ranked pairs, by group."""
-        rows = [GroupOfPairs(name=name, pairs=[_pair(pair) for pair in ranked]) for name, ranked in groups.items()]
-        return cls(format="stcal pairs 1", groups=rows)
-
-
-def _pair(row: PairGates) -> RankedPair:
-    score = row.score
-    return RankedPair(
-        first=score.first,
-        second=score.second,
-        shared=score.shared,
-        median_angle_deg=_degrees(score.median_angle_rad),
-        in_front=score.in_front,
-        forward=score.forward,
-        verdict=score.verdict,
-        ranking=[_gate(gate) for gate in row.own],
-        as_set=_gates(row.as_set),
-        defaults=_gates(row.defaults),
-    )
-
-
-def _gates(verdict: GateVerdict) -> GatesRow:
-    return GatesRow(relaxations=verdict.relaxations, gates=[_gate(gate) for gate in verdict.gates])
-
-
-def _gate(gate: Gate) -> GateRow:
-    if not gate.name.endswith("angle") or isinstance(gate.value, str) or gate.limit is None:
-        return GateRow(gate=gate.name, value=gate.value, limit=gate.limit, passed=gate.passed)
-    value, limit = _degrees(gate.value), _degrees(gate.limit)
-    return GateRow(gate=f"{gate.name}_deg", value=value, limit=limit, passed=gate.passed)
-
-
-def _degrees(angle_rad: float) -> float:
-    """Returns the angle in degrees, rounded to 9 digits, so that a limit reads as it was given."""
-    return round(float(np.degrees(angle_rad)), 9)
 
 
 def database_text(written: Exported) -> str:

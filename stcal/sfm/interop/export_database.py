@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import require_arguments
 from stcal.io.images import name_fault
 from stcal.sfm.interop.schema import SCHEMAS, SOURCE, Column, Index, Reference, Schema, SchemaTable, find_schema
 from stcal.sfm.mapping.database import colmap_camera, from_colmap_px, image_ids, match_labels
 from stcal.sfm.mapping.models import KEYPOINT_TOLERANCE_PX, parameter_count
 from stcal.sfm.mapping.pairs import image_graph, kind_of_graph
-from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 
 PAIR_BASE = 2**31 - 1
 """Factor of the smaller image id in a pair's id, to which the larger one is added (COLMAP's ``kMaxNumImages``)."""
@@ -212,7 +213,37 @@ class Exported:
     camera_models: tuple[str, ...]
 
 
-def export_database(database: Path, out: Path, schema: str, run: SavedRun | None = None) -> Exported:
+@require_arguments
+def export_database(run: AnyRun, out: str | Path, schema: str) -> Exported:
+    """Copies the database of a run for another version of COLMAP; ids, orders and values stay.
+
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    out : str or Path
+        New file; it appears complete and checked, or not at all.
+    schema : str
+        Version of COLMAP that is to open it: ``3.8`` to ``4.2``.
+
+    Returns
+    -------
+    Exported
+        ``path``, name of the ``schema``, and counts of ``images`` and ``pairs``.
+
+    Raises
+    ------
+    InputError
+        The schema is unknown; ``out`` exists or cannot be written; the database is in use, damaged, of another version
+        or not as the run left it; or it holds something that has no place in the schema.
+    StcalError
+        The written copy differs from the database or the schema.
+    """
+    run = saved_run(run)
+    return copy_database(run.database, Path(out), schema, run)
+
+
+def copy_database(database: Path, out: Path, schema: str, run: SavedRun | None = None) -> Exported:
     """Writes the content of ``database`` to ``out`` in the schema of another COLMAP version.
 
     Ids, the order of keypoints, matches and pairs, and every blob stay the same. ``database`` is only read. Every blob,

@@ -12,6 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.json import Part
@@ -28,7 +29,7 @@ from stcal.sfm.mapping.models import (
     write_reconstruction,
 )
 from stcal.sfm.runs.report import CameraInSpace, ImageResiduals, ReportCamera
-from stcal.sfm.runs.saved import SavedRun, load_run
+from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 
 ROUNDING = 1e-6
 """Relative rounding error of a residual that is computed again from the model's files."""
@@ -169,27 +170,42 @@ class _Point:
     views: tuple[tuple[int, int], ...]
 
 
-def export_model(run: str | Path, out: str | Path, kind: str) -> ExportedModel:
-    """Writes a run's final model, mm, target frame, in another program's format. It appears complete or not at all.
+@require_arguments
+def export_model(run: AnyRun, out: str | Path, form: str) -> ExportedModel:
+    """Writes the final model of a run in another program's format: mm, target frame, labels beside it.
 
-    The model must agree with the report in the residual of every keypoint and the pose of every camera.
+    It appears complete or not at all. The model must agree with the report in the residual of every keypoint and the
+    pose of every camera.
 
     NVM and Bundler support one focal length, little distortion and a centred principal point. They get an ideal camera
     without distortion, and the keypoints as this camera sees them. This is exact, but photographs have to be
     undistorted to match.
 
-    ``out`` : new file or folder, or an empty folder for a format of :data:`FOLDERS`; missing parent folders are made;
-    ``kind`` : a :data:`ModelFormat`.
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    out : str or Path
+        New file for ``ply`` and ``nvm``, new or empty folder for the others; missing parent folders are made.
+    form : {"colmap-bin", "colmap-txt", "ply", "nvm", "bundler"}
+        The format.
 
-    Raises InputError if it is no finished run, its model is damaged or changed, the format is unknown, or ``out``
-    exists.
+    Returns
+    -------
+    ExportedModel
+        Paths of model and ``labels``, counts of ``images`` and ``points``, and the ideal camera of NVM and Bundler, px.
+
+    Raises
+    ------
+    InputError
+        Not a finished run, a damaged or changed model, an unknown format, or ``out`` exists.
     """
-    out = Path(out)
+    out, kind = Path(out), form
     if kind not in get_args(ModelFormat):
         raise InputError("E-OPTION-FORM", f"format {kind}: unknown; give one of {', '.join(get_args(ModelFormat))}")
     labels = out / "labels.csv" if kind in FOLDERS else out.with_name(f"{out.name}.labels.csv")
     _require_free(out, labels, kind)
-    saved = load_run(run)
+    saved = saved_run(run)
     report = saved.report_as(ReportOfModel)
     saved = replace(saved, camera=saved.adjusted_camera(report.camera))
     reconstruction, points = _labelled_points(saved)

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import InputError, MappingError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.io.files import json_text, save
 from stcal.parallel import one_thread
@@ -17,7 +18,7 @@ from stcal.sfm.adjust.options import AdjustOptions
 from stcal.sfm.data.model import WorldModel
 from stcal.sfm.mapping.database import image_ids
 from stcal.sfm.mapping.models import ReadModel, find_models, read_model
-from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 
 Chained = Literal["chain", "paper"]
 
@@ -78,12 +79,45 @@ def faces_from_models(read: Sequence[ReadModel], run: SavedRun, solve: Chained =
     return replace(calibration, notes=(*notes, *calibration.notes))
 
 
+@require_arguments
 @one_thread()
-def calibrate_models(model: Path, run: SavedRun, solve: Chained = "chain") -> Calibration:
-    """Returns scale and faces from a COLMAP model, or from the models in a folder, of the run's database."""
+def calibrate_models(
+    model: str | Path, run: AnyRun, solve: Chained = "chain", out: str | Path | None = None
+) -> Calibration:
+    """Returns scale and faces from COLMAP models of a run's database that were made or edited elsewhere.
+
+    Parameters
+    ----------
+    model : str or Path
+        A COLMAP model, or the folder of several.
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    solve : {"chain", "paper"}
+        Every way to a face weighed; or as in Zhang & Wei (2017): λ by rows, three-point frames, single transforms.
+    out : str or Path, optional
+        File for the faces, as ``faces.json``; nothing is written if None.
+
+    Returns
+    -------
+    Calibration
+        ``target`` and models in mm, target frame; ``scales`` by group; ``notes``.
+
+    Raises
+    ------
+    InputError
+        The models are not of the run's database, state different cameras, or ``out`` cannot be written.
+    ScaleError
+        The board of a group is not in its model.
+    MappingError
+        The reference face is in none of the models, or a face is not linked to it.
+    """
+    run, model = saved_run(run), Path(model)
     ids = image_ids(run.observations)
     read = [read_model(path, run.observations, ids, run.corrected_px) for path in find_models(model)]
-    return faces_from_models(read, run, solve)
+    calibration = faces_from_models(read, run, solve)
+    if out is not None:
+        write_faces(Path(out), calibration, run, solve)
+    return calibration
 
 
 def write_faces(path: Path, calibration: Calibration, run: SavedRun, solve: Chained = "chain") -> None:

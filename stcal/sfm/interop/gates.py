@@ -6,21 +6,26 @@ here, pair by pair, from the centres of the mapping.
 """
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
+from stcal.io.json import Part, ResultFile
 from stcal.sfm.data.model import ImageObservations
 from stcal.sfm.mapping.colmap import pycolmap
 from stcal.sfm.mapping.database import colmap_camera, image_ids, match_labels, to_colmap_px, write_database
 from stcal.sfm.mapping.incremental import LOG_ERRORS_ONLY, SEED, pipeline_options
 from stcal.sfm.mapping.pairs import MIN_ANGLE_RAD, MIN_IN_FRONT, MIN_LABELS, PairOptions, PairScore
-from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.report import Number, PairRow
+from stcal.sfm.runs.saved import AnyRun, SavedRun, saved_run
 
 MIN_TRIALS = 30
 """Least number of RANSAC trials for the initial pair, a constant of COLMAP and not an option."""
@@ -82,11 +87,29 @@ class _TwoViews:
     angle_rad: float
 
 
-def run_gates(run: SavedRun, group: str | None = None) -> dict[str, list[PairGates]]:
-    """Returns the gates of every ranked pair of a run or of one of its groups, by group, in the run's order.
+@require_arguments
+def initial_pairs(run: AnyRun, group: str | None = None) -> dict[str, list[PairGates]]:
+    """Returns the ranked candidates for the initial pair of each group, with every gate that they meet.
 
-    Raises InputError if there is no such group, or the report lacks its pairs.
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    group : str, optional
+        Name of one group; all groups if None.
+
+    Returns
+    -------
+    dict of list of PairGates
+        Pairs by group, the chosen one first: its ``score``, our ``own`` gates, and COLMAP's with our options
+        (``as_set``) and with its ``defaults``; angles in rad.
+
+    Raises
+    ------
+    InputError
+        The run has no such group, or its report lacks the pairs.
     """
+    run = saved_run(run)
     ranked = ranked_pairs(run)
     if group is not None and group not in ranked:
         raise InputError("E-RUN-NO-GROUP", f"group {group}: not in run {run.folder}; give one of {', '.join(ranked)}")
@@ -364,3 +387,83 @@ def _in_words(verdict: GateVerdict) -> str:
 
 def _number(name: str, value: float) -> str:
     return f"{np.degrees(value):.4g}°" if name.endswith("angle") else f"{value:.4g}"
+
+
+class GateRow(Part):
+    gate: str
+    value: Number | str
+    limit: Number | None
+    passed: bool
+
+
+class GatesRow(Part):
+    relaxations: int | None
+    gates: list[GateRow]
+
+
+class RankedPair(PairRow):
+    ranking: list[GateRow] = Field(
+        description="our own gates: `labels`, `min_angle_deg`, `in_front`, `max_angle_deg`; only the first where it "
+        "fails: `gate`, `value`, `limit`, `passed`"
+    )
+    as_set: GatesRow = Field(
+        description="COLMAP with the options of `run`. `relaxations`: 0: the pair passes; n: after COLMAP has halved "
+        "limits n times, in turn that of the inliers and that of the angle, which it does up to twice each while "
+        "images stay out; null: never. `gates`: `gate`, `value`, `limit`, `passed`, at the limits not yet relaxed"
+    )
+    defaults: GatesRow = Field(
+        description="COLMAP with its own options: `relaxations` and `gates` with `gate`, `value`, `limit`, `passed`"
+    )
+
+
+class GroupOfPairs(Part):
+    name: str
+    pairs: list[RankedPair] = Field(
+        description="as in `report.json`: `first`, `second`, `shared`, `median_angle_deg`, `in_front`, `forward`, "
+        "`verdict`; with"
+    )
+
+
+class PairsFile(ResultFile):
+    """The JSON file of ``pairs``."""
+
+    format: Literal["stcal pairs 1"] = Field(description="the file's form and its version")
+    groups: list[GroupOfPairs] = Field(description="`name` of the group, and its pairs")
+
+    @classmethod
+    def of(cls, groups: Mapping[str, Sequence[PairGates]]) -> "PairsFile":
+        """Returns the file of the ranked pairs, by group."""
+        rows = [GroupOfPairs(name=name, pairs=[_pair(pair) for pair in ranked]) for name, ranked in groups.items()]
+        return cls(format="stcal pairs 1", groups=rows)
+
+
+def _pair(row: PairGates) -> RankedPair:
+    score = row.score
+    return RankedPair(
+        first=score.first,
+        second=score.second,
+        shared=score.shared,
+        median_angle_deg=_degrees(score.median_angle_rad),
+        in_front=score.in_front,
+        forward=score.forward,
+        verdict=score.verdict,
+        ranking=[_gate(gate) for gate in row.own],
+        as_set=_gates(row.as_set),
+        defaults=_gates(row.defaults),
+    )
+
+
+def _gates(verdict: GateVerdict) -> GatesRow:
+    return GatesRow(relaxations=verdict.relaxations, gates=[_gate(gate) for gate in verdict.gates])
+
+
+def _gate(gate: Gate) -> GateRow:
+    if not gate.name.endswith("angle") or isinstance(gate.value, str) or gate.limit is None:
+        return GateRow(gate=gate.name, value=gate.value, limit=gate.limit, passed=gate.passed)
+    value, limit = _degrees(gate.value), _degrees(gate.limit)
+    return GateRow(gate=f"{gate.name}_deg", value=value, limit=limit, passed=gate.passed)
+
+
+def _degrees(angle_rad: float) -> float:
+    """Returns the angle in degrees, rounded to 9 digits, so that a limit reads as it was given."""
+    return round(float(np.degrees(angle_rad)), 9)

@@ -36,7 +36,7 @@ class NativeColmap:
     mapper_options: frozenset[str]
 
 
-def find_colmap(path: Path | None = None) -> NativeColmap:
+def find_colmap(path: str | Path | None = None) -> NativeColmap:
     """Returns the program at ``path``, or the one on the PATH.
 
     Raises InputError if there is none, it is not COLMAP, or it fails or hangs when asked for its version.

@@ -1,5 +1,6 @@
 """The four sides and the top of a box that stands: where they are, and where circles may lie on each of them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,11 +60,17 @@ def sides_of(size_mm: tuple[float, float, float], names: tuple[str, ...] = NAMES
 
 
 def faces_of(text: str) -> tuple[str, ...]:
-    """Parses ``front,right,top`` into the names of sides; all of them if the text is empty.
+    """Parses ``front,right,top`` into the names of sides; all of them if the text is empty."""
+    names = tuple(name.strip() for name in text.split(",")) if text else NAMES
+    require_sides(names, text)
+    return names
+
+
+def require_sides(names: Sequence[str], text: str) -> None:
+    """Refuses names of sides on which circles cannot lie together; ``text`` : the names in the message.
 
     Raises InputError if a name is unknown or occurs twice, or if no two of the sides are neighbours.
     """
-    names = tuple(name.strip() for name in text.split(",")) if text else NAMES
     for name in names:
         if name not in NAMES:
             raise InputError("E-OPTION-VALUE", f"--faces {text}: {name!r} is no side; use some of {', '.join(NAMES)}")
@@ -75,18 +82,22 @@ def faces_of(text: str) -> tuple[str, ...]:
             f"--faces {text}: two sides with a common edge needed, so that one photograph shows both; "
             "use such as front,right,top",
         )
-    return names
 
 
 def size_of(text: str) -> tuple[float, float, float]:
     """Parses ``W,H,D`` into width, height and depth in mm.
 
-    Raises InputError if the text is not three lengths, or a length is outside 1 mm to 100 m.
+    Raises InputError if the text is not three lengths.
     """
     try:
         width, height, depth = map(float, text.split(","))
     except ValueError as error:
         raise InputError("E-OPTION-VALUE", f"--size {text}: W,H,D in mm needed, such as 120,120,100") from error
-    if not all(1 <= side <= 1e5 for side in (width, height, depth)):
-        raise InputError("E-OPTION-RANGE", f"--size {text}: sides of 1 mm to 100 m needed")
+    require_size((width, height, depth), text)
     return width, height, depth
+
+
+def require_size(size_mm: Sequence[float], text: str) -> None:
+    """Refuses sides outside 1 mm to 100 m; ``text`` : the size in the message."""
+    if not all(1 <= side <= 1e5 for side in size_mm):
+        raise InputError("E-OPTION-RANGE", f"--size {text}: sides of 1 mm to 100 m needed")

@@ -8,11 +8,13 @@ import numpy as np
 
 from stcal.design import BoardDesign, Polarity
 from stcal.errors import InputError
+from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import COEFFICIENTS, Camera
 from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.read import camera_model
 from stcal.sfm.data.patterns import MAX_TILT_RAD
 from stcal.sfm.detect.circles.candidates import EllipseOptions, diameter_limits_px
-from stcal.sfm.make.box import NAMES, sides_of
+from stcal.sfm.make.box import NAMES, require_sides, require_size, sides_of
 from stcal.sfm.make.pattern import HIDDEN, LARGE, MadeTarget, make_pattern, unnamed_cases
 from stcal.synthetic.scene import FOCAL_PER_WIDTH
 
@@ -36,14 +38,35 @@ BOARD_SIGMA_MM = 0.02
 """Position error of dots that a good printer prints. A milled or photographic plate states its own."""
 
 
-@dataclass(frozen=True, slots=True)
-class MakeOptions:
-    """Options of the design.
+@dataclass(frozen=True, slots=True, repr=False)
+class DesignOptions(Brief):
+    """A target of circles to be designed for a box.
 
-    ``size_mm`` : width, height, depth of the box; ``circles`` : number of circles per face; ``radius_mm`` : radius of
-    the smaller circles, None to choose a suitable one; ``distance_mm`` : distance from the cameras; ``width`` : image
-    width in px, for 3:2 images of a 24 mm lens; used only without ``camera``; ``faces`` : names of the sides with
-    circles, the reference face first.
+    Parameters
+    ----------
+    size_mm : tuple of float
+        Width, height and depth of the box, mm.
+    circles : int
+        Number of circles on each face.
+    radius_mm : float, optional
+        Radius of the smaller circles, mm; one that suits box and camera if None.
+    distance_mm : float
+        Distance of the cameras from the target, mm.
+    width : int
+        Width of the images, px; 3:2 images of a 24 mm lens, if no ``camera`` is given.
+    camera : Camera, optional
+        Camera, whose file must state the image size.
+    polarity : {"dark", "bright"}
+        Dark circles on bright plates, or the reverse.
+    seed : int
+        Seed of the random pattern.
+    faces : tuple of str
+        Sides with circles, of ``front``, ``right``, ``back``, ``left`` and ``top``; the reference face first.
+
+    Raises
+    ------
+    InputError
+        A value is of another type, a side of the box is below 1 mm or above 100 m, or no two faces are neighbours.
     """
 
     size_mm: tuple[float, float, float]
@@ -51,10 +74,15 @@ class MakeOptions:
     radius_mm: float | None = None
     distance_mm: float = 1000.0
     width: int = 5184
-    camera: CameraModel | None = None
+    camera: Camera | CameraModel | None = None
     polarity: Polarity = "dark"
     seed: int = 0
     faces: tuple[str, ...] = NAMES
+
+    def __post_init__(self):
+        require_fields(self, "design", circles=1, radius_mm=0, distance_mm=0, width=1, seed=0)
+        require_size(self.size_mm, ",".join(f"{side:g}" for side in self.size_mm))
+        require_sides(self.faces, ",".join(self.faces))
 
     def ideal_camera(self) -> Camera:
         """Returns the camera without its distortion, or a default camera if none is given.
@@ -63,12 +91,13 @@ class MakeOptions:
         """
         width, height = self.width, round(self.width * 2 / 3)
         focal = np.full(2, FOCAL_PER_WIDTH * width)
-        if self.camera is not None:
-            width, height, focal = self.camera.width, self.camera.height, self.camera.focal
+        model = None if self.camera is None else camera_model(self.camera)
+        if model is not None:
+            width, height, focal = model.width, model.height, model.focal
         if not (width and height):
             raise InputError(
                 "E-CAMERA-SIZE",
-                f"camera file {self.camera and self.camera.source} states no image size; add it to the file",
+                f"camera file {model and model.source} states no image size; add it to the file",
             )
         return Camera(width, height, focal, [(width - 1) / 2, (height - 1) / 2], np.zeros(COEFFICIENTS))
 
@@ -89,7 +118,7 @@ class Made:
     number of cases of hidden circles that were tried; the faces were identified in all of them.
     """
 
-    options: MakeOptions
+    options: DesignOptions
     pattern: MadeTarget
     board: BoardDesign
     radius_mm: float
@@ -97,10 +126,10 @@ class Made:
     cases: int
 
 
-def make_target(options: MakeOptions, progress: Callable[[int, int], None] | None = None) -> Made:
+def make_target(options: DesignOptions, progress: Callable[[int, int], None] | None = None) -> Made:
     """Returns a board, and a pattern for each side of the box that is to have one.
 
-    ``options`` : MakeOptions; ``progress`` : called with (done, total), numbers of cases of hidden circles.
+    ``options`` : DesignOptions; ``progress`` : called with (done, total), numbers of cases of hidden circles.
 
     Raises InputError if circles are too small or too large for the camera, too few, or without room, or if a face is
     not identified with some of its circles hidden.
@@ -130,7 +159,7 @@ def make_target(options: MakeOptions, progress: Callable[[int, int], None] | Non
 
 
 def _named(
-    options: MakeOptions, radius_mm: float, progress: Callable[[int, int], None] | None
+    options: DesignOptions, radius_mm: float, progress: Callable[[int, int], None] | None
 ) -> tuple[MadeTarget, int]:
     """Returns the first pattern whose faces are all identified in every case of hidden circles, and the number of
     cases."""
@@ -150,7 +179,7 @@ def _named(
     )
 
 
-def _board(options: MakeOptions, least_mm: float) -> BoardDesign:
+def _board(options: DesignOptions, least_mm: float) -> BoardDesign:
     pitch = max(PITCH_SHARE * max(options.size_mm), 4 * least_mm)
     pitch = float(np.ceil(pitch / PITCH_STEP_MM - 1e-9) * PITCH_STEP_MM)
     camera, (width, _, depth) = options.ideal_camera(), options.size_mm

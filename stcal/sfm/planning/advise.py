@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from stcal.sfm.planning.forecast import (
 )
 from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.planning.views import PlannedView, candidates, known_scene
-from stcal.sfm.runs.saved import SavedRun, adjusted_run, load_run
+from stcal.sfm.runs.saved import AnyRun, SavedRun, adjusted_run, saved_run
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 from stcal.synthetic.scene import Group, Scene, group_name
 
@@ -144,14 +143,14 @@ def doubts(run: SavedRun) -> str:
 
 @require_arguments
 @one_thread()
-def advise(known: Known | SavedRun | str | Path, count: int = 5, progress: Progress | None = None) -> Advice:
+def advise(known: Known | AnyRun, count: int = 5, progress: Progress | None = None) -> Advice:
     """Returns the views that lower the σ of the worst face most, one after the other, and new groups of as many images.
 
     Parameters
     ----------
-    known : SavedRun, str or Path
-        A finished run, by its folder or as :func:`stcal.sfm.load_run` returns it; or its geometry, by
-        :func:`known_of`.
+    known : str, Path, SavedRun or RunResult
+        The folder of a finished run, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned; or its
+        geometry, by :func:`known_of`.
     count : int
         Number of views to choose, each in addition to those before it.
     progress : callable, optional
@@ -162,10 +161,8 @@ def advise(known: Known | SavedRun | str | Path, count: int = 5, progress: Progr
     Advice
         The views, with the worst face and its σ (mm) after each; the present σ and their sources.
     """
-    if isinstance(known, str | Path):
-        known = load_run(known)
-    if isinstance(known, SavedRun):
-        known = known_of(known)
+    if not isinstance(known, Known):
+        known = known_of(saved_run(known))
     setup = known.setup
     photographs = photographs_of(known.models, setup.board, setup.camera, setup.prior)
     now = forecast(known.models, setup, photographs=photographs)

@@ -1,13 +1,24 @@
 """Forecast of photographs of a body with boards or tags on its faces, which is turned before a camera; no board."""
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import combinations, product
+from pathlib import Path
 
 import numpy as np
 
-from stcal.design import FaceDesign, KnownDistance, ScaleReference, TargetDesign, scale_reference
+from stcal.design import (
+    BoardDesign,
+    FaceDesign,
+    KnownDistance,
+    ScaleReference,
+    TargetDesign,
+    reference_board,
+    scale_reference,
+)
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import camera_prior, refinable
 from stcal.io.cameras.read import camera_model
@@ -19,7 +30,8 @@ from stcal.sfm.data.model import ImageObservations, MetricModel
 from stcal.sfm.mapping.incremental import assemble
 from stcal.sfm.mapping.placed import unknown_lens
 from stcal.sfm.planning.forecast import CentreNoise, Setup, forecast, variance_shares
-from stcal.sfm.planning.session import NEARER, Plan, PlanOptions, Remedy, widest_aperture_mm
+from stcal.sfm.planning.nominal import nominal_poses
+from stcal.sfm.planning.session import NEARER, Plan, PlanOptions, Remedy, plan_with_board, widest_aperture_mm
 from stcal.sfm.planning.views import PlannedView, axes_of, looking_at, single
 from stcal.synthetic.body import BodyOptions, BodyScene, body_camera, make_body_scene
 
@@ -30,6 +42,54 @@ LEAST_COSINE = -0.2
 """Smallest cosine of the angle between two faces that one view is to show."""
 MAX_TILT_RAD = float(np.radians(60))
 """Largest tilt of a face whose corners count as seen."""
+
+
+@require_arguments
+def plan(
+    options: PlanOptions,
+    target: TargetDesign,
+    board: BoardDesign | None = None,
+    nominal: Mapping[str, Rigid] | str | Path | None = None,
+) -> Plan:
+    """Returns the forecast of a plan.
+
+    The geometry is nominal. Board and cameras stand where a simulated session would have them; a body with boards or
+    tags on its faces is turned before a camera, without a board.
+
+    Parameters
+    ----------
+    options : PlanOptions
+        Images, camera, groups and noise.
+    target : TargetDesign
+        Design of the target, drawing frame of each face, mm.
+    board : BoardDesign, optional
+        Board with its σ, mm; the reference board if None. There must be none beside a body with boards or tags.
+    nominal : dict of Rigid, or path, optional
+        Pose of every face in one common frame, mm, by face id, or ``faces.json`` of an earlier run; the rough poses of
+        the design if None.
+
+    Returns
+    -------
+    Plan
+        σ to expect of every face against the reference face, mm and rad, their sources, and what would help most.
+
+    Raises
+    ------
+    InputError
+        If a face has no nominal pose, a group names an unknown face, a board or groups are given for a body with boards
+        or tags, or there are more dots than ``MAX_DOTS`` or ``MAX_CENTRES``.
+    DegenerateError
+        If a group cannot be photographed as planned.
+    """
+    printed = bool(target.with_faces(printed=True).faces)
+    if printed and (unfit := [n for n, v in {"--groups": options.groups, "--board": board}.items() if v]):
+        raise InputError(
+            "E-OPTION-CONFLICT", f"{unfit[0]}: not for a body with boards or tags on its faces; leave it out"
+        )
+    poses = dict(nominal) if isinstance(nominal, Mapping) else nominal_poses(target, nominal)
+    if printed:
+        return plan_body(options, target, poses)
+    return plan_with_board(options, target, reference_board() if board is None else board, poses)
 
 
 @one_thread()

@@ -51,8 +51,21 @@ class CentreNoise:
     Processing, example 3.13), so that the centre of a circle of radius r has σ = edge/√(π r): noise by the root of its
     perimeter.
 
-    ``edge`` : px^1.5; ``narrow_px`` : minor semi-axis at which half of the information is lost, 0 for no loss;
-    ``floor_px`` : σ per axis that does not depend on the size; ``corner_px`` : σ per axis of corners, which have none.
+    Parameters
+    ----------
+    edge : float
+        Noise along the rim, px^1.5.
+    narrow_px : float
+        Minor semi-axis at which half of the information is lost, px; 0 for no loss.
+    floor_px : float
+        σ per axis that does not depend on the size, px.
+    corner_px : float
+        σ per axis of corners, which have no size, px.
+
+    Raises
+    ------
+    InputError
+        A value is negative or no number.
     """
 
     edge: float

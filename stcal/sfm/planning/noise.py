@@ -1,8 +1,9 @@
 """The σ of centres that a plan is forecast with, and a text on where it comes from."""
 
+from stcal.geometry.arrays import require_arguments
 from stcal.sfm.planning.advise import known_of
 from stcal.sfm.planning.forecast import BLUR_PX, CONTRAST, IMAGE_NOISE, PRACTICE, CentreNoise
-from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.saved import AnyRun, saved_run
 
 
 def stated_noise(sigma_px: float) -> tuple[CentreNoise, str]:
@@ -10,10 +11,22 @@ def stated_noise(sigma_px: float) -> tuple[CentreNoise, str]:
     return CentreNoise(0.0, floor_px=sigma_px, corner_px=sigma_px), "--noise, whatever the size of a circle"
 
 
-def noise_of_run(run: SavedRun) -> tuple[CentreNoise, str]:
-    """Returns σ by size and tilt of the circles, as estimated from a run."""
-    known = known_of(run)
-    return known.noise.scaled(known.setup.sigma0), f"by size and tilt as in {run.folder}"
+@require_arguments
+def noise_of_run(run: AnyRun) -> CentreNoise:
+    """Returns the noise of centres by size and tilt of the circles, as estimated from a run.
+
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+
+    Returns
+    -------
+    CentreNoise
+        As :class:`stcal.sfm.PlanOptions` takes it.
+    """
+    known = known_of(saved_run(run))
+    return known.noise.scaled(known.setup.sigma0)
 
 
 def expected_noise(of_corners: bool = False) -> tuple[CentreNoise, str]:

@@ -18,7 +18,7 @@ from stcal.synthetic.observe import image_circles
 from stcal.synthetic.scene import Scene
 
 
-def nominal_poses(target: TargetDesign, faces: Path | None) -> dict[str, Rigid]:
+def nominal_poses(target: TargetDesign, faces: str | Path | None) -> dict[str, Rigid]:
     """Returns the pose of every face in one frame. ``faces`` : a ``faces.json``, or None for the rough poses of the
     design.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, require_arguments, require_fields
+from stcal.geometry.arrays import Brief, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_plane
 from stcal.geometry.rigid import Rigid
@@ -149,39 +149,11 @@ def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ..
     return tuple(pair_of_name[name] for name in names)
 
 
-@require_arguments
 @one_thread()
-def plan(
+def plan_with_board(
     options: PlanOptions, target: TargetDesign, board: BoardDesign, nominal: dict[str, Rigid] | None = None
 ) -> Plan:
-    """Returns the forecast of a plan.
-
-    The geometry is nominal, and board and cameras stand where a simulated session would have them.
-
-    Parameters
-    ----------
-    options : PlanOptions
-        Images, camera, groups and noise.
-    target : TargetDesign
-        Design of the target, drawing frame of each face, mm.
-    board : BoardDesign
-        Board with its σ, mm.
-    nominal : dict of Rigid, optional
-        Pose of every face in one common frame, mm, by face id.
-
-    Returns
-    -------
-    Plan
-        σ to expect of every face against the reference face, mm and rad, their sources, and what would help most.
-
-    Raises
-    ------
-    InputError
-        If a face has no nominal pose, a group names an unknown face, or there are more dots than ``MAX_DOTS`` or
-        ``MAX_CENTRES``.
-    DegenerateError
-        If a group cannot be photographed as planned.
-    """
+    """Returns the forecast of photographs of a target of circles beside a board; see :func:`stcal.sfm.plan`."""
     if (dots := board.rows * board.columns) > MAX_DOTS:
         raise InputError(
             "E-PLAN-TOO-LARGE",

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from stcal.errors import DegenerateError, InputError, InputNote
 from stcal.geometry.align import align_rigid
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Rigid
 from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.json import ByFace, Part, Pose, PoseCovariance, ResultFile, Vector3, read_result
@@ -90,8 +91,21 @@ class CompareFile(ResultFile):
     )
 
 
+@require_arguments
 def compare(run: str | Path, truth: str | Path) -> CompareFile:
-    """Returns the errors of ``RUN/faces.json`` (or of the file itself) against a truth file.
+    """Returns the errors of a run's faces, circles and labels against the truth of a simulated data set.
+
+    Parameters
+    ----------
+    run : str or Path
+        The run's folder, or its ``faces.json`` alone; the labels are not compared then.
+    truth : str or Path
+        ``truth.json`` of the data set.
+
+    Returns
+    -------
+    CompareFile
+        Errors of each face, µm and millidegrees in the target frame, also over their σ; counts of wrong labels.
 
     Raises
     ------

@@ -6,17 +6,36 @@ import numpy as np
 from pydantic import Field
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_fields
 from stcal.io.json import ByFace, ByLabel, Part
 
 
 @dataclass(frozen=True, slots=True)
 class Tolerances:
-    """Largest differences allowed: faces and circles in the target frame, cameras against the target.
+    """Largest differences that a cross-check accepts.
 
-    ``sigma`` : limit for our result from the native models, faces and circles in units of their own σ: half a σ, added
-    to σ, makes 1.12 σ; ``mapped_sigma`` : limit for the two programs' own results, which are computed group by group
-    with iterations that end earlier: noise does not explain differences beyond 3 σ. The other limits apply if they are
-    given. For a run without σ, ``face_um``, ``face_mdeg``, ``circle_um`` apply, too, by default 2, 1, 2.
+    Faces and circles are compared in the target frame, cameras against the target. Limits that are None do not apply;
+    for a run without σ ``face_um``, ``face_mdeg`` and ``circle_um`` do, by default 2, 1 and 2.
+
+    Parameters
+    ----------
+    face_um, face_mdeg : float, optional
+        Of the position and the rotation of a face, µm and millidegrees.
+    circle_um : float, optional
+        Of a circle, µm.
+    camera_um, camera_mdeg : float, optional
+        Of the position and the attitude of a camera, µm and millidegrees.
+    sigma : float
+        Of our result from the native models, faces and circles, in units of their own σ: half a σ, added to σ, makes
+        1.12 σ.
+    mapped_sigma : float
+        Of the two programs' own results, in the same unit. They are computed group by group with iterations that end
+        earlier: noise does not explain differences beyond 3 σ.
+
+    Raises
+    ------
+    InputError
+        A limit is negative or no number.
     """
 
     face_um: float | None = None
@@ -34,10 +53,11 @@ class Tolerances:
 
     def __post_init__(self):
         for name, value in asdict(self).items():
-            if value is not None and not 0 <= value < np.inf:
+            if isinstance(value, int | float) and not 0 <= value < np.inf:
                 raise InputError(
                     "E-OPTION-RANGE", f"tolerance {name} {value:g}: a number of 0 or more needed; give another"
                 )
+        require_fields(self, "tolerances")
 
 
 def allowed_text(tolerances: Tolerances) -> str:

@@ -16,6 +16,7 @@ from stcal.boards.file import save_run_board
 from stcal.boards.target import save_body
 from stcal.design import TargetDesign
 from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.write import save_camera
 from stcal.io.files import (
@@ -46,7 +47,7 @@ from stcal.sfm.report.page import report_html
 from stcal.sfm.runs.output import report_of, residuals_px
 from stcal.sfm.runs.report import ReportFile
 from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.saved import SavedRun
+from stcal.sfm.runs.saved import AnyRun, SavedRun, folder_of
 from stcal.sfm.runs.transaction import RunFolder, added_results, complete_interrupted
 from stcal.sfm.runs.verify import verify
 
@@ -171,20 +172,30 @@ class ReportAgain:
         return "\n".join([*warnings, *notes, *(f"report: {path}" for path in self.files)])
 
 
-def report_again(run: Path, pdf: bool, out: Path | None = None) -> ReportAgain:
-    """Makes the page of a finished run anew from its ``report.json`` and its overlays, and a PDF if requested.
+@require_arguments
+def report_again(run: AnyRun, pdf: bool = False, out: str | Path | None = None) -> ReportAgain:
+    """Writes the page of a finished run again, from its ``report.json`` and its overlays, and a PDF if requested.
 
     Parameters
     ----------
-    run : the run's folder
-    pdf : whether to make the PDF
-    out : file for the page, the PDF beside it; if None, those in the folder are replaced
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    pdf : bool
+        Whether the PDF is written, beside the page; it needs the extra ``pdf``.
+    out : str or Path, optional
+        File for the page (HTML); the page in the run's folder is replaced if None.
+
+    Returns
+    -------
+    ReportAgain
+        Paths of the ``files`` that were written, and ``notes``.
 
     Raises
     ------
     InputError
         Not a finished run, a damaged file in it, a file that cannot be written, or no WeasyPrint.
     """
+    run, out = folder_of(run), None if out is None else Path(out)
     if not (run / RUN_MARKER).is_file():
         raise InputError(
             "E-RUN-FOLDER", f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"

@@ -35,6 +35,7 @@ from stcal.sfm.mapping.models import read_model
 from stcal.sfm.mapping.pairs import PairOptions
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.report import ReportCamera, ReportRead
+from stcal.sfm.runs.result import RunResult
 from stcal.sfm.runs.transaction import MarkerFile, complete_interrupted
 
 AGAIN = "run it again"
@@ -131,6 +132,30 @@ class SavedRun(Brief):
             return self.camera
         camera = Camera(self.camera.width, self.camera.height, own.focal_px, own.centre_px, own.distortion)
         return Camera.of(camera, self.camera.colmap_model)
+
+
+AnyRun = SavedRun | RunResult | str | Path
+"""A finished run: its folder, or what :func:`load_run` or ``run`` returned."""
+
+
+def folder_of(run: AnyRun) -> Path:
+    """Returns the folder of a run.
+
+    Raises
+    ------
+    InputError
+        No file of the run was kept.
+    """
+    if isinstance(run, RunResult):
+        if run.out is None:
+            raise InputError("E-RUN-FOLDER", "run: in memory, no file of it was kept; run it with out=")
+        return run.out
+    return run.folder if isinstance(run, SavedRun) else Path(run)
+
+
+def saved_run(run: AnyRun) -> SavedRun:
+    """Returns the run as read back from its folder; errors as of :func:`load_run`."""
+    return run if isinstance(run, SavedRun) else load_run(folder_of(run))
 
 
 @require_arguments

@@ -1,15 +1,16 @@
 """Verification that a run's folder holds what the run wrote: ``verify``."""
 
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
 import stcal
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.io.files import ADDED, CACHE, READY, RUN_MARKER, UNFINISHED
 from stcal.io.json import ResultFile, checked, read_json
+from stcal.sfm.runs.saved import AnyRun, folder_of
 from stcal.sfm.runs.transaction import (
     DATABASE_SIDES,
     RESULTS,
@@ -59,15 +60,28 @@ class VerifyFile(ResultFile):
         return clauses + [f"made by stcal {self.version}, this is {self.stcal}"] * (self.version != self.stcal)
 
 
-def verify(run: str | Path) -> VerifyFile:
-    """Compares the hashes of all files of a finished run with those that were kept when it ended; nothing is written.
+@require_arguments
+def verify(run: AnyRun) -> VerifyFile:
+    """Compares the hashes of all files of a finished run with those that were kept when it ended.
+
+    Nothing is written, and files may be damaged.
+
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+
+    Returns
+    -------
+    VerifyFile
+        Names of the files that are ``missing``, ``changed`` or ``added``; ``whole`` if there are none.
 
     Raises
     ------
     InputError
         Not a run's folder, or one without hashes: unfinished, or of a version that kept none.
     """
-    run = Path(run)
+    run = folder_of(run)
     if not (run / RUN_MARKER).is_file():
         raise InputError(
             "E-RUN-FOLDER", f"run {run}: not a run's folder (no {RUN_MARKER}); give the --out of a finished run"

@@ -5,7 +5,7 @@ step are those of its own command, so that each step can be repeated by itself.
 """
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +13,16 @@ import numpy as np
 
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
+from stcal.geometry.arrays import require_arguments
+from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.read import camera_model
 from stcal.io.files import save
 from stcal.io.images import find_images
 from stcal.io.join import join, table_of
 from stcal.io.table import POSE, Table, read_table
+from stcal.parallel import Progress
 from stcal.robot.axes.model import AxesResult, robot_from_sweeps
 from stcal.robot.axes.sweeps import find_arcs, length_of, ring
 from stcal.robot.identification.result import IdentifyOptions
@@ -38,9 +42,10 @@ from stcal.workflows.from_photos.result import AXES, DRAWING, POSES, SAME_ROWS, 
 PHOTOGRAPHS = "the photographs"
 
 
-def from_photos(
+@require_arguments
+def robot_from_photos(
     images: str | Path,
-    camera: CameraModel,
+    camera: str | Path | Camera | CameraModel,
     target: TargetCircles,
     design: TargetDesign,
     joints: str | Path,
@@ -50,20 +55,37 @@ def from_photos(
     key: str = "image",
     measure_options: MeasureOptions | None = None,
     options: IdentifyOptions | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
     columns: str | Path | None = None,
 ) -> FromPhotos:
-    """Measure the target in photographs, identify the arm that carried it, and compensate targets.
+    """Measures the target in photographs, identifies the arm that carried it, and compensates targets.
 
     Parameters
     ----------
-    images, camera, target, design, board, progress : as in :func:`stcal.sfm.measurement.images.measure`
-    joints : table of joint values with a column ``key`` that names the photograph of each row (CSV)
-    nominal : the arm as drawn, mm and rad; the model by which the controller commands it
-    targets : poses or joint values to compensate
-    key : name of the column of photographs
-    measure_options, options : options of measuring and of identifying; the defaults if None
-    columns : map of the columns of ``joints``
+    images : str or Path
+        Folder of the photographs, and of folders of them.
+    camera : Camera
+        The camera that took them, or its file.
+    target : TargetCircles
+        The calibrated target, of :func:`stcal.sfm.read_target` or ``RunResult.circles()``.
+    design : TargetDesign
+        Its design.
+    joints : str or Path
+        Table of joint values with a column ``key`` that names the photograph of each row (CSV).
+    nominal : Robot
+        The arm as drawn, mm and rad; the model by which the controller commands it.
+    targets : str, Path or Table, optional
+        Poses or joint values to compensate.
+    board : BoardDesign, optional
+        The board whose dots are to be told apart, if it is in view.
+    key : str
+        Name of the column of photographs.
+    measure_options, options : MeasureOptions, IdentifyOptions
+        Options of measuring and of identifying; the defaults if None.
+    progress : callable, optional
+        Called with (stage, done, total).
+    columns : str or Path, optional
+        Columns, delimiter … of ``joints`` (TOML).
 
     Returns
     -------
@@ -79,7 +101,7 @@ def from_photos(
     values = read_joints(joints, key, [file.name for file in find_images(images)[0]], nominal, columns)
     carried = dict.fromkeys(targets_of(values), Rigid())
     wanted = None if targets is None else read_targets(targets, replace(nominal, tools=carried))
-    measured = measure(images, camera, target, design, board, measure_options, progress)
+    measured = measure(images, camera_model(camera), target, design, board, measure_options, progress)
     return from_measured(str(images), measured, values, nominal, wanted, options)
 
 
@@ -107,7 +129,7 @@ def from_measured(
     wanted: Targets | None = None,
     options: IdentifyOptions | None = None,
 ) -> FromPhotos:
-    """Perform the steps after the photographs are measured; arguments and errors as in :func:`from_photos`.
+    """Perform the steps after the photographs are measured; arguments and errors as in :func:`robot_from_photos`.
 
     ``values`` : table from :func:`read_joints`; ``wanted`` : targets to compensate.
     """

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from stcal.errors import StcalError
+from stcal.geometry.arrays import require_arguments
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.pairs import Setup
 from stcal.handeye.judge.remarks import Grave
@@ -26,7 +27,7 @@ from stcal.handeye.validate import (
 from stcal.parallel import Progress
 from stcal.workflows.handeye.arm import with_arm
 from stcal.workflows.handeye.inputs import HandEyeInput
-from stcal.workflows.handeye.offset import lag_tried
+from stcal.workflows.handeye.offset import at_offset, lag_tried, with_offset
 
 ALL, AUTO = "all", "auto"
 """Words in place of a method's name: all methods, compared; the way of solving that predicts best."""
@@ -42,6 +43,72 @@ class Splits:
     seed: int = 0
     workers: int | None = None
     motions: int | None = None
+
+
+@require_arguments
+def calibrate_handeye(
+    given: HandEyeInput,
+    method: str | None = None,
+    options: HandEyeOptions | None = None,
+    *,
+    refine_camera: bool = False,
+    time_offset: bool = False,
+    repeats: int = 15,
+    held_out: int | None = None,
+    seed: int = 0,
+    motions: int | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Returns where the camera sits on the flange, or in the base, with errors on poses held out.
+
+    Parameters
+    ----------
+    given : HandEyeInput
+        Of :func:`stcal.workflows.read_handeye`.
+    method : str, optional
+        One of :data:`stcal.handeye.METHODS`, or ``all`` to compare them; the way that predicts poses held out best if
+        None.
+    options : HandEyeOptions, optional
+        Known errors, and further unknowns; the symmetries of the board are those of ``given``.
+    refine_camera : bool
+        Whether the intrinsics are adjusted, from those of the camera file with their σ.
+    time_offset : bool
+        Whether the offset of the two clocks is estimated first.
+    repeats : int
+        Number of splits of the cross-validation; 0 for none.
+    held_out : int, optional
+        Number of poses held out in each; a quarter if None.
+    seed : int
+        Seed of the splits.
+    motions : int, optional
+        Number of the last motions to predict from the poses before.
+    workers : int, optional
+        Number of processes; one per core if None.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Outcome
+        ``result``, a :class:`stcal.handeye.HandEye`, mm and rad; its errors on poses ``held_out``; ``all_notes()``.
+
+    Raises
+    ------
+    StcalError
+        As of :func:`stcal.handeye.handeye`; the message also names what was left out before.
+    """
+    setup, options, offset = given.setup or "eye-in-hand", options or HandEyeOptions(), None
+    with_scale = options.with_scale or given.unit_mm is not None
+    camera = given.prior if refine_camera else options.camera
+    options = replace(options, camera=camera, with_scale=with_scale, symmetries=given.symmetries)
+    if method is None and not (refine_camera or camera is not None or with_scale or options.four_dof):
+        method = AUTO
+    if time_offset:
+        given, options, offset = at_offset(given, setup, options)
+    validation = Splits(repeats, held_out, seed, workers, motions)
+    told = progress or (lambda *_: None)
+    return with_offset(calibrate(given, setup, method, options, validation, told, time_offset), offset)
 
 
 def calibrate(

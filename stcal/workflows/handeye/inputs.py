@@ -1,5 +1,6 @@
 """Inputs of a hand-eye calibration: pose pairs of one file or two, or images of a board with the robot's poses."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -8,13 +9,14 @@ import numpy as np
 
 from stcal.boards.several import load_boards
 from stcal.errors import DegenerateError, InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
 from stcal.handeye.data.formats.record import Said
 from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
 from stcal.handeye.data.pairs import SETUPS, Loop, Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
-from stcal.handeye.data.stream import Timed
+from stcal.handeye.data.stream import TOLERANCE_S, Timed
 from stcal.handeye.judge.flips import flipped, tilted
 from stcal.handeye.judge.remarks import spread_text
 from stcal.handeye.methods import closed_form
@@ -85,6 +87,87 @@ def two_files(
             require_own(path, quaternions)
         _require_unsaid(statements, f"{first}, {second}")
     return told
+
+
+@require_arguments
+def read_handeye(
+    source: Source | str,
+    poses: str | Path | None = None,
+    camera: str | Path | None = None,
+    board: str | Path | None = None,
+    *,
+    setup: Setup | None = None,
+    rotation: Sequence[str] = (),
+    length_unit: Sequence[str] = (),
+    poses_are: Sequence[str] = (),
+    quaternions: Order = "wxyz",
+    columns: str | Path | None = None,
+    tolerance_s: float = TOLERANCE_S,
+    image_times: str | Path | None = None,
+    times_columns: str | Path | None = None,
+    time_offset: bool = False,
+    robot: Robot | None = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> HandEyeInput:
+    """Returns the poses of a hand-eye calibration, from photographs of a board or from a file of any known form.
+
+    Parameters
+    ----------
+    source : str, Path or Table
+        Folder of the photographs; or a file of pairs of poses.
+    poses : str or Path, optional
+        The robot's poses at the photographs: a file, or a folder with a file for each.
+    camera, board : str or Path, optional
+        Files of the camera and of the board, or boards, in the photographs.
+    setup : {"eye-in-hand", "eye-to-hand"}, optional
+        What carries the camera; as a file says, or ``eye-in-hand``, if None.
+    rotation : sequence of str
+        Convention of angles that files do not name, such as ``kuka-abc``, ``rpy``, ``rotvec`` or ``ZYX``; with
+        ``robot=`` or ``camera=`` in front for one side.
+    length_unit : sequence of str
+        Unit of lengths in files that do not say it, ``mm``, ``m`` …, likewise.
+    poses_are : sequence of str
+        Names of the poses where files do not say it: ``base_from_flange`` or ``flange_from_base``, and
+        ``camera_from_board`` or ``board_from_camera``.
+    quaternions : {"wxyz", "xyzw"}
+        As columns of quaternions are named, or x, y, z, w in the order in which they stand.
+    columns : str or Path, optional
+        Columns, delimiter … of the robot's poses beside photographs (TOML).
+    tolerance_s : float
+        Time within which the nearest of the robot's poses is taken where none can be interpolated, s.
+    image_times, times_columns : str or Path, optional
+        Table of the times of photographs, and its columns (TOML).
+    time_offset : bool
+        Whether the offset of the two clocks is to be estimated.
+    robot : Robot, optional
+        The robot at whose joint values, in ``poses``, the photographs were taken, if its parameters are solved for.
+    workers : int, optional
+        Number of processes; one per core if None.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    HandEyeInput
+        ``pairs`` of poses, mm; ``views`` of the board, ``left_out`` and ``understood``. For
+        :func:`stcal.workflows.calibrate_handeye` and :func:`stcal.workflows.plan_handeye`.
+
+    Raises
+    ------
+    InputError
+        A file is missing or not of the required form, one file too many was given, or no image shows the board.
+    """
+    statements = replace(Said.of_options(rotation, length_unit, poses_are, setup), columns=_path(columns))
+    timing = Timing(tolerance_s, _path(image_times), time_offset, _path(times_columns))
+    place, told = Path(source) if isinstance(source, str) else source, progress or (lambda *_: None)
+    files = _path(poses), _path(camera), _path(board)
+    given = read_input(place, *files, workers, told, quaternions, statements, timing, robot)
+    return given if setup is None else replace(given, setup=setup_of(statements, given.setup, given.where))
+
+
+def _path(path: str | Path | None) -> Path | None:
+    return None if path is None else Path(path)
 
 
 @one_thread()
@@ -439,12 +522,28 @@ MOST_ROUNDS = 3
 """Largest number of rounds of solving and tilting; a flip by few degrees stands out when the larger ones are gone."""
 
 
-def without_flips(inputs: HandEyeInput, setup: Setup, options: HandEyeOptions) -> tuple[HandEyeInput, str]:
-    """Returns the input with the second pose of a flat target, tilted the other way, for poses that agree with the
-    others only so; and a sentence that names them.
+@require_arguments
+def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) -> tuple[HandEyeInput, str]:
+    """Returns the input with the second pose of a flat target, tilted the other way, for poses that agree only so.
 
-    Raises InputError: images, which tell the poses by themselves.
+    Parameters
+    ----------
+    given : HandEyeInput
+        Pairs of poses, of :func:`stcal.workflows.read_handeye`.
+    options : HandEyeOptions, optional
+        As for :func:`stcal.workflows.calibrate_handeye`.
+
+    Returns
+    -------
+    HandEyeInput, str
+        The input, and a sentence that names the poses.
+
+    Raises
+    ------
+    InputError
+        The input is of images, which tell the poses by themselves.
     """
+    inputs, setup, options = given, given.setup or "eye-in-hand", options or HandEyeOptions()
     if inputs.views is not None:
         raise InputError(
             "E-OPTION-NEEDS", "--undo-flips: only with poses; corners of images tell the tilt, leave it out"

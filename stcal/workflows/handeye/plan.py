@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.handeye import HandEyeOptions, NextPoses, plan_poses
-from stcal.handeye.data.pairs import Setup
 from stcal.handeye.result import HandEye
 from stcal.handeye.solve import handeye
 from stcal.parallel import one_thread
@@ -32,21 +32,26 @@ class Planned:
     notes: tuple[str, ...]
 
 
+@require_arguments
 @one_thread()
-def plan_next(given: HandEyeInput, setup: Setup, count: int = 3, robot: Robot | None = None, seed: int = 0) -> Planned:
-    """Solve with the poses taken, and name those that would lower the worst σ most.
+def plan_handeye(given: HandEyeInput, count: int = 3, robot: Robot | None = None, seed: int = 0) -> Planned:
+    """Returns the robot poses that would lower the worst σ at the board most, after those of a hand-eye calibration.
 
     Parameters
     ----------
-    given : poses taken so far
-    setup : {"eye-in-hand", "eye-to-hand"}: what carries the camera
-    count : number of poses to plan
-    robot : robot within whose joint limits the poses are to be, from its own base to its flange, no tool
-    seed : seed of the candidates
+    given : HandEyeInput
+        Poses taken so far, of :func:`stcal.workflows.read_handeye`.
+    count : int
+        Number of poses to plan.
+    robot : Robot, optional
+        Robot within whose joint limits the poses are to be, from its own base to its flange, no tool.
+    seed : int
+        Seed of the candidates.
 
     Returns
     -------
     Planned
+        ``poses`` to take, mm; with a robot ``joints``, deg or mm, by column; the ``result`` so far.
 
     Raises
     ------
@@ -55,6 +60,7 @@ def plan_next(given: HandEyeInput, setup: Setup, count: int = 3, robot: Robot | 
     DegenerateError
         For the reasons given in :func:`stcal.handeye.handeye`.
     """
+    setup = given.setup or "eye-in-hand"
     options = HandEyeOptions(with_scale=given.unit_mm is not None, symmetries=given.symmetries)
     result = handeye(given.pairs, setup, None, given.views, options)
     camera = outline = None

@@ -1,5 +1,6 @@
 """Hand-eye calibration of several cameras: inputs and solution."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -8,9 +9,10 @@ import numpy as np
 
 from stcal.boards.several import load_boards
 from stcal.errors import DegenerateError, InputError, StcalError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye.data.formats.record import Said
-from stcal.handeye.data.rig import RigCamera, RigFiles, RigPoses
+from stcal.handeye.data.rig import RigCamera, RigFiles, RigPoses, read_rig_file
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import TOLERANCE_S
 from stcal.handeye.report.outcome import Outcome, RigOutcome
@@ -19,7 +21,6 @@ from stcal.handeye.rig.validate import RigHeldOut, cross_validate_rig, widened_b
 from stcal.handeye.validate import LEAST_LEFT, splits
 from stcal.io.cameras.read import read_camera
 from stcal.parallel import Progress, one_thread
-from stcal.workflows.handeye.calibrate import Splits
 from stcal.workflows.handeye.inputs import Photographed, photographed, pitch_of
 from stcal.workflows.handeye.times import Timing
 
@@ -38,19 +39,54 @@ class RigInput:
     notes: tuple[str, ...] = ()
 
 
+@require_arguments
 @one_thread()
-def read_rig(
-    files: RigFiles,
-    workers: int | None = None,
-    progress: Progress = lambda *_: None,
+def read_handeye_rig(
+    rig: RigFiles | str | Path,
+    *,
+    rotation: Sequence[str] = (),
+    length_unit: Sequence[str] = (),
+    poses_are: Sequence[str] = (),
     quaternions: Order = "wxyz",
-    statements: Said | None = None,
     tolerance_s: float = TOLERANCE_S,
+    workers: int | None = None,
+    progress: Progress | None = None,
 ) -> RigInput:
-    """Returns the board in all images of all cameras, with the robot's poses.
+    """Returns the board in all photographs of several cameras of one robot, with the robot's poses.
 
-    Raises InputError: the message says what is wrong with a file, and names the camera.
+    Parameters
+    ----------
+    rig : str, Path or RigFiles
+        The rig file (TOML), or what it names.
+    rotation : sequence of str
+        Convention of angles that files do not name, such as ``kuka-abc``, ``rpy``, ``rotvec`` or ``ZYX``; with
+        ``robot=`` or ``camera=`` in front for one side.
+    length_unit : sequence of str
+        Unit of lengths in files that do not say it, ``mm``, ``m`` …, likewise.
+    poses_are : sequence of str
+        Names of the poses where files do not say it: ``base_from_flange`` or ``flange_from_base``, and
+        ``camera_from_board`` or ``board_from_camera``.
+    quaternions : {"wxyz", "xyzw"}
+        As columns of quaternions are named, or x, y, z, w in the order in which they stand.
+    tolerance_s : float
+        Time within which the nearest of the robot's poses is taken where none can be interpolated, s.
+    workers : int, optional
+        Number of processes; one per core if None.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    RigInput
+        For :func:`stcal.workflows.calibrate_handeye_rig`; ``left_out`` and ``understood`` in words.
+
+    Raises
+    ------
+    InputError
+        A file is not of the required form; the message names the camera.
     """
+    files = rig if isinstance(rig, RigFiles) else read_rig_file(Path(rig))
+    statements, progress = Said.of_options(rotation, length_unit, poses_are), progress or (lambda *_: None)
     design, cameras = load_boards(files.board), []
     by_file = {
         camera_files.poses: read_robot_poses(camera_files.poses, quaternions, statements)
@@ -138,20 +174,53 @@ def _shared(cameras: list[tuple[RobotPoses, Photographed]]) -> tuple[Poses, tupl
     return Poses.of(flange), tuple(names), rows
 
 
-def calibrate_rig(
+@require_arguments
+def calibrate_handeye_rig(
     given: RigInput,
-    refine: bool = False,
+    refine_camera: bool = False,
     with_scale: bool = False,
-    validation: Splits | None = None,
-    progress: Progress = lambda *_: None,
+    *,
+    repeats: int = 15,
+    held_out: int | None = None,
+    seed: int = 0,
+    workers: int | None = None,
+    progress: Progress | None = None,
 ) -> RigOutcome:
-    """Solve all cameras in one adjustment and each by itself, and compare both on held-out poses of the robot.
+    """Returns where several cameras sit on one flange, or in one base, and in each other, from one adjustment.
 
-    Raises StcalError: for the reasons given in :func:`stcal.handeye.handeye_rig`; the message also names what was left
-    out before.
+    Each camera is solved by itself too, and both are compared on poses of the robot held out.
+
+    Parameters
+    ----------
+    given : RigInput
+        Of :func:`stcal.workflows.read_handeye_rig`.
+    refine_camera : bool
+        Whether the intrinsics are adjusted too, of each camera from its own with σ.
+    with_scale : bool
+        Whether the board's true size is found from the robot's motion.
+    repeats : int
+        Number of splits of the cross-validation; 0 for none.
+    held_out : int, optional
+        Number of poses of the robot held out in each; a quarter if None.
+    seed : int
+        Seed of the splits.
+    workers : int, optional
+        Number of processes; one per core if None.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    RigOutcome
+        ``rig``, a :class:`stcal.handeye.Rig`, mm and rad; errors on poses ``held_out``; ``all_notes()``.
+
+    Raises
+    ------
+    StcalError
+        As of :func:`stcal.handeye.handeye_rig`; the message also names what was left out before.
     """
-    validation = validation or Splits()
-    options = RigOptions(refine=refine, with_scale=with_scale, symmetries=given.symmetries)
+    progress = progress or (lambda *_: None)
+    options = RigOptions(refine=refine_camera, with_scale=with_scale, symmetries=given.symmetries)
     poses, setup = given.given, given.files.setup
     try:
         rig = handeye_rig(poses, setup, options)
@@ -165,19 +234,19 @@ def calibrate_rig(
             error.append(f"; {len(dropped)} left out before, first {dropped[0][0]}: {dropped[0][1]}: {dropped[0][2]}")
         raise
     poses, options = same_numbering(poses, setup, given.symmetries), replace(options, symmetries=())
-    notes, held_out, factor = given.notes, None, 1.0
-    if validation.repeats and (validation.held_out or len(poses) > LEAST_LEFT):
-        rows = splits(len(poses), validation.held_out, validation.repeats, validation.seed)
+    notes, errors, factor = given.notes, None, 1.0
+    if repeats and (held_out or len(poses) > LEAST_LEFT):
+        rows = splits(len(poses), held_out, repeats, seed)
         done = partial(progress, "held out")
         try:
-            held_out = cross_validate_rig(poses, setup, options, rows, validation.workers, done)
-            rig, factor = widened_by_scatter(rig, held_out)
+            errors = cross_validate_rig(poses, setup, options, rows, workers, done)
+            rig, factor = widened_by_scatter(rig, errors)
         except DegenerateError as error:
             notes += (f"no errors on poses held out: {error}",)
     by_itself = tuple(alone_or_none(poses, i, setup, options) for i in range(len(poses.cameras)))
     notes += of_places(rig.names, list(by_itself))
-    cameras = tuple(_part(given, poses, rig, held_out, refine, i) for i in range(len(poses.cameras)))
-    return RigOutcome(given.files.file.name, rig, cameras, by_itself, held_out, notes, given.understood, factor)
+    cameras = tuple(_part(given, poses, rig, errors, refine_camera, i) for i in range(len(poses.cameras)))
+    return RigOutcome(given.files.file.name, rig, cameras, by_itself, errors, notes, given.understood, factor)
 
 
 def _part(given: RigInput, poses: RigPoses, rig: Rig, held_out: RigHeldOut | None, refine: bool, i: int) -> Outcome:

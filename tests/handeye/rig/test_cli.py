@@ -9,9 +9,8 @@ import pytest
 
 from stcal.cli.main import main
 from stcal.geometry.rigid import Poses, Rigid
-from stcal.handeye.data.rig import read_rig_file
 from stcal.handeye.data.robot_poses import read_robot_poses
-from stcal.workflows.handeye.rig import read_rig
+from stcal.workflows.handeye.rig import read_handeye_rig
 from tests.handeye.rig.photographed import LEFT_FROM, photographed_rig, write_poses
 from tests.outcome import ended
 from tests.shared import own_copy
@@ -124,7 +123,7 @@ def test_a_camera_of_a_file_of_several_is_named(rig, files):
     assert "camera left: camera file" in error
     assert "in a rig file camera_name" in error
     (files / "rig.toml").write_text(text.replace('"both.txt"', '"both.txt"\ncamera_name = "2"'))
-    assert read_rig(read_rig_file(files / "rig.toml"), 1).given.cameras[0].name == "left"
+    assert read_handeye_rig(files / "rig.toml", workers=1).given.cameras[0].name == "left"
 
 
 def test_what_it_reads_is_not_written_over(rig, files):

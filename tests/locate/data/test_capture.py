@@ -11,7 +11,7 @@ from stcal.cli.main import app
 from stcal.errors import InputError
 from stcal.io import device as module
 from stcal.io.device import OpenCVSource, SimulatedSource
-from stcal.locate.data.exposures import Settings, capture, find_scenes, scene_folder
+from stcal.locate.data.exposures import capture, find_scenes, scene_folder
 from tests.outcome import fails_with
 
 
@@ -60,7 +60,7 @@ def driver(monkeypatch):
 
 def test_what_was_really_set_is_written(driver, tmp_path):
     source = OpenCVSource("/dev/video3", 2.0)
-    found = capture(source, [10.0, 100.0], tmp_path / "scenes" / "a", Settings(2.0, 0.0))
+    found = capture(source, [10.0, 100.0], tmp_path / "scenes" / "a", 2.0, 0.0)
     assert [(row.exposure, row.exposure_set) for row in found.exposures] == [(10, 9), (100, 99)]
     # Old frames of the queue are passed over: each image is of its own exposure.
     for name, grey in (("10.png", 9), ("100.png", 99)):
@@ -79,7 +79,7 @@ def test_a_camera_that_refuses_says_so_and_nothing_is_written(driver, tmp_path):
         before = getattr(driver, name)
         setattr(driver, name, value)
         with fails_with(said):
-            capture(OpenCVSource("0"), [10.0, 20.0], tmp_path / "a", Settings(None, 0.0))
+            capture(OpenCVSource("0"), [10.0, 20.0], tmp_path / "a", None, 0.0)
         setattr(driver, name, before)
         assert not (tmp_path / "a").exists()
     driver.takes_gain = False

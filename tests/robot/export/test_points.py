@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
-from stcal.robot.export import exported
+from stcal.robot.export import robot_program
 from stcal.robot.export.files import FORMS
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
@@ -44,7 +44,7 @@ class Case:
         self.poses = forward(self.nominal, self.told)
 
     def text(self, form: str, wanted="joints", pulses=None, name="my-points.x") -> str:
-        return exported(self.result, self.real, form, self.folder / name, wanted, pulses).text
+        return robot_program(self.result, self.real, form, self.folder / name, wanted, pulses).text
 
 
 @pytest.fixture(scope="module")
@@ -119,12 +119,12 @@ def test_configuration_of_abb(case):
 
 
 def test_what_is_said_and_left_out(case):
-    made_ = exported(case.result, case.real, "kuka", case.folder / "a.dat")
+    made_ = robot_program(case.result, case.real, "kuka", case.folder / "a.dat")
     assert made_.notes[0].endswith("a.dat: 5 points, joints")
     assert made_.notes[1].endswith("a.dat: left out, as they are not reached: line 7")
     assert "; line 3, pose ?se 1\n" in made_.text
     made_.text.encode("ascii")
-    notes = " ".join(exported(case.result, case.real, "yaskawa", case.folder / "a.jbi").notes)
+    notes = " ".join(robot_program(case.result, case.real, "yaskawa", case.folder / "a.jbi").notes)
     assert "poses: joint values are pulses there; give --pulses-per-deg" in notes
     assert "of the tool at 10.000, 20.000, 150.000 mm on the flange" in notes or "on the flange; set ///TOOL" in notes
     assert "DEFDAT my_points PUBLIC" in case.text("kuka")
@@ -137,10 +137,10 @@ def test_refusals(case):
         case.text("yaskawa", pulses=(1.0, 2.0))
     alone = compensate(case.real, read_targets(case.path, case.real))
     with fails_with("E-COMPENSATE-POSES … --nominal"):
-        exported(alone, case.real, "ur", case.folder / "a", "poses")
+        robot_program(alone, case.real, "ur", case.folder / "a", "poses")
     unreached = replace(case.result, found=replace(case.result.found, status=("unreachable",) * 6))
     with fails_with("E-EXPORT-UNREACHED … 6"):
-        exported(unreached, case.real, "ur", case.folder / "a")
+        robot_program(unreached, case.real, "ur", case.folder / "a")
 
 
 def test_poses_of_two_tools_are_refused(case, tmp_path):
@@ -150,8 +150,8 @@ def test_poses_of_two_tools_are_refused(case, tmp_path):
     path.write_text("\n".join(",".join(row) for row in [["target", *joint_columns(robot)], *rows]) + "\n")
     result = compensate(robot, read_targets(path, robot), robot)
     with fails_with("E-EXPORT-TOOLS … 2 … '', 'ball'"):
-        exported(result, robot, "kuka", path, "poses")
-    assert "line 3, target ball" in exported(result, robot, "kuka", path).text
+        robot_program(result, robot, "kuka", path, "poses")
+    assert "line 3, target ball" in robot_program(result, robot, "kuka", path).text
 
 
 SCARA = Robot(
@@ -168,14 +168,14 @@ def test_prismatic_joints(tmp_path):
     path.write_text("\n".join(",".join(r) for r in [joint_columns(SCARA), *(joint_cells(SCARA, v) for v in q)]) + "\n")
     result = compensate(SCARA, read_targets(path, SCARA), SCARA)
     shown = np.where(SCARA.prismatic, q, np.degrees(q))
-    fanuc = exported(result, SCARA, "fanuc", path).text
+    fanuc = robot_program(result, SCARA, "fanuc", path).text
     assert re.search(r"J3 = 120\.500000000  mm,\n\tJ4 = -22\.918311805 deg\n\};", fanuc)
-    abb = lines(exported(result, SCARA, "abb", path).text, r"\[\[" + six(*[""] * 6) + r"\]")
+    abb = lines(robot_program(result, SCARA, "abb", path).text, r"\[\[" + six(*[""] * 6) + r"\]")
     assert np.abs(abb - np.pad(shown, ((0, 0), (0, 2)))).max() < 1e-8
     with fails_with("E-ROBOT-MISMATCH … 4 … 1"):
-        exported(result, SCARA, "ur", path)
+        robot_program(result, SCARA, "ur", path)
     with fails_with("E-ROBOT-MISMATCH … 1"):
-        exported(result, SCARA, "yaskawa", path, pulses_per_deg=(1, 1, 1, 1))
+        robot_program(result, SCARA, "yaskawa", path, pulses_per_deg=(1, 1, 1, 1))
 
 
 @pytest.mark.slow

@@ -52,7 +52,7 @@ def plain(saved):
 def stated(saved, tmp_path):
     path = tmp_path / "lab.toml"
     path.write_text(STATEMENT)
-    return statement_of(saved.board_design.stated, path, ["date=2026-03-01"])
+    return statement_of(saved.board_design.stated, path, {"date": "2026-03-01"})
 
 
 @pytest.mark.slow
@@ -119,7 +119,7 @@ def test_a_statement_goes_before_the_boards_own(saved, tmp_path):
     path = tmp_path / "lab.toml"
     path.write_text("[board]\ntemperature_c = 24\n")
     own = StatedSize(expansion_ppm_per_k=8.0, temperature_c=30.0)
-    found = statement_of(own, path, ["operator=B", "serial = 12"])
+    found = statement_of(own, path, {"operator": "B", "serial": "12"})
     assert (found.board.expansion_ppm_per_k, found.board.temperature_c) == (8.0, 24.0)
     assert found.origin["board", "temperature_c"] == str(path)
     assert found.origin["board", "expansion_ppm_per_k"] == "board.toml"

@@ -16,7 +16,7 @@ from stcal.sfm.adjust.refine import moved_poses
 from stcal.sfm.camera.equations import Setting, derivatives
 from stcal.sfm.camera.intrinsics import adjust_intrinsics, design_shapes, model_parameters
 from stcal.sfm.camera.report import rig_report
-from stcal.sfm.camera.rig import _sightings, _start, adjust_rig, calibrate_rig, gathered, symmetries
+from stcal.sfm.camera.rig import _sightings, _start, adjust_rig, gathered, rig_of, symmetries
 from stcal.workflows.calibrate_camera import Models, camera_names, files_of
 from tests.outcome import fails_with
 from tests.sfm.camera.rigs import alone, calibrated_alone, seen_by_rig
@@ -31,7 +31,7 @@ def pair():
 
 @pytest.fixture(scope="module")
 def rig(pair):
-    return calibrate_rig(pair[1], BOARD)
+    return rig_of(pair[1], BOARD)
 
 
 def off(found: Rigid, truth: Rigid) -> np.ndarray:
@@ -76,7 +76,7 @@ def test_errors_of_many_rigs_are_as_large_as_their_sigma(count):
     places, intrinsics = [], []
     for seed in range(6):
         seen = seen_by_rig(np.random.default_rng(100 + seed), count, 10)
-        one, other = squares(seen, calibrate_rig(alone(seen), BOARD))
+        one, other = squares(seen, rig_of(alone(seen), BOARD))
         places += one
         intrinsics += other
     assert np.mean(places) / 6 == pytest.approx(1.0, abs=0.75)
@@ -142,7 +142,7 @@ def test_dots_that_a_camera_counts_from_the_other_end_are_counted_alike(pair, ri
     seen, cameras = pair
     turned = [half_turned(view) for view in seen.views[1]]
     other = calibrated_alone(seen.cameras[1], seen.models[1], turned)
-    found = calibrate_rig({"left": cameras["left"], "right": other}, BOARD)
+    found = rig_of({"left": cameras["left"], "right": other}, BOARD)
     assert not found.apart
     assert found.camera_from_first[1].matrix() == pytest.approx(rig.camera_from_first[1].matrix(), abs=1e-3)
 
@@ -157,7 +157,7 @@ def test_a_view_of_another_instant_is_set_apart_and_named(pair):
         replace(m, images=tuple(names.get(name, name) for name in m.images)) for m in right.intrinsics.models
     )
     swapped = replace(right, views=tuple(swap), intrinsics=replace(right.intrinsics, models=models))
-    rig = calibrate_rig({"left": cameras["left"], "right": swapped}, BOARD)
+    rig = rig_of({"left": cameras["left"], "right": swapped}, BOARD)
     assert {each.image for each in rig.apart} == {first, second}
     assert all("px RMS from where left saw it" in each.reason for each in rig.apart)
     assert any("2 views are none of their instant" in each for each in rig.warnings)
@@ -175,7 +175,7 @@ def test_a_camera_that_shares_no_instant_is_named(pair):
     models = tuple(replace(m, images=tuple(names[name] for name in m.images)) for m in right.intrinsics.models)
     other = replace(right, views=views, intrinsics=replace(right.intrinsics, models=models))
     with fails_with("E-RIG-UNLINKED … right … left"):
-        calibrate_rig({"left": cameras["left"], "right": other}, BOARD)
+        rig_of({"left": cameras["left"], "right": other}, BOARD)
 
 
 def test_instants_of_a_plain_board_that_never_turns_do_not_tell_its_ends(pair):

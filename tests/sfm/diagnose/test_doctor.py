@@ -17,7 +17,7 @@ from stcal.labels import CircleLabel
 from stcal.sfm import RunOptions, run
 from stcal.sfm.data.patterns import Pattern, ideal_border, in_view
 from stcal.sfm.detect.circles.candidates import EllipseOptions, find_ellipses
-from stcal.sfm.diagnose.doctor import _depth_of_field, diagnose, missing_circles
+from stcal.sfm.diagnose.doctor import _depth_of_field, doctor, missing_circles
 from stcal.sfm.diagnose.examine import LEAST_MIN_DIAMETER_PX, trace_outlines
 from stcal.sfm.diagnose.findings import Diagnosis, Finding, GateCount, by_gate, in_order, table
 from stcal.sfm.mapping.database import image_ids
@@ -73,7 +73,7 @@ class Patient:
     def run(self, **options) -> Diagnosis:
         files = [self.folder / name for name in ("images", "cameras.txt", "run", "target.toml", "board.toml")]
         run(*files, RunOptions(workers=1, solve="chain", **options))
-        return diagnose(load_run(self.folder / "run"), workers=1)
+        return doctor(load_run(self.folder / "run"), workers=1)
 
     def arguments(self, command: str, *more) -> list:
         """Of ``stcal-sfm``."""
@@ -121,7 +121,7 @@ def let_in(diagnosis: Diagnosis, option: str) -> set[tuple[str, str]]:
 
 
 def test_a_good_run_lacks_no_circle(small_run):
-    diagnosis = diagnose(load_run(small_run), workers=1)
+    diagnosis = doctor(load_run(small_run), workers=1)
     assert unlabelled(diagnosis) == set()
     assert {f.gate for f in diagnosis.findings} == {"views"}
     never = {f.labels[0].split(":")[0] for f in diagnosis.findings if not f.image and f.value == 0}
@@ -354,7 +354,7 @@ def test_images_that_moved_or_are_gone(patient, tmp_path):
     moved = patient.images.rename(tmp_path / "elsewhere")
 
     def found(images=None) -> Finding:
-        return by_label(diagnose(saved, images, workers=1), FIRST)["2:7"]
+        return by_label(doctor(saved, images, workers=1), FIRST)["2:7"]
 
     assert (found().gate, found().unit) == ("not_examined", "px")
     assert 10 < found().value < 30
@@ -401,7 +401,7 @@ def test_a_report_of_another_version_is_refused(small_run):
     saved = load_run(small_run)
     del saved.report["left_out"]["files"]
     with fails_with("E-RUN-VERSION … 'files'"):
-        diagnose(saved, workers=1)
+        doctor(saved, workers=1)
 
 
 @pytest.mark.parametrize(("key", "wrong"), [("limit", []), ("value", {}), ("gate", 7), ("unit", None), ("label", 1.5)])
@@ -410,7 +410,7 @@ def test_a_damaged_report_is_refused(small_run, key, wrong):
     good = {"image": FIRST, "label": "2:7", "gate": "rim", "value": 0.5, "limit": 0.8, "unit": "px"}
     saved.report["left_out"]["circles"] = [good, good | {key: wrong}]
     with fails_with("E-RUN-VERSION"):
-        diagnose(saved, workers=1)
+        doctor(saved, workers=1)
 
 
 def test_the_table():

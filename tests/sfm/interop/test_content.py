@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from stcal.errors import InputError
-from stcal.sfm.interop.export_database import export_database
+from stcal.sfm.interop.export_database import copy_database
 from stcal.sfm.runs.saved import load_run
 from tests.outcome import fails_with
 from tests.shared import own_copy
@@ -88,7 +88,7 @@ NOT_WHOLE = {
 def test_what_is_not_whole_is_refused(spoilt, tmp_path, case):
     statement, message = NOT_WHOLE[case]
     with pytest.raises(InputError, match=rf"database\.db: damaged \(.*{message}.*\); make the run again$") as caught:
-        export_database(spoilt(statement), tmp_path / "out.db", "4.2")
+        copy_database(spoilt(statement), tmp_path / "out.db", "4.2")
     assert len(str(caught.value).splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["database.db"]
 
@@ -126,7 +126,7 @@ def test_what_the_run_did_not_label_is_refused(spoilt, saved, tmp_path, case):
     statement, message = NOT_OF_THE_RUN[case]
     database = spoilt(statement)
     with fails_with(message) as caught:
-        export_database(database, tmp_path / "out.db", "4.2", saved)
+        copy_database(database, tmp_path / "out.db", "4.2", saved)
     assert len(str(caught.value).splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["database.db"]
 

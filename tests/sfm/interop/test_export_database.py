@@ -21,7 +21,7 @@ import pytest
 
 from stcal.errors import InputError, StcalError
 from stcal.sfm.interop import export_database as export
-from stcal.sfm.interop.export_database import export_database, table_differences
+from stcal.sfm.interop.export_database import copy_database, table_differences
 from stcal.sfm.interop.schema import SCHEMAS, schema_of_version
 from stcal.sfm.mapping.incremental import pipeline_options
 from tests.outcome import fails_with
@@ -135,14 +135,14 @@ def no_screen(monkeypatch):
 def test_the_schema_is_what_the_program_itself_makes(schema, small_run, tmp_path):
     """Against an empty database of native COLMAP 3.8 and of pycolmap 4.2, made here and now."""
     empty_database(schema, tmp_path / "empty.db")
-    export_database(small_run / "database.db", tmp_path / "out.db", schema)
+    copy_database(small_run / "database.db", tmp_path / "out.db", schema)
     assert described(tmp_path / "out.db") == described(tmp_path / "empty.db")
 
 
 @pytest.mark.parametrize("schema", PUBLISHED, ids=[f"{schema} as published, not run here" for schema in PUBLISHED])
 def test_the_schema_is_the_published_one(schema, small_run, tmp_path):
     """Against what was recorded when each version was run; the versions themselves are not here."""
-    export_database(small_run / "database.db", tmp_path / "out.db", schema)
+    copy_database(small_run / "database.db", tmp_path / "out.db", schema)
     lines = described(tmp_path / "out.db")
     assert hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16] == PUBLISHED[schema], "\n".join(lines)
 
@@ -150,7 +150,7 @@ def test_the_schema_is_the_published_one(schema, small_run, tmp_path):
 @pytest.mark.parametrize("schema", SCHEMAS)
 def test_everything_is_kept(schema, full_database, tmp_path):
     """Every row and value, its type and its place; what a version has no column for was empty."""
-    written = export_database(full_database, tmp_path / "out.db", schema)
+    written = copy_database(full_database, tmp_path / "out.db", schema)
     assert (written.images, written.pairs, written.camera_models) == (8, 28, ("OPENCV",))
     ours, theirs = columns_of(full_database), columns_of(tmp_path / "out.db")
     for table, columns in theirs.items():
@@ -186,7 +186,7 @@ def test_our_database_is_only_read(database, tmp_path, monkeypatch):
     before, since = state_of(database.parent), database.stat().st_mtime_ns
     monkeypatch.setattr(export.sqlite3, "connect", connect)
     for schema in SCHEMAS:
-        export_database(database, tmp_path / f"{schema}.db", schema)
+        copy_database(database, tmp_path / f"{schema}.db", schema)
     assert state_of(database.parent) == before
     assert database.stat().st_mtime_ns == since
     own = [path for path in opened if str(database) in path]
@@ -199,7 +199,7 @@ def test_a_database_in_rollback_mode_is_read_with_its_locks(database, tmp_path):
     with closing(sqlite3.connect(database)) as opened:
         opened.execute("PRAGMA journal_mode = DELETE")
     before = state_of(database.parent)
-    export_database(database, tmp_path / "out.db", "3.8")
+    copy_database(database, tmp_path / "out.db", "3.8")
     assert state_of(database.parent) == before
     assert (tmp_path / "out.db").is_file()
 
@@ -232,7 +232,7 @@ def points_by_track(model) -> dict[tuple, np.ndarray]:
 def test_pycolmap_makes_the_same_model_of_the_export(schema, small_run, tmp_path):
     """Exactly the same: pycolmap brings the older schema back to its own, and finds the same numbers in it."""
     names, pair = first_group(small_run)
-    export_database(small_run / "database.db", tmp_path / "out.db", schema)
+    copy_database(small_run / "database.db", tmp_path / "out.db", schema)
     ours = mapped(small_run / "database.db", tmp_path / "ours", names, pair)
     theirs = mapped(tmp_path / "out.db", tmp_path / "theirs", names, pair)
     assert theirs.num_reg_images() == ours.num_reg_images() == len(names)
@@ -246,7 +246,7 @@ def test_native_colmap_maps_the_export(small_run, tmp_path):
     """Debian's 3.8 with thresholds for few points: every image of the group, every circle."""
     colmap = native_colmap()
     names, pair = first_group(small_run)
-    export_database(small_run / "database.db", tmp_path / "out.db", "3.8")
+    copy_database(small_run / "database.db", tmp_path / "out.db", "3.8")
     (tmp_path / "names.txt").write_text("\n".join(names) + "\n")
     (tmp_path / "model").mkdir()
     options = pipeline_options(names, pair)
@@ -356,18 +356,18 @@ def test_what_has_no_place_is_refused_with_the_version_that_has_it(what, databas
     statements, older, message, newer = REFUSALS[what]
     change(database, *statements)
     with fails_with(message) as refusal:
-        export_database(database, tmp_path / "out.db", older)
+        copy_database(database, tmp_path / "out.db", older)
     assert f"schema {older} has no place for it; give --schema {newer} or later" in str(refusal.value)
     assert "\n" not in str(refusal.value)
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
-    export_database(database, tmp_path / "out.db", newer)
+    copy_database(database, tmp_path / "out.db", newer)
     assert (tmp_path / "out.db").is_file()
 
 
 def test_an_unknown_camera_model_has_no_place_anywhere(database, tmp_path):
     change(database, "UPDATE cameras SET model = 99")
     with fails_with("E-SCHEMA-NO-PLACE … 1 … 99"):
-        export_database(database, tmp_path / "out.db", "4.2")
+        copy_database(database, tmp_path / "out.db", "4.2")
 
 
 @pytest.fixture
@@ -377,7 +377,7 @@ def refused(tmp_path):
     def message(database, schema="3.8", out="out.db", error=InputError) -> str:
         before, beside = state_of(database.parent), state_of(tmp_path)
         with pytest.raises(error) as refusal:
-            export_database(database, tmp_path / out, schema)
+            copy_database(database, tmp_path / out, schema)
         assert state_of(database.parent) == before
         assert state_of(tmp_path) == beside
         assert "\n" not in str(refusal.value)
@@ -408,7 +408,7 @@ def test_a_folder_that_is_not_there(database, refused):
 def test_a_database_that_pycolmap_has_open(database, refused):
     with closing(pycolmap.Database.open(str(database))):
         assert "database.db: in use by another program (database.db-wal, database.db-shm" in refused(database)
-    assert "Exported" in repr(export_database(database, database.parent / "out.db", "3.8"))
+    assert "Exported" in repr(copy_database(database, database.parent / "out.db", "3.8"))
 
 
 def test_side_files_of_a_program_that_did_not_end_well(database, refused):
@@ -528,7 +528,7 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(links, database, tmp_p
 
     if not links:
         monkeypatch.setattr(export.os, "link", no_links)
-    export_database(database, tmp_path / "first.db", "3.8")
+    copy_database(database, tmp_path / "first.db", "3.8")
     assert (tmp_path / "first.db").is_file()
     check = export._require_same_content
 
@@ -538,7 +538,7 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(links, database, tmp_p
 
     monkeypatch.setattr(export, "_require_same_content", slow)
     with fails_with("E-OUTPUT-EXISTS"):
-        export_database(database, tmp_path / "out.db", "3.8")
+        copy_database(database, tmp_path / "out.db", "3.8")
     assert (tmp_path / "out.db").read_text() == "theirs"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["first.db", "out.db", "run"]
 

@@ -13,9 +13,10 @@ from stcal.lookalikes import MIN_COMMON
 from stcal.sfm.detect.sightings import confusable, in_common, is_named, mirror_images
 from stcal.sfm.make import design
 from stcal.sfm.make.box import NAMES, faces_of, sides_of, size_of
-from stcal.sfm.make.design import MakeOptions, make_target
+from stcal.sfm.make.design import DesignOptions, make_target
 from stcal.sfm.make.pattern import HIDDEN, LARGE, LEAST_CIRCLES, make_pattern, unnamed_cases
-from stcal.sfm.planning.session import PlanOptions, plan
+from stcal.sfm.planning.bodies import plan
+from stcal.sfm.planning.session import PlanOptions
 from stcal.synthetic.designs import face_of_drawing, second_design
 from tests.outcome import fails_with
 
@@ -24,7 +25,7 @@ SIZE = (130.0, 110.0, 100.0)
 
 @pytest.fixture(scope="module")
 def made():
-    return make_target(MakeOptions(SIZE, circles=LEAST_CIRCLES, distance_mm=800.0, width=2592))
+    return make_target(DesignOptions(SIZE, circles=LEAST_CIRCLES, distance_mm=800.0, width=2592))
 
 
 @pytest.mark.slow
@@ -69,7 +70,7 @@ def test_likeness_is_found_where_there_is_some(made):
     assert in_common(mirrored, face, mirrored=True) == len(face.ids)
     assert in_common(face, face) == 0
     two = Alike("two", "dark", (face, turned))
-    camera = MakeOptions(SIZE, width=2592).ideal_camera()
+    camera = DesignOptions(SIZE, width=2592).ideal_camera()
     failed, cases = unnamed_cases(two, camera, 800.0, HIDDEN, None)
     assert len(failed) == cases == 168
 
@@ -82,7 +83,7 @@ def test_a_symmetric_design_fails_the_cases_of_hidden_circles():
     rows[7] = ("8", 45.0, 27.0, 6.0)
     face, _ = face_of_drawing("only", rows, "1", "5", "6")
     target = TargetDesign("rows", "dark", (face,))
-    failed, cases = unnamed_cases(target, MakeOptions(SIZE, width=2592).ideal_camera(), 800.0, HIDDEN, None)
+    failed, cases = unnamed_cases(target, DesignOptions(SIZE, width=2592).ideal_camera(), 800.0, HIDDEN, None)
     odd = [gone for _, gone in failed if {"3", "8"} <= set(gone)]  # the one off its place, and where it would go
     assert len(odd) == 8
     assert len(failed) < 0.2 * cases
@@ -91,7 +92,7 @@ def test_a_symmetric_design_fails_the_cases_of_hidden_circles():
 @pytest.mark.full
 def test_a_pattern_that_is_not_always_named_is_drawn_anew(monkeypatch):
     """Nine circles leave six, which is all that a face needs: of such patterns one in a few fails a case."""
-    options = MakeOptions((130.0, 120.0, 110.0), circles=LEAST_CIRCLES, width=1296)
+    options = DesignOptions((130.0, 120.0, 110.0), circles=LEAST_CIRCLES, width=1296)
     with monkeypatch.context() as once:
         once.setattr(design, "ATTEMPTS", 1)
         with fails_with("E-MAKE-UNNAMED … 1 … 420 … 1"):
@@ -146,10 +147,10 @@ def test_another_seed_makes_another_pattern():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (MakeOptions(SIZE, radius_mm=1.0), "E-MAKE-RADIUS … --radius-mm … 1 … 1000 … 2.28"),
-        (MakeOptions(SIZE, radius_mm=60.0, distance_mm=500.0), "E-MAKE-RADIUS"),
-        (MakeOptions(SIZE, circles=8), "E-MAKE-CIRCLES … --circles … 8 … 9 … 6 … 3"),
-        (MakeOptions(SIZE, circles=40, radius_mm=9.0), "E-MAKE-ROOM … front … 40 … 9 … 14.4"),
+        (DesignOptions(SIZE, radius_mm=1.0), "E-MAKE-RADIUS … --radius-mm … 1 … 1000 … 2.28"),
+        (DesignOptions(SIZE, radius_mm=60.0, distance_mm=500.0), "E-MAKE-RADIUS"),
+        (DesignOptions(SIZE, circles=8), "E-MAKE-CIRCLES … --circles … 8 … 9 … 6 … 3"),
+        (DesignOptions(SIZE, circles=40, radius_mm=9.0), "E-MAKE-ROOM … front … 40 … 9 … 14.4"),
     ],
 )
 def test_what_cannot_be_made_is_refused(options, said):
@@ -217,7 +218,7 @@ def test_outlines_at_any_angle_are_taken(tmp_path, angle_deg):
 @pytest.mark.slow
 @pytest.mark.parametrize("distance_mm", [400.0, 600.0, 1000.0])
 def test_box_and_board_fit_the_image_side_by_side(distance_mm):
-    made = make_target(MakeOptions((130.0, 110.0, 90.0), distance_mm=distance_mm, faces=("front", "right", "top")))
+    made = make_target(DesignOptions((130.0, 110.0, 90.0), distance_mm=distance_mm, faces=("front", "right", "top")))
     assert made.board.radius_mm >= made.least_mm
     target = made.pattern.target
     planned = plan(PlanOptions(images=3, distance_mm=distance_mm), target, made.board, target.rough_poses())

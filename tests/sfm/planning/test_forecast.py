@@ -37,7 +37,7 @@ from stcal.sfm.planning.forecast import (
 )
 from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.planning.session import PlanOptions, widest_aperture_mm
-from stcal.sfm.planning.session import plan as make_plan
+from stcal.sfm.planning.session import plan_with_board as make_plan
 from stcal.sfm.planning.views import PlannedView, candidates, known_scene
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.designs import tag_cube

@@ -5,9 +5,11 @@ import io
 import numpy as np
 import pytest
 
+import stcal
+from stcal import workflows
 from stcal.io.device import SimulatedSource
-from stcal.workflows.capture import Trigger, photograph
-from stcal.workflows.watch import Growing, WatchOptions
+from stcal.workflows.growing import GrowingRun, Update, WatchOptions
+from stcal.workflows.photographs import Trigger, capture
 from tests.outcome import fails_with
 from tests.shared import own_copy
 
@@ -16,7 +18,7 @@ AT_ONCE = {"exposure": None, "settle_s": 0.0}
 
 def growing(data, root):
     files = data / "cameras.txt", root / "run", data / "target.toml", data / "board.toml"
-    return Growing.of(root / "images", *files, WatchOptions(views=0))
+    return GrowingRun.of(root / "images", *files, WatchOptions(views=0))
 
 
 @pytest.mark.slow
@@ -27,7 +29,7 @@ def test_photographs_become_a_run(small_dataset, tmp_path):
     own_copy(next((small_dataset / "images" / "12").iterdir()), earlier)
     before = earlier.read_bytes()
     trigger = Trigger(2, 0.0, io.StringIO(), print)
-    taken = list(photograph(source, own, "12", ready=trigger.ready, **AT_ONCE))
+    taken = list(capture(source, own, "12", ready=trigger.ready, **AT_ONCE))
     assert [each.name for each in taken] == ["12/IMG_0008.png", "12/IMG_0009.png"]
     assert earlier.read_bytes() == before
     last = taken[-1].update
@@ -42,11 +44,28 @@ def test_photographs_become_a_run(small_dataset, tmp_path):
 @pytest.mark.slow
 def test_saturated_circles_are_said(small_dataset, tmp_path):
     own, source = growing(small_dataset, tmp_path), SimulatedSource(small_dataset / "images" / "12", gain=1.6)
-    (taken,) = photograph(source, own, "12", ready=Trigger(1, 0.0, io.StringIO(), print).ready, **AT_ONCE)
+    (taken,) = capture(source, own, "12", ready=Trigger(1, 0.0, io.StringIO(), print).ready, **AT_ONCE)
     assert taken.saturated > taken.circles / 2
     assert "expose less, saturated circles grow" in taken.light()
     assert taken.update.result is None
     assert "2 needed" in taken.update.reason
+
+
+def test_the_command_and_the_function_take_the_same(stcal_sfm, small_dataset, tmp_path, monkeypatch):
+    """The runs themselves are those of the slow tests above."""
+    monkeypatch.setattr(GrowingRun, "update", lambda *_: Update(1, (), (), (), None, "2 needed", None, {}))
+    files = [small_dataset / name for name in ("cameras.txt", "target.toml", "board.toml")]
+    words = "--camera", files[0], "--target", files[1], "--board", files[2], "--out", tmp_path / "run"
+    shown = "--group", "12", "--simulate", small_dataset / "images" / "12", "--every", "0", "--count", "2"
+    assert stcal_sfm("capture", tmp_path / "one", *words, *shown)[0] == 0
+    source = stcal.SimulatedSource(small_dataset / "images" / "12")
+    growing = workflows.GrowingRun.of(tmp_path / "two", files[0], tmp_path / "run", *files[1:])
+    taken = list(workflows.capture(source, growing, "12", lambda number: number <= 2))
+    assert [each.name for each in taken] == ["12/IMG_0001.png", "12/IMG_0002.png"]
+    for each in taken:
+        assert (tmp_path / "two" / each.name).read_bytes() == (tmp_path / "one" / each.name).read_bytes()
+    with fails_with("E-FIELD-TYPE … source … Source"):
+        workflows.capture("0", growing, "12", lambda _: False)
 
 
 def test_enter_takes_one_and_the_end_of_input_ends():
@@ -68,5 +87,5 @@ def test_a_camera_without_further_images_and_a_name_that_is_none(small_dataset, 
     with fails_with("E-DEVICE-NO-IMAGE"):
         source.expose(None, 0.0)
     with fails_with("E-DEVICE-NAME … group … '../x'"):
-        next(photograph(source, growing(small_dataset, tmp_path), "../x", ready=lambda _: True, **AT_ONCE))
+        next(capture(source, growing(small_dataset, tmp_path), "../x", ready=lambda _: True, **AT_ONCE))
     assert not (tmp_path / "images").exists()

@@ -10,9 +10,7 @@ import stcal
 from stcal.errors import InputError
 from stcal.io.files import RUN_MARKER
 from stcal.sfm.interop import crosscheck as interop
-from stcal.sfm.runs.crosscheck import Tolerances
 from stcal.sfm.runs.options import RunOptions
-from stcal.sfm.runs.saved import load_run
 from stcal.sfm.runs.transaction import MarkerFile, added_results, run_folder
 from stcal.sfm.runs.verify import require_whole, verified_text, verify
 from tests.outcome import INPUT, assert_error, fails_with
@@ -132,9 +130,9 @@ def test_no_run_begins_while_a_crosscheck_maps(small_run, tmp_path, monkeypatch)
         with run_folder(run, MARKER, {}):
             pytest.fail("a run began")
 
-    monkeypatch.setattr(interop, "crosscheck", meanwhile)
+    monkeypatch.setattr(interop, "_compared", meanwhile)
     with fails_with("E-OUTPUT-IN-USE"):
-        interop.crosscheck_run(load_run(run), None, Tolerances(), 60)
+        interop.crosscheck(run, into_report=True)
     assert verify(run).whole
 
 

@@ -2,10 +2,13 @@
 
 import pytest
 
+from stcal import workflows
 from stcal.errors import DegenerateError
-from stcal.workflows.watch import WatchOptions, watch
+from stcal.workflows.growing import GrowingRun, Update, WatchOptions, watch
 from tests.outcome import fails_with
 from tests.shared import own_copy
+
+UPDATE = Update(8, (), (), (), None, "two groups needed", None, {})
 
 
 def watched(data, folder, out, sleep, **options):
@@ -65,9 +68,28 @@ def test_advice_that_cannot_be_given_is_told(small_dataset, tmp_path, monkeypatc
     def none(*_):
         raise DegenerateError("E-TEST", "no view")
 
-    monkeypatch.setattr("stcal.workflows.watch.advise", none)
+    monkeypatch.setattr("stcal.workflows.growing.advise", none)
     (update,) = watched(small_dataset, small_dataset / "images", tmp_path / "run", lambda _: None)
     assert (update.result is None, update.advice, update.reason) == (False, None, "no view")
+
+
+def test_the_command_and_the_function_look_alike(stcal_sfm, small_dataset, tmp_path, monkeypatch):
+    """The runs themselves are those of the slow tests above."""
+    said = []
+    monkeypatch.setattr(GrowingRun, "update", lambda self, count, *_, **__: said.append((self.out, count)) or UPDATE)
+    files = [small_dataset / name for name in ("cameras.txt", "target.toml", "board.toml")]
+    words = "--camera", files[0], "--target", files[1], "--board", files[2], "--idle", "0.15", "--interval", "0.1"
+    ended = stcal_sfm("watch", small_dataset / "images", *words, "--out", tmp_path / "one")
+    assert ended[0] == 0
+    assert UPDATE.reason in ended[1]
+    options = workflows.WatchOptions(0.1, 0.15)
+    (update,) = workflows.watch(
+        small_dataset / "images", files[0], tmp_path / "two", *files[1:], options, sleep=lambda _: None
+    )
+    assert update is UPDATE
+    assert [count for _, count in said] == [8, 8]
+    with fails_with("E-FIELD-TYPE … options"):
+        workflows.watch(small_dataset / "images", files[0], tmp_path, options=0.1)
 
 
 def test_an_empty_folder_ends_and_none_is_an_error(small_dataset, tmp_path):
@@ -96,7 +118,7 @@ def test_a_photograph_counts_when_two_looks_agree_and_no_other_is_used(small_dat
         files, _ = self._files(complete)
         used.append([file.name for file in files])
 
-    monkeypatch.setattr("stcal.workflows.watch.Growing.update", update)
+    monkeypatch.setattr("stcal.workflows.growing.GrowingRun.update", update)
     folder = tmp_path / "images"
     folder.mkdir()
     for name in "ab":

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.files import save, unwritable
 from stcal.io.poses.static import Static, read_messages, read_ros1_launch, read_ros2_launch
@@ -13,7 +14,7 @@ from stcal.io.table import require_poses_written
 from stcal.sfm.interop.export import solids, tables, viewers
 from stcal.sfm.interop.export.content import Content, content_of
 from stcal.sfm.interop.export.viewers import write_rrd
-from stcal.sfm.runs.saved import load_run
+from stcal.sfm.runs.saved import AnyRun, saved_run
 
 ROOT = "target"
 """Default name of the target frame."""
@@ -63,17 +64,33 @@ class ExportedRun:
     notes: list[str]
 
 
-def export_run(run: str | Path, path: str | Path, form: str = "", name: str = ROOT) -> ExportedRun:
+@require_arguments
+def export_run(run: AnyRun, out: str | Path, form: str = "", name: str = ROOT) -> ExportedRun:
     """Writes faces and circles to a new file, with σ, cameras and photographs if the form holds them.
 
-    ``run`` : folder of a finished run; ``path`` : new file, whose suffix gives the form; ``form`` : form of
-    :data:`FORMS`, in place of the one of the suffix; ``name`` : name of the target frame, and prefix of the other
-    frames' names.
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+    out : str or Path
+        New file, whose suffix gives the form: ``.urdf``, ``.xacro``, ``.yaml`` (tf2), ``.py`` and ``.launch`` (ROS 2
+        and 1), ``.yml`` (OpenCV), ``.csv``, ``.ply``, ``.dxf``, ``.gltf``, ``.glb`` or ``.rrd`` (Rerun).
+    form : {"urdf", "xacro", "tf2", "ros2", "ros1", "opencv", "csv", "ply", "dxf", "gltf", "glb", "rerun"}, optional
+        Form in place of that of the suffix.
+    name : str
+        Name of the target frame, and prefix of the other frames' names.
 
-    Raises InputError if it is no finished run, the file exists, the form is unknown, a library is not installed, or
-    the name is bad.
+    Returns
+    -------
+    ExportedRun
+        ``path``, ``form``, and ``notes`` on what the file lacks.
+
+    Raises
+    ------
+    InputError
+        Not a finished run, the file exists, the form is unknown, a library is not installed, or the name is bad.
     """
-    path = Path(path)
+    path = Path(out)
     form = form or form_of(path)
     if form not in FORMS:
         raise InputError("E-OPTION-FORM", f"--form {form}: unknown; one of {', '.join(FORMS)} needed")
@@ -81,7 +98,7 @@ def export_run(run: str | Path, path: str | Path, form: str = "", name: str = RO
         raise InputError("E-OUTPUT-EXISTS", f"{path}: exists, and nothing is overwritten; give a new file")
     if not path.parent.is_dir():
         raise InputError("E-OUTPUT-FOLDER", f"{path}: no folder {path.parent}; make it, or give another place")
-    content = content_of(load_run(run), name)
+    content = content_of(saved_run(run), name)
     write = FORMS[form].write
     if write is not None:
         save(path, write(content))

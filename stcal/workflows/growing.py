@@ -10,8 +10,10 @@ import numpy as np
 from stcal.boards.file import run_board_of as board_of
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
+from stcal.geometry.arrays import require_arguments, require_fields
+from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import CameraModel
-from stcal.io.cameras.read import read_camera
+from stcal.io.cameras.read import camera_model, read_camera
 from stcal.io.design import target_of
 from stcal.io.files import CACHE
 from stcal.io.images import Skipped, chosen_images, find_images
@@ -32,9 +34,21 @@ RELOAD_S = 5
 class WatchOptions:
     """Options of watching a folder.
 
-    ``interval_s`` : interval at which the folder is looked at, s; a photograph counts when it has not changed between
-    two looks; ``idle_s`` : time without a new photograph after which watching ends, s; never if None; ``views`` :
-    number of views to advise after each run; none where 0; ``run`` : options of the runs.
+    Parameters
+    ----------
+    interval_s : float
+        Interval at which the folder is looked at, s; a photograph counts when it has not changed between two looks.
+    idle_s : float, optional
+        Time without a new photograph after which watching ends, s; never if None.
+    views : int
+        Number of views to advise after each run; none where 0.
+    run : RunOptions, optional
+        Options of the runs; the defaults if None.
+
+    Raises
+    ------
+    InputError
+        A time is not positive, or a value of another type.
     """
 
     interval_s: float = 1.0
@@ -43,6 +57,7 @@ class WatchOptions:
     run: RunOptions | None = None
 
     def __post_init__(self):
+        require_fields(self, "watch")
         if not (0 < self.interval_s < 1e6 and (self.idle_s is None or 0 < self.idle_s < 1e9) and self.views >= 0):
             raise InputError(
                 "E-OPTION-RANGE",
@@ -71,10 +86,23 @@ class Update:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Growing:
-    """A calibration over a growing set of photographs: folders, designs and options.
+class GrowingRun:
+    """A run over a growing set of photographs, made by :meth:`of`.
 
-    ``camera`` : its file or model; ``out`` : the run's folder.
+    Parameters
+    ----------
+    images : Path
+        Folder of the photographs, with a folder for each group.
+    camera : path or CameraModel
+        The camera's file, or what it states.
+    out : Path
+        The run's folder.
+    target, board : TargetDesign, BoardDesign
+        The designs.
+    views : int
+        Number of views to advise after each run.
+    options : RunOptions
+        Options of the run, with every default decided.
     """
 
     images: Path
@@ -89,18 +117,17 @@ class Growing:
     def of(
         cls,
         images: str | Path,
-        camera: str | Path | CameraModel,
+        camera: str | Path | Camera | CameraModel,
         out: str | Path,
-        target: str | Path | TargetDesign | None,
-        board: str | Path | BoardDesign | None,
-        options: WatchOptions,
-    ) -> "Growing":
-        """Returns the calibration for a user's input. Files are read here, so that faults in them are reported at
-        once."""
-        designs = target_of(target), board_of(board)
+        target: str | Path | TargetDesign | None = None,
+        board: str | Path | BoardDesign | None = None,
+        options: WatchOptions | None = None,
+    ) -> "GrowingRun":
+        """Returns the run for a user's input, whose files are read here; arguments as of :func:`watch`."""
+        designs, options = (target_of(target), board_of(board)), options or WatchOptions()
         settled = (options.run or RunOptions()).settled(designs[0])
-        model = camera if isinstance(camera, CameraModel) else read_camera(camera)
-        given = model if isinstance(camera, CameraModel) else camera
+        model = camera_model(camera)
+        given = camera if isinstance(camera, str | Path) else model
         return cls(Path(images), given, Path(out), *designs, options.views, settled)
 
     def update(
@@ -158,9 +185,10 @@ class Growing:
         )
 
 
+@require_arguments
 def watch(
     images: str | Path,
-    camera: str | Path | CameraModel,
+    camera: str | Path | Camera | CameraModel,
     out: str | Path,
     target: str | Path | TargetDesign | None = None,
     board: str | Path | BoardDesign | None = None,
@@ -168,13 +196,16 @@ def watch(
     progress: Progress | None = None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[Update]:
-    """Repeat the run whenever photographs were added to a folder or removed from it; detections of the others are kept.
+    """Repeats the run whenever photographs were added to a folder or removed from it.
+
+    Detections of the other photographs are kept.
 
     Parameters
     ----------
     images : path
         Folder with one folder of images for each group; may be empty at first.
-    camera : path or CameraModel
+    camera : path, Camera or CameraModel
+        The camera, or its file.
     out : path
         The run's folder: new, empty, or of an earlier run. Its page reloads itself, until another run is written there.
     target, board : paths or designs
@@ -198,7 +229,7 @@ def watch(
         output folder is not a run's.
     """
     options = options or WatchOptions()
-    growing = Growing.of(images, camera, out, target, board, options)
+    growing = GrowingRun.of(images, camera, out, target, board, options)
     images = Path(images)
     if not images.is_dir():
         raise InputError(

@@ -10,10 +10,11 @@ from typing import TextIO
 
 import numpy as np
 
+from stcal.geometry.arrays import require_arguments
 from stcal.io.device import SATURATED, Source, checked_name, png
 from stcal.io.files import save
 from stcal.parallel import Progress
-from stcal.workflows.watch import Growing, Update
+from stcal.workflows.growing import GrowingRun, Update
 
 FIRST = 1
 NUMBERED = re.compile(r"IMG_(\d{4,})\.png")
@@ -72,37 +73,39 @@ class Trigger:
         return True
 
 
-def photograph(
+@require_arguments
+def capture(
     source: Source,
-    growing: Growing,
+    growing: GrowingRun,
     group: str,
-    exposure: float | None,
-    settle_s: float,
     ready: Callable[[int], bool],
+    exposure: float | None = None,
+    settle_s: float = 0.3,
     progress: Progress | None = None,
 ) -> Iterator[Taken]:
-    """Take photographs of a group, ``IMAGES/<group>/IMG_0001.png`` …, and after each run over all photographs so far.
+    """Takes photographs of a group, ``IMAGES/<group>/IMG_0001.png`` …, and after each run over all photographs so far.
 
     Parameters
     ----------
-    source : Source
-        The camera.
-    growing : Growing
-        The calibration.
+    source : OpenCVSource or SimulatedSource
+        The camera; or anything else with a ``name`` and their methods.
+    growing : GrowingRun
+        The run, with the folder that the photographs are written to.
     group : str
         Name of the group, in which only the camera moves. Its folder may hold earlier photographs, which stay.
+    ready : callable
+        Waits for the photograph of this number in the group; returns False at the end.
     exposure : float, optional
         Exposure in the driver's unit; unchanged if None.
     settle_s : float
         Time that the camera is given before each photograph, s.
-    ready : callable
-        Waits for the photograph of this number in the group; returns False at the end.
     progress : callable, optional
         Called with (stage, done, total).
 
     Yields
     ------
     Taken
+        The photograph, with the state of the run.
 
     Raises
     ------

@@ -1,0 +1,61 @@
+"""The functions of `stcal.workflows` for hand-eye calibration give what their commands write."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from stcal import workflows
+from stcal.cli.main import main
+from stcal.handeye.report.file import HandEyeFile
+from stcal.handeye.report.planned import planned_file
+from stcal.io.files import json_text
+from tests.handeye.test_plan_cli import NOISE, poses_file
+from tests.outcome import ended, fails_with
+from tests.support.handeye import simulated
+
+
+@pytest.fixture
+def poses(tmp_path):
+    return poses_file(tmp_path / "poses.csv", simulated(np.random.default_rng(8), 8, **NOISE))
+
+
+@pytest.fixture
+def written(monkeypatch, capsys, tmp_path):
+    def call(*words) -> dict:
+        monkeypatch.setattr(sys, "argv", ["stcal", "handeye", *map(str, words), "--json", str(tmp_path / "a.json")])
+        assert ended(main, capsys)[0] == 0
+        return json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
+
+    return call
+
+
+def test_calibrate_handeye(written, poses):
+    answer = written(poses, "--splits", 0, "--method", "pose", "--setup", "eye-in-hand")
+    given = workflows.read_handeye(poses, setup="eye-in-hand")
+    found = workflows.calibrate_handeye(given, "pose", repeats=0)
+    assert json.loads(json_text(HandEyeFile.of(found, whole=True))) == answer
+    with fails_with("E-FIELD-TYPE … given … HandEyeInput"):
+        workflows.calibrate_handeye(poses)
+    with fails_with("E-OPTION-VALUE … setup"):
+        workflows.read_handeye(poses, setup="in hand")
+
+
+def test_plan_handeye(written, poses):
+    answer = written("plan", poses, "--count", 1)
+    found = workflows.plan_handeye(workflows.read_handeye(poses), 1)
+    assert json.loads(json_text(planned_file(found.result, found.poses, found.joints))) == answer
+
+
+def test_without_flips(poses):
+    given, said = workflows.without_flips(workflows.read_handeye(poses))
+    assert given.pairs.camera_from_board == workflows.read_handeye(poses).pairs.camera_from_board
+    assert said.endswith("0 of 8 poses: none")
+
+
+def test_a_rig_file_is_read(tmp_path):
+    with fails_with(f"E-FILE-UNREADABLE … {tmp_path}"):
+        workflows.read_handeye_rig(tmp_path / "rig.toml")
+    with fails_with("E-FIELD-TYPE … given … RigInput"):
+        workflows.calibrate_handeye_rig(tmp_path)

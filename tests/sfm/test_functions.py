@@ -1,0 +1,165 @@
+"""Public functions give what their commands print and write; commands and functions: `tests/test_python_functions.py`.
+
+Functions take a run as its folder, as `load_run` reads it, or as `run` returned it.
+"""
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import stcal
+from stcal import sfm
+from stcal.io.files import json_text
+from stcal.sfm.diagnose.findings import DoctorFile
+from stcal.sfm.interop.gates import PairsFile
+from stcal.sfm.planning.file import plan_text
+from tests.outcome import fails_with
+from tests.shared import own_copy
+
+
+def written_json(stcal_sfm, out, *words) -> dict:
+    """What a command writes as JSON."""
+    assert stcal_sfm(*words, "--json", out)[0] == 0
+    return json.loads(out.read_text(encoding="utf-8"))
+
+
+def test_verify_and_pairs_and_doctor(stcal_sfm, small_result, small_run, small_dataset, tmp_path):
+    answer = written_json(stcal_sfm, tmp_path / "a.json", "verify", small_run)
+    assert json.loads(json_text(sfm.verify(small_result))) == answer
+    answer = written_json(stcal_sfm, tmp_path / "b.json", "pairs", small_run, "--group", "14")
+    assert json.loads(json_text(PairsFile.of(sfm.initial_pairs(small_run, "14")))) == answer
+    images = small_dataset / "images"
+    answer = written_json(stcal_sfm, tmp_path / "c.json", "doctor", small_run, "--images", images, "--workers", "1")
+    found = DoctorFile.of(sfm.doctor(sfm.load_run(small_run), images, workers=1))
+    assert json.loads(json_text(found)) == answer
+
+
+def test_compare(stcal_sfm, small_run, small_dataset, tmp_path):
+    truth = small_dataset / "truth.json"
+    answer = written_json(stcal_sfm, tmp_path / "a.json", "compare", small_run, truth)
+    assert json.loads(json_text(sfm.compare(small_run, truth))) == answer
+
+
+def test_uncertainty_budget(stcal_sfm, small_result, small_run, tmp_path):
+    words = "budget", small_run, "--field", "operator=A", "--no-strict"
+    answer = written_json(stcal_sfm, tmp_path / "a.json", *words)
+    found = sfm.uncertainty_budget(small_result, fields={"operator": "A"})
+    assert json.loads(json_text(found.file)) == answer
+    assert found.file.fields["operator"] == "A"
+    assert "A" in found.document().text()
+    with fails_with("E-OPTION-NEEDS … --columns … --check-lengths"):
+        sfm.uncertainty_budget(small_run, columns=tmp_path / "columns.toml")
+    with fails_with("E-OPTION-VALUE … 62"):
+        sfm.uncertainty_budget(small_run, fields={61 * "n": ""})
+
+
+def test_exports(stcal_sfm, small_result, small_run, tmp_path):
+    for words, call in (
+        (("export", "urdf"), lambda out: sfm.export_run(small_result, out)),
+        (("export-model", "ply", "--format", "ply"), lambda out: sfm.export_model(small_run, out, "ply")),
+        (("export-database", "db", "--schema", "3.8"), lambda out: sfm.export_database(small_result, out, "3.8")),
+    ):
+        one, two = tmp_path / f"one.{words[1]}", tmp_path / f"two.{words[1]}"
+        assert stcal_sfm(words[0], small_run, one, *words[2:])[0] == 0
+        assert call(two).path == two
+        assert two.read_bytes().replace(b"two.", b"one.") == one.read_bytes()
+
+
+def test_detect_images(stcal_sfm, small_dataset, tmp_path):
+    photograph, data = next((small_dataset / "images" / "12").iterdir()), small_dataset
+    (tmp_path / "images" / "12").mkdir(parents=True)
+    own_copy(photograph, tmp_path / "images" / "12")
+    camera, target, board = (data / name for name in ("cameras.txt", "target.toml", "board.toml"))
+    files = "--camera", camera, "--target", target, "--board", board, "--workers", "1"
+    assert stcal_sfm("detect", tmp_path / "images", *files, "--out", tmp_path / "out")[0] == 0
+    array = np.asarray(Image.open(photograph))
+    (seen,) = sfm.detect_images({"12": [array]}, camera, None, target, board, sfm.RunOptions(workers=1)).images.values()
+    rows = list(csv.DictReader((tmp_path / "out" / "detections.csv").read_text(encoding="utf-8").splitlines()))
+    assert [row["label"] for row in rows] == [str(label) for label in seen.labels]
+    np.testing.assert_allclose([[float(row[key]) for key in ("x_px", "y_px")] for row in rows], seen.xy_px, atol=1e-6)
+
+
+def test_design_target(stcal_sfm, monkeypatch, tmp_path):
+    """Cases of hidden circles, which take seconds: `make/test_design.py`."""
+    monkeypatch.setattr("stcal.sfm.make.design.unnamed_cases", lambda *_: ([], 1))
+    words = "--size", "130,120,110", "--faces", "front,right", "--circles", "9", "--images", "2", "--width", "1296"
+    _, said, _ = stcal_sfm("design", tmp_path / "one", *words)
+    options = sfm.DesignOptions((130.0, 120.0, 110.0), 9, width=1296, faces=("front", "right"))
+    found = sfm.design_target(options, 2, tmp_path / "two")
+    assert plan_text(found.forecast, found.source) in said
+    for name, path in zip(("target.toml", "board.toml"), found.files, strict=True):
+        assert path.read_bytes() == (tmp_path / "one" / name).read_bytes()
+    with fails_with("E-OUTPUT-EXISTS … target.toml"):
+        sfm.design_target(options, 2, tmp_path / "two")
+    with fails_with("E-OPTION-VALUE … under"):
+        sfm.DesignOptions((130.0, 120.0, 110.0), faces=("front", "under"))
+
+
+def test_design_tag_body_and_plan(stcal_sfm, tmp_path):
+    words = "--images", "10", "--distance", "300", "--width", "900"
+    _, said, _ = stcal_sfm("design", tmp_path / "one", "--tags", "cube", "--size", "50", *words)
+    session = sfm.PlanOptions(10, distance_mm=300.0, width=900)
+    found = sfm.design_tag_body("cube", 50.0, session=session)
+    assert plan_text(found.forecast, found.source) in said
+    assert found.files == ()
+    target = stcal.load_target(tmp_path / "one" / "target.toml")
+    assert plan_text(sfm.plan(session, target), found.source) in said
+    with fails_with("E-OPTION-CONFLICT … board"):
+        sfm.plan(session, target, stcal.reference_board())
+
+
+def test_noise_of_run(small_run):
+    noise = sfm.noise_of_run(small_run)
+    assert 0.001 < noise.edge < 0.2  # as of `planning/test_forecast.py`
+
+
+def test_calibrate_models(stcal_sfm, small_run, tmp_path):
+    one, two = tmp_path / "one.json", tmp_path / "two.json"
+    assert stcal_sfm("faces", small_run / "models", "--run", small_run, "--out", one)[0] == 0
+    found = sfm.calibrate_models(small_run / "models", small_run, out=two)
+    assert one.read_bytes() == two.read_bytes()
+    assert json.loads(one.read_text(encoding="utf-8"))["reference_face"] == found.target.reference_face
+
+
+def test_crosscheck_names_what_is_missing(stcal_sfm, small_run, tmp_path):
+    """The comparison itself: `interop/test_crosscheck.py`."""
+    program = tmp_path / "no-colmap"
+    own = own_copy(small_run, tmp_path / "run")  # its lock is taken
+    assert stcal_sfm("crosscheck", own, "--colmap", program).error == "E-COLMAP-PROGRAM"
+    with fails_with("E-COLMAP-PROGRAM … no-colmap"):
+        sfm.crosscheck(small_run, program, sfm.Tolerances(sigma=1.0))
+    with fails_with("E-FIELD-TYPE … tolerances … Tolerances"):
+        sfm.crosscheck(small_run, program, 0.5)
+
+
+def test_report_again(stcal_sfm, small_run, tmp_path):
+    one, two = tmp_path / "one.html", tmp_path / "two.html"
+    assert stcal_sfm("report", small_run, "--out", one)[0] == 0
+    assert sfm.report_again(small_run, out=two).files == (two,)
+    assert one.read_bytes() == two.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [sfm.verify, sfm.doctor, sfm.initial_pairs, sfm.uncertainty_budget, sfm.crosscheck, sfm.report_again, sfm.advise],
+    ids=lambda call: call.__name__,
+)
+def test_a_run_is_a_folder_or_a_result(call, small_result, tmp_path):
+    with fails_with("E-FIELD-TYPE … 7"):
+        call(7)
+    with fails_with("E-RUN-FOLDER … out"):
+        call(replace(small_result, out=None))
+    with fails_with(f"E-RUN-FOLDER … {tmp_path}"):
+        call(tmp_path)
+
+
+def test_a_damaged_file_is_changed(small_run, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copy(small_run / "stcal-run.json", run)
+    assert not sfm.verify(run).whole
