@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from stcal.boards.design import CornerBoard
 from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid
-from stcal.labels import DotLabel
 from stcal.parallel import one_thread
 from stcal.sfm.camera.calibrate import CameraCalibration, rejudged, residual_rms_px
 from stcal.sfm.camera.equations import Setting, State
@@ -70,6 +71,8 @@ def symmetries(board: BoardDesign, unique: bool) -> list[Rigid]:
     """Returns the symmetries of a board, board_from_board; only the identity if ``unique``."""
     if unique or board.unique():
         return [Rigid()]
+    if isinstance(board, CornerBoard) and board.printed is not None:
+        return [Rigid(), *board.printed.symmetries()]
     middle = np.append(board.pitch_mm * np.array([board.columns - 1, board.rows - 1]) / 2, 0.0)
     turns = []
     for quarter in range(0, 4, 1 if board.rows == board.columns else 2):
@@ -169,7 +172,9 @@ def _where(
     seen: list[Sighting],
 ) -> _Where:
     """Returns the relation of least median deviation (Rousseeuw 1984) among those from one instant and one symmetry."""
-    corners = board.places_mm([board.labels()[i] for i in (0, board.columns - 1, -board.columns, -1)])
+    xyz = board.places_mm(board.labels())
+    diagonals = (xyz[:, 0] + xyz[:, 1], xyz[:, 0] - xyz[:, 1])
+    corners = xyz[[int(pick(along)) for along in diagonals for pick in (np.argmin, np.argmax)]]
     relations = [
         each.camera_from_board @ turn.inverse() @ pose.inverse()
         for each, pose in zip(seen, first_from_board, strict=True)
@@ -206,9 +211,9 @@ def _off_px(camera: Camera, expected: np.ndarray, observed: np.ndarray) -> np.nd
 
 def _renumbered(each: Sighting, board: BoardDesign, turn: Rigid) -> Sighting:
     """Returns the sighting with its dots numbered after a turn of the board."""
-    places = turn @ board.places_mm(each.view.labels)
-    cells = np.round(places[:, 1::-1] / board.pitch_mm).astype(int)
-    view = replace(each.view, labels=tuple(DotLabel(row, column) for row, column in cells.tolist()))
+    labels = board.labels()
+    _, nearest = cKDTree(board.places_mm(labels)).query(turn @ board.places_mm(each.view.labels))
+    view = replace(each.view, labels=tuple(labels[i] for i in nearest.tolist()))
     return replace(each, view=view, camera_from_board=each.camera_from_board @ turn.inverse())
 
 
