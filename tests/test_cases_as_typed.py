@@ -86,7 +86,10 @@ TYPED: dict[str, tuple[Typed, ...]] = {
     "metashape_p3p4": (Typed(says=("p3 = 0.85, p4 = -0.44 has no place here", "FULL_OPENCV", "start only")),),
     "mrcal_splined": (
         Typed(says=("splines of 30×20 points has no place here", "valid_intrinsics_region", "turned by 3.8")),
-        Typed(says=("apart: 1.1",)),
+        Typed(
+            says=("is compared by its own projection, within its valid_intrinsics_region", "apart: 1.14"),
+            never=("fitted",),
+        ),
     ),
     "name_choice": (
         Typed(says=("OPENCV", "written")),

@@ -87,7 +87,7 @@ def compare(
     from stcal.report.camera import comparison_figure, comparison_text
     from stcal.report.figure import save
 
-    first_lens, second_lens = _lens(first, name, size), _lens(second, name, size)
+    first_lens, second_lens = _lens(first, name, size, False), _lens(second, name, size, False)
     difference = camera_difference(first_lens, second_lens)
     say("\n".join(comparison_text(difference)))
     if plot:
@@ -102,8 +102,11 @@ def _camera(path: Path, name: str, size: str) -> "Camera":
     return lens.near.camera if isinstance(lens, SizedLens) else lens
 
 
-def _lens(path: Path, name: str, size: str) -> "Camera | SizedLens":
-    """Return the camera of a file, or a lens of another model with the fit to it, whose quality is printed."""
+def _lens(path: Path, name: str, size: str, fit: bool = True) -> "Camera | SizedLens":
+    """Return the camera of a file, or a lens of another model with the fit to it.
+
+    ``fit`` : whether the fit is what is used, so that its quality is printed, or the lens itself.
+    """
     from stcal.io.cameras.difference import SizedLens, fit_lens
     from stcal.io.cameras.model import CameraModel
     from stcal.io.cameras.photograph import camera_of_photograph, is_photograph
@@ -122,5 +125,9 @@ def _lens(path: Path, name: str, size: str) -> "Camera | SizedLens":
     if isinstance(lens, CameraModel) or not (width and height):
         return sized_camera(lens, path, (width, height))
     fitted = fit_lens(lens, width, height)
-    print_each("note", fitted_text(lens.called, fitted, lens.region is not None))
+    if fit:
+        print_each("note", fitted_text(lens.called, fitted, lens.region is not None))
+    else:
+        where = ", within its valid_intrinsics_region" if lens.region is not None else ""
+        print_each("note", [f"{path}: {lens.called} is compared by its own projection{where}, not by a fit to it"])
     return SizedLens(lens, width, height, fitted)

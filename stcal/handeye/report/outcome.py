@@ -286,7 +286,7 @@ def _of_motions(outcome: Outcome) -> Finding | None:
         said = f"the flange turns by {first:.0f}° (RMS) about one axis: the camera's place along this axis is not found"
         remedy = (
             f"measure where the camera is along this axis, {in_words(observability.axes[0])} of the flange, which a "
-            "robot of four axes cannot show; or turn the flange about another axis too, if it can, and leave --four-dof out"
+            "robot of four axes cannot show; or turn the flange about another axis too, and leave --four-dof out"
         )
         return Finding("Motions of the flange", word, said, "one axis", f"{AS_ONE:g} × σ of a pose", remedy)
     said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
