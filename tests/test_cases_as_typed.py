@@ -110,7 +110,7 @@ TYPED: dict[str, tuple[Typed, ...]] = {
         Typed(says=("the instrument or the robot's base elsewhere from line 32 on: 13 mm", "another station")),
     ),
     "rob_tracker_nomap": (Typed(INPUT, "", ("joints.csv: no column Point Name", "--key 'NAME=Point Name'")),),
-    "rob_ur_kinematics_yaml": (Typed(INPUT, "", ("kinematics.forearm", "and 3 more")),),
+    "rob_ur_kinematics_yaml": (Typed(INPUT, "", ("without forearm, wrist_1, wrist_2", "calibration anew")),),
     "ros1_echo": (
         Typed(values=camera(1133, 1128, 960.5, 600.5, -0.0152, 0.0132, -0.0248, 0.0178, names=FISHEYE)),
         Typed(values=camera(1133, 1128, 960.5, 600.5, -0.0152, 0.0132, -0.0248, 0.0178, names=FISHEYE)),
@@ -300,14 +300,29 @@ def test_a_located_case_comes_to_the_truth(typed, shared_case, tmp_path, case):
         assert np.linalg.norm(np.array(scene["camera_from_obj"])[:3, 3] - place) < 5 * sigma + 0.01
 
 
-def test_the_robot_under_its_right_convention(typed, tmp_path, shared_case, monkeypatch, capsys):
-    """As the error says: its file with the other convention then fits to 1 mm, where 1050 mm were missed."""
-    typed("rob_std_as_modified")
-    file = tmp_path / "rob_std_as_modified" / "robot.toml"
-    file.write_text(file.read_text().replace('convention = "modified"', 'convention = "standard"'))
+COUPLED = (
+    "coupling = [\n"
+    + "".join(
+        f"  [{', '.join('1' if i == j else '-1' if (i, j) == (2, 1) else '0' for j in range(6))}],\n" for i in range(6)
+    )
+    + "]\n"
+)
+RIGHTED = {
+    "rob_std_as_modified": lambda text: text.replace('convention = "modified"', 'convention = "standard"'),
+    "rob_coupling_unstated": lambda text: COUPLED + text,
+}
+"""The robot's file as the error tells to write it."""
+
+
+@pytest.mark.parametrize("case", RIGHTED)
+def test_a_robot_written_as_the_error_says(typed, tmp_path, case, monkeypatch, capsys):
+    """Rows held out are then missed by less than 1 mm, where 606 and 1050 mm were."""
+    typed(case)
+    file = tmp_path / case / "robot.toml"
+    file.write_text(RIGHTED[case](file.read_text()))
     monkeypatch.setattr(sys, "argv", shlex.split("stcal robot identify data.csv --robot robot.toml --out out.toml"))
-    code, out, _ = ended(main, capsys)
-    assert code == 0
+    code, out, error = ended(main, capsys)
+    assert code == 0, error
     held_out = re.search(r"^held out.* ([\d.]+) +[\d.]+$", out, re.MULTILINE)
     assert held_out
     assert float(held_out[1]) < 1
