@@ -118,7 +118,12 @@ def test_a_trackers_export_is_joined_by_two_names(call, tmp_path):
 
 
 def test_a_part_of_a_universal_robots_calibration_is_named(call):
-    assert_error(call("rob_ur_kinematics_yaml", "robot convert k.yaml {tmp}/o.toml"), 2, "kinematics.forearm", "add it")
+    assert_error(
+        call("rob_ur_kinematics_yaml", "robot convert k.yaml {tmp}/o.toml"),
+        2,
+        "forearm, wrist_1, wrist_2",
+        "anew",
+    )
 
 
 def test_names_of_apriltag(call, shared_case, tmp_path):

@@ -334,6 +334,7 @@ class AsymmetricCirclesDesign:
             self.radii_mm()[0],
             self.polarity,
             self.sigma_mm,
+            rings=self._ring_cells(cells),
             taken=cells,
             circles=self,
         )

@@ -86,7 +86,7 @@ def compare(
     from stcal.report.camera import comparison_figure, comparison_text
     from stcal.report.figure import save
 
-    first_lens, second_lens = _lens(first, name, size), _lens(second, name, size)
+    first_lens, second_lens = _lens(first, name, size, False), _lens(second, name, size, False)
     difference = compare_cameras(first_lens.lens, second_lens.lens)
     say("\n".join(comparison_text(difference)))
     if plot:
@@ -94,8 +94,11 @@ def compare(
         say(f"picture: {plot}")
 
 
-def _lens(path: Path, name: str, size: str) -> "LoadedLens":
-    """Returns the lens of a file, and prints the quality of a fit, or what EXIF says."""
+def _lens(path: Path, name: str, size: str, fit: bool = True) -> "LoadedLens":
+    """Returns the lens of a file, and prints the quality of a fit, or what EXIF says.
+
+    ``fit`` : whether the fit is what is used, so that its quality is printed, or the lens itself.
+    """
     from stcal.io.cameras.difference import SizedLens, load_lens
     from stcal.report.camera import exif_text, fitted_text
 
@@ -103,8 +106,12 @@ def _lens(path: Path, name: str, size: str) -> "LoadedLens":
     if len(sides) != 2 or not all(side.isdigit() for side in sides):
         raise InputError("E-OPTION-SIZE", f"--size {size}: two numbers with x between needed, such as 1920x1080")
     found = load_lens(path, name, (int(sides[0]), int(sides[1])))
-    if isinstance(found.lens, SizedLens):
-        print_each("note", fitted_text(found.lens.lens.called, found.lens.near, found.lens.lens.region is not None))
+    lens = found.lens
+    if isinstance(lens, SizedLens) and fit:
+        print_each("note", fitted_text(lens.lens.called, lens.near, lens.lens.region is not None))
+    elif isinstance(lens, SizedLens):
+        where = ", within its valid_intrinsics_region" if lens.lens.region is not None else ""
+        print_each("note", [f"{path}: {lens.lens.called} is compared by its own projection{where}, not by a fit to it"])
     elif found.told:
         print_each("note", [exif_text(found.told)])
     return found

@@ -453,10 +453,10 @@ def _remarks(
 ) -> tuple[str, ...]:
     """Returns notes on outliers, moves between two poses, groups of poses, the board's size, and distances."""
     names = tuple(name for name, bad in zip(task.pairs.names, outliers, strict=True) if not bad)
-    notes = remarks.of_outliers(task.pairs.names, outliers, residuals)
-    if outliers.any():
-        z = closed_form.mean_pose(task.loop[~outliers].chain(x))
-        notes += flips.note_of(task.pairs.names, flips.flipped(task.loop, x, z, outliers))
+    z = closed_form.mean_pose(task.loop[~outliers].chain(x))
+    tilted = flips.flipped(task.loop, x, z, outliers)
+    notes = remarks.of_outliers(task.pairs.names, outliers, residuals, tilted)
+    notes += flips.note_of(task.pairs.names, tilted)
     moved = remarks.of_order(task.pairs.names, residuals, task.loop.jacobian(x)[:, :, :12])
     notes += moved or remarks.of_groups(names, residuals[~outliers])
     if not (task.options.with_scale or task.options.four_dof):

@@ -376,7 +376,7 @@ def _tag(data: bytes, tag: int) -> object:
 def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | None:
     """Return width and height, px, of most files, by their headers, and one of their names; None if none is readable.
 
-    Of sizes that are equally frequent it is that of the first readable file.
+    Raises InputError: two sizes are equally frequent, so that the order of the files would decide.
     """
     with_size: dict[tuple[int, int], list[ImageFile]] = {}
     for file in files:
@@ -388,6 +388,7 @@ def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | Non
     unknown = with_size.pop((0, 0), [])
     order = {file.name: i for i, file in enumerate(files)}
     ranked = sorted(with_size.values(), key=lambda own: (-len(own), order[own[0].name]))
+    _refuse_a_tie({size: own for size, own in with_size.items() if len(own) == len(ranked[0])})
     for own in (*ranked, unknown):
         for file in own:
             try:
@@ -396,6 +397,24 @@ def common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str] | Non
                 continue
             return (width, height), file.name
     return None
+
+
+def _refuse_a_tie(equal: dict[tuple[int, int], list[ImageFile]]) -> None:
+    """Raise an error if there are several sizes, each with as many images, of which some are readable."""
+    sizes = [size for size, own in equal.items() if any(_is_readable(file) for file in own)] if len(equal) > 1 else []
+    if len(sizes) < 2:
+        return
+    shown = " and ".join(f"{len(equal[s])} of {s[0]}×{s[1]} px, first {equal[s][0].name}" for s in sizes[:2])
+    turn = "turn one half back by 90°, or leave it out" if sizes[0] == sizes[1][::-1] else "leave one size out"
+    raise InputError("E-IMAGES-SIZES", f"images: {shown}: no size is that of the majority; {turn}")
+
+
+def _is_readable(file: ImageFile) -> bool:
+    try:
+        decode(file.read(), file.name)
+    except (InputError, OSError):
+        return False
+    return True
 
 
 def require_common_size(files: Sequence[ImageFile]) -> tuple[tuple[int, int], str]:

@@ -1,6 +1,6 @@
 """Observations of one simulated image: the circles in view, and measured centres without rendering pixels."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,6 +47,24 @@ class ImageCircles:
         }.items():
             object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
         object.__setattr__(self, "must_find", frozen(self.must_find, (n,), "must_find", bool))
+
+    def select(self, rows: np.ndarray) -> "ImageCircles":
+        """Returns the circles of a mask (n,)."""
+        labels = tuple(label for label, own in zip(self.labels, rows, strict=True) if own)
+        return ImageCircles(labels, *(getattr(self, name)[rows] for name in _ARRAYS))
+
+    def smaller(self, share: float) -> "ImageCircles":
+        """Returns circles of this share of the radius at the same places."""
+        return replace(self, radius_mm=share * self.radius_mm)
+
+
+_ARRAYS = ("xyz_camera", "normal_camera", "radius_mm", "tilt_rad", "centre_px", "must_find")
+
+
+def together(first: ImageCircles, second: ImageCircles) -> ImageCircles:
+    """Returns the circles of both."""
+    arrays = (np.concatenate([getattr(first, name), getattr(second, name)]) for name in _ARRAYS)
+    return ImageCircles((*first.labels, *second.labels), *arrays)
 
 
 def image_circles(scene: Scene, group: str, image: int) -> ImageCircles:

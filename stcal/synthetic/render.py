@@ -13,7 +13,7 @@ from stcal.geometry.arrays import require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel
-from stcal.synthetic.observe import ImageCircles, image_circles, rim_points
+from stcal.synthetic.observe import ImageCircles, image_circles, rim_points, together
 from stcal.synthetic.optics import SHARP_PX, WIDEST_PX, ThinLens, blur_evenly, defocused
 from stcal.synthetic.scene import Group, Scene
 
@@ -250,6 +250,8 @@ FINE = 4
 RIM_REACH_PX = 1.5
 SPREAD_BY_DISTORTION = 1.3
 """Largest factor by which the lens distortion may enlarge a circle of confusion."""
+HOLE_SHARE = 0.4
+"""Radius of the hole in a dot that tells a board from its turns, in radii of the dot."""
 STEEP_RAD = np.radians(75)
 FULL_SCALE = 255.0
 
@@ -354,9 +356,16 @@ def render(scene: Scene, group: str, image: int, options: RenderOptions | None =
     dot = np.array([isinstance(label, DotLabel) for label in circles.labels], bool)
     base = np.where(dot, board, face)
     levels = base * (1 + options.spread * rng.standard_normal(len(base)))
-    picture = _add_circles(
-        picture, scene.camera, circles, levels, np.where(dot, scene.board.rim_mm, options.rim_mm), options
-    )
+    rim_mm = np.where(dot, scene.board.rim_mm, options.rim_mm)
+    rings = {DotLabel(*cell) for cell in scene.board.rings}
+    holes = np.array([label in rings for label in circles.labels], bool)
+    if holes.any():
+        # The light of a hole is that of the plate in place of its dot's; circles are added to the plate's.
+        plate = look_of(scene.board.polarity).plate
+        circles = together(circles, circles.select(holes).smaller(HOLE_SHARE))
+        levels = np.append(levels, 2 * plate - levels[holes])
+        rim_mm = np.append(rim_mm, np.minimum(rim_mm[holes], 0))
+    picture = _add_circles(picture, scene.camera, circles, levels, rim_mm, options)
     return _expose(picture, options, rng)
 
 

@@ -11,7 +11,6 @@ from stcal.boards.design import (
     AprilGridDesign,
     AsymmetricCirclesDesign,
     BoardView,
-    CharucoDesign,
     CornerBoard,
     FlatBoard,
     HexagonalCirclesDesign,
@@ -190,8 +189,8 @@ def corner_grid(board: FlatBoard) -> CornerBoard:
     if isinstance(board, TagLayout):
         raise InputError(
             "E-BOARD-TYPE",
-            f"--board: {kind_of(board)}; a board of dots, a chessboard, a ChArUco board, an AprilGrid or asymmetric "
-            "circles needed to calibrate a camera",
+            f"--board: {kind_of(board)}; a board of dots, a chessboard, a ChArUco board, an AprilGrid, asymmetric "
+            "or hexagonal circles needed to calibrate a camera",
         )
     return CornerBoard.of(board)
 
@@ -304,11 +303,6 @@ def calibrate_rig(
         raise InputError(
             "E-OPTION-VALUE", f"--model {unknown[0]}=…: no folder {unknown[0]} in {folder}; it has {', '.join(names)}"
         )
-    if isinstance(board, AprilGridDesign | AsymmetricCirclesDesign):
-        raise InputError(
-            "E-BOARD-TYPE",
-            f"--board: {kind_of(board)}; with --rig a board of dots, a chessboard or a ChArUco board needed",
-        )
     grid = board if isinstance(board, BoardDesign) else corner_grid(board)
     cameras: dict[str, CameraCalibration] = {}
     for name in names:
@@ -326,7 +320,7 @@ def calibrate_rig(
         except StcalError as error:
             raise type(error)(error.code, f"rig: {name}: {error}") from error
         cameras[name] = calibration
-    return rig_of(cameras, grid, isinstance(board, CharucoDesign))
+    return rig_of(cameras, grid)
 
 
 def camera_names(folder: Path) -> list[str]:

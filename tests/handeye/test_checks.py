@@ -203,7 +203,7 @@ def test_radians_that_are_called_degrees_are_said(side):
     flange = flange if side == "board" else small(flange)
     board = board if side == "robot" else small(board)
     said = "the robot and the board" if side == "both" else f"the {side}"
-    with pytest.raises(InputError, match=f"if the angles of {said} are radians, name their columns _rad; if not, pair"):
+    with pytest.raises(InputError, match=f"if the angles of {said} are radians, .*_rad, or .*-rad; if not, pair"):
         handeye(HandEyePoses(flange, board))
 
 
@@ -381,7 +381,7 @@ def test_flips_are_named_and_undone_where_asked():
     [note] = [note for note in found.notes if "tilted the other way" in note]
     assert [int(word) - 1 for word in re.findall(r"pose (\d+)", note)] == rows
     assert not any("tilted" in note for note in handeye(truth.pairs).notes)
-    mended, said = without_flips(HandEyeInput("poses", pairs), "eye-in-hand", HandEyeOptions())
+    mended, said = without_flips(HandEyeInput("poses", pairs))
     assert said.startswith("tilted the other way, as --undo-flips asks, 5 of 20 poses")
     again = handeye(mended.pairs)
     assert not again.outliers.any()
@@ -420,9 +420,9 @@ def test_rough_poses_that_fit_another_setup_better_are_said(sets):
             notes = handeye(truth.pairs, "eye-to-hand").notes
         except StcalError as error:
             notes = (str(error),)
-        said += any("the setup is eye-in-hand" in note for note in notes)
+        said += any("--setup eye-in-hand" in note for note in notes)
         right = handeye(truth.pairs, "eye-in-hand").notes
-        assert not any("the setup is eye-to-hand" in note for note in right)
+        assert not any("--setup eye-to-hand" in note for note in right)
     assert said >= 0.8 * sets
 
 

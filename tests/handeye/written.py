@@ -368,6 +368,26 @@ def colmap_binary(folder: Path, pairs: HandEyePoses, unit_mm: float = 1000.0) ->
     return arguments
 
 
+def kitti(folder: Path, pairs: HandEyePoses) -> Arguments:
+    """Twelve numbers in a row, as KITTI's odometry has them."""
+    both = (in_metres(pairs.base_from_flange), in_metres(pairs.camera_from_board))
+    return two(folder, *("\n".join(line(m[:3].ravel()) for m in side) for side in both))
+
+
+def named_elements(folder: Path, pairs: HandEyePoses) -> Arguments:
+    """Columns T[0][0] … T[3][3] of the robot, and r11 … r33, t1 … t3 of the camera, mm."""
+    heads = (
+        [f"T[{i}][{j}]" for i in range(4) for j in range(4)],
+        [
+            *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
+            *("t1", "t2", "t3"),
+        ],
+    )
+    a = [line(m.ravel(), ",") for m in matrices(pairs.base_from_flange)]
+    b = [line([*m[:3, :3].ravel(), *m[:3, 3]], ",") for m in matrices(pairs.camera_from_board)]
+    return two(folder, "\n".join([",".join(heads[0]), *a]), "\n".join([",".join(heads[1]), *b]), "csv")
+
+
 FORMATS: dict[str, Callable[[Path, HandEyePoses], Arguments]] = {
     "OpenCV's arrays": opencv_arrays,
     "OpenCV's rotation vectors": rotation_vectors,
@@ -404,6 +424,8 @@ FORMATS: dict[str, Callable[[Path, HandEyePoses], Arguments]] = {
     "numbered matrices": counted,
     "count of matrices": count_alone,
     "camodocal": camodocal,
+    "KITTI": kitti,
+    "columns of matrices": named_elements,
     "Zivid and OpenCV folders": zivid_folders,
     "COLMAP text": colmap_text,
     "COLMAP binary": colmap_binary,

@@ -230,6 +230,22 @@ READERS: dict[str, tuple[str, Callable[[Path], np.ndarray]]] = {
         ),
         of_robot_poses,
     ),
+    "poses, rows of KITTI": (
+        "".join(f"1.0 0.0 0.0 0.{i} 0.0 {c} {-s} 0.2 0.0 {s} {c} 0.3\n" for i, s, c in SINES),
+        of_robot_poses,
+    ),
+    "poses, table of matrices": (
+        ",".join(["image", *(f"T[{i}][{j}]" for i in range(3) for j in range(4))])
+        + "\n"
+        + "".join(f"{i}.png,1,0,0,0.{i},0,{c},{-s},0.2,0,{s},{c},0.3\n" for i, s, c in SINES),
+        of_robot_poses,
+    ),
+    "poses, table of rotations": (
+        ",".join(["image", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "t1", "t2", "t3"])
+        + "\n"
+        + "".join(f"{i}.png,1,0,0,0,{c},{-s},0,{s},{c},0.{i},0.2,0.3\n" for i, s, c in SINES),
+        of_robot_poses,
+    ),
     "URDF": (URDF, of_urdf),
     "calibration.conf": (CONF, of_conf),
     "rig": (RIG, of_rig),

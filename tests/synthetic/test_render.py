@@ -150,3 +150,26 @@ def test_options_are_checked():
         RenderOptions(reflectance=1.2)
     with fails_with("E-SIMULATE-OPTIONS … noise … -1"):
         RenderOptions(noise=-1)
+
+
+def test_rings_are_dots_with_a_hole_about_the_same_centre():
+    """The hole has 0.4 of the radius and the plate's grey; the mean of the light is where the dot's centre is seen."""
+    rings = ((1, 2), (2, 3))
+    board = replace(second_design()[1], rings=rings, corner=None, corner_radius_mm=None)
+    scene = make_scene(SceneOptions(seed=2, images_per_group=2, width=1296, height=864), board=board)
+    plain = replace(scene, board=replace(board, rings=()))
+    options = RenderOptions(noise=0, spread=0, blur_px=0.5)
+    group = next(iter(scene.groups))
+    off = render(scene, group, 0, options).astype(float) - render(plain, group, 0, options)
+    circles = image_circles(scene, group, 0)
+    y, x = np.nonzero(np.abs(off) > 0)
+    near = {}
+    for label, centre, radius, xyz in zip(
+        circles.labels, circles.centre_px, circles.radius_mm, circles.xyz_camera, strict=True
+    ):
+        inside = np.hypot(x - centre[0], y - centre[1]) < 1.2 * scene.camera.focal[0] * radius / xyz[2]
+        if inside.any():
+            light = off[y[inside], x[inside]]
+            near[label] = np.hypot(*(light @ np.column_stack([x[inside], y[inside]]) / light.sum() - centre))
+    assert set(near) == {f"board:{row}:{column}" for row, column in rings}
+    assert max(near.values()) < 0.1  # px: perspective moves the centre of so small an ellipse by less

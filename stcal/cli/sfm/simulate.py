@@ -221,16 +221,11 @@ def _designs(target: Path | None, board: Path | None, second_design: bool) -> "t
     if second_design:
         return other()[:2]
     board_design = board_of(board)
-    if board_design is not None and board_design.rings:
-        raise InputError(
-            "E-BOARD-RINGS",
-            f"--board {board}: rings are not drawn beside a target; leave them out to simulate it",
-        )
     if isinstance(board_design, CornerBoard):
         raise InputError(
             "E-BOARD-TYPE",
-            f"--board {board}: squares or tags, which are not drawn beside a target; a board of dots or of asymmetric "
-            "circles needed here (`run` takes this one)",
+            f"--board {board}: squares or tags, which are not drawn beside a target; a board of dots, asymmetric "
+            "or hexagonal circles needed here (`run` takes this one)",
         )
     return target_of(target), board_design
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from stcal.errors import InputError
 from stcal.geometry.rigid import Order, Poses
+from stcal.handeye.data.formats.keys import inverse_name
 from stcal.handeye.data.formats.numeric import read_columns, todays
 from stcal.handeye.data.formats.recognise import read_content
 from stcal.handeye.data.formats.record import FRAMES, Content, Frames, Role, Said, Side
@@ -95,7 +96,7 @@ def _told(content: Content, path: Path, statements: Said) -> Told:
     """Returns the pose pairs of a file's content; errors as :func:`read_pairs`."""
     if not content.both:
         side = content.sides[0]
-        held = f"{side.frames.name} alone" if side.frames is not None else "poses of one side, which is not said,"
+        held = f"{side.frames.name} alone" if side.frames is not None else "poses of one side, robot or camera"
         raise InputError(
             "E-POSES-MIXED", f"{path}: {content.form} with {held}; give the robot's file as --a and the camera's as --b"
         )
@@ -314,10 +315,11 @@ def _direction(side: Side, role: Role, path: Path, statements: Said) -> Frames:
     option = statements.frames_of(role)
     if option is not None:
         if side.frames is not None and side.frames.stated and side.frames.name != option:
+            name = inverse_name(side.frames.by.rpartition(" ")[2])
             raise InputError(
                 "E-OPTION-CONTRADICTS",
-                f"{path}: {side.frames.name} {side.frames.by}, --poses-are {option}; rename it, "
-                "or leave the option out",
+                f"{path}: {side.frames.name} {side.frames.by}, --poses-are {option}; if the name is wrong, change it "
+                f"in the file{f', to {name}' if name else ''}; else leave the option out",
             )
         return Frames(option, "as you say")
     if side.frames is not None:

@@ -29,7 +29,7 @@ WELL = np.radians(0.5), 5.0
 LOST = 0.25
 """Share of the spread of the poses that the solution leaves unexplained, above which the poses of robot and camera have
 nothing in common."""
-NAMED = "name the columns so, or give --poses-are"
+NAMED = "rename them in the file, or give --poses-are where the file does not name them"
 NAMED_ORDER = "name the columns so, or reorder the numbers in other files"
 RADIANS_AS_DEGREES = np.radians(11.0)
 """Largest rotation between two poses whose three angles, up to π each, were taken for degrees: 2 · √3 · 3.14°."""
@@ -81,7 +81,10 @@ def check_conventions(
         if max(turn, shift) > LOST:
             remedy = "pair each pose of the board with that of the flange at the same moment"
             if radians := _as_of_radians(loop, by_images):
-                remedy = f"if the angles of {radians} are radians, name their columns _rad; if not, {remedy}"
+                remedy = (
+                    f"if the angles of {radians} are radians, name their columns _rad, or give a --rotation that "
+                    f"ends in -rad; if not, {remedy}"
+                )
             else:
                 remedy += (
                     f", and {'check the camera file' if by_images else 'look for another convention of rotations'}"
@@ -119,7 +122,7 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
         "; or images are mirrored: use them as taken" if by_images else ""
     )
     variants = {
-        f"{INVERTED}: if these are {named}, {NAMED}; if all are named rightly, the setup is {kind}": (
+        f"{INVERTED}: if these are {named}, {NAMED}; if all are named rightly, give --setup {kind}": (
             replace(loop, camera_from_board=eye.inverse())
         ),
         **_other_units(loop, by_images),

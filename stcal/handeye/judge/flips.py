@@ -8,7 +8,7 @@ from stcal.geometry.least_squares import PoseStack
 from stcal.geometry.plane import mirrored
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.pairs import Loop
-from stcal.handeye.judge.remarks import Aside
+from stcal.handeye.judge.remarks import Aside, spoken
 
 PUT_RIGHT = 0.2
 """Largest share of a pose's error of rotation that is left when it is tilted the other way. Of errors of any direction
@@ -32,7 +32,7 @@ def note_of(names: tuple[str, ...], flips: np.ndarray) -> tuple[str, ...]:
     """Returns a note on the poses that are flipped, (m,)."""
     if not flips.any():
         return ()
-    shown = ", ".join(name for name, flip in zip(names, flips, strict=True) if flip)
+    shown = ", ".join(spoken(name) for name, flip in zip(names, flips, strict=True) if flip)
     return (
         Aside(
             f"{flips.sum()} of the poses left out agree when tilted the other way, as the second pose of a flat target "

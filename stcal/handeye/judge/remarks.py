@@ -49,13 +49,25 @@ NEAR_MM = 20.0
 """Distance, in mm, below which no camera sees a board."""
 
 
-def of_outliers(names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray) -> tuple[str, ...]:
-    """Returns notes on the poses that were left out, (m,), with their residuals (m, 6)."""
+def spoken(name: str) -> str:
+    """Returns the name of a pose for a sentence: ``pose 2`` for a bare number."""
+    return f"pose {name}" if name.isdigit() else name
+
+
+def of_outliers(
+    names: tuple[str, ...], outliers: np.ndarray, residuals: np.ndarray, flips: np.ndarray
+) -> tuple[str, ...]:
+    """Returns notes on the poses that were left out, (m,), with their residuals (m, 6).
+
+    ``flips`` : (m,) those that agree with the others when they are tilted the other way.
+    """
     notes = []
     for i in np.flatnonzero(outliers):
         turn, shift = np.degrees(np.linalg.norm(residuals[i, :3])), np.linalg.norm(residuals[i, 3:])
-        notes.append(Aside(f"{names[i]} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out"))
-    if outliers.mean() > MANY:
+        notes.append(
+            Aside(f"{spoken(names[i])} contradicts the others, by {turn:.2g}° and {shift:.2g} mm, and was left out")
+        )
+    if (outliers & ~flips).mean() > MANY:
         notes.append(
             Grave(
                 f"{outliers.sum()} of {len(outliers)} poses contradict the others: with so many look first for a wrong "

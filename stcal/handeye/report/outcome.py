@@ -1,6 +1,6 @@
 """All results of a hand-eye command, of one camera or of a rig, and the verdict on them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,10 +9,11 @@ from scipy.stats import f
 
 from stcal.geometry.rigid import skew
 from stcal.handeye.choose import Choice
-from stcal.handeye.data.pairs import FRAMES, HandEyePoses
+from stcal.handeye.data.pairs import FRAMES, HandEyePoses, Loop
 from stcal.handeye.data.views import Views
-from stcal.handeye.judge.observability import COMMON_MM
-from stcal.handeye.judge.remarks import MANY, Aside, Grave
+from stcal.handeye.judge.flips import flipped
+from stcal.handeye.judge.observability import COMMON_MM, in_words
+from stcal.handeye.judge.remarks import MANY, Aside, Grave, spoken
 from stcal.handeye.judge.verdict import BAD, CARE, GOOD, Finding, Verdict, Word
 from stcal.handeye.result import HandEye
 from stcal.handeye.rig.solve import Rig
@@ -102,9 +103,20 @@ class Outcome:
         """Returns the names of the poses that contradict the others."""
         return tuple(name for name, bad in zip(self.result.names, self.result.outliers, strict=True) if bad)
 
+    def flips(self) -> tuple[str, ...]:
+        """Returns the names of the outliers that agree with the others when they are tilted the other way."""
+        result = self.result
+        if self.pairs is None or not result.outliers.any():
+            return ()
+        loop = Loop.of(self.pairs, result.setup)
+        tilted = flipped(loop, result.mount_from_camera, result.stand_from_board, result.outliers)
+        return tuple(name for name, flip in zip(result.names, tilted, strict=True) if flip)
+
 
 SUSPICIOUS, FAILED = 1e-3, 1e-5
 """Significance levels of ``use with care`` and of ``do not use``."""
+SHOWN = 3
+"""Number of poses that a sentence names."""
 HALF, MOST = 0.5, 0.9
 """Limits of the transform's share in the variance of a prediction. Beyond half, more poses help more than a better
 robot or camera would; beyond nine tenths, the error of a prediction is three times that of a pose."""
@@ -229,9 +241,11 @@ def _of_motions(outcome: Outcome) -> Finding | None:
     first, second, _ = np.degrees(observability.turns_rad)
     if not np.isfinite(ratio):
         said = f"the flange turns by {first:.0f}° (RMS) about one axis: the camera's place along this axis is not found"
-        return Finding(
-            "Motions of the flange", word, said, "one axis", f"{AS_ONE:g} × σ of a pose", observability.missing()
+        remedy = (
+            f"measure where the camera is along this axis, {in_words(observability.axes[0])} of the flange, which a "
+            "robot of four axes cannot show; or turn the flange about another axis too, and leave --four-dof out"
         )
+        return Finding("Motions of the flange", word, said, "one axis", f"{AS_ONE:g} × σ of a pose", remedy)
     said = f"the flange turns by {first:.0f}° and {second:.0f}° (RMS) about two axes"
     if word != GOOD:
         said = f"by these motions the camera's place has {ratio:.2f} times the σ of one pose, in its worst direction"
@@ -244,11 +258,31 @@ def _of_outliers(outcome: Outcome) -> Finding:
     bad, count = outcome.outliers(), len(outcome.result.names)
     word = GOOD if not bad else BAD if len(bad) > MANY * count else CARE
     said = f"none of {count} poses contradicts the others"
-    if bad:
-        few = ", ".join(bad[:3]) + (f" and {len(bad) - 3} more" if len(bad) > 3 else "")
-        said = f"{len(bad)} of {count} poses contradict{'s' * (len(bad) == 1)} the others: {few}"
-    remedy = "look at these poses: moved while the image was taken, or paired with another image" if bad else ""
+    if not bad:
+        return Finding("Outliers", word, said, "0", "0")
+    flips = outcome.flips()
+    said, remedy = f"{_counted(bad, count)} the others: {_few(bad)}", "look at these poses"
+    if flips:
+        said = f"{len(flips)} of {count} poses are tilted the other way, as the second pose of a flat target is: "
+        said += _few(flips)
+        if others := tuple(name for name in bad if name not in flips):
+            said += f"; {_counted(others, count)} the others: {_few(others)}"
+            remedy = f"look at {_few(others)}"
+    remedy += ": moved while the image was taken, or paired with another image"
+    if len(flips) == len(bad):
+        remedy = ""
+    if flips:
+        undo = "solve with --undo-flips, which takes the other tilt, or give images in place of the board's poses"
+        remedy = "; ".join(part for part in (undo if outcome.views is None else "", remedy) if part)
     return Finding("Outliers", word, said, str(len(bad)), "0", remedy)
+
+
+def _counted(bad: Sequence[str], count: int) -> str:
+    return f"{len(bad)} of {count} poses contradict{'s' * (len(bad) == 1)}"
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(map(spoken, names[:SHOWN])) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
 
 
 def of_notes(notes: Iterable[str]) -> list[Finding]:

@@ -9,7 +9,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.handeye.choose import Choice
 from stcal.handeye.data.pairs import FRAMES
 from stcal.handeye.judge.observability import Observability
-from stcal.handeye.judge.remarks import Aside
+from stcal.handeye.judge.remarks import Aside, spoken
 from stcal.handeye.judge.verdict import Verdict
 from stcal.handeye.report.figures import (
     BAD,
@@ -87,7 +87,11 @@ def scale_text(outcome: Outcome, sigma_scale: float) -> str:
 
 def _headline(outcome: Outcome) -> str:
     result, bad = outcome.result, outcome.outliers()
-    without = f", without {len(bad)} that contradict{'s' * (len(bad) == 1)} them: {', '.join(bad)}" if bad else ""
+    without = (
+        f", without {len(bad)} that contradict{'s' * (len(bad) == 1)} them: {', '.join(map(spoken, bad))}"
+        if bad
+        else ""
+    )
     return f"{result.setup}, {result.method}: {len(result.names) - len(bad)} poses{without}"
 
 

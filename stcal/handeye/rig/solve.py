@@ -392,6 +392,7 @@ def _rig(
             tuple(name for name, use in zip(camera.images, with_robot_pose, strict=True) if use),
             ~used[with_robot_pose],
             residuals[with_robot_pose],
+            np.zeros(int(with_robot_pose.sum()), bool),
         )
         notes += remarks.of_groups(used_images, residuals[used]) + remarks.of_distance(loop)
         notes += of_camera_file(float(solution.camera_gain[i]), sigma_of_camera)

@@ -13,6 +13,7 @@ from stcal.errors import InputError
 from stcal.geometry.arrays import frozen
 from stcal.geometry.rigid import Order
 from stcal.io.files import TABLE_BYTES, read_bytes
+from stcal.io.poses.matrices import find_matrices
 from stcal.io.poses.rotations import (
     ROTATION_VECTOR,
     Convention,
@@ -103,6 +104,8 @@ def read_rotations(table: Table, prefix: str = "", rotation: str | None = None) 
     matrix = [f"{prefix}r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
     if (values := _all(table, matrix)) is not None:
         return Turned(proper(values.reshape(-1, 3, 3), places, where), "3×3 matrices", tuple(matrix))
+    if len(found := find_matrices(table, prefix)) == 1:
+        return Turned(proper(found[0].rotations(table), places, where), "3×3 matrices", found[0].rotation)
     return _triple(table, prefix, rotation) or _four(table, prefix, rotation)
 
 

@@ -84,6 +84,14 @@ def robot_of_kinematics(content: Mapping, where: str, convention: Convention) ->
 
     Raises InputError: a link is missing, or its values are no numbers.
     """
+    held = content["kinematics"]
+    missing = [name for name in LINKS if name not in held] if isinstance(held, Mapping) else []
+    if missing:
+        raise InputError(
+            "E-ROBOT-FILE-LINKS",
+            f"{where}: kinematics without {', '.join(missing)}; an arm of Universal Robots has six links, "
+            f"{', '.join(LINKS)}: extract its calibration anew with ur_calibration, or copy the whole file",
+        )
     links = validated(content, _File, where).kinematics
     chains = []
     for turned in (_turning, from_roll_pitch_yaw):

@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from stcal.boards.design import CornerBoard
 from stcal.design import BoardDesign
 from stcal.errors import DegenerateError, InputError
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid
-from stcal.labels import DotLabel
 from stcal.parallel import one_thread
 from stcal.sfm.camera.calibrate import CameraCalibration, rejudged, residual_rms_px
 from stcal.sfm.camera.equations import Setting, State
@@ -66,10 +67,12 @@ def instant_of(image: str) -> str:
     return str(PurePosixPath(image).with_suffix(""))
 
 
-def symmetries(board: BoardDesign, unique: bool) -> list[Rigid]:
-    """Returns the symmetries of a board, board_from_board; only the identity if ``unique``."""
-    if unique or board.unique():
+def symmetries(board: BoardDesign) -> list[Rigid]:
+    """Returns the symmetries of a board, board_from_board; the identity alone if its points are identified uniquely."""
+    if board.unique():
         return [Rigid()]
+    if isinstance(board, CornerBoard) and board.printed is not None:
+        return [Rigid(), *board.printed.symmetries()]
     middle = np.append(board.pitch_mm * np.array([board.columns - 1, board.rows - 1]) / 2, 0.0)
     turns = []
     for quarter in range(0, 4, 1 if board.rows == board.columns else 2):
@@ -83,17 +86,16 @@ def gathered(
     cameras: Sequence[Camera],
     sightings: Sequence[Sighting],
     board: BoardDesign,
-    unique: bool = False,
 ) -> Together:
     """Returns the poses of the cameras on the rig from views of the same instants.
 
     ``names``, ``cameras`` : cameras of the rig; ``sightings`` : views of all cameras, at most one of each camera and
-    instant; ``board`` : board with its grid; ``unique`` : whether the board's points are identified uniquely.
+    instant; ``board`` : board with its grid.
 
     Raises InputError: two images have the same camera and instant. Raises DegenerateError: a camera shares no instant
     with the others, or its instants do not determine how its board is numbered.
     """
-    turns = symmetries(board, unique)
+    turns = symmetries(board)
     by_instant = _by_instant(names, sightings)
     pose_on_rig, final, apart = {0: Rigid()}, list(by_instant[0].values()), []
     placed = dict(by_instant[0])
@@ -169,7 +171,9 @@ def _where(
     seen: list[Sighting],
 ) -> _Where:
     """Returns the relation of least median deviation (Rousseeuw 1984) among those from one instant and one symmetry."""
-    corners = board.places_mm([board.labels()[i] for i in (0, board.columns - 1, -board.columns, -1)])
+    xyz = board.places_mm(board.labels())
+    diagonals = (xyz[:, 0] + xyz[:, 1], xyz[:, 0] - xyz[:, 1])
+    corners = xyz[[int(pick(along)) for along in diagonals for pick in (np.argmin, np.argmax)]]
     relations = [
         each.camera_from_board @ turn.inverse() @ pose.inverse()
         for each, pose in zip(seen, first_from_board, strict=True)
@@ -206,9 +210,9 @@ def _off_px(camera: Camera, expected: np.ndarray, observed: np.ndarray) -> np.nd
 
 def _renumbered(each: Sighting, board: BoardDesign, turn: Rigid) -> Sighting:
     """Returns the sighting with its dots numbered after a turn of the board."""
-    places = turn @ board.places_mm(each.view.labels)
-    cells = np.round(places[:, 1::-1] / board.pitch_mm).astype(int)
-    view = replace(each.view, labels=tuple(DotLabel(row, column) for row, column in cells.tolist()))
+    labels = board.labels()
+    _, nearest = cKDTree(board.places_mm(labels)).query(turn @ board.places_mm(each.view.labels))
+    view = replace(each.view, labels=tuple(labels[i] for i in nearest.tolist()))
     return replace(each, view=view, camera_from_board=each.camera_from_board @ turn.inverse())
 
 
@@ -249,14 +253,13 @@ class RigCalibration:
 
 
 @one_thread()
-def rig_of(cameras: Mapping[str, CameraCalibration], board: BoardDesign, unique: bool = False) -> RigCalibration:
+def rig_of(cameras: Mapping[str, CameraCalibration], board: BoardDesign) -> RigCalibration:
     """Adjusts the cameras of one rig together.
 
     Parameters
     ----------
     cameras : calibrations of the single cameras by name. Views of one instant have the same name except for the suffix.
     board : board that all cameras saw
-    unique : whether the board's points are identified uniquely, as on a ChArUco board
 
     Returns
     -------
@@ -272,7 +275,7 @@ def rig_of(cameras: Mapping[str, CameraCalibration], board: BoardDesign, unique:
         raise InputError("E-RIG-CAMERAS", f"rig: {len(cameras)} camera, 2 needed; calibrate one without --rig")
     names, alone = tuple(cameras), tuple(cameras.values())
     sightings = [each for k, camera in enumerate(alone) for each in _sightings(k, camera)]
-    together = gathered(names, [each.intrinsics.camera for each in alone], sightings, board, unique)
+    together = gathered(names, [each.intrinsics.camera for each in alone], sightings, board)
     joint = adjust_rig(alone, together, board)
     return _result(names, alone, together, joint, board)
 

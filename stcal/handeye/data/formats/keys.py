@@ -49,6 +49,17 @@ def frames_of(key: str) -> Frames | None:
     return None
 
 
+def inverse_name(key: str) -> str:
+    """Returns a name with its two frames changed about, like ``t_cam2target`` of ``t_target2cam``; empty where the name
+    is of another form."""
+    for between in ("_from_", "_wrt_", "_in_", "2"):
+        head, separator, tail = key.partition(between)
+        if separator:
+            prefix = next(iter(re.findall(r"^(?:rot|trans|rotation|translation|rvecs?|tvecs?|[rthRTH])_", head)), "")
+            return f"{prefix}{tail}{separator}{head.removeprefix(prefix)}"
+    return ""
+
+
 def role_of(key: str) -> Role | None:
     """Returns the side whose poses a name means, where the name has no direction."""
     name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.keys import role_of
+from stcal.handeye.data.formats.keys import frames_of, role_of
 from stcal.handeye.data.formats.record import (
     EVERY_FRAME,
     FRAMES,
     MATRICES,
+    MATRICES_3X4,
     ROLES,
     Content,
     Frames,
@@ -25,6 +26,7 @@ from stcal.handeye.data.formats.record import (
 )
 from stcal.handeye.data.formats.single import ROS
 from stcal.io.poses.columns import find_column, places_of, read_rotations
+from stcal.io.poses.matrices import MatrixColumns, find_matrices
 from stcal.io.poses.rotations import of_quaternions, require_finite, said_convention, turned_values
 from stcal.io.table import LENGTHS, Table
 
@@ -42,6 +44,8 @@ THREE_ROWS = 12
 ORTHOGONAL = 0.05
 """Largest deviation of RRᵀ from the identity of numbers that are a rotation; six other numbers of a pose deviate by
 their size."""
+IDENTITY = 1e-6
+"""Largest deviation of a first matrix that is the identity in what digits files have."""
 COMMENTS = ("#", "//", "%")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
 
@@ -88,9 +92,10 @@ def read_numbers(text: str, statements: Said, where: str) -> Content | None:
         return _blocks(lines, where)
     if labels_alone:
         return None
-    if width == 3 or (width == THREE_ROWS and _three_rows(lines)):
+    if width == 3:
         raise InputError(
-            "E-MATRIX-ROWS", f"{where}: {width} numbers in a line, as of a matrix 3×4 or 3×3; 4×4 needed: add 0 0 0 1"
+            "E-MATRIX-ROWS",
+            f"{where}: 3 numbers in a line, as of a matrix 3×3, which has no place; write matrices 3×4 or 4×4",
         )
     values, places = np.array([line.values for line in lines]), tuple(f"line {line.number}" for line in lines)
     if width > TUM and any(_of_euroc(comment, width) for comment in comments):  # velocities and biases follow
@@ -105,6 +110,8 @@ def read_numbers(text: str, statements: Said, where: str) -> Content | None:
     if width == MATRIX:
         rotation, translation = of_matrices(values.reshape(-1, 4, 4), places, where)
         return Content("4×4 matrices, a row each", (Side(rotation, translation, places, MATRICES, names=names),))
+    if width == THREE_ROWS and _three_rows(values):
+        return _of_kitti(values.reshape(-1, 3, 4), places, names, where)
     if width in PAIRS:
         return _pairs(values, statements, places, names, where)
     rotation, words = turned_values(values[:, 3:], statements.rotation, "the numbers after x, y, z", places, where)
@@ -124,12 +131,25 @@ def _pairs(
     return Content(f"rows of {half} + {half} numbers, the robot's pose first", tuple(sides))
 
 
-def _three_rows(lines: list[Line]) -> bool:
-    """True if lines of twelve numbers are matrices 3×4."""
-    turn = np.array([line.values for line in lines]).reshape(-1, 3, 4)[:, :, :3]
-    if not np.isfinite(turn).all() or np.abs(turn).max() > 2:
-        return False
-    return bool(np.abs(turn @ np.swapaxes(turn, 1, 2) - np.eye(3)).max() < ORTHOGONAL)
+def _three_rows(values: np.ndarray) -> bool:
+    """True if most rows of twelve numbers (m, 12) are matrices 3×4, so that one that is none can be named."""
+    turn = values.reshape(-1, 3, 4)[:, :, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(turn @ np.swapaxes(turn, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    return bool(2 * np.count_nonzero(off < ORTHOGONAL) > len(off))
+
+
+def _of_kitti(matrices: np.ndarray, places: tuple[str, ...], names: tuple[str, ...], where: str) -> Content:
+    """Returns poses from matrices (m, 3, 4), a row each.
+
+    A first matrix of the identity tells KITTI's odometry: poses of the camera in its first frame, in metres. No board
+    stands in its camera's centre.
+    """
+    rotation, translation = of_matrices(matrices, places, where)
+    first = bool(np.abs(matrices[0] - np.eye(4)[:3]).max() < IDENTITY)
+    form = "3×4 matrices, a row each" + (", the first one at the origin, as KITTI writes trajectories" if first else "")
+    unit = Unit("m", "as in KITTI") if first else None
+    return Content(form, (Side(rotation, translation, places, MATRICES_3X4, unit, names=names, trajectory=first),))
 
 
 def _without_counts(lines: list[Line], where: str) -> list[Line]:
@@ -200,23 +220,25 @@ def _number(token: str) -> float | None:
 
 
 def _blocks(lines: list[Line], where: str) -> Content | None:
-    """Returns matrices of four lines each, with or without a name before each."""
-    names, rows, starts = [], [], []
+    """Returns matrices of four lines each, or of three where no line is 0 0 0 1, with or without a name before each."""
+    every = np.array([line.values for line in lines if line.values])
+    three = len(every) % 3 == 0 and not (every == [0, 0, 0, 1]).all(axis=1).any() and _three_rows(every.reshape(-1, 12))
+    names, rows, starts, height = [], [], [], 3 if three else 4
     for line in lines:
         if line.label:
             names.append(line.label)
         if line.values:
-            if len(rows) % 4 == 0:
+            if len(rows) % height == 0:
                 starts.append(line.number)
             rows.append(line.values)
-        if line.label and len(rows) % 4 > (1 if line.values else 0):
+        if line.label and len(rows) % height > (1 if line.values else 0):
             raise InputError(
-                "E-MATRIX-ROWS", f"{where}: line {line.number}: a name after {len(rows) % 4} rows of a matrix, 4 needed"
+                "E-MATRIX-ROWS",
+                f"{where}: line {line.number}: a name after {len(rows) % height} rows of a matrix, {height} needed",
             )
-    if len(rows) % 4:
-        three = "; matrices 3×4 need a row 0 0 0 1 each" if len(rows) % 3 == 0 else ""
+    if len(rows) % height:
         raise InputError(
-            "E-MATRIX-ROWS", f"{where}: {len(rows)} rows of 4 numbers, 4 for each matrix needed{three}; correct them"
+            "E-MATRIX-ROWS", f"{where}: {len(rows)} rows of 4 numbers, 4 for each matrix needed; correct them"
         )
     if names and len(names) != len(starts):
         raise InputError(
@@ -224,8 +246,9 @@ def _blocks(lines: list[Line], where: str) -> Content | None:
         )
     places = tuple(f"line {number}" for number in starts)
     require_each_once(names, places[: len(names)], where)
-    rotation, translation = of_matrices(np.array(rows).reshape(-1, 4, 4), places, where)
-    return Content("4×4 matrices as text", (Side(rotation, translation, places, MATRICES, names=tuple(names)),))
+    rotation, translation = of_matrices(every.reshape(-1, height, 4), places, where)
+    words = MATRICES_3X4 if three else MATRICES
+    return Content(f"{words} as text", (Side(rotation, translation, places, words, names=tuple(names)),))
 
 
 def _of_euroc(comment: str, width: int) -> bool:
@@ -270,8 +293,6 @@ NAMES = (
 NUMBERS = ("nr", "no", "number", "index", "id", "#")
 """Columns that name a row where no value occurs twice: elsewhere they number something else, such as the board."""
 _MESSAGE = re.compile(r"(?P<of>.*?)[./_]?(?:position|translation)[./_]x", re.IGNORECASE)
-_ELEMENT = re.compile(r"(?P<stem>[A-Za-z_]+?)_?(?P<row>[0-4])_?(?P<column>[0-4])")
-"""Column of one element of a matrix."""
 _STAMP = (("secs", "nsecs"), ("sec", "nanosec"))
 
 
@@ -296,6 +317,8 @@ def read_columns(table: Table, key: str, statements: Said) -> Content | None:
         side = _side(table, f"{frame}_", Frames(frame, f"by the columns {frame}_…"), names, statements)
         if side is not None:
             sides.append(side)
+    if not sides:
+        sides = _named_matrices(table, names)
     if not sides:
         side = _side(table, "", None, names, statements)
         sides = [side] if side is not None else []
@@ -400,10 +423,15 @@ def _of_messages(table: Table, messages: Sequence[_Message], names: tuple[str, .
 
 def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ...], statements: Said) -> Side | None:
     """Returns the poses in the columns that begin with a prefix; None where place or rotation is missing."""
-    matrices = _matrices(table, prefix)
-    if matrices is not None:
-        rotation, translation = of_matrices(matrices, places_of(table), table.where)
-        return Side(rotation, translation, places_of(table), MATRICES, None, frames, names)
+    full = [matrix for matrix in find_matrices(table, prefix) if matrix.translation]
+    if len(full) > 1:
+        raise InputError(
+            "E-POSES-MIXED",
+            f"{table.where}: columns of {len(full)} matrices, {', '.join(matrix.stem for matrix in full)}; begin their "
+            f"names with the transforms, {FRAMES['robot'][0]}_ and {FRAMES['camera'][0]}_, or take the others out",
+        )
+    if full:
+        return _of_matrix(table, full[0], frames, names)
     place = _place(table, prefix)
     if place is None:
         return None
@@ -415,23 +443,30 @@ def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ..
     return Side(turned.rotation, at, places_of(table), turned.words, unit, frames, names, covariance=covariance)
 
 
-def _matrices(table: Table, prefix: str) -> np.ndarray | None:
-    """Returns the matrices (m, 4, 4) of columns that name row and column of each element; None where there are none.
+def _of_matrix(table: Table, matrix: MatrixColumns, frames: Frames | None, names: tuple[str, ...]) -> Side:
+    """Returns the poses of matrices whose elements are columns."""
+    rotation, translation = of_matrices(matrix.matrices(table), places_of(table), table.where)
+    unit = Unit(matrix.unit, "by the columns", True) if matrix.unit else None
+    return Side(rotation, translation, places_of(table), MATRICES, unit, frames, names)
 
-    Rows and columns count from 0 or from 1, as in m00 … m33, r11 … r44 or T_0_0; the row 0 0 0 1 may be missing.
-    """
-    by_stem: dict[str, dict[tuple[int, int], str]] = {}
-    for column in table.columns:
-        if column.startswith(prefix) and (element := _ELEMENT.fullmatch(column.removeprefix(prefix))):
-            by_stem.setdefault(element["stem"].lower(), {})[int(element["row"]), int(element["column"])] = column
-    for elements in by_stem.values():
-        first = min(min(place) for place in elements)
-        wanted = [(row, column) for row in range(first, first + 4) for column in range(first, first + 4)]
-        if set(elements) in (set(wanted), set(wanted[:THREE_ROWS])):
-            matrices = np.tile(np.eye(4).ravel(), (len(table), 1))
-            for i, place in enumerate(wanted[: len(elements)]):
-                matrices[:, i] = table.numbers(elements[place])
-            return matrices.reshape(-1, 4, 4)
+
+def _named_matrices(table: Table, names: tuple[str, ...]) -> list[Side]:
+    """Returns the matrices of both sides whose columns begin with names of the transforms or of the sides; none where
+    there are not two of them, or their names do not tell."""
+    full = [matrix for matrix in find_matrices(table) if matrix.translation]
+    frames = [_frames_of_stem(matrix.stem) for matrix in full]
+    if len(full) != len(ROLES) or {frame.role for frame in frames if frame is not None} != set(ROLES):
+        return []
+    return [_of_matrix(table, matrix, frame, names) for matrix, frame in zip(full, frames, strict=True)]
+
+
+def _frames_of_stem(stem: str) -> Frames | None:
+    """Returns the transform that the beginning of names of columns means, by ``gripper2base_T`` or ``robot_m``."""
+    for name in (stem, re.sub(r"[\s_.\-]*(?:[TRHMrmh]|mat|matrix|pose)$", "", stem)):
+        if frames := frames_of(name):
+            return replace(frames, by=f"by the columns {stem}…")
+        if role := role_of(name):
+            return Frames(FRAMES[role][0], f"by the columns {stem}…", False)
     return None
 
 

@@ -29,6 +29,8 @@ SUFFIXES = (".yaml", ".yml", ".json", ".txt", ".csv", ".npy", ".npz")
 
 _BRACKETED_UNIT = re.compile(r"(?<=\w)\s*\[[a-zµ°]{1,3}\]", re.I)
 """A unit in the header of a table, which is no list of YAML."""
+_INDEX = re.compile(r"(?<=[\w\]])\[\d\]")
+"""Index of an element in the header of a table, as in ``T[0][3]``."""
 
 _SPACED = re.compile(r"([A-Za-z_]\w*\s+){5,}[A-Za-z_]\w*")
 """A header of columns between which spaces stand, of six names at least, as a pose needs."""
@@ -98,7 +100,7 @@ def _of_text(text: str, path: Path, statements: Said, key: str, quaternions: Ord
     content = read_numbers(text, statements, where)
     if content is not None:
         return content
-    if re.match(r"[^:\[{]*[,;\t]", _BRACKETED_UNIT.sub("", first)) or _SPACED.fullmatch(first):
+    if re.match(r"[^:\[{]*[,;\t]", _INDEX.sub("", _BRACKETED_UNIT.sub("", first))) or _SPACED.fullmatch(first):
         table = read_table(path, "pose file", quaternions)
         return None if todays(table) else read_columns(table, key, statements)
     value = _yaml(text, where)

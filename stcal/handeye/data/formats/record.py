@@ -20,7 +20,7 @@ FRAMES: dict[Role, tuple[str, str]] = {
 }
 """The transform that is needed for each side, and its inverse."""
 EVERY_FRAME = tuple(name for names in FRAMES.values() for name in names)
-MATRICES = "4×4 matrices"
+MATRICES, MATRICES_3X4 = "4×4 matrices", "3×4 matrices"
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,12 +182,12 @@ class Said:
 
 
 def of_matrices(matrices: np.ndarray, places: Sequence[str], where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the rotations and translations of homogeneous matrices (m, 4, 4).
+    """Returns the rotations and translations of homogeneous matrices (m, 4, 4), or (m, 3, 4) without the last row.
 
     Raises InputError: a last row that is not 0 0 0 1, or a matrix whose upper left part is not a rotation.
     """
     require_finite(matrices, places, where)
-    bad = np.flatnonzero(np.abs(matrices[:, 3] - [0, 0, 0, 1]).max(axis=1) > 0)
+    bad = np.flatnonzero(np.abs(matrices[:, 3:] - [0, 0, 0, 1]).max(axis=(1, 2), initial=0.0) > 0)
     if len(bad):
         i = bad[0]
         turned = " (the last column is: the matrix is transposed)" if not matrices[i, :3, 3].any() else ""

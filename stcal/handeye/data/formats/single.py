@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.record import MATRICES, Said, Unit, of_matrices
+from stcal.handeye.data.formats.record import MATRICES, MATRICES_3X4, Said, Unit, of_matrices
 from stcal.io.poses.rotations import (
     ROTATION_VECTOR,
     Convention,
@@ -118,11 +118,11 @@ def name_in(value: Mapping) -> str:
 def _of_array(array: np.ndarray, statements: Said, place: str, where: str) -> One | None:
     if array.shape == (16,):
         array = array.reshape(4, 4)
-    if array.shape in ((3, 4), (12,)):
-        raise InputError("E-MATRIX-ROWS", f"{where}: {place}: a matrix 3×4, 4×4 needed; add the row 0 0 0 1")
-    if array.shape == (4, 4):
+    if array.shape == (12,):
+        array = array.reshape(3, 4)
+    if array.shape in ((4, 4), (3, 4)):
         rotation, translation = of_matrices(array[None], (place,), where)
-        return One(rotation[0], translation[0], MATRICES)
+        return One(rotation[0], translation[0], MATRICES if len(array) == 4 else MATRICES_3X4)
     if array.shape in ((6,), (7,)):
         require_finite(array[None], (place,), where)
         rotation, turned = turned_values(

@@ -12,6 +12,7 @@ from stcal.handeye.data.formats.keys import frames_of, role_of
 from stcal.handeye.data.formats.record import (
     FRAMES,
     MATRICES,
+    MATRICES_3X4,
     ROLES,
     Content,
     Frames,
@@ -302,12 +303,8 @@ def _side_of(value: Any, statements: Said, where: str, frames: Frames | None) ->
     array = numbers(value)
     if array is None:
         return _listed(value, statements, where, frames, "pose") if isinstance(value, list) else None
-    if array.ndim == 3 and array.shape[1:] == (3, 4):
-        raise InputError(
-            "E-MATRIX-ROWS", f"{where}: {len(array)} matrices 3×4, 4×4 needed; add the row 0 0 0 1 to each"
-        )
-    if array.shape == (4, 4) or array.shape == (16,):
-        array = array.reshape(1, 4, 4)
+    if array.shape in ((4, 4), (16,), (3, 4)):
+        array = array.reshape(1, -1, 4)
     if array.ndim == 2 and array.shape[1] == 16:
         array = array.reshape(-1, 4, 4)
     if array.ndim == 2 and array.shape[1] in (6, 7):
@@ -315,11 +312,11 @@ def _side_of(value: Any, statements: Said, where: str, frames: Frames | None) ->
         require_finite(array, places, where)
         turned, words = turned_values(array[:, 3:], statements.rotation, "the numbers after x, y, z", places, where)
         return Side(turned, array[:, :3], places, words, frames=frames)
-    if array.ndim != 3 or array.shape[1:] != (4, 4):
+    if array.ndim != 3 or array.shape[1:] not in ((4, 4), (3, 4)):
         return None
     places = tuple(f"pose {i}" for i in range(1, len(array) + 1))
     rotation, translation = of_matrices(array, places, where)
-    return Side(rotation, translation, places, MATRICES, frames=frames)
+    return Side(rotation, translation, places, MATRICES if array.shape[1] == 4 else MATRICES_3X4, frames=frames)
 
 
 def _listed(values: Sequence, statements: Said, where: str, frames: Frames | None, what: str) -> Side | None:

@@ -65,7 +65,7 @@ def in_m(m):
         (changed(1, transposed), ["pose 2", "last row", "0 0 0 1 needed", "transposed"]),
         (changed(4, one_nan), ["pose 5", "not finite"]),
         (changed(0, in_m), ["pose 1 is", "as if in two units", "--length-unit"]),
-        (GOOD[:, :3], ["5 matrices 3×4, 4×4 needed; add the row 0 0 0 1"]),
+        (2 * GOOD[:, :3], ["pose 1", "not a rotation", "stretched by 2"]),
         (np.zeros((0, 4, 4)), ["shape (0, 4, 4); poses needed"]),
         (np.zeros((3, 5)), ["no poses found", "4×4 matrices", "TUM", "needed"]),
     ],
@@ -158,8 +158,8 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
     ("text", "parts"),
     [
         (f"{ROW}\n{ROW} 1\n{ROW}\n", ["line 2: 17 numbers, 16 in most other lines"]),
-        ("1 0 0 5\n0 1 0 6\n0 0 1 7\n", ["3 rows of 4 numbers, 4 for each matrix", "0 0 0 1 each"]),
-        ("1 0 0 5 0 1 0 6 0 0 1 7\n", ["12 numbers in a line", "4×4 needed"]),
+        ("2 0 0 5\n0 1 0 6\n0 0 1 7\n", ["3 rows of 4 numbers, 4 for each matrix"]),
+        ("1 0 0\n0 1 0\n0 0 1\n", ["3 numbers in a line", "no place", "3×4 or 4×4"]),
         (TUM + TUM, ["line 1 and line 2: both are of '1.5'"]),
         (TUM.replace("0 1\n", "0.5 1\n"), ["line 1: quaternion of length 1.118, 1 ± 0.001 needed"]),
         (TUM.replace("0 1\n", "1e308 1\n"), ["line 1: quaternion of length inf"]),
@@ -181,7 +181,7 @@ TUM = "1.5 0.1 0.2 0.3 0 0 0 1\n"
         ("{" * 100_000, ["not YAML"]),
         ("name: cell\n", ["no poses found in it"]),
         ("- {image: a, matrix: [1, 2]}\n", ["no poses found in it"]),
-        ('{"a.png": [[1,0,0,0],[0,1,0,0],[0,0,1,0]]}', ["a.png: a matrix 3×4, 4×4 needed"]),
+        ('{"a.png": [[2,0,0,0],[0,1,0,0],[0,0,1,0]]}', ["a.png: the 3×3 part is not a rotation"]),
         ('{"parameters": {}, "transform": {}}', ["the result of an easy_handeye calibration; give its samples"]),
         (
             '[{"position": {"x": 1, "y": 2, "z": null}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}]',
@@ -356,7 +356,7 @@ def written(folder, text, name="poses.txt"):
     ("text", "error"),
     [
         ("7\n" + "\n".join(line(m.ravel()) for m in GOOD), "E-POSES-COUNT … line 1 … 7 … 5"),
-        ("\n".join(line(m[:3].ravel()) for m in GOOD), "E-MATRIX-ROWS … 12 numbers … 0 0 0 1"),
+        ("\n".join(line(m[:3].ravel()) for m in GOOD), "E-POSES-MIXED … 3×4 matrices … --a"),
         ("1,2,3,4,5,6,7,8,9,10,11,12\n", "E-ROTATION-AMBIGUOUS … robot … --rotation"),
         ("frameCount: 2\nT1_0: [1]\nT2_0: [1]\n", "E-POSES-COUNT … T1_ … 2"),
         ("frameCount: 1\nT1_0: [1]\nT2_0: [1]\n", "E-POSE-VALUE … T1_0"),

@@ -1,0 +1,362 @@
+"""Every input in ``../shared/cases``, as it was typed: it ends right, or in a line that says what to do.
+
+What is right is the truth beside an input, the numbers that stand in it (projected by OpenCV, NumPy or pycolmap in
+``tests/io/test_shared_cases.py``), or how the input was made, said here. Files that commands write go to a copy.
+"""
+
+import json
+import re
+import shlex
+import shutil
+import stat
+import sys
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import pytest
+
+from stcal.boards.file import load_run_board
+from stcal.cli.main import main
+from stcal.io.design import load_target
+from tests.io.reported_cameras import SAMPLES, metashape, perspective
+from tests.outcome import COMPUTATION, INPUT, ended, lines_of
+from tests.test_shared_cases import apart, truth
+
+pytestmark = pytest.mark.slow
+
+
+@dataclass(frozen=True)
+class Typed:
+    """What a command must come to.
+
+    ``code`` : exit code; ``error`` : code of its error; ``says`` : words in this order in what it prints, all in one
+    line where there is an error; ``values`` : number behind a name in its tables, and how far off it may be;
+    ``never`` : words that would mislead; ``command`` : where the file ``cmd`` describes calls in place of naming one.
+    """
+
+    code: int = 0
+    error: str = ""
+    says: tuple[str, ...] = ()
+    values: dict[str, tuple[float, float]] = field(default_factory=dict)
+    never: tuple[str, ...] = ()
+    command: str = ""
+
+
+def camera(fx: float, fy: float, cx: float, cy: float, *k: float, names: str = "k1 k2 p1 p2 k3") -> dict:
+    """Parameters as a camera is shown, to the last digit."""
+    shown = dict(zip(("fx", "fy", "cx", "cy", *names.split()), (fx, fy, cx, cy, *k), strict=False))
+    return {name: (value, 5e-5 if name in ("fx", "fy", "cx", "cy") else 5e-8) for name, value in shown.items()}
+
+
+FISHEYE = "k1 k2 k3 k4"
+KITTI = (-3.728755e-01, 2.037299e-01, 2.219027e-03, 1.383707e-03, -7.233722e-02)
+CAM_TXT = camera(1502, 1501, 959.5, 539.5, -0.1, 0.02, 0.0001, 0.0002)
+MOVED = ("pose 2, pose 4, pose 5 and 3 more", "--undo-flips")
+HALF_A_TURN = ("all tags would fit if every tag stood half a turn the other way", "add 180 to each angle_deg")
+TYPED: dict[str, tuple[Typed, ...]] = {
+    "aruco_flips_30pc": (
+        Typed(says=("6 of 20 poses are tilted the other way", *MOVED), never=("wrong setup", "paired with another")),
+    ),
+    "bouguet_m": (Typed(values=camera(657.395, 657.763, 302.984, 242.617, -0.2559, 0.1276, -0.0002, 0.00003)),),
+    "camodocal": (
+        Typed(INPUT, "E-HANDEYE-CONVENTION", ("flange_from_base", "--poses-are", "--setup"), never=("column",)),
+    ),
+    "colmap_300_cameras": (Typed(values=camera(1503, 1501, 959.5, 539.5, -0.1, 0.02, 0.0001, 0.0002)),),
+    "ehe_eye_on_base_forgotten": (
+        Typed(says=("do not use: the camera is 1426 mm off the flange", "give --setup eye-to-hand")),
+    ),
+    "elastic_file_differs": (
+        Typed(says=("identified, the same rows            2.9963   3.3354",)),
+        Typed(says=("2.9963", "3.3354")),
+    ),
+    "euroc_sensor": (Typed(values=camera(458.6, 457.2, 367.2, 248.3, -0.283, 0.0739, 0.000193, 1.76e-05)),),
+    "exif": (Typed(INPUT, "E-CAMERA-EXIF", ("5.7 mm, but no size of its pixels", "give a camera file")),),
+    "interactive": (Typed(values=camera(*SAMPLES[0], *SAMPLES[1])),),
+    "json_tabs": (Typed(values=camera(800, 801, 320.5, 240.5, -0.1, 0.02, 1e-4, -2e-4)),),
+    "kitti": (Typed(values=camera(984.2439, 980.8141, 690.0, 233.1966, *KITTI)),),
+    "kuka_semicolon_comma": (Typed(says=("use with care", "pose 2 contradicts the others")),),
+    "loc_apriltag_ros_yaml": (Typed(COMPUTATION, says=(*HALF_A_TURN, "upright: true"), never=("accept ",)),),
+    "loc_bundle": (Typed(says=("2 scenes, 2 accepted",)),),
+    "loc_layout_y_up": (
+        Typed(COMPUTATION, says=("all tags would fit if Y pointed down", "change the signs of y_mm and angle_deg")),
+    ),
+    "loc_sigma_aligned": (Typed(says=("6 scenes, 6 accepted",)),),
+    "loc_tag36h11_name": (Typed(says=("2 scenes, 2 accepted",)),),
+    "metashape_p3p4": (Typed(says=("p3 = 0.85, p4 = -0.44 has no place here", "FULL_OPENCV", "start only")),),
+    "mrcal_splined": (
+        Typed(says=("splines of 30×20 points has no place here", "valid_intrinsics_region", "turned by 3.8")),
+        Typed(
+            says=("is compared by its own projection, within its valid_intrinsics_region", "apart: 1.14"),
+            never=("fitted",),
+        ),
+    ),
+    "name_choice": (
+        Typed(says=("OPENCV", "written")),
+        Typed(says=("written",)),
+        Typed(says=("written",)),
+    ),
+    "opencv_fisheye_model": (
+        Typed(values=camera(420.5, 421.1, 639.2, 479.8, -0.021, 0.013, -0.009, 0.0021, names=FISHEYE)),
+    ),
+    "opencv_old_names": (Typed(values=camera(*SAMPLES[0], *SAMPLES[1])),),
+    "opencv_omnidir_xi": (Typed(says=("ξ = 1.21 has no place here", "THIN_PRISM_FISHEYE", "0.012 px RMS")),),
+    "own_target_mirror": (),
+    "reg_german_csv": (Typed(says=("24 inliers, 0 outliers",)),),
+    "reg_sa_two_exports": (Typed(says=("24 inliers, 0 outliers",)),),
+    "rob_coupling_unstated": (Typed(INPUT, "", ("joint 3 were coupled to joint 2 by -1", "give coupling")),),
+    "rob_std_as_modified": (Typed(INPUT, "", ("standard convention", 'give convention = "standard"')),),
+    "rob_tracker_moved_halfway": (
+        Typed(says=("the instrument or the robot's base elsewhere from line 32 on: 13 mm", "another station")),
+    ),
+    "rob_tracker_nomap": (Typed(INPUT, "", ("joints.csv: no column Point Name", "--key 'NAME=Point Name'")),),
+    "rob_ur_kinematics_yaml": (Typed(INPUT, "", ("without forearm, wrist_1, wrist_2", "calibration anew")),),
+    "ros1_echo": (
+        Typed(values=camera(1133, 1128, 960.5, 600.5, -0.0152, 0.0132, -0.0248, 0.0178, names=FISHEYE)),
+        Typed(values=camera(1133, 1128, 960.5, 600.5, -0.0152, 0.0132, -0.0248, 0.0178, names=FISHEYE)),
+    ),
+    "ros_camera_model_fisheye": (
+        Typed(values=camera(401.25, 402.75, 868.4, 601.9, 0.1712, -0.0331, 0.0004, -0.0007, names=FISHEYE)),
+    ),
+    "ros_coefficients": tuple(
+        Typed(
+            INPUT if refused else 0,
+            "E-CAMERA-MODEL" if name == "invbc" else "E-CAMERA-UNCALIBRATED" if refused else "",
+            ("calibrate",) if refused else ("written",),
+            command=f"stcal camera convert {name}.yaml out_{name}.txt",
+        )
+        for name in ("invbc", "kb", "none0", "plumb8", "rat8", "six", "thin12", "tilt14", "uncal", "zeros5")
+        for refused in (name in ("invbc", "uncal"),)
+    ),
+    "ros_none": (Typed(INPUT, "E-CAMERA-KEY", ("binning_x = 2", "set it to 0")),),
+    "rotated_tags": (Typed(COMPUTATION, says=("3 scenes, 0 accepted", *HALF_A_TURN)),),
+    "scara_4dof_inverted_cam": (
+        Typed(INPUT, "E-HANDEYE-CONVENTION", ("board_from_camera", "rename them in the file"), {}, ("column",)),
+    ),
+    "stale_tf_half": (
+        Typed(INPUT, "", ("the flange's pose is the same to the last digit in 6 rows", "read the robot's pose anew")),
+    ),
+    "stereo_yml": (Typed(INPUT, "E-CAMERA-SEVERAL", ("2 cameras", "choose of 1, 2", "--name")),),
+    "tum_lag_20ms_no_option": (
+        Typed(says=("do not use", "clock is 20 ± 0.1 ms behind the camera's", "solve with --time-offset")),
+    ),
+    "twelve_numbers_noheader": (Typed(says=("rows of 6 + 6 numbers", "line 2 contradicts the others")),),
+    "ur_pendant": (Typed(says=("use with care", "pose 2 contradicts the others")),),
+    "wal": (Typed(INPUT, "E-CAMERA-UNREADABLE", ("db.db-wal", "copy both")),),
+    "yaml_directive_comment": (
+        Typed(
+            values=camera(
+                *(190.97847715128717, 190.9733070521226, 254.93170605935475, 256.8974428996504),
+                *(0.0034823894022493434, 0.0007150348452162257, -0.0020532361418706202, 0.00020293673591811182),
+                names=FISHEYE,
+            )
+        ),
+    ),
+}
+"""By folder, each command of its ``cmd``."""
+
+
+@pytest.fixture
+def typed(monkeypatch, capsys, shared_case, tmp_path):
+    """Runs each command of a case in a copy of its folder; beside it are the images of ``loc_bundle``."""
+
+    def run(case: str, more: str = "") -> list:
+        folder = tmp_path / case
+        shutil.copytree(shared_case(case), folder, ignore=shutil.ignore_patterns("out.toml", "[lr].json"))
+        for path in (folder, *folder.rglob("*")):
+            path.chmod(path.stat().st_mode | stat.S_IWUSR)
+        if case == "own_target_mirror":
+            return []
+        if "loc_bundle" in (folder / "cmd").read_text() and case != "loc_bundle":
+            shutil.copytree(shared_case("loc_bundle/images"), tmp_path / "loc_bundle" / "images")
+        monkeypatch.chdir(folder)
+        outcomes = []
+        for words in commands(case, (folder / "cmd").read_text()):
+            monkeypatch.setattr(sys, "argv", shlex.split(f"{words}{more}"))
+            outcomes.append(ended(main, capsys))
+        return outcomes
+
+    return run
+
+
+def commands(case: str, text: str) -> list[str]:
+    """The calls of a ``cmd`` as a shell splits them; those of name_choice write to files of their own."""
+    stated = [expected.command for expected in TYPED[case] if expected.command]
+    if stated:
+        return stated
+    calls = [call.strip() for call in re.split(r";|&&", text.split("#")[0]) if call.strip()]
+    if case == "name_choice":
+        calls = [call.replace("out.txt", f"out{i}.txt") for i, call in enumerate(calls)]
+    return calls
+
+
+def in_order(words: tuple[str, ...], text: str) -> bool:
+    at = 0
+    for word in words:
+        at = text.find(word, at)
+        if at < 0:
+            return False
+        at += len(word)
+    return True
+
+
+def test_every_case_is_here(shared_case):
+    assert {path.name for path in shared_case("").iterdir() if path.is_dir()} == set(TYPED)
+
+
+@pytest.mark.parametrize("case", TYPED)
+def test_a_case_as_typed(typed, case):
+    outcomes = typed(case)
+    assert len(outcomes) == len(TYPED[case])
+    for expected, outcome in zip(TYPED[case], outcomes, strict=True):
+        code, out, err = outcome
+        assert code == expected.code, out + err
+        assert "Traceback" not in out + err
+        printed = " ".join((out + err).split())
+        if code == INPUT:
+            (line,) = [each for each in lines_of(err) if each.startswith("error: ")]
+            printed = line
+            assert outcome.error.startswith(expected.error or "E-")
+        assert in_order(tuple(" ".join(word.split()) for word in expected.says), printed), printed
+        assert not any(word in printed for word in expected.never), printed
+        for name, (value, off) in expected.values.items():
+            found = re.search(rf"^{name} +(-?[\d.]+)", out, re.MULTILINE)
+            assert found, f"no {name} in {out}"
+            assert abs(float(found[1]) - value) <= off, f"{name} {found[1]}, {value} needed"
+
+
+HAND_EYE = {
+    "aruco_flips_30pc": ("flange_from_camera", 0.25, 1.1, ""),
+    "ehe_eye_on_base_forgotten": ("base_from_camera", 0.12, 0.9, " --setup eye-to-hand"),
+    "kuka_semicolon_comma": ("flange_from_camera", 0.13, 0.8, ""),
+    "twelve_numbers_noheader": ("flange_from_camera", 0.13, 0.8, ""),
+    "ur_pendant": ("flange_from_camera", 0.13, 0.8, ""),
+    "tum_lag_20ms_no_option": ("flange_from_camera", 0.06, 0.5, " --time-offset --method pose --splits 0"),
+}
+"""Transform, and how far off it may be, ° and mm: four times the root of the sum of the σ² that are printed, and 0.06°
+of the truth, which has four digits. With the option that the command asks for where it says not to use the result."""
+
+
+@pytest.mark.parametrize("case", HAND_EYE)
+def test_a_hand_eye_case_comes_to_the_truth(typed, shared_case, tmp_path, case):
+    name, degrees, mm, more = HAND_EYE[case]
+    (outcome,) = typed(case, f"{more} --out {tmp_path}/h.json")
+    assert outcome[0] == 0, outcome
+    found = np.array(json.loads((tmp_path / "h.json").read_text())[name])
+    turn, shift = apart(truth(shared_case(case)), found)
+    assert turn < degrees
+    assert shift < mm
+
+
+def test_flips_are_undone_as_the_verdict_says(typed, shared_case, tmp_path):
+    (outcome,) = typed("aruco_flips_30pc", f" --undo-flips --out {tmp_path}/h.json")
+    rows = [
+        int(i) + 1 for i in re.findall(r"\d+", (shared_case("aruco_flips_30pc") / "truth").read_text().split("[")[-2])
+    ]
+    assert f"6 of 20 poses: {', '.join(f'pose {i}' for i in rows)}" in outcome[1] + outcome[2]
+    assert "verdict: good" in outcome[1]
+    found = np.array(json.loads((tmp_path / "h.json").read_text())["flange_from_camera"])
+    assert apart(truth(shared_case("aruco_flips_30pc")), found)[1] < 1.0
+
+
+def test_the_camera_of_a_scara_under_its_right_name(typed, shared_case, tmp_path, monkeypatch, capsys):
+    """All but the height, which a robot of four axes does not show: 0.2 mm and 0.02° of noise on 12 poses."""
+    (outcome,) = typed("scara_4dof_inverted_cam", " --poses-are board_from_camera")
+    assert "t_cam2target" in outcome[2]
+    text = (shared_case("scara_4dof_inverted_cam") / "poses.json").read_text().replace("target2cam", "cam2target")
+    (tmp_path / "poses.json").write_text(text)
+    words = f"stcal handeye {tmp_path}/poses.json --four-dof --out {tmp_path}/h.json"
+    monkeypatch.setattr(sys, "argv", shlex.split(words))
+    code, out, _ = ended(main, capsys)
+    assert code == 0
+    assert "measure where the camera is along this axis" in out
+    found, wanted = np.array(json.loads((tmp_path / "h.json").read_text())["flange_from_camera"]), None
+    wanted = truth(shared_case("scara_4dof_inverted_cam"))
+    assert apart(wanted, found)[0] < 0.1
+    np.testing.assert_allclose(found[:2, 3], wanted[:2, 3], atol=0.3)
+
+
+@pytest.mark.parametrize("case", ["reg_german_csv", "reg_sa_two_exports"])
+def test_a_registered_case_comes_to_the_truth(typed, shared_case, tmp_path, case):
+    """σ of a coordinate 0.01 mm and of a rotation 0.001° are printed; the truth has four digits, 0.006°."""
+    typed(case)
+    found = json.loads((tmp_path / case / "r.json").read_text())["b_from_a"]
+    turn, shift = apart(truth(shared_case(case)), np.array(found))
+    assert turn < 0.01
+    assert shift < 0.06
+
+
+@pytest.mark.parametrize("case", ["loc_bundle", "loc_sigma_aligned"])
+def test_a_located_case_comes_to_the_truth(typed, shared_case, tmp_path, case):
+    """Places within five times the σ that are printed, and 0.01 mm."""
+    typed(case)
+    scenes = json.loads((tmp_path / case / "l.json").read_text())["scenes"]
+    file = next(path for name in ("truth", "truth.txt") if (path := shared_case(case) / name).exists())
+    numbers = file.read_text().partition("\n")[2] if file.suffix else file.read_text()
+    wanted = np.array(re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", numbers), float)
+    wanted = wanted.reshape(-1, 4, 4)[:, :3, 3] if file.suffix else wanted.reshape(-1, 3, 4)[:, :, 3]
+    for scene, place in zip(scenes, wanted, strict=True):
+        sigma = np.sqrt(np.trace(np.array(scene["covariance"])[3:, 3:]))
+        assert np.linalg.norm(np.array(scene["camera_from_obj"])[:3, 3] - place) < 5 * sigma + 0.01
+
+
+COUPLED = (
+    "coupling = [\n"
+    + "".join(
+        f"  [{', '.join('1' if i == j else '-1' if (i, j) == (2, 1) else '0' for j in range(6))}],\n" for i in range(6)
+    )
+    + "]\n"
+)
+RIGHTED = {
+    "rob_std_as_modified": lambda text: text.replace('convention = "modified"', 'convention = "standard"'),
+    "rob_coupling_unstated": lambda text: COUPLED + text,
+}
+"""The robot's file as the error tells to write it."""
+
+
+@pytest.mark.parametrize("case", RIGHTED)
+def test_a_robot_written_as_the_error_says(typed, tmp_path, case, monkeypatch, capsys):
+    """Rows held out are then missed by less than 1 mm, where 606 and 1050 mm were."""
+    typed(case)
+    file = tmp_path / case / "robot.toml"
+    file.write_text(RIGHTED[case](file.read_text()))
+    monkeypatch.setattr(sys, "argv", shlex.split("stcal robot identify data.csv --robot robot.toml --out out.toml"))
+    code, out, error = ended(main, capsys)
+    assert code == 0, error
+    held_out = re.search(r"^held out.* ([\d.]+) +[\d.]+$", out, re.MULTILINE)
+    assert held_out
+    assert float(held_out[1]) < 1
+
+
+def test_own_target_is_not_its_mirror_image(shared_case, tmp_path, monkeypatch, capsys):
+    """Three faces of nine circles, some off their grid of 35 mm: drawn and read; mirrored images are said."""
+    folder = shared_case("own_target_mirror")
+    target, board = load_target(folder / "target.toml"), load_run_board(folder / "board.toml")
+    assert (len(target.faces), len(board.labels())) == (3, 63)
+    words = (
+        f"stcal sfm simulate {tmp_path}/data --target {folder}/target.toml --board {folder}/board.toml --groups "
+        "front-right --images 3 --width 1944 --distance 700 --workers 1"
+    )
+    monkeypatch.setattr(sys, "argv", shlex.split(words))
+    assert ended(main, capsys)[0] == 0
+    images = sorted((tmp_path / "data" / "images").rglob("*.jpg"))
+    (tmp_path / "mirrored" / "a").mkdir(parents=True)
+    for image in images:
+        cv2.imwrite(str(tmp_path / "mirrored" / "a" / image.name), cv2.flip(cv2.imread(str(image)), 1))
+    seen = {}
+    for name, source in (("right", tmp_path / "data" / "images"), ("mirrored", tmp_path / "mirrored")):
+        words = (
+            f"stcal sfm detect {source} --target {folder}/target.toml --board {folder}/board.toml --camera "
+            f"{tmp_path}/data/cameras.txt --out {tmp_path}/{name} --workers 1"
+        )
+        monkeypatch.setattr(sys, "argv", shlex.split(words))
+        seen[name] = ended(main, capsys)
+    assert seen["right"][1].count("faces front, right") == 3
+    assert "faces front" not in seen["mirrored"][1]
+    assert "mirror" in seen["mirrored"][1] + seen["mirrored"][2]
+
+
+def test_values_of_foreign_lenses_are_projected_apart():
+    """The pixels that reported files are compared with differ from those without the keys that were dropped before."""
+    plain = perspective((3269.75, 3268.25, 1971, 1523.75), [0.11, -0.32, -0.0031, 0.0012, 0.21])
+    assert np.abs(metashape() - plain).max() > 1
