@@ -254,7 +254,7 @@ def _detect(
     # No size is given: it comes from most of the images, and messages should say so.
     model = CameraModel(camera.focal, camera.centre, camera.distortion, colmap_model, None, None, "the images")
     step = counted(progress, f"detect {rounds}", len(files))
-    return detect_files(files, model, target, board, ellipses or EllipseOptions(), cache, workers, step)
+    return detect_files(files, model, target, board, ellipses or EllipseOptions(), cache, workers, step, pictures=False)
 
 
 def _without_board(detection: DetectionResult, views: Sequence[ImageObservations]) -> list[Skipped]:

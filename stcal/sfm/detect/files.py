@@ -86,6 +86,7 @@ def detect_files(
     progress: Callable[[str], None] | None = None,
     detector: Detector | None = None,
     forms: bool = True,
+    pictures: bool = True,
 ) -> DetectionResult:
     """Detects circles in all files; unusable files are skipped and listed.
 
@@ -95,6 +96,7 @@ def detect_files(
     progress : called with the name of each finished file, in any order
     detector : what reads one image; ours where None
     forms : whether one photograph in several forms, as PNG and JPEG, counts once, as files of one content always do
+    pictures : whether a small picture of each image is kept, for overlays
 
     Raises
     ------
@@ -105,8 +107,8 @@ def detect_files(
     """
     camera, size_from = sized_by(camera_model, files)
     cache.mkdir(parents=True, exist_ok=True)
-    settings = _fingerprint(detector, camera, target, board, options)
-    jobs = [(file, camera, size_from, target, board, options, settings, detector) for file in files]
+    settings = _fingerprint(detector, camera, target, board, options, pictures)
+    jobs = [(file, camera, size_from, target, board, options, settings, detector, pictures) for file in files]
     found: list[DetectedImage | Skipped | None] = [None] * len(files)
     if any(cache.glob("*.npz")):
         with ThreadPoolExecutor() as pool:  # reading and hashing release the interpreter
@@ -155,7 +157,12 @@ def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera,
 
 
 def _fingerprint(
-    detector: Detector | None, camera: Camera, target: TargetDesign, board: BoardDesign | None, options: EllipseOptions
+    detector: Detector | None,
+    camera: Camera,
+    target: TargetDesign,
+    board: BoardDesign | None,
+    options: EllipseOptions,
+    pictures: bool,
 ) -> str:
     """Returns a hash of everything that detection depends on except the image."""
 
@@ -173,6 +180,7 @@ def _fingerprint(
         asdict(options),
     ]
     parts += [detector.__name__] if detector else []
+    parts += [] if pictures else ["no picture"]
     return hashlib.sha256(json.dumps(parts, default=plain, sort_keys=True).encode()).hexdigest()
 
 
@@ -199,6 +207,7 @@ def _detect_file(
     options: EllipseOptions,
     settings: str,
     detector: Detector | None,
+    pictures: bool,
 ) -> tuple[str, bytes] | Skipped:
     """Detects circles in one file; returns the key of the result and its content for the cache."""
     loaded = load_image(file, camera, size_from)
@@ -210,7 +219,8 @@ def _detect_file(
     except ConvergenceError as error:
         return Skipped(file.name, str(error), "distortion")
     digest, key = _key(data, settings)
-    return key, _packed(detection, key, digest, image)
+    picture, scale = thumbnail(grey_8bit(image)) if pictures else (np.zeros(0, np.uint8), 1.0)
+    return key, _packed(detection, key, digest, picture, scale)
 
 
 def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedImage:
@@ -245,8 +255,7 @@ def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, 
     return data, image
 
 
-def _packed(detection: ImageDetection, key: str, digest: str, image: np.ndarray) -> bytes:
-    jpeg, scale = thumbnail(grey_8bit(image))
+def _packed(detection: ImageDetection, key: str, digest: str, picture: np.ndarray, scale: float) -> bytes:
     meta = {
         "digest": digest,
         "scale": scale,
@@ -268,7 +277,7 @@ def _packed(detection: ImageDetection, key: str, digest: str, image: np.ndarray)
             arrays |= {f"open_rows_{i}_{k}": face.rows, f"open_circles_{i}_{k}": face.circles}
     for i, each in enumerate(detection.boards):
         arrays |= {f"board_{f.name}_{i}": getattr(each, f.name) for f in fields(BoardSighting)}
-    return packed(key, {"thumbnail": jpeg, **arrays}, meta)
+    return packed(key, {"thumbnail": picture, **arrays}, meta)
 
 
 def _load(file: ImageFile, path: Path, reused: bool) -> DetectedImage | None:

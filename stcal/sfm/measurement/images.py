@@ -149,7 +149,16 @@ def measure(
         with tempfile.TemporaryDirectory(prefix="stcal-measure-") as scratch:
             cache = Path(scratch)
             detection = detect_files(
-                files, camera, design, board, options.ellipses, cache, options.workers, step, forms=False
+                files,
+                camera,
+                design,
+                board,
+                options.ellipses,
+                cache,
+                options.workers,
+                step,
+                forms=False,
+                pictures=False,
             )
         observations, notes = _labelled(detection.images, detection.camera, design)
         prior = None if camera.covariance is None else CameraPrior(camera.colmap_model, camera.covariance)
