@@ -27,18 +27,18 @@ def convert(
         Arg("A"),
     ],
     out: Annotated[Path, "Write the other form to this file: .toml or .urdf.", Arg("B", writes=True)],
-    from_link: Annotated[str, "Begin at this link of a URDF; at its root if not given."] = "",
+    from_link: Annotated[str, "Begin at this link of a URDF; if not given, at its root."] = "",
     to_link: Annotated[
         list[str] | None,
-        "End at this link of a URDF; at the only one that can be if not given. Repeat it for the hands of "
-        "several arms on a trunk.",
+        "End at this link of a URDF; if not given, at the only possible one. Repeat it for the hands of several arms "
+        "on a trunk.",
     ] = None,
-    convention: Annotated[ConventionName, "Write rows of Denavit and Hartenberg in this convention."] = "standard",
+    convention: Annotated[ConventionName, "Write Denavit-Hartenberg rows in this convention."] = "standard",
     nominal: Annotated[
         Path | None, "Add the deviations of a calibration.conf to the rows of this robot file (TOML)."
     ] = None,
 ) -> None:
-    """Write a robot file as URDF, or the joints of a URDF or an arm of Universal Robots as a robot file."""
+    """Write a robot file as URDF, or a URDF or the calibration of a Universal Robots arm as a robot file."""
     from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
     from stcal.robot.urdf.read import load_urdf
     from stcal.robot.urdf.write import coupled, require_urdf_written, robot_urdf
@@ -127,7 +127,7 @@ def _is_xml(path: Path) -> bool:
 
 
 def init(
-    file: Annotated[Path, "Write the robot file here.", Arg(writes=True)] = Path("robot.toml"),
+    file: Annotated[Path, "Write the robot file to this file.", Arg(writes=True)] = Path("robot.toml"),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
     from stcal.robot.kinematics.file import require_robot_written, robot_toml
