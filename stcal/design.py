@@ -525,8 +525,8 @@ def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDes
     if board is not None and type(board) is not BoardDesign:
         raise InputError(
             "E-BOARD-TYPE",
-            "--board: circles of a lattice or corners beside a target that tells its own size; a rectangular board of "
-            "dots needed, or none",
+            "--board: a lattice of circles or corners, beside a target whose own size is known; a rectangular board "
+            "of dots needed, or none",
         )
     known = {} if board is None else {entry.name: getattr(board, entry.name) for entry in fields(BoardDesign)}
     none = {"rows": 0, "columns": 0, "pitch_mm": 1.0, "radius_mm": 0.25, "polarity": "bright", "sigma_mm": 1.0}

@@ -183,11 +183,12 @@ def run(
 
     if hand_eye and registration:
         raise InputError(
-            "E-OPTION-CONFLICT", f"--hand-eye {hand_eye}, --registration {registration}: two ways to one base; give one"
+            "E-OPTION-CONFLICT",
+            f"--hand-eye {hand_eye}, --registration {registration}: both lead to the base; give one",
         )
     chain = None
     if hand_eye is None and robot_poses:
-        raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, of a camera on the flange")
+        raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, for a camera on the flange")
     if hand_eye is None and registration is None and offset:
         raise InputError(
             "E-OPTION-NEEDS",

@@ -238,7 +238,7 @@ def require_usable(strict: bool, reasons: Sequence[str], page: Path | None = Non
         where = f"; see {page}" if page else ""
         raise ChecksFailed(
             "E-CHECKS-FAILED",
-            f"{'; '.join(reasons)}; results are written, do not use them, or end with 0 by --no-strict{where}",
+            f"{'; '.join(reasons)}; results are written, do not use them; --no-strict ends with 0{where}",
         )
 
 

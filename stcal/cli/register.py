@@ -63,7 +63,7 @@ def register(
     out: Annotated[Path | None, "Write all results to this file (JSON).", WRITES] = None,
     report: shared.ReportFile = None,
 ) -> None:
-    """Find b_from_a from points measured in two frames, with σ and outliers, and show where residuals are systematic."""
+    """Find b_from_a from points measured in two frames, with σ and outliers, and show systematic residuals."""
     from stcal.register import register as registered
     from stcal.register.core.liu2017 import Liu2017Options, sample_sizes
     from stcal.register.core.pairs import read_pairs

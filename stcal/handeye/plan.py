@@ -120,7 +120,7 @@ def plan_poses(
         if not len(flange):
             raise InputError(
                 "E-PLAN-NO-VIEW",
-                f"plan: none of {CANDIDATES} views as near and as far as the board was seen holds all of it and "
+                f"plan: none of {CANDIDATES} views at the distances at which the board was seen shows all of it and "
                 f"{MARGIN:.0%} of the image around; take it from farther away, or give a smaller board",
             )
         unscaled = Poses(candidate_views.rotation, candidate_views.translation / result.scale)

@@ -264,7 +264,8 @@ def _by_equations(task: _Task, method: str) -> HandEye:
         if len(loop) < 3 or Observability.of(loop).useless:
             raise DegenerateError(
                 "E-HANDEYE-LARGE-TURNS",
-                f"hand-eye: without {left_out}, that turn by more than 170° against others, too few poses are left for "
+                f"hand-eye: without {left_out}, which turn by more than 170° relative to others, too few poses are "
+                "left for "
                 f"{method}; use method pose or shah",
             )
     if method in (*AX_XB, *AX_ZB):

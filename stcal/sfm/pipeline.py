@@ -182,7 +182,7 @@ def run_on_files(
         raise InputError(
             "E-CAMERA-NEEDED",
             "missing option '--camera': circles without a board of dots need a camera file, which `stcal-sfm "
-            "calibrate-camera` makes; a board in view, or faces with a board or tags, tell the camera too",
+            "calibrate-camera` makes; the camera is also found if a board is in view, or if faces have a board or tags",
         )
     if options.compare:
         require_dots(known, f"--compare {options.compare}")
@@ -219,9 +219,7 @@ def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:
                 "E-CHECK-OWN", f"check {name}: returns {type(check).__name__}; a Check needed, such as judge returns"
             )
         if check.key in {other.key for other in (*result.checks, *checks)}:
-            raise InputError(
-                "E-CHECK-OWN", f"check {name}: key {check.key!r} is taken by another; choose one of its own"
-            )
+            raise InputError("E-CHECK-OWN", f"check {name}: key {check.key!r} is already used; choose another")
         checks.append(check)
     return checks
 
@@ -379,7 +377,7 @@ def _require_for_printed(options: RunOptions) -> None:
     for name in (name for name, is_given in given.items() if is_given):
         raise InputError(
             "E-OPTION-CONFLICT",
-            f"{name}: for targets of circles alone, and faces here have boards or tags; leave it out",
+            f"{name}: only for targets of circles, and faces of this one have boards or tags; leave it out",
         )
 
 

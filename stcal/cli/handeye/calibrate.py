@@ -183,7 +183,10 @@ def handeye(
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
     statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup)
     if times_columns is not None and image_times is None:
-        raise InputError("E-OPTION-NEEDS", f"--times-columns {times_columns}: of times of images; give --image-times")
+        raise InputError(
+            "E-OPTION-NEEDS",
+            f"--times-columns {times_columns}: it describes a table of image times; give --image-times",
+        )
     timing = Timing(time_tolerance, image_times, time_offset, times_columns)
     pairs = params.source_of(source, first, second, key, statements, quaternions, timing, columns, columns_a)
     folder = isinstance(pairs, Path) and pairs.is_dir()
@@ -273,11 +276,11 @@ def _require_arm(
     """Checks that the options of the arm are compatible."""
     if robot_out and not with_kinematics:
         raise InputError(
-            "E-OPTION-NEEDS", "--robot-out: only with --with-kinematics; the robot is as its file says else"
+            "E-OPTION-NEEDS", "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file"
         )
     if with_kinematics and not folder:
         raise InputError(
-            "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, in which the arm is seen to err"
+            "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, which show the arm's errors"
         )
     if with_kinematics and method not in (None, "reprojection"):
         raise InputError(
@@ -286,7 +289,7 @@ def _require_arm(
     if with_kinematics and four_dof:
         raise InputError(
             "E-OPTION-CONFLICT",
-            "--with-kinematics, --four-dof: one of them; an arm that turns about one axis hides its own",
+            "--with-kinematics, --four-dof: give one of them; rotations about one axis do not determine the kinematics",
         )
 
 
@@ -300,10 +303,10 @@ def _require_fitting(
     if camera_out and not (refine_camera or with_arm):
         raise InputError(
             "E-OPTION-NEEDS",
-            "--camera-out: only with --refine-camera or --with-kinematics; the camera is as given else",
+            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given",
         )
     if refine_camera and of_poses:
-        raise InputError("E-OPTION-NEEDS", "--refine-camera: only with images; poses tell nothing of the camera")
+        raise InputError("E-OPTION-NEEDS", "--refine-camera: only with images; poses do not determine the intrinsics")
     if camera_out and method not in (None, ALL, "reprojection"):
         raise InputError("E-OPTION-METHOD", f"--camera-out: {method} does not adjust the camera; leave --method out")
     if method not in (None, ALL, *METHODS):

@@ -47,10 +47,10 @@ def convert(
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
     made = None if source.suffix.lower() in (*XML, ".toml") else _of_universal(source, nominal, convention)
     if made is None and nominal is not None:
-        raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
+        raise InputError("E-OPTION-NEEDS", "--nominal: only with a calibration.conf; leave it out")
     if made is not None:
         if from_link or to_link:
-            raise InputError("E-OPTION-NEEDS", "--from-link, --to-link: only of a URDF that is read; leave them out")
+            raise InputError("E-OPTION-NEEDS", "--from-link, --to-link: only for reading a URDF; leave them out")
         robot, said = made
         say(f"robot {robot.name}: {len(robot.rows)} joints, of Universal Robots")
         print_each(f"note: {source}", said)
@@ -76,7 +76,7 @@ def convert(
         return
     if from_link or to_link or convention != "standard":
         raise InputError(
-            "E-OPTION-NEEDS", "--from-link, --to-link, --convention: only of a URDF that is read; leave them out"
+            "E-OPTION-NEEDS", "--from-link, --to-link, --convention: only for reading a URDF; leave them out"
         )
     robot = load_robot(source)
     text = robot_urdf(robot)
@@ -107,7 +107,7 @@ def _of_universal(source: Path, nominal: Path | None, convention: "Convention") 
     if content is None:
         return None
     if nominal is not None:
-        raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
+        raise InputError("E-OPTION-NEEDS", "--nominal: only with a calibration.conf; leave it out")
     robot, off_mm = robot_of_kinematics(content, str(source), convention)
     said = (
         "angles are read about turned axes, as ur_calibration computes them and the controller moves; a URDF with the "

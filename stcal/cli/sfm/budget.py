@@ -48,7 +48,9 @@ def budget(
     from stcal.sfm.runs.verify import verify
 
     if columns is not None and check_lengths is None:
-        raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of lengths; give it with --check-lengths")
+        raise InputError(
+            "E-OPTION-NEEDS", f"--columns {columns}: it describes a table of lengths; give it with --check-lengths"
+        )
     saved = load_run(run)
     stated = statement_of(saved.board_design.stated, statement, field or ())
     if pdf:
@@ -56,7 +58,7 @@ def budget(
     if lengths_statement is not None and lengths is None:
         raise InputError(
             "E-OPTION-NEEDS",
-            f"--lengths-statement {lengths_statement}: of a second calibration; give it with --lengths",
+            f"--lengths-statement {lengths_statement}: it is for a second calibration; give it with --lengths",
         )
     computed, tests, others = budget_of_run(saved, stated), [], []
     if check_lengths is not None:

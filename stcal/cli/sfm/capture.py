@@ -65,7 +65,7 @@ def plan(
         )
     if noise is not None and run is not None:
         raise InputError(
-            "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: two sources of one σ; give one of them"
+            "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both give the σ of centres; give one of them"
         )
     if noise is not None:
         centre_noise, source = stated_noise(noise)

@@ -122,7 +122,9 @@ def measure(
     if images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, --serve or --live")
     if columns is not None and joints is None:
-        raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of joint values; give it with --joints")
+        raise InputError(
+            "E-OPTION-NEEDS", f"--columns {columns}: it describes a table of joint values; give it with --joints"
+        )
     shared.load_ahead(workers)
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera

@@ -89,7 +89,7 @@ def check_conventions(
             raise InputError(
                 "E-HANDEYE-CONVENTION",
                 f"{contradict}, where they spread over {np.degrees(spread[0]):.3g}° and {spread[1]:.3g} mm (RMS), as "
-                f"if the two sides had nothing in common; {remedy}",
+                f"if poses of robot and camera did not belong together; {remedy}",
             )
     behind = loop.camera_from_board.translation[:, 2] <= 0
     if behind.all():

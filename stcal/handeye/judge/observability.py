@@ -112,7 +112,7 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
             raise DegenerateError(
                 "E-HANDEYE-AXES",
                 f"{where}: the flange turns by {turns}° (RMS) about its principal axes, "
-                "that of a robot of four axes about one only; leave --four-dof (in Python four_dof) out",
+                "but a robot of four axes turns about one only; leave --four-dof (in Python four_dof) out",
             )
     elif observability.useless:
         slides = (

@@ -192,7 +192,7 @@ def require_known(unread: Mapping, source: str, harmless: Collection[str] = (), 
             raise InputError(
                 "E-CAMERA-KEY",
                 f"camera file {source}: {'.'.join(path)[:80]} = {_short(value)} may change the projection and is not "
-                f"taken here; {taken}remove it if the lens is right without it, or calibrate without it",
+                f"supported; {taken}remove it if the lens is right without it, or calibrate without it",
             )
     if unknown:
         more = f" and {len(unknown) - SHOWN} more" if len(unknown) > SHOWN else ""

@@ -461,7 +461,7 @@ def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -
         elif place_of_tag:
             raise DegenerateError(
                 "E-LAYOUT-UNLINKED",
-                f"layout: {image.name} shares no tag with the other images, and the board looks the same turned; "
+                f"layout: {image.name} shares no tag with the other images, and the board looks the same when turned; "
                 "show a tag of another image too, or use a board without symmetry",
             )
         else:

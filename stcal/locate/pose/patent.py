@@ -202,7 +202,8 @@ def locate_as_patent(
     ]
     if not solved:
         raise DegenerateError(
-            "E-LOCATE-NO-POSE", f"{where}: no exposure shows the tags' corners so; check layout and camera file"
+            "E-LOCATE-NO-POSE",
+            f"{where}: no pose explains the tags' corners in any exposure; check layout and camera file",
         )
     errors, (first, second), det_j, i = min(solved, key=lambda each: each[0][0])
     same = same_pose(first, second)

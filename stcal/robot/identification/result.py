@@ -91,7 +91,7 @@ class IdentifyOptions:
         if self.model == "auto" and self.folds < LEAST_FOLDS:
             raise InputError(
                 "E-OPTION-RANGE",
-                f"folds is {self.folds}: models are compared by rows held out; {LEAST_FOLDS} or more folds needed",
+                f"folds is {self.folds}: models are compared on held-out rows; {LEAST_FOLDS} or more folds needed",
             )
 
 

@@ -361,7 +361,7 @@ def _refuse_redundant(problem: InverseProblem) -> None:
     if n > 6:
         raise InputError(
             "E-ROBOT-REDUNDANT",
-            f"robot {problem.robot.name}: {n} joints reach a pose in endlessly many ways; "
+            f"robot {problem.robot.name}: {n} joints reach a pose in infinitely many ways; "
             "give the joint values to stay near to (columns q1_deg …)",
         )
 

@@ -151,7 +151,7 @@ class Measurements(Brief):
         """Returns rows by a mask, slice or list. Distances cannot be selected, as they refer to one another."""
         if self.distances is not None:
             raise InputError(
-                "E-MEASURED-DISTANCES", f"{self.where}: distances refer to other rows, so that rows cannot be taken out"
+                "E-MEASURED-DISTANCES", f"{self.where}: distances refer to other rows, so that rows cannot be left out"
             )
         rows = np.arange(len(self))[index]
         optional = {name: getattr(self, name) for name in ("positions", "rotations", "covariance", "common")}

@@ -52,7 +52,7 @@ def robot_urdf(robot: Robot) -> str:
     if robot.elasticity is not None:
         raise InputError(
             "E-ROBOT-ELASTICITY",
-            f"robot {robot.name}: a URDF has no place for its elasticity; remove [elasticity] for the axes alone, or "
+            f"robot {robot.name}: a URDF cannot hold its elasticity; remove [elasticity] for the axes alone, or "
             "export compensated points (`stcal robot compensate --export`)",
         )
     chain = replace(robot, world_from_base=Rigid()).chain()

@@ -319,7 +319,7 @@ def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
     if targets.poses is None:
         raise InputError(
             "E-TARGETS-NO-POSES",
-            f"{targets.where}: joint values without poses; only the nominal robot knows which poses they command, "
+            f"{targets.where}: joint values without poses; only the nominal robot can tell which poses they command; "
             "give its file with --nominal",
         )
     confirmed, doubts = on_targets(identified, targets)

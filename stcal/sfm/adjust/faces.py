@@ -158,7 +158,7 @@ def face_frames(
     length = np.linalg.norm(across, axis=1, keepdims=True)
     if (length[:, 0] < 1e-6 * np.linalg.norm(along_y, axis=1)).any():
         raise DegenerateError(
-            "E-FACE-COLLINEAR", f"face {face.id}: its frame circles are mapped in one line; check their labels"
+            "E-FACE-COLLINEAR", f"face {face.id}: its frame circles are mapped on one line; check their labels"
         )
     axis_y = across / length
     return Poses(np.stack([axis_x, axis_y, np.cross(axis_x, axis_y)], axis=2), origin)

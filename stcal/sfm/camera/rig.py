@@ -141,8 +141,8 @@ def _alone(names: Sequence[str], own: Sequence[Mapping[str, Sighting]], rest: li
     return DegenerateError(
         "E-RIG-UNLINKED",
         f"rig: camera {names[k]} shares no instant with {', '.join(rest)}: its images, such as {next(iter(own[k]))}, "
-        "show the board when theirs do not, or have other names; add images of one instant, named alike in both "
-        "folders, that show the board",
+        "show the board when theirs do not, or have other names; add images of the same instants that show the board, "
+        "with the same names in both folders",
     )
 
 
@@ -189,8 +189,9 @@ def _where(
     ):
         raise DegenerateError(
             "E-RIG-TURNED",
-            f"rig: camera {name}: {len(seen)} shared instants do not tell which way round it saw the board, which "
-            "looks the same after a turn; add instants with the board turned and tilted, or use a board with one "
+            f"rig: camera {name}: {len(seen)} shared instants do not determine the orientation in which it saw the "
+            "board, which looks the same after a turn; add instants with the board turned and tilted, or use a board "
+            "with one "
             "larger dot",
         )
     return _Where(relations[best], deviation[best].argmin(axis=1).tolist(), least[best].tolist(), limit)

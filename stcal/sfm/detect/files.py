@@ -443,6 +443,6 @@ def require_upright(images: tuple[DetectedImage, ...]) -> None:
         raise DetectionError(
             "E-FACES-MIRRORED",
             f"{len(mirrored)} of {len(mirrored) + len(upright)} images with a face are mirrored, first "
-            f"{first.file.name}: face {', '.join(first.detection.mirrored)} is seen as in a mirror; turn the images "
-            "back, or use the files that the camera wrote",
+            f"{first.file.name}: face {', '.join(first.detection.mirrored)} appears mirrored; flip the images back, "
+            "or use the files that the camera wrote",
         )

@@ -86,8 +86,9 @@ class PublishedPattern:
             raise InputError(
                 "E-TARGET-NOT-PUBLISHED",
                 f"target {target.name}: not read by the rules of Zhang & Wei (2017) ({error}); --solve paper needs "
-                "faces with large circles along X, Y and the diagonal, a small one beside the origin on each axis, and "
-                "a small one beside the diagonal's last whose direction names the face; use joint or chain",
+                "faces with large circles along X, Y and the diagonal, a small circle beside the origin on each axis, "
+                "and a small circle beside the last one of the diagonal, whose direction identifies the face; use "
+                "joint or chain",
             ) from error
 
     @classmethod

@@ -76,7 +76,7 @@ def crosscheck_run(
     with added_results(saved.folder) as stage:
         if read_json(saved.folder / "report.json", "", AGAIN) != saved.report:
             raise InputError(
-                "E-RUN-REPLACED", f"run {saved.folder}: other results took their place meanwhile; cross-check it again"
+                "E-RUN-REPLACED", f"run {saved.folder}: its results were replaced meanwhile; cross-check it again"
             )
         check = crosscheck(saved, colmap, tolerances, timeout_s, progress)
         write_report(stage, judged(saved.report | {"crosscheck": check.model_dump()}), saved.folder)
@@ -182,7 +182,7 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
     except InputError as error:
         raise MappingError(
             "E-COLMAP-NO-MODEL",
-            f"group {group}: what native COLMAP {native.version} made of the run's database is of no use: {error}",
+            f"group {group}: what native COLMAP {native.version} made from the run's database cannot be used: {error}",
         ) from error
 
 
@@ -197,8 +197,8 @@ def _own(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids)
     if reconstruction is None:
         raise MappingError(
             "E-COLMAP-NO-MODEL",
-            f"group {group}: pycolmap makes no model from the run's initial pair alone (the run registered its own "
-            "relative pose); there is nothing to cross-check",
+            f"group {group}: pycolmap makes no model from the run's initial pair alone (the run used its own relative "
+            "pose); a cross-check is not possible",
         )
     written = place / "own-model"
     written.mkdir()

@@ -452,7 +452,7 @@ def _require_same_content(source: sqlite3.Connection, written: sqlite3.Connectio
                 raise StcalError(
                     "E-EXPORT-READ-BACK",
                     f"export for {wanted.name}: row {row} of {table.name} differs from the database; nothing is "
-                    "written; see that no other program is at the database, and try again",
+                    "written; check that no other program uses the database, and try again",
                 )
         for name in table.column_names():
             if name not in SOURCE.tables[table.name].column_names():

@@ -143,8 +143,8 @@ def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: 
     if len(placed) < 2:
         raise MappingError(
             "E-BODY-FEW-IMAGES",
-            f"group {group[0].group}: {len(placed)} of {len(group)} images show faces of known shape well enough, "
-            "2 needed; add images that show two faces each",
+            f"group {group[0].group}: {len(placed)} of {len(group)} images show faces of known shape well enough, 2 "
+            "needed; add images that each show two faces",
         )
     designed: dict[Label, np.ndarray] = {
         label: xyz

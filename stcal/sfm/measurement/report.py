@@ -151,7 +151,8 @@ def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str,
     conflicts = [name for name in further if name in header]
     if conflicts:
         raise InputError(
-            "E-TABLE-COLUMNS-CONFLICT", f"{joints.where}: column {conflicts[0]} is measured here; leave it out"
+            "E-TABLE-COLUMNS-CONFLICT",
+            f"{joints.where}: column {conflicts[0]} is an output of this command; leave it out",
         )
     names = joints.text(IMAGE)
     cells = [joints.columns[name] for name in further]

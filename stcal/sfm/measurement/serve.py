@@ -115,7 +115,7 @@ class MeasureServer:
             reason = getattr(error, "strerror", None) or error
             raise InputError(
                 "E-SERVICE-ADDRESS",
-                f"--host {options.host} --port {options.port}: cannot be listened at: {reason}; give another",
+                f"--host {options.host} --port {options.port}: cannot be opened: {reason}; give another",
             ) from error
         self.server_address: tuple = self._socket.getsockname()
 

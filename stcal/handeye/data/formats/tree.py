@@ -126,7 +126,7 @@ def camodocal(value: Mapping, where: str) -> Content | None:
         matrices = [numbers(value[key]) for key in keys]
         wrong = next((key for key, m in zip(keys, matrices, strict=True) if m is None or m.shape != (4, 4)), None)
         if wrong is not None:
-            raise InputError("E-POSE-VALUE", f"{where}: {wrong}: not a 4×4 matrix; record the pairs anew")
+            raise InputError("E-POSE-VALUE", f"{where}: {wrong}: not a 4×4 matrix; record the pairs again")
         rotation, translation = of_matrices(np.array(matrices), keys, where)
         frames = Frames(FRAMES[role][0], "as handeye_calib_camodocal writes it", False)
         sides.append(Side(rotation, translation, tuple(f"pose {found[key][2]}" for key in keys), MATRICES, ROS, frames))
@@ -332,7 +332,8 @@ def _listed(values: Sequence, statements: Said, where: str, frames: Frames | Non
             return None
         if single is None:
             raise InputError(
-                "E-POSE-VALUE", f"{where}: {place}: no pose like the one before it; correct it, or take it out"
+                "E-POSE-VALUE",
+                f"{where}: {place}: not a pose of the same form as the one before it; correct it, or take it out",
             )
         poses.append(single)
     return _side(poses, places, where, frames) if poses else None
