@@ -205,7 +205,7 @@ class _Trial:
         return next(each for each in candidates if self._behind(each, best, rows) <= BY_CHANCE)
 
     def _behind(self, candidate: Candidate, other: Candidate, rows: np.ndarray) -> float:
-        """Returns the mean error of a candidate less that of another one, in standard errors of the difference."""
+        """Returns the mean error of a candidate minus that of another one, in standard errors of this difference."""
         difference = self.outcomes[candidate].error_mm - self.outcomes[other].error_mm
         excess, standard_error = _difference(difference, rows)
         return excess / max(standard_error, TINY_MM) if excess > 0 else 0.0

@@ -146,7 +146,7 @@ def handeye(
     views: Views | None = None,
     options: HandEyeOptions | None = None,
 ) -> HandEye:
-    """Returns the result of one method, with σ as its own residuals tell them.
+    """Returns the result of one method, with σ estimated from its own residuals.
 
     The parameters are those of :func:`stcal.handeye.handeye`, which chooses a method where none is named and widens σ
     by what poses held out show; here the method is ``reprojection`` with views, else ``pose``, if None.
@@ -170,7 +170,7 @@ def solved(
     views: Views | None,
     options: HandEyeOptions | None,
 ) -> "Solved":
-    """Returns the result of :func:`handeye` with what solutions without some poses start from."""
+    """Returns the result of :func:`handeye` with the state from which solutions without some poses start."""
     method = method or ("pose" if views is None else "reprojection")
     if method not in METHODS:
         raise InputError(

@@ -32,7 +32,7 @@ class RigCamera(Brief):
     images : tuple of str
         Name of each view.
     prior : CameraPrior, optional
-        Prior of the intrinsics, which are exact where it is None.
+        Prior of the intrinsics; None if they are exact.
     """
 
     name: str

@@ -126,7 +126,7 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
 
 
 def scale_is_seen(scale: float, sigma: float, poses: int) -> bool:
-    """True if a scale, solved for with this σ, is more than what noise makes of it."""
+    """True if a scale that was solved for with this σ is larger than noise alone would make it."""
     return scale > 0 and (scale / sigma) ** 2 > SCALE_SEEN * poses
 
 

@@ -22,13 +22,13 @@ class Grave(str):
 
 
 class Aside(str):
-    """A note that takes nothing from the result, or whose subject the verdict judges by itself."""
+    """A note that does not weaken the result, or whose subject the verdict judges itself."""
 
     __slots__ = ()
 
 
 class SizeDoubt(Grave):
-    """A note that the board is of another size than stated, which a clock's lag can feign."""
+    """A note that the board's size differs from the stated one, which an offset of the clocks can also cause."""
 
     __slots__ = ()
 

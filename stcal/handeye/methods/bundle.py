@@ -67,7 +67,7 @@ class Corners:
     arm: LinearArm | None = None
 
     def places(self) -> dict[str, slice]:
-        """Returns the places of the unknowns in a step; the slice of what is not solved for is empty."""
+        """Returns the slices of the unknowns in a step; those of what is not solved for are empty."""
         sizes = {"x": 6, "z": 6, "camera": self.basis.shape[1], "scale": int(self.with_scale)}
         sizes["arm"] = 0 if self.arm is None else len(self.arm.parameters)
         exact = self.robot is None and not self.sigma["robot_mm"]
@@ -365,7 +365,7 @@ class RigCorners:
         return sigma_of_group
 
     def places(self) -> dict[str, slice]:
-        """Returns the places of the unknowns in a step: all X, Z, the intrinsics of all cameras, and the shared
+        """Returns the slices of the unknowns in a step: all X, Z, the intrinsics of all cameras, and the shared
         unknowns."""
         shared = self.each[0].places()
         sizes = {

@@ -285,7 +285,7 @@ class _AxisFitting:
         return float(np.sqrt((self.weights[:, None] * self.residuals() ** 2).sum() / max(self.redundancy(), 1)))
 
     def huber(self) -> np.ndarray:
-        """Returns weights (k,) by the lengths of the residuals."""
+        """Returns Huber weights (k,) from the lengths of the residuals."""
         length = np.linalg.norm(self.residuals(), axis=1)
         return huber_weights(length, HUBER * self.robust_sigma(length))
 

@@ -291,8 +291,8 @@ def inverse(
 def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     """Returns all joint vectors within the limits that bring the tool to ``pose``, one for each branch.
 
-    Turns by 2π are one branch: the value nearest to the middle of the limits stands for them. At a singular pose, where
-    there is a continuum of solutions, some of them. Found by many starts, the same ones every time.
+    Joint values that differ by 2π are one branch, with the value nearest to the middle of the limits. At a singular
+    pose, which has a continuum of solutions, only some are returned. The search has many starts, the same every time.
 
     Parameters
     ----------
@@ -311,7 +311,7 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     Raises
     ------
     InputError
-        More than six joints, of which there are endlessly many solutions; an unknown tool.
+        The arm has more than six joints, and so infinitely many solutions; or the tool is unknown.
     """
     problem = InverseProblem.of(robot, tool)
     _refuse_redundant(problem)

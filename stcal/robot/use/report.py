@@ -31,9 +31,9 @@ from stcal.robot.use.verification import Verification
 
 
 def verification_figure(result: Verification):
-    """Returns a plot of the absolute distance error of each pose and its mean, a line for each set (the paper's fig.
+    """Returns a plot of the absolute distance error of each pose, with its mean, a line for each set.
 
-    8).
+    It is figure 8 of Zhang & Wei (2017).
     """
     figure = new_figure(7.5, 3.4)
     axes = figure.add_axes((0.09, 0.16, 0.89, 0.7))

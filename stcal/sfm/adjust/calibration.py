@@ -46,7 +46,7 @@ class SigmaFactors:
 
     @property
     def of_target(self) -> float:
-        """The factor of all points of the target together: the larger one where it has circles and printed corners."""
+        """Returns the factor for all points of the target: the larger one if it has circles and printed corners."""
         return max(self.circles, self.printed) if self.printed_faces else self.circles
 
     def kinds(self, labels: Sequence[Label]) -> np.ndarray:
@@ -314,9 +314,9 @@ def image_sigma_factors(models: Sequence[GroupModel], camera: Camera, printed: I
     """Returns the ratios of the residuals of adjusted free networks to the centres' own σ: variance components by kind
     (Förstner 1979).
 
-    ``printed`` : ids of printed faces, whose corners have a factor of their own. It and the factor of ``circles`` are
-    not below 1. σ of some centres hold what is uncertain of their corrections, and σ of printed corners what all
-    photographs share: neither is a residual, so that small residuals do not deny σ.
+    ``printed`` : ids of printed faces, whose corners have their own factor. This factor and that of ``circles`` are at
+    least 1, as their σ include errors that do not show in residuals: the uncertainty of corrections of centres, and
+    errors of printed corners that all photographs share.
     """
     start = SigmaFactors(1.0, 1.0, 1.0, 1.0, frozenset(printed))
     square, redundancy = np.zeros(3), np.zeros(3)

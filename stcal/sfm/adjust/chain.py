@@ -145,7 +145,7 @@ def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -
 def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
     """Returns the simple ways from one face to another as (faces, groups), the shortest first.
 
-    None has more than one face more than the shortest.
+    Each has at most one face more than the shortest.
     """
     by_group: dict[str, list[str]] = {}
     for face in faces:

@@ -51,7 +51,7 @@ class FaceInGroup:
 def missing_frame_circles(face: FaceDesign, mapped: Collection[str]) -> tuple[str, ...]:
     """Returns the ids of the circles that define the frame of the face but are not mapped.
 
-    None are missing of a face of known shape, whose frame is that of its whole design.
+    A face of known shape lacks none, as its frame is that of its whole design.
     """
     if face.sigma_mm is not None:
         return ()

@@ -86,8 +86,8 @@ class Network:
     def score_of_image(self, image: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns :meth:`score` of one parameter for each coordinate that was observed in an image: (2k, 2k), (2k,).
 
-        They explain the image's residuals whatever they are, as if the image were taken out. The order is all of the
-        first coordinate, then all of the second.
+        These parameters can explain any residuals of the image, as if the image were left out. Those of the first
+        coordinate come first, then those of the second.
         """
         rows = self.model.rows_by_image()[image]
         k, p = len(rows), len(self.model.labels)

@@ -164,7 +164,7 @@ def _applies(fitted: _Fitted, networks: Sequence[Network]) -> bool:
 
 
 def _explained_by_few(fitted: _Fitted, networks: Sequence[Network]) -> float:
-    """Returns what the parameters of a quarter of the images explain, of those that explain most alone."""
+    """Returns how much the parameters of a quarter of the images explain, of the images that explain most."""
     equations = [network.score(_apart(fitted.cause, network)) for network in networks]
     gains = []
     for i, (network, (normal, right)) in enumerate(zip(networks, equations, strict=True)):
@@ -183,9 +183,9 @@ def _explained_by_few(fitted: _Fitted, networks: Sequence[Network]) -> float:
 
 
 def _explained_by_one(networks: Sequence[Network], left: float) -> float:
-    """Returns what any one image explains, if it is taken out.
+    """Returns how much leaving out one image explains, at most.
 
-    ``left`` : squared residual per degree of freedom that is not explained.
+    ``left`` : squared residual per degree of freedom that remains unexplained.
     """
     most = 0.0
     for network in networks:

@@ -103,7 +103,7 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
     """Tests for a residual field that is the same in all images: x and y are each a cubic of the place in the image.
 
     Wrong intrinsics cause such a field, too. A field that they do not explain is due to a lens or sensor that the
-    camera model does not describe. A field of 0.002 px RMS is allowed, as there is one in any images.
+    camera model does not describe. A field of 0.002 px RMS is allowed, as any images have one.
     """
     key, title = "residual-field", "Residuals over the image"
 

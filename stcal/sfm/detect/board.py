@@ -95,9 +95,10 @@ def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: Boar
 
 
 def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:
-    """Finds for each candidate, mapped to a circle of the board's radius, the dots one pitch away in the four
-    directions, of a hexagonal board six, that most neighbours agree on. Returns (n, 4 or 6) indices or −1, and
-    (n, 2, 2) whose columns are the two steps."""
+    """Finds the dots one pitch away from each candidate, in the directions on which most neighbours agree.
+
+    There are four directions, six on a hexagonal board. Distances are taken in coordinates that map the candidate to a
+    circle of the board's radius. Returns (n, 4 or 6) indices or −1, and (n, 2, 2) whose columns are the two steps."""
     n, sides = len(candidates), directions(board)
     k = min(NEIGHBOURS + 1, n)
     near = candidates.tree.query(candidates.xy, k=k)[1][:, 1:]
@@ -218,7 +219,7 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
 def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera) -> BoardReading:
     """Returns the reading with the numberings that put the board's dots with a hole where the image shows holes.
 
-    A dot has a hole if its middle differs from its body by much of what bodies differ from the board.
+    A dot has a hole if its middle differs from its body by a large share of the contrast of bodies to the board.
 
     ``grey`` : (height, width) 8-bit image; ``camera`` : its camera.
     """
@@ -325,8 +326,10 @@ def _place(
 
 
 def _offsets(cells: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Shifts (k, 2) of cells (n, 2), more than ``MAX_UNEXPLAINED``, that leave no more than that many of them outside
-    of a board along each axis; row by row."""
+    """Returns the shifts (k, 2) of cells (n, 2) that leave at most ``MAX_UNEXPLAINED`` of them outside of the board at
+    each end of each axis, row by row.
+
+    n is larger than ``MAX_UNEXPLAINED``."""
     if len(cells) > size.prod() + MAX_UNEXPLAINED:
         return np.zeros((0, 2), int)
     in_order = np.sort(cells, axis=0)

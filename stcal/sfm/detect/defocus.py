@@ -41,8 +41,8 @@ class Focus:
 
     ``image`` : its name; ``focused_mm`` : distance of the plane of focus along the optical axis, None if the image does
     not determine it; ``depth_mm`` : depths of the nearest and the farthest circle; ``blur_px`` : blur (σ) at these;
-    ``shift_px`` : largest correction of a centre, 0 if none is needed; ``note`` : what the blur shows that defocus does
-    not explain, empty by default.
+    ``shift_px`` : largest correction of a centre, 0 if none is needed; ``note`` : blur that defocus does not explain,
+    in words; empty by default.
     """
 
     image: str
@@ -111,7 +111,7 @@ def correct_defocus(
     """Returns the images with centres at which a lens with blur that is the same everywhere would show them.
 
     Out of focus, blur varies with depth, and so across a tilted circle: a fit with one blur for each circle moves
-    towards the blurrier side. What is uncertain of the correction is added to the covariances.
+    towards the blurrier side. The uncertainty of the correction is added to the covariances.
 
     Parameters
     ----------

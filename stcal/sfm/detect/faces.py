@@ -1,9 +1,9 @@
 """Faces of the target: the pattern is found in the face plane, after a homography, and the face named there.
 
-Document 000 walks along image directions and decides by dot products, which perspective breaks. Here two
-neighbouring candidates that may be two neighbouring circles of a design determine a map of the plane. The map is grown
-to all circles of a face, and all readings of the same candidates compete. A face is named only if one reading explains
-more circles than every other.
+Zhang & Wei (2017) walk along directions in the image and decide by scalar products, which perspective distorts. Here
+two neighbouring candidates that may be two neighbouring circles of a design determine a map of the plane. The map is
+extended to all circles of a face, and all readings of the same candidates compete. A face is named only if one reading
+explains more circles than every other.
 """
 
 from dataclasses import dataclass

@@ -93,8 +93,8 @@ def detect_files(
     ----------
     cache : folder for results by content
     progress : called with the name of each finished file, in any order
-    detector : what reads one image; ours where None
-    forms : whether one photograph in several forms, as PNG and JPEG, counts once, as files of one content always do
+    detector : function that reads one image; that of this package if None
+    forms : whether a photograph in several forms, such as PNG and JPEG, counts once; files of equal content always do
 
     Raises
     ------
@@ -128,9 +128,9 @@ def detect_files(
 
 
 def seen_by(detection: DetectionResult, camera: Camera, target: TargetDesign) -> DetectionResult:
-    """Returns the detections of corners alone, made with a camera without distortion, for another camera.
+    """Returns detections of corners, made with a camera without distortion, converted to another camera.
 
-    It moves those of tags, see :func:`stcal.boards.faces.shift_by_curves`.
+    Corners of tags move, see :func:`stcal.boards.faces.shift_by_curves`.
     """
     images = []
     for image in detection.images:
@@ -146,7 +146,7 @@ def seen_by(detection: DetectionResult, camera: Camera, target: TargetDesign) ->
 
 
 def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera, str]:
-    """The camera, and what its size is from: a file of OpenCV may not say it, then most of the images do."""
+    """Returns the camera with its image size, and the source of the size: the file, or most images if it lacks one."""
     if camera_model.width and camera_model.height:
         return camera_model.sized(camera_model.width, camera_model.height), "the camera file"
     size, name = require_common_size(files)
@@ -224,7 +224,7 @@ def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedI
 
 
 def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, np.ndarray] | Skipped:
-    """Content of a file and the grey image in it, or why it cannot be used; ``size_from`` : what the size is from.
+    """Returns the content of a file and its grey image, or why it cannot be used; ``size_from`` : source of the size.
 
     Raises
     ------
@@ -378,8 +378,10 @@ def copy_of(file: ImageFile, first: str, what: str = "") -> Skipped:
 
 
 def _without_copies(found: list[DetectedImage | Skipped], forms: bool) -> tuple[list[DetectedImage], list[Skipped]]:
-    """A second copy of a photograph adds no information and would pass for it: of files with the same content the
-    plainest name stays, of one photograph in several ``forms`` the one without losses."""
+    """Returns the images without copies of photographs, and the files that are skipped.
+
+    A copy adds no information, but would count as a further observation. Of files with equal content, the one with the
+    plainest name is kept; of one photograph in several ``forms``, the lossless one."""
     every = [each for each in found if isinstance(each, DetectedImage)]
     plain: dict[str, DetectedImage] = {}
     for each in sorted(every, key=lambda each: _plainness(each.file)):
@@ -402,8 +404,9 @@ def _plainness(file: ImageFile) -> tuple[bool, bool, int]:
 
 
 def _in_two_forms(images: list[DetectedImage]) -> Iterator[tuple[DetectedImage, DetectedImage]]:
-    """Pairs of images in different forms whose circles are at the same places, to some px. A camera that stands still
-    takes such pairs too, but in one form."""
+    """Yields pairs of images in different forms whose circles are at the same places, to some px.
+
+    A camera that does not move takes such pairs too, but all in the same form."""
     kinds = [each.file.path.suffix.lower()[:4].replace(".jpe", ".jpg") for each in images]
     if len(set(kinds)) < 2:
         return
@@ -434,7 +437,7 @@ def require_upright(images: tuple[DetectedImage, ...]) -> None:
     Raises
     ------
     DetectionError
-        Of the images that show a face more are mirrored than are not.
+        More than half of the images with a face are mirrored.
     """
     mirrored = [image for image in images if image.detection.mirrored]
     upright = [image for image in images if image.detection.faces and not image.detection.mirrored]

@@ -85,7 +85,7 @@ def predict_circles(
 ) -> PredictedCircles | None:
     """Predicts the circles in view of an image from the arrangement; None if the arrangement lacks the image.
 
-    Circles with a larger tilt are left out. Circles not in ``seen`` are wanted.
+    Circles tilted by more than ``max_tilt_rad`` are left out. Circles that are not in ``seen`` are wanted.
     """
     pose = arrangement.camera_from_group.get(image)
     if pose is None:

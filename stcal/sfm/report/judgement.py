@@ -209,7 +209,7 @@ def _absent(report: dict) -> list[str]:
 
 
 def _missing_faces(report: dict) -> list[str]:
-    """Returns the faces that the photographs were to show and that are not in the result."""
+    """Returns the faces that were expected from the photographs and are missing from the result."""
     expected = report["summary"].get("faces_expected") or []
     return [face for face in _absent(report) if face in expected]
 

@@ -109,7 +109,7 @@ def easy_handeye(value: Mapping, statements: Said, where: str) -> Content | None
 def camodocal(value: Mapping, where: str) -> Content | None:
     """Returns the pairs that handeye_calib_camodocal records: ``T1_0``, ``T2_0`` …, tip in base and tag in camera.
 
-    Raises InputError: a matrix is missing, is none, or ``frameCount`` is another number.
+    Raises InputError: a matrix is missing or not valid, or ``frameCount`` is another number.
     """
     found = {key: match for key in value if (match := _CAMODOCAL.fullmatch(str(key)))}
     if "frameCount" not in value or not found:

@@ -42,7 +42,7 @@ class Fits:
     """The fits of n blurred ellipses side by side, ideal px.
 
     Pixels are rows of (n, …, m) arrays of single precision, which is enough as coordinates are taken from the start of
-    each centre; ``real`` is 1 where a pixel is, 0 behind the last one of an ellipse.
+    each centre; ``real`` is 1 for a pixel, and 0 after the last one of an ellipse.
     """
 
     def __init__(self, image, ellipses: Ellipses, half, to_ideal, intruders):
