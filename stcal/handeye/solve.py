@@ -359,7 +359,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
         return adjust_views(loop, flange, views, first, noise, intrinsics, options.with_scale, camera, options.arm)
 
     solution, contradicted = _by_true_robot(task, adjusted_by)
-    state, outliers, found = solution.state.of(0), ~solution.used[0], solution.found[0]
+    state, outliers, reprojection = solution.state.of(0), ~solution.used[0], solution.found[0]
     if solution.sigma_scale is not None:
         require_scale(state.scale, solution.sigma_scale, task.loop, task.pairs.where)
     x, z = state.mount_from_camera, state.stand_from_board
@@ -368,7 +368,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
         x, z, covariance, notes = _without_slide(task, x, z, solution.normal())
     if solution.camera_error is not None:
         covariance = solution.camera_error.covariance(covariance)
-    adjusted = replace(solution.loops[0], camera_from_board=resected(names, views, found))
+    adjusted = replace(solution.loops[0], camera_from_board=resected(names, views, reprojection))
     residuals = adjusted.residuals(x, z)
     notes += _remarks(task, x, outliers, residuals, solution.scale_hint)
     notes += of_camera_file(float(solution.camera_gain[0]), solution.sigma)
@@ -386,7 +386,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
         sigma_scale=solution.sigma_scale,
         sigma=solution.sigma,
         estimated=solution.estimated,
-        reprojection=found,
+        reprojection=reprojection,
         observability=task.seen,
         notes=notes + remarks.of_rounds(solution.settled),
     )

@@ -34,7 +34,7 @@ class LayoutPlan(Brief):
     size_mm : (n,) array
         Side lengths, NaN if not given.
     origin : int
-        Row of the tag whose middle is the origin of {obj}.
+        Row of the tag whose centre is the origin of {obj}.
     corners_mm : (n, 4, 2) array
         Nominal corners in the plane of the target, NaN if a place is not given.
     unusual_size : bool

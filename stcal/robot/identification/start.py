@@ -1,5 +1,4 @@
-"""Start of an identification: base and tools by the nominal axes; and refusal of data that this robot cannot have
-made."""
+"""Start of an identification: base and tools fitted with the nominal axes; refuses data that do not fit the robot."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -398,7 +397,7 @@ def _couplings(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, M
 
 
 def _inner(robot: Robot) -> list[int]:
-    """Returns revolute joints whose zeros neither base nor tool takes up: all but the first and the last."""
+    """Returns the revolute joints whose zeros neither base nor tool can absorb: all but the first and the last."""
     return [i for i in range(1, len(robot.rows) - 1) if robot.joints[i].type == "revolute"]
 
 

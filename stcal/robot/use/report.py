@@ -168,9 +168,9 @@ def _colours(count: int) -> list[str]:
 
 def design_report(result: PoseDesign, robot: Robot) -> Document:
     """Returns the report of ``design``: indices of the chosen poses against random ones, places, joint values."""
-    told = f"σ of predicted positions: {1000 * result.sigma_mm:.1f} µm per axis"
+    sigma_sentence = f"σ of predicted positions: {1000 * result.sigma_mm:.1f} µm per axis"
     if np.isfinite(result.random_sigma_mm):
-        told += (
+        sigma_sentence += (
             f", of random poses {1000 * result.random_sigma_mm:.1f} µm; to be as good these would have to be "
             f"{(result.random_sigma_mm / result.sigma_mm) ** 2:.2f} times as many"
         )
@@ -193,7 +193,7 @@ def design_report(result: PoseDesign, robot: Robot) -> Document:
             Section(
                 "Against random poses",
                 [
-                    told,
+                    sigma_sentence,
                     left_out if unseen else "",
                     Table(heads, _indices(result), over),
                     page_only(

@@ -222,7 +222,7 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
     def by(direction: np.ndarray) -> Callable[[Network], np.ndarray]:
         return lambda network: network.model.whiten(_by_parameters(network, camera) @ direction)
 
-    found = [
+    causes = [
         _Cause("the focal length is not that of the camera file", "zoom or focus is not as at the calibration, or the "
                f"file is of another lens: {ANEW}", _percent("focal length"), by(focal)),
         _Cause("the photographs are scaled against the camera file", "give the photographs in the size of the "
@@ -250,13 +250,13 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
                "them again", lambda value, _: "in more than one image", _by_motion, "image"),
     ]  # fmt: skip
     if np.abs(removed).max() > 0:
-        found.append(
+        causes.append(
             _Cause("the photographs are already undistorted", "the camera file has a distortion that they no longer "
                    "have: give the original photographs, or set the distortion in the camera file to 0",
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
                    "not in them", by(removed), whole=True)
         )  # fmt: skip
-        found.append(
+        causes.append(
             _Cause("the distortion of the camera file has its sign reversed", "its program undistorts where this one "
                    "distorts: change the signs of all coefficients in the camera file",
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the way",
@@ -265,12 +265,12 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
     for quarters in (1, 2, 3) if camera.width == camera.height else (2,):
         turned = _turned(camera, quarters)[:, None] - camera.parameters()[:, None]
         if np.abs(turned[2:4]).max() > LEAST_SHIFT_PX:
-            found.append(
+            causes.append(
                 _Cause(f"the photographs are turned by {90 * quarters}° against the camera file", "turn them back, as "
                        "the sensor has them, without the rotation that a viewer or converter applied",
                        lambda value, _: f"principal point {100 * value[0]:.0f} % of the way", by(turned), whole=True)
             )  # fmt: skip
-    return found
+    return causes
 
 
 def _turned(camera: Camera, quarters: int) -> np.ndarray:

@@ -240,7 +240,7 @@ def moved_check(networks: Sequence[Network]) -> Check:
     test with six degrees of freedom.
     """
     trials: list[Trial] = []
-    found: dict[str, tuple[Network, np.ndarray, list[int]]] = {}
+    tested_by_group: dict[str, tuple[Network, np.ndarray, list[int]]] = {}
     for network in networks:
         model = network.model
         on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])
@@ -259,13 +259,13 @@ def moved_check(networks: Sequence[Network]) -> Check:
                 shift_um = 1e3 * float(np.linalg.norm(test.estimate[3:]))
                 trials.append(Trial(name, shift_um, "µm", test.statistic, test.freedom, redundancy - test.freedom))
                 tested.append(i)
-        found[model.group] = network, columns, tested
+        tested_by_group[model.group] = network, columns, tested
     check = judge("moved", "Target against board, image by image", trials, "images", "")
     if not check.names or len(check.names) > max(NEARLY_ALL * check.tested, 1):
         return _take_out(check, "")
     guilt = [
         culprits_by_score(network, columns, tested, check.tested, f"group {group}")
-        for group, (network, columns, tested) in found.items()
+        for group, (network, columns, tested) in tested_by_group.items()
         if any(network.model.images[i] in check.names for i in tested)
     ]
     remedy = (

@@ -101,10 +101,10 @@ def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.n
     circle of the board's radius. Returns (n, 4 or 6) indices or −1, and (n, 2, 2) whose columns are the two steps."""
     n, sides = len(candidates), directions(board)
     k = min(NEIGHBOURS + 1, n)
-    near = candidates.tree.query(candidates.xy, k=k)[1][:, 1:]
+    neighbours = candidates.tree.query(candidates.xy, k=k)[1][:, 1:]
     inverse = np.linalg.inv(candidates.shape)
-    largest, smallest = singular_values(inverse[:, None] @ candidates.shape[near])
-    step = np.einsum("nij,nkj->nki", inverse, candidates.xy[near] - candidates.xy[:, None])
+    largest, smallest = singular_values(inverse[:, None] @ candidates.shape[neighbours])
+    step = np.einsum("nij,nkj->nki", inverse, candidates.xy[neighbours] - candidates.xy[:, None])
     length = np.linalg.norm(step, axis=2) * board.radius_mm / board.pitch_mm
     ok = (np.abs(length - 1) < STEP_TOLERANCE) & (largest < MAX_AXIS_RATIO) & (smallest > 1 / MAX_AXIS_RATIO)
     # Blur makes small dots look larger, and diagonal neighbours then pass for direct ones: the nearest tell.
@@ -120,7 +120,7 @@ def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.n
     for side in range(sides):
         cost = np.where(ok & (direction == side), error, np.inf)
         best = cost.argmin(1)
-        links[:, side] = np.where(np.isfinite(cost.min(1)), near[np.arange(n), best], -1)
+        links[:, side] = np.where(np.isfinite(cost.min(1)), neighbours[np.arange(n), best], -1)
     pitch = board.pitch_mm / board.radius_mm
     axes = np.stack([np.cos(agreed), -np.sin(agreed), np.sin(agreed), np.cos(agreed)], 1).reshape(n, 2, 2) * pitch
     return links, candidates.shape @ axes @ board.steps()

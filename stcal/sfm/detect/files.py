@@ -107,20 +107,20 @@ def detect_files(
     cache.mkdir(parents=True, exist_ok=True)
     settings = _fingerprint(detector, camera, target, board, options)
     jobs = [(file, camera, size_from, target, board, options, settings, detector) for file in files]
-    found: list[DetectedImage | Skipped | None] = [None] * len(files)
+    outcomes: list[DetectedImage | Skipped | None] = [None] * len(files)
     if any(cache.glob("*.npz")):
         with ThreadPoolExecutor() as pool:  # reading and hashing release the interpreter
-            found[:] = pool.map(lambda file: _kept(file, settings, cache), files)
-    pending = [i for i, each in enumerate(found) if each is None]
-    for file, each in zip(files, found, strict=True):
+            outcomes[:] = pool.map(lambda file: _kept(file, settings, cache), files)
+    pending = [i for i, each in enumerate(outcomes) if each is None]
+    for file, each in zip(files, outcomes, strict=True):
         if each is not None and progress:
             progress(file.name)
     for k, outcome in run_on_images(_detect_file, [jobs[i] for i in pending], workers, kept=True):
         i = pending[k]
-        found[i] = outcome if isinstance(outcome, Skipped) else _stored(files[i], cache, *outcome)
+        outcomes[i] = outcome if isinstance(outcome, Skipped) else _stored(files[i], cache, *outcome)
         if progress:
             progress(files[i].name)
-    images, skipped = _without_copies([f for f in found if f is not None], forms)
+    images, skipped = _without_copies([f for f in outcomes if f is not None], forms)
     if not images:
         first = skipped[0]
         raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {first.name}: {first.reason}")
@@ -327,7 +327,7 @@ def look_again(
 
     An image that can no longer be read is left as it was after the first look; one that is gone is an error.
     """
-    found: dict[str, SecondLook] = {}
+    looks: dict[str, SecondLook] = {}
     pending: list[tuple[ImageFile, Camera, PredictedCircles, EllipseOptions]] = []
     paths: list[Path] = []
     for image, predicted in jobs:
@@ -337,12 +337,12 @@ def look_again(
             pending.append((image.file, camera, predicted, options))
             paths.append(path)
         else:
-            found[image.file.name] = known
+            looks[image.file.name] = known
     for k, look in run_on_images(_look_again, pending, workers, kept=True):
         if look is not None:
             keep(paths[k], _centre_arrays(look.centres), {"labels": look.labels, "missed": look.missed})
-            found[pending[k][0].name] = look
-    return found
+            looks[pending[k][0].name] = look
+    return looks
 
 
 def _predicted_key(digest: str, predicted: PredictedCircles, camera: Camera, options: EllipseOptions) -> str:
@@ -377,12 +377,12 @@ def copy_of(file: ImageFile, first: str, what: str = "") -> Skipped:
     return Skipped(file.name, f"the same image as {first}{what}", "copy")
 
 
-def _without_copies(found: list[DetectedImage | Skipped], forms: bool) -> tuple[list[DetectedImage], list[Skipped]]:
+def _without_copies(outcomes: list[DetectedImage | Skipped], forms: bool) -> tuple[list[DetectedImage], list[Skipped]]:
     """Returns the images without copies of photographs, and the files that are skipped.
 
     A copy adds no information, but would count as a further observation. Of files with equal content, the one with the
     plainest name is kept; of one photograph in several ``forms``, the lossless one."""
-    every = [each for each in found if isinstance(each, DetectedImage)]
+    every = [each for each in outcomes if isinstance(each, DetectedImage)]
     plain: dict[str, DetectedImage] = {}
     for each in sorted(every, key=lambda each: _plainness(each.file)):
         plain.setdefault(each.digest, each)
@@ -394,7 +394,7 @@ def _without_copies(found: list[DetectedImage | Skipped], forms: bool) -> tuple[
             continue
         gone[second.file.name] = copy_of(second.file, first.file.name, ", saved in another form")
     images = [each for each in every if each.file.name not in gone]
-    skipped = [each if isinstance(each, Skipped) else gone.get(each.file.name) for each in found]
+    skipped = [each if isinstance(each, Skipped) else gone.get(each.file.name) for each in outcomes]
     return images, [each for each in skipped if each is not None]
 
 

@@ -384,12 +384,12 @@ def _together(found: list[tuple[int, PlaneView, Rigid]], reach_mm: float) -> np.
     return np.linalg.norm(corners[:, None] - corners, axis=3).max(2) < reach_mm
 
 
-def _adjusted(found: Arrangement, focal_px: float) -> Arrangement:
+def _adjusted(arrangement: Arrangement, focal_px: float) -> Arrangement:
     """Adjusts the poses of images and planes to least reprojection error over the accepted views."""
-    images, planes = list(found.camera_from_group), list(found.group_from_plane)
-    rows = [(a, planes.index(v.plane), v) for a, i in enumerate(images) for v in found.views[i]]
+    images, planes = list(arrangement.camera_from_group), list(arrangement.group_from_plane)
+    rows = [(a, planes.index(v.plane), v) for a, i in enumerate(images) for v in arrangement.views[i]]
     if not rows:
-        return found
+        return arrangement
     bundle = PlaneBundle(
         np.concatenate([np.full(len(v.rows), a) for a, _, v in rows]),
         np.concatenate([np.full(len(v.rows), b) for _, b, v in rows]),
@@ -398,11 +398,11 @@ def _adjusted(found: Arrangement, focal_px: float) -> Arrangement:
         focal_px,
     )
     poses, placed = bundle.adjusted(
-        PoseStack.of(*(found.camera_from_group[i] for i in images)),
-        PoseStack.of(*(found.group_from_plane[p] for p in planes)),
+        PoseStack.of(*(arrangement.camera_from_group[i] for i in images)),
+        PoseStack.of(*(arrangement.group_from_plane[p] for p in planes)),
     )
     return replace(
-        found,
+        arrangement,
         camera_from_group={i: poses.rigid(a) for a, i in enumerate(images)},
         group_from_plane={p: placed.rigid(b) for b, p in enumerate(planes)},
     )

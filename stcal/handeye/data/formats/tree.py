@@ -111,14 +111,16 @@ def camodocal(value: Mapping, where: str) -> Content | None:
 
     Raises InputError: a matrix is missing or not valid, or ``frameCount`` is another number.
     """
-    found = {key: match for key in value if (match := _CAMODOCAL.fullmatch(str(key)))}
-    if "frameCount" not in value or not found:
+    matches = {key: match for key in value if (match := _CAMODOCAL.fullmatch(str(key)))}
+    if "frameCount" not in value or not matches:
         return None
     count = value["frameCount"]
     sides = []
     for role, number in zip(ROLES, ("1", "2"), strict=True):
-        keys = sorted((key for key, match in found.items() if match[1] == number), key=lambda key: int(found[key][2]))
-        if [int(found[key][2]) for key in keys] != list(range(count if isinstance(count, int) else 0)):
+        keys = sorted(
+            (key for key, match in matches.items() if match[1] == number), key=lambda key: int(matches[key][2])
+        )
+        if [int(matches[key][2]) for key in keys] != list(range(count if isinstance(count, int) else 0)):
             raise InputError(
                 "E-POSES-COUNT",
                 f"{where}: {len(keys)} matrices T{number}_…, frameCount is {count}; as many from T{number}_0 on needed",
@@ -129,7 +131,9 @@ def camodocal(value: Mapping, where: str) -> Content | None:
             raise InputError("E-POSE-VALUE", f"{where}: {wrong}: not a 4×4 matrix; record the pairs again")
         rotation, translation = of_matrices(np.array(matrices), keys, where)
         frames = Frames(FRAMES[role][0], "as handeye_calib_camodocal writes it", False)
-        sides.append(Side(rotation, translation, tuple(f"pose {found[key][2]}" for key in keys), MATRICES, ROS, frames))
+        sides.append(
+            Side(rotation, translation, tuple(f"pose {matches[key][2]}" for key in keys), MATRICES, ROS, frames)
+        )
     return Content("pairs of handeye_calib_camodocal", tuple(sides))
 
 

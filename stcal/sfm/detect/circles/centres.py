@@ -22,7 +22,7 @@ MAX_CHANCE = 4.2
 """Largest ratio of one circle's squares to the median: exceeded by chance by one in a thousand (χ² of six degrees of
 freedom). It bounds the influence of a dirty circle."""
 SHARP_PX, SHARP = 1.5, 0.33
-"""Above this blur, in pixels or in the ellipse's smaller radius, the response of the fit to a shift is computed from
+"""Blur, in pixels and in the ellipse's smaller radius, above which the response of the fit to a shift is computed from
 the image. Below it, this changed σ by 1 % only; it takes a tenth of the time of the fit."""
 
 
@@ -143,23 +143,23 @@ def measure_centres(
         pixels; one pattern if None
     """
     focal = float(np.sqrt(camera.focal.prod()))
-    found = _fitted(image, camera, ellipses, neighbours)
-    centre, uneven = found.centre / focal, found.uneven / focal
-    groups, ok = np.zeros(len(ellipses), int) if groups is None else groups, found.rim >= MIN_RIM
-    factor = np.array([correlation(found.chance[ok & (groups == i)]) for i in range(groups.max(initial=0) + 1)])
-    covariance = factor[groups, None, None] * found.covariance / focal**2
+    rims = _fitted(image, camera, ellipses, neighbours)
+    centre, uneven = rims.centre / focal, rims.uneven / focal
+    groups, ok = np.zeros(len(ellipses), int) if groups is None else groups, rims.rim >= MIN_RIM
+    factor = np.array([correlation(rims.chance[ok & (groups == i)]) for i in range(groups.max(initial=0) + 1)])
+    covariance = factor[groups, None, None] * rims.covariance / focal**2
     covariance += UNTRUSTED**2 * uneven[:, :, None] * uneven[:, None, :]
     distorted, jacobian = camera.distort_jacobian(centre)
     jacobian = jacobian * camera.focal[:, None]
     return Centres(
         centre_px=distorted * camera.focal + camera.centre,
         centre=centre,
-        shape=found.shape / focal,
+        shape=rims.shape / focal,
         covariance_px2=jacobian @ covariance @ np.swapaxes(jacobian, 1, 2),
-        blur_px=found.blur,
-        contrast=found.contrast,
-        noise=found.noise,
-        rim=found.rim,
+        blur_px=rims.blur,
+        contrast=rims.contrast,
+        noise=rims.noise,
+        rim=rims.rim,
         uneven_px=(jacobian @ uneven[..., None])[..., 0],
         ok=ok,
     )
