@@ -140,7 +140,7 @@ class TargetDesign(Brief):
     faces : tuple of FaceDesign
         The first one is the reference face.
     unusual_size : bool
-        Whether radii that no hardware has in mm are meant as they stand.
+        True if unusually large or small radii are not a mistake of units.
     distances : tuple of KnownDistance
         Known distances between its points.
 
@@ -273,7 +273,7 @@ class BoardDesign:
     stated : StatedSize
         What is stated of its size beside the drawing.
     unusual_size : bool
-        Whether a pitch or radius that no hardware has in mm is meant as it stands.
+        True if an unusually large or small pitch or radius is not a mistake of units.
     rim_mm : float
         Height of the rims in front of the dots, negative for dots that stand out; mm.
     rings : tuple of (int, int)

@@ -129,7 +129,7 @@ class TagLayout(Brief):
     sigma_mm : float
         σ of a corner's coordinate.
     unusual_size : bool
-        Whether sides that no hardware has in mm are meant as they stand.
+        True if unusually long or short sides are not a mistake of units.
 
     Raises
     ------

@@ -138,7 +138,7 @@ class _Outcome:
 def _solved(
     pairs: HandEyePoses, setup: Setup, method: str, views: Views | None, options: HandEyeOptions, rows: np.ndarray
 ) -> _Outcome | StcalError:
-    """Returns what a candidate makes of all poses and without those of each split, or the error if it fails."""
+    """Returns the results of a candidate from all poses and without those of each split, or the error if it fails."""
     try:
         solution = solved(pairs, setup, method, views, options)
         partial = tuple(solution.without(out) for out in rows)

@@ -148,8 +148,8 @@ def handeye(
 ) -> HandEye:
     """Returns the result of one method, with σ estimated from its own residuals.
 
-    The parameters are those of :func:`stcal.handeye.handeye`, which chooses a method where none is named and widens σ
-    by what poses held out show; here the method is ``reprojection`` with views, else ``pose``, if None.
+    The parameters are those of :func:`stcal.handeye.handeye`, which chooses a method if none is named, and widens σ
+    by the errors on held-out poses; here the method is ``reprojection`` with views, else ``pose``, if None.
 
     Raises
     ------

@@ -107,10 +107,10 @@ def run(
     reload_s
         Seconds after which the page of the report reloads itself, for a run that is repeated; never if None.
     checks
-        Checks of one's own: functions of the result that return a :class:`stcal.sfm.Check`, such as
+        Additional checks: functions of the result that return a :class:`stcal.sfm.Check`, such as
         :func:`stcal.sfm.judge` makes. They count in the answer and stand in the report like all others.
     every
-        Of a video: the sharpest of so many frames is used; by ``auto``, also the value if None, the sharpest of those
+        Of a video: the sharpest of this many frames is used; by ``auto``, also the value if None, the sharpest of those
         between which the view hardly changes.
 
     Returns
@@ -290,8 +290,9 @@ def _camera_of_dots(
     options: RunOptions,
     progress: Progress,
 ) -> CameraModel:
-    """Returns the camera by which the dots of the board lie on their grid, with the covariance of what any camera
-    fulfils: the adjustment of all groups estimates it again, from the same dots.
+    """Returns the camera calibrated from the dots of the board, with the weak prior of an unknown lens.
+
+    The adjustment of all groups estimates it again from the same dots, so that the σ of the calibration are not used.
 
     Raises
     ------

@@ -151,7 +151,7 @@ def _inverted_names(camera_from_board: Poses, by_images: bool) -> str:
 
 
 def _other_units(loop: Loop, by_images: bool) -> dict[str, Loop]:
-    """Returns the loop with either side's lengths in the other unit, by what to do.
+    """Returns the loop with either side's lengths in the other unit; the key says what to do.
 
     Residuals show only the ratio of the two units: metres taken for mm on one side look like mm taken for metres on
     the other. Lengths beyond :data:`HALL_MM` show which it is.

@@ -93,7 +93,7 @@ def of_order(names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray
     """Returns a note if camera or board moved between two poses, or drifts along them.
 
     ``residuals`` : (m, 6) in the order of the poses, outliers too; ``jacobian`` : (m, 6, 12) by X and Z. A move is
-    named where it explains most of the residuals: errors of robot and camera go with the poses' order, too.
+    named only if it explains most of the residuals, as errors of robot and camera may vary with the order, too.
     """
     parts = residuals.reshape(-1, 2, 3)
     sigma = np.repeat(np.median(np.linalg.norm(parts, axis=2), axis=0), 3)

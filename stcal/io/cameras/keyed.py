@@ -1,7 +1,7 @@
 """Camera files of keys and values, of many programs, by one table of their keys.
 
-A program is read by what its keys are called: ``ROLES`` of :mod:`stcal.io.cameras.keys` has the names in use, and
-:data:`TABLES` those that mean something else in one program. What is left goes through
+A file is read by the names of its keys. ``ROLES`` of :mod:`stcal.io.cameras.keys` has the names in use, and
+:data:`TABLES` those that have another meaning in one program. What is left goes through
 :func:`stcal.io.cameras.keys.require_known`.
 """
 

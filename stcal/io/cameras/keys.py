@@ -109,7 +109,7 @@ def plain(key: object) -> str:
 
 
 def role_of(key: str) -> str | None:
-    """Return what a key holds, by :data:`ROLES`; None if it is not known."""
+    """Return the role of a key, by :data:`ROLES`; None if it is not known."""
     bare = plain(PREFIX.sub("", key))
     return ROLES.get(plain(key)) or ROLES.get(f"camera{bare}") or ROLES.get(bare)
 

@@ -132,7 +132,7 @@ class Gain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjustment:
-    """A solution with the σ that go with it. ``notes`` : on iterations that did not converge."""
+    """A solution with its σ. ``notes`` : on iterations that did not converge."""
 
     solution: Solution
     weighting: Weighting

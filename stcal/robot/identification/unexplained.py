@@ -153,7 +153,10 @@ class _Rest:
         measured: Observed,
         root: np.ndarray,
     ) -> "_Rest":
-        """Returns what is left of ``errors`` (r, w); ``root`` : (r,) roots of the weights, 0 for rows left out."""
+        """Returns the unexplained part of ``errors`` (r, w).
+
+        ``root`` : (r,) roots of the weights, 0 for rows left out.
+        """
 
         def white(values: np.ndarray) -> np.ndarray:
             return (root[:, None, None] * weighting.whiten(values, measured)).reshape(errors.size, -1)

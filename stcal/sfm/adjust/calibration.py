@@ -65,7 +65,7 @@ class Calibration(Brief):
     ``models`` : models that the result rests on, mm, target frame, without groups that are not linked to it;
     ``camera`` : refined camera if it was refined, else the given one; ``notes`` : faces without a frame and the
     reasons, and an adjustment that did not settle; ``rim_mm`` : heights of the rims behind which circles lie, if the
-    result is of the luminous surface, empty if it is of what is seen; ``rim_sigma_mm`` : σ of all of them together;
+    result is the luminous surface, empty if it is the visible outline; ``rim_sigma_mm`` : σ of all of them together;
     ``circle_sigma_px`` : σ of the centres of the target's circles and corners in the joint adjustment, RMS per axis.
     """
 
@@ -287,8 +287,8 @@ def _adjust_all(
     """Runs the joint adjustments from the chained result; returns the state of the last one and the factors on the
     centres' σ.
 
-    The eccentricity is computed anew before each adjustment. With refined intrinsics the factors are computed anew,
-    too: a wrong camera causes residuals of its own.
+    The eccentricity is computed again before each adjustment. With refined intrinsics, so are the factors, since a
+    wrong camera enlarges residuals.
     """
     radius = target.radius_of() | board.radius_of()
     covariances = [m.covariance_px2 for m in models]

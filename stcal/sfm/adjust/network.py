@@ -78,7 +78,7 @@ class Network:
         return normal.sum(0) - weighted @ coupled.T, right.sum(0) - weighted @ self.point_right
 
     def score_by_image(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns :meth:`score` of parameters that every image has for itself: (m, q, q) and (m, q)."""
+        """Returns :meth:`score` of separate parameters for each image: (m, q, q) and (m, q)."""
         normal, right, to_points = self._by_image(columns)
         weighted = to_points @ self.covariance_mm2
         return normal - weighted @ np.swapaxes(to_points, 1, 2), right - weighted @ self.point_right

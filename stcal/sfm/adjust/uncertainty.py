@@ -136,7 +136,7 @@ def _position_sources_mm(state: Adjusted, scale: float, own: Derivatives) -> dic
 def scale_sigma(xyz_model: np.ndarray, covariance_mm2: np.ndarray) -> float:
     """Returns the relative σ of the scale of the circles.
 
-    The scale is that of the similarity between the circles as adjusted and as they are.
+    The scale is that of the similarity between the adjusted and the true circles.
     """
     middle = xyz_model - xyz_model.mean(0)
     gradient = (middle / (middle**2).sum()).ravel()

@@ -133,8 +133,7 @@ def sources_of(
     statement: Statement,
     camera_given: bool = True,
 ) -> tuple[Source, ...]:
-    """Returns all rows of the budget, also of inputs of which nothing is known, so that the reader sees what is left
-    out.
+    """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out.
 
     ``camera`` : the camera as given to the run, with the covariance that its file states; ``refined`` : True if its
     intrinsics were adjusted; ``camera_given`` : False if the photographs alone told it.
@@ -323,7 +322,7 @@ def conditions_of(statement: Statement, board: BoardDesign) -> Conditions:
 
 
 def _growth(stated: StatedSize) -> float | None:
-    """Returns by what a body is larger, relatively, than at its reference temperature; None if it is not known."""
+    """Returns the relative expansion of a body since its reference temperature; None if it is not known."""
     warmer = warmer_k(stated)
     if 0.0 in (warmer, stated.expansion_ppm_per_k):
         return 0.0

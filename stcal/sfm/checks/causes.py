@@ -2,7 +2,8 @@
 named first.
 
 A cause that all images share makes many checks fail, which each name something else. A hypothesis is a set of further
-parameters of the free networks (score test). It explains what it takes from the squared residuals beyond chance.
+parameters of the free networks (score test). It explains the part by which it reduces the squared residuals beyond
+chance.
 """
 
 from collections.abc import Callable, Sequence
@@ -124,7 +125,7 @@ def _fit(cause: _Cause, networks: Sequence[Network]) -> _Fitted | None:
 
 
 def _apart(cause: _Cause, network: Network) -> np.ndarray:
-    """Returns the columns with parameters of each image, or of the group, for itself."""
+    """Returns the columns with separate parameters for each image, or for the group."""
     columns = cause.columns(network)
     if cause.scope == "group":
         return columns

@@ -250,10 +250,10 @@ def _packed(detection: ImageDetection, key: str, digest: str, image: np.ndarray)
     meta = {
         "digest": digest,
         "scale": scale,
-        "faces": [each.face for each in detection.faces],
-        "printed": [each.face for each in detection.printed],
+        "faces": [sighting.face for sighting in detection.faces],
+        "printed": [sighting.face for sighting in detection.printed],
         "boards": len(detection.boards),
-        "open_faces": [[each.face for each in faces] for faces in detection.open_faces],
+        "open_faces": [[sighting.face for sighting in faces] for faces in detection.open_faces],
         "mirrored": detection.mirrored,
         "notes": detection.notes,
         "candidates": detection.candidates,
@@ -266,8 +266,8 @@ def _packed(detection: ImageDetection, key: str, digest: str, image: np.ndarray)
     for i, faces in enumerate(detection.open_faces):
         for k, face in enumerate(faces):
             arrays |= {f"open_rows_{i}_{k}": face.rows, f"open_circles_{i}_{k}": face.circles}
-    for i, each in enumerate(detection.boards):
-        arrays |= {f"board_{f.name}_{i}": getattr(each, f.name) for f in fields(BoardSighting)}
+    for i, sighting in enumerate(detection.boards):
+        arrays |= {f"board_{f.name}_{i}": getattr(sighting, f.name) for f in fields(BoardSighting)}
     return packed(key, {"thumbnail": jpeg, **arrays}, meta)
 
 
@@ -382,20 +382,20 @@ def _without_copies(outcomes: list[DetectedImage | Skipped], forms: bool) -> tup
 
     A copy adds no information, but would count as a further observation. Of files with equal content, the one with the
     plainest name is kept; of one photograph in several ``forms``, the lossless one."""
-    every = [each for each in outcomes if isinstance(each, DetectedImage)]
-    plain: dict[str, DetectedImage] = {}
-    for each in sorted(every, key=lambda each: _plainness(each.file)):
-        plain.setdefault(each.digest, each)
-    firsts = [(each, plain[each.digest]) for each in every]
-    gone = {each.file.name: copy_of(each.file, first.file.name) for each, first in firsts if each is not first}
-    for one, two in _in_two_forms([each for each, first in firsts if each is first] if forms else []):
-        first, second = sorted((one, two), key=lambda each: _plainness(each.file))
-        if {first.file.name, second.file.name} & gone.keys() or not _same_pixels(first.file, second.file):
+    detected = [outcome for outcome in outcomes if isinstance(outcome, DetectedImage)]
+    plainest: dict[str, DetectedImage] = {}
+    for image in sorted(detected, key=lambda image: _plainness(image.file)):
+        plainest.setdefault(image.digest, image)
+    firsts = [(image, plainest[image.digest]) for image in detected]
+    copies = {image.file.name: copy_of(image.file, first.file.name) for image, first in firsts if image is not first}
+    for one, two in _in_two_forms([image for image, first in firsts if image is first] if forms else []):
+        first, second = sorted((one, two), key=lambda image: _plainness(image.file))
+        if {first.file.name, second.file.name} & copies.keys() or not _same_pixels(first.file, second.file):
             continue
-        gone[second.file.name] = copy_of(second.file, first.file.name, ", saved in another form")
-    images = [each for each in every if each.file.name not in gone]
-    skipped = [each if isinstance(each, Skipped) else gone.get(each.file.name) for each in outcomes]
-    return images, [each for each in skipped if each is not None]
+        copies[second.file.name] = copy_of(second.file, first.file.name, ", saved in another form")
+    images = [image for image in detected if image.file.name not in copies]
+    skipped = [outcome if isinstance(outcome, Skipped) else copies.get(outcome.file.name) for outcome in outcomes]
+    return images, [reason for reason in skipped if reason is not None]
 
 
 def _plainness(file: ImageFile) -> tuple[bool, bool, int]:

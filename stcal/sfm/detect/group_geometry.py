@@ -62,7 +62,7 @@ class Arrangement:
 def arrange(
     images: Sequence[list[Readings]], patterns: dict[str, Pattern], step_mm: float, focal_px: float
 ) -> Arrangement:
-    """Returns the arrangement that explains most circles of one group, without what a mirror shows.
+    """Returns the arrangement that explains most circles of one group, without reflections in a mirror.
 
     Parameters
     ----------

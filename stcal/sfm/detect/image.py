@@ -118,7 +118,7 @@ def detect_image(
     """Finds and measures all points of the target and the board in one grey image of the camera's size.
 
     Circles are searched where the design has any, outside of a board of corners; corners of printed faces and of such a
-    board are taken as they are found.
+    board are used as found.
 
     Raises
     ------

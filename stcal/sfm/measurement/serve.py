@@ -195,7 +195,7 @@ class MeasureServer:
             stalest.refuse_at_once(reason)
 
     def pause_s(self, connection: "_Connection", count: int) -> float:
-        """Returns how long to wait before more is read from a connection that has sent so many bytes."""
+        """Returns how long to wait before more is read from a connection that has sent this many bytes."""
         if connection.known or not self.service.beside_others(connection.client):
             return 0.0
         now = time.monotonic()

@@ -99,7 +99,7 @@ class _Cause:
 
 
 def judged(report: dict) -> dict:
-    """Returns the content of ``report.json`` with its judgement made anew."""
+    """Returns the content of ``report.json`` with a new judgement."""
     return report | {"judgement": judgement_of(report).model_dump()}
 
 

@@ -172,7 +172,7 @@ class ReportAgain:
 
 
 def report_again(run: Path, pdf: bool, out: Path | None = None) -> ReportAgain:
-    """Makes the page of a finished run anew from its ``report.json`` and its overlays, and a PDF if requested.
+    """Makes the page of a finished run again from its ``report.json`` and its overlays, and a PDF if requested.
 
     Parameters
     ----------

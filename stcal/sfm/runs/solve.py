@@ -278,8 +278,8 @@ def solve_body(
 ) -> tuple[list[GroupSolution], list[str]]:
     """Maps and refines the groups of a body that its faces of known shape have placed.
 
-    Returns the solutions, and the reasons why groups have none. Images that show no such face are resected by what the
-    others map.
+    Returns the solutions, and the reasons why groups have none. Images that show no such face are resected by the
+    points that the others map.
 
     Raises
     ------
