@@ -344,11 +344,11 @@ def _result(
     names: tuple[str, ...],
     alone: tuple[CameraCalibration, ...],
     together: Together,
-    found: Adjusted,
+    adjusted: Adjusted,
     board: BoardDesign,
 ) -> RigCalibration:
-    state, setting = found.state, found.setting
-    covariance = np.linalg.inv(found.last.normal)
+    state, setting = adjusted.state, adjusted.setting
+    covariance = np.linalg.inv(adjusted.last.normal)
     covariance = (covariance + covariance.T) / 2
     pose_covariance = np.zeros((len(names), 6, 6))
     for k in range(1, len(names)):
@@ -357,7 +357,7 @@ def _result(
     for each in together.sightings:
         members.setdefault(each.instant, {})[names[each.camera]] = each.view.name
     shared = tuple(sum(len(m) > 1 and name in m for m in members.values()) for name in names)
-    intrinsics = [_of_camera(k, alone[k].intrinsics, found, covariance) for k in range(len(names))]
+    intrinsics = [_of_camera(k, alone[k].intrinsics, adjusted, covariance) for k in range(len(names))]
     return RigCalibration(
         names=names,
         cameras=tuple(rejudged(a, own, board) for a, own in zip(alone, intrinsics, strict=True)),
@@ -368,10 +368,10 @@ def _result(
         instants=dict(sorted(members.items())),
         rms_px=_rms_by_instant(state, together),
         apart=together.apart,
-        factor=found.factors.centres,
-        dots=found.factors.dots,
+        factor=adjusted.factors.centres,
+        dots=adjusted.factors.dots,
         redundancy=state.redundancy(setting.kept),
-        warnings=tuple(_warnings(names, shared, together, found)),
+        warnings=tuple(_warnings(names, shared, together, adjusted)),
     )
 
 

@@ -211,11 +211,11 @@ def _comparison(
     native: NativeColmap,
     schema: str,
     external: Calibration,
-    own: Calibration,
+    of_pycolmap: Calibration,
     again: Calibration,
     tolerances: Tolerances,
 ) -> Crosscheck:
-    native_images, pycolmap_images = _images(external), _images(own)
+    native_images, pycolmap_images = _images(external), _images(of_pycolmap)
     images = ImagesRegistered(
         native=len(native_images),
         pycolmap=len(pycolmap_images),
@@ -225,10 +225,10 @@ def _comparison(
     )
     faces = run.faces.target_from_face_covariance
     mapping = MappingCompared(
-        faces=_faces(external.target.target_from_face, own.target.target_from_face, faces),
-        circles_um=_circles(external.target.circles, own.target.circles),
-        circles_sigmas=_circle_sigmas(external.target.circles, own.target.circles, run),
-        cameras=_cameras(external, own, run),
+        faces=_faces(external.target.target_from_face, of_pycolmap.target.target_from_face, faces),
+        circles_um=_circles(external.target.circles, of_pycolmap.target.circles),
+        circles_sigmas=_circle_sigmas(external.target.circles, of_pycolmap.target.circles, run),
+        cameras=_cameras(external, of_pycolmap, run),
     )
     result = ResultCompared(
         faces=face_differences(again.target, run),
@@ -243,7 +243,9 @@ def _comparison(
         schema=schema,
         tolerances=tolerances,
         images=images,
-        residual_rms_px=ResidualRms(native=_rms_px(external, run), pycolmap=_rms_px(own, run), run=_run_rms(run)),
+        residual_rms_px=ResidualRms(
+            native=_rms_px(external, run), pycolmap=_rms_px(of_pycolmap, run), run=_run_rms(run)
+        ),
         mapping=mapping,
         result=result,
         plain=FacesCompared(faces=face_differences(external.target, run)),

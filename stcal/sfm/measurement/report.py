@@ -278,7 +278,7 @@ def measure_report(result: MeasureResult, where: str) -> Document:
     verdicts = any(fit_verdict(image.pose) != "passed" for image in result.images)
     statuses = {image.pose.status for image in result.images}
     colours = legend({s: c for s, c in COLOUR_OF.items() if s in statuses} if len(statuses) > 1 else {})
-    told = summary(result)
+    summary_lines = summary(result)
     heads = [
         "<image",
         "<faces",
@@ -303,13 +303,13 @@ def measure_report(result: MeasureResult, where: str) -> Document:
         contradicting = fold("Circles left out", contradicting)
     return Document(
         "Poses of the target",
-        f"{where}: {told[0]}",
+        f"{where}: {summary_lines[0]}",
         [
-            Section("", [Printed(_printed(result)), Printed(told[1:])], terminal=True),
+            Section("", [Printed(_printed(result)), Printed(summary_lines[1:])], terminal=True),
             Section(
                 "Path in the camera frame",
                 [
-                    alarms(told[1:]),
+                    alarms(summary_lines[1:]),
                     f"Origin of the target, mm. Ellipses: σ{f', {times:g} times enlarged' if times != 1 else ''}. "
                     "Lines join the images of a folder by name",
                     colours,
