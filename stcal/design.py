@@ -140,7 +140,7 @@ class TargetDesign(Brief):
     faces : tuple of FaceDesign
         The first one is the reference face.
     unusual_size : bool
-        Whether radii that no hardware has in mm are meant as they stand.
+        True if unusually large or small radii are not a mistake of units.
     distances : tuple of KnownDistance
         Known distances between its points.
 
@@ -273,7 +273,7 @@ class BoardDesign:
     stated : StatedSize
         What is stated of its size beside the drawing.
     unusual_size : bool
-        Whether a pitch or radius that no hardware has in mm is meant as it stands.
+        True if an unusually large or small pitch or radius is not a mistake of units.
     rim_mm : float
         Height of the rims in front of the dots, negative for dots that stand out; mm.
     rings : tuple of (int, int)
@@ -525,8 +525,8 @@ def scale_reference(board: BoardDesign | None, target: TargetDesign) -> BoardDes
     if board is not None and type(board) is not BoardDesign:
         raise InputError(
             "E-BOARD-TYPE",
-            "--board: circles of a lattice or corners beside a target that tells its own size; a rectangular board of "
-            "dots needed, or none",
+            "--board: a lattice of circles or corners, beside a target whose own size is known; a rectangular board "
+            "of dots needed, or none",
         )
     known = {} if board is None else {entry.name: getattr(board, entry.name) for entry in fields(BoardDesign)}
     none = {"rows": 0, "columns": 0, "pitch_mm": 1.0, "radius_mm": 0.25, "polarity": "bright", "sigma_mm": 1.0}

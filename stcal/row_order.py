@@ -70,7 +70,7 @@ def change_along(errors: np.ndarray, explained: np.ndarray, motions: np.ndarray)
     explained : (r, w, k) array
         Derivatives by the fitted parameters, in the same units.
     motions : (r, w, c) array
-        Effects of motions of what may have moved, in the same units.
+        Effects of the motions that may have happened, in the same units.
 
     Returns
     -------

@@ -165,7 +165,7 @@ class Result:
 
 def test_checks_of_ones_own_have_their_own_names():
     assert [each.verdict for each in own_checks(Result(), [lambda _: check("mine")])] == ["failed"]  # 5 σ
-    with fails_with("E-CHECK-OWN … 'camera' is taken"):
+    with fails_with("E-CHECK-OWN … 'camera' is already used"):
         own_checks(Result(), [lambda _: check("camera")])
     with fails_with("E-CHECK-OWN … bool"):
         own_checks(Result(), [lambda _: True])

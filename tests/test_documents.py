@@ -36,9 +36,9 @@ def test_every_option_is_documented():
 
 VERBS = """
 Accept Add Adjust Advise Allow Also Answer Assume Begin Blur Calibrate Call Choose Compare Compute Convert Copy Correct
-Count Cross-validate Decide Detect Divide Draw End Explain Find Fit Follow Forecast Give Hand Hold Identify Ignore Keep
-Lay Listen Look Make Map Match Measure Multiply Name Photograph Place Plan Print Rank Read Reject Render Replace Run Say
-Send Set Show Solve Spread Start Stop Take Tell Treat Use Write
+Count Cross-validate Decide Define Detect Divide Draw End Explain Find Fit Follow Forecast Give Hand Hold Identify
+Ignore Keep Lay Listen Look Make Map Match Measure Multiply Name Number Photograph Place Plan Print Rank Read Reject
+Render Replace Run Say Send Set Show Solve Spread Start Stop Take Tell Treat Use Write
 """
 """With which a help text may begin; *Also* goes before one of the others."""
 

@@ -113,7 +113,7 @@ class _Foretold:
     step_px: np.ndarray
 
     def agrees(self, xy_px: np.ndarray) -> np.ndarray:
-        """Return a mask (n,) of the corners that lie where they are foretold."""
+        """Return a mask (n,) of the corners that are at their predicted places."""
         if len(xy_px) < TESTED_FROM:
             return np.ones(len(xy_px), bool)
         off = np.linalg.norm(xy_px - self.xy_px, axis=1)

@@ -112,7 +112,7 @@ def require_tags(tags: Sequence[tuple[str, int]], corners_mm: np.ndarray, unusua
             raise InputError(
                 "E-TAG-OVERLAP",
                 f"{where}: tags {ids[j]} and {ids[i]} lie on each other: {apart[j]:.3g} mm apart, "
-                f"sides {sides[j]:.3g} and {sides[i]:.3g} mm; are the places metres? correct them",
+                f"sides {sides[j]:.3g} and {sides[i]:.3g} mm; check that places are not in metres, and correct them",
             )
 
 
@@ -129,7 +129,7 @@ class TagLayout(Brief):
     sigma_mm : float
         σ of a corner's coordinate.
     unusual_size : bool
-        Whether sides that no hardware has in mm are meant as they stand.
+        True if unusually long or short sides are not a mistake of units.
 
     Raises
     ------

@@ -353,7 +353,8 @@ def flat_board(content: dict[str, Any], where: str) -> BoardDesign | FlatBoard:
         return _asymmetric(validated(content, _AsymmetricCircles, where), where)
     if kind == SET:
         raise InputError(
-            "E-BOARD-SINGLE", f"{where}: several boards, not flat together; the file of a single board needed here"
+            "E-BOARD-SINGLE",
+            f"{where}: several boards that are not in one plane; the file of a single board needed here",
         )
     raise InputError("E-BOARD-TYPE", f"{where}: type {kind!r}; one of {', '.join(KINDS)} needed")
 

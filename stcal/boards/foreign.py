@@ -82,7 +82,7 @@ def tags_of_bundle(content: dict[str, Any], where: str) -> dict[str, Any]:
     data = validated(content, _BundlesFile, where)
     if len(data.tag_bundles) > 1:
         names = ", ".join(bundle.name for bundle in data.tag_bundles)
-        raise InputError("E-LAYOUT-BUNDLES", f"{where}: bundles {names}: one needed; leave it alone in the file")
+        raise InputError("E-LAYOUT-BUNDLES", f"{where}: bundles {names}: one needed; leave only that one in the file")
     if not data.tag_bundles:
         sizes = [
             {"dictionary": data.tag_family, "id": t.id, "size_mm": METRE_MM * t.size} for t in data.standalone_tags
@@ -194,8 +194,8 @@ def kalibr_board_of(
         if data.tagSpacing < LEAST_GAP <= (ratio := data.tagSpacing / data.tagSize) <= 1:
             raise InputError(
                 "E-BOARD-SPACING",
-                f"{where}: tagSpacing {data.tagSpacing:g}, at least {LEAST_GAP:g} usual: it is the gap over tagSize, "
-                f"no length; of a gap of {data.tagSpacing:g} m it is {ratio:.4g}",
+                f"{where}: tagSpacing {data.tagSpacing:g}, at least {LEAST_GAP:g} usual: it is the gap divided by "
+                f"tagSize, not a length; of a gap of {data.tagSpacing:g} m it is {ratio:.4g}",
             )
         return AprilGridDesign(data.tagRows, data.tagCols, size, data.tagSpacing, None, data.codeOffset, KALIBR_FAMILY)
     if kind == "checkerboard":
@@ -212,7 +212,7 @@ def kalibr_board_of(
         if not data.asymmetricGrid:
             raise InputError(
                 "E-BOARD-RADIUS",
-                f"{where}: asymmetricGrid false, a grid whose circles have no radius; write a board.toml with rows, "
+                f"{where}: asymmetricGrid false: a grid whose circles have no radius; write a board.toml with rows, "
                 "columns, pitch_mm, radius_mm and polarity",
             )
         spacing = METRE_MM * data.spacingMeters

@@ -43,7 +43,7 @@ class _Place(PoseEntry):
             if len(given_keys) > 1:
                 conflicting = min(given_keys - {"common_from_board"})
                 raise InputError(
-                    "E-BOARD-KEY-CONFLICT", f"{where}: common_from_board and {conflicting}; the place needed once"
+                    "E-BOARD-KEY-CONFLICT", f"{where}: common_from_board and {conflicting}; give one of them"
                 )
             if [len(row) for row in self.common_from_board] != [4] * 4:
                 raise InputError("E-BOARD-PLACE", f"{where}: common_from_board: 4 rows of 4 numbers needed")
@@ -94,7 +94,7 @@ def _board(path: Path, entry: dict[str, Any], where: str) -> BoardDesign | FlatB
         raise InputError("E-BOARD-FILE-KEY", f"{where}: file: a string needed")
     if extra := sorted(set(entry) - {"file"}):
         raise InputError(
-            "E-BOARD-KEY-CONFLICT", f"{where}: {', '.join(extra)} beside file; what the board is stands in its file"
+            "E-BOARD-KEY-CONFLICT", f"{where}: {', '.join(extra)} beside file; the board's file says what the board is"
         )
     try:
         return load_flat_board(path.parent / entry["file"])
@@ -108,7 +108,8 @@ def _require_told_apart(found: BoardSet, where: str) -> None:
         if _turnable(board):
             raise InputError(
                 "E-BOARD-AMBIGUOUS",
-                f"{where}: {name} looks the same turned, so that its points have no numbers in the common frame; "
+                f"{where}: {name} looks the same when turned, so that its points cannot be numbered in the common "
+                "frame; "
                 "a chessboard of an odd and an even side, a larger corner dot, or tags needed",
             )
     for (first_name, first), (second_name, second) in combinations(zip(found.names, found.boards, strict=True), 2):

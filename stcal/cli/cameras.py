@@ -27,24 +27,26 @@ Form = Literal[
 """Format of a camera file."""
 
 
-NameOption = Annotated[str, "Choose this camera of a file of several, such as cam1 or 2; and write this name."]
-SizeOption = Annotated[str, "Take images of this size, px, where the file states none.", Opt(metavar="WxH")]
+NameOption = Annotated[
+    str, "Choose this camera from a file of several, such as cam1 or 2; it is also the name that is written."
+]
+SizeOption = Annotated[str, "Take images to have this size, px, if the file states none.", Opt(metavar="WxH")]
 PlotFile = Annotated[Path | None, "Draw a picture into this file (PNG or SVG).", WRITES]
 
 
 @app.command()
 def convert(
-    source: Annotated[Path, "Read the camera from this file, of any form.", Arg("A")],
+    source: Annotated[Path, "Read the camera from this file, in any form.", Arg("A")],
     out: Annotated[Path, "Write the camera to this file.", Arg("B", writes=True)],
     form: Annotated[
         Form | None,
-        "Write this form; if not given that of B's suffix: .txt colmap, .bin colmap-bin, .yaml opencv, "
+        "Write this form; if not given, it follows from B's suffix: .txt colmap, .bin colmap-bin, .yaml opencv, "
         ".cameramodel mrcal, .xml metashape, .mat matlab.",
     ] = None,
     name: NameOption = "",
     size: SizeOption = "",
 ) -> None:
-    """Convert a camera file to the form of another program, and say what that has no place for."""
+    """Convert a camera file to the form of another program, and say what that form cannot hold."""
     from stcal.io.cameras.write import form_of, save_camera
 
     kind = form_of(out, form)
@@ -75,13 +77,13 @@ def show(
 
 @app.command()
 def compare(
-    first: Annotated[Path, "Read a camera from this file, of any form.", Arg("A")],
-    second: Annotated[Path, "Read the camera to compare from this file.", Arg("B")],
+    first: Annotated[Path, "Read the first camera from this file, in any form.", Arg("A")],
+    second: Annotated[Path, "Read the camera to compare from this file, in any form.", Arg("B")],
     name: NameOption = "",
     size: SizeOption = "",
     plot: PlotFile = None,
 ) -> None:
-    """Compare two cameras: how many pixels apart they see the same ray, after the turn that brings them nearest."""
+    """Compare two cameras: by how many pixels their images of a ray differ, after the rotation that fits best."""
     from stcal.io.cameras.difference import compare_cameras
     from stcal.report.camera import comparison_figure, comparison_text
     from stcal.report.figure import save

@@ -1,6 +1,6 @@
 """Parameters of commands: what a command writes beside a parameter's type, and Typer's form of it.
 
-``count: Annotated[int, "Name so many poses.", Opt(min=1, max=100)] = 3`` is the option ``--count``: its text of help,
+``count: Annotated[int, "Name this many poses.", Opt(min=1, max=100)] = 3`` is the option ``--count``: its text of help,
 and whatever else must be said. Its name, and its panel of the help text, follow from the parameter's name and type.
 """
 

@@ -13,7 +13,7 @@ from stcal.errors import InputError
 
 app = typer.Typer(
     name="stcal locate",
-    help="Find a planar target of several tags under any light, with a verdict whether its pose may be trusted.",
+    help="Find a planar target of several tags in any light, and judge whether its pose may be trusted.",
     cls=Commands,
     **PLAIN,
 )
@@ -28,7 +28,7 @@ MethodName = Literal["joint", "patent"]
 def schedule(
     shortest: Annotated[float, "Start with this exposure time, in any unit.", Arg()],
     longest: Annotated[float, "End with this exposure time, in the same unit.", Arg()],
-    count: Annotated[int, "Print so many exposure times.", Arg(min=1, max=1000)],
+    count: Annotated[int, "Print this many exposure times.", Arg(min=1, max=1000)],
 ) -> None:
     """Print exposure times in a geometric series."""
     from stcal.locate.data.exposures import exposure_times
@@ -41,18 +41,18 @@ def schedule(
 def capture(
     out: Annotated[Path, "Write the scene's folder of images below this folder.", Arg("SCENES")] = Path("scenes"),
     scene: Annotated[str, "Name the scene like this; its folder must not exist."] = "scene-1",
-    device: Annotated[str, "Use this camera: a number, or a place such as /dev/video0 (V4L2, UVC)."] = "0",
+    device: Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."] = "0",
     shortest: Annotated[
         float, "Start with this exposure, in the driver's unit; V4L2: 100 µs.", Opt(min=1e-9, max=1e9)
     ] = 10.0,
     longest: Annotated[float, "End with this exposure, in the driver's unit.", Opt(min=1e-9, max=1e9)] = 1000.0,
-    count: Annotated[int, "Take so many, in a geometric series.", Opt(min=1, max=1000)] = 5,
+    count: Annotated[int, "Take this many exposures, in a geometric series.", Opt(min=1, max=1000)] = 5,
     gain: Annotated[
-        float | None, "Set this gain, in the driver's unit; as it is if not given.", Opt(min=0, max=1e6)
+        float | None, "Set this gain, in the driver's unit; if not given, it stays as it is.", Opt(min=0, max=1e6)
     ] = None,
     settle: Annotated[float, "Give the camera this time after each change, s.", Opt("--settle-s", min=0, max=60)] = 0.3,
     simulate: Annotated[
-        Path | None, "Use a simulated camera that sees this image at exposure 1, in place of --device."
+        Path | None, "Use a simulated camera that shows this image at exposure 1, in place of --device."
     ] = None,
 ) -> None:
     """Take an exposure series with a camera of this machine, for run: SCENES/<scene>/<exposure>.png."""
@@ -90,7 +90,7 @@ def calibrate(
     workers: shared.Workers = None,
     json_file: shared.JsonFile = None,
 ) -> None:
-    """Find where the corners of the target's tags lie, with σ, in a frame in the middle of the layout's origin tag."""
+    """Find the corners of the target's tags, with σ, in the frame at the centre of the layout's origin tag."""
     from stcal.boards.file import load_flat_board
     from stcal.io.cameras.read import read_camera
     from stcal.locate.calibration.solve import calibrate as calibrated
@@ -120,33 +120,38 @@ def run(
     camera: shared.CameraFile,
     out: Annotated[Path | None, "Write the accepted poses to this file (CSV).", WRITES] = None,
     method: Annotated[
-        MethodName, "Use joint, all exposures together, or patent, each by itself as published."
+        MethodName, "Use joint, all exposures together, or patent, each exposure separately as published."
     ] = "joint",
-    hand_eye: Annotated[Path | None, "Add poses in the robot's base by this result of `stcal handeye` (JSON)."] = None,
+    hand_eye: Annotated[
+        Path | None, "Add poses in the robot's base, using this result of `stcal handeye` (JSON)."
+    ] = None,
     robot_poses: Annotated[Path | None, "Read base_from_flange of each scene from this file (CSV)."] = None,
     key: Annotated[str, "Match scenes and rows of --robot-poses by this column."] = "scene",
     columns: Annotated[Path | None, "Read --robot-poses with the columns, delimiter … of this file (TOML)."] = None,
     registration: Annotated[
         Path | None,
-        "Add poses in the robot's base by this result of `stcal register` (JSON): a the camera, b the base.",
+        "Add poses in the robot's base, using this result of `stcal register` (JSON), with a the camera and b the "
+        "base.",
     ] = None,
     quaternions: shared.Quaternions = "wxyz",
     offset: Annotated[
-        Path | None, "Add goal poses by obj_from_goal, 4×4 in the target's frame, of this file (JSON)."
+        Path | None, "Add goal poses, using obj_from_goal, 4×4 in the target's frame, from this file (JSON)."
     ] = None,
-    min_tags: Annotated[int, "Reject a pose from fewer tags.", Opt(min=1, max=10_000)] = 1,
-    min_spread_px: Annotated[float, "Reject a pose whose corners extend over less, px.", Opt(min=0, max=1e5)] = 12.0,
+    min_tags: Annotated[int, "Reject a pose from fewer tags than this.", Opt(min=1, max=10_000)] = 1,
+    min_spread_px: Annotated[
+        float, "Reject a pose whose corners spread over less than this, px.", Opt(min=0, max=1e5)
+    ] = 12.0,
     min_foreshortening: Annotated[
         float,
-        "Reject a pose with a smaller cosine between the target's normal and the line of sight.",
+        "Reject a pose if the cosine between the target's normal and the line of sight is smaller than this.",
         Opt(min=0, max=1),
     ] = 0.17,
     max_p: Annotated[float, "Reject a pose whose χ² p-value is below this."] = 1e-4,
-    flip_odds: Annotated[float, "Call a pose ambiguous whose second solution has larger odds than this."] = 1e-6,
-    sigma_margin: Annotated[
-        float, "Allow for σ that are all too small by up to this factor.", Opt(min=1, max=1000)
-    ] = 1.5,
-    equal_deg: Annotated[float, "Treat two solutions nearer than this as one.", Opt(min=0, max=180)] = 1.0,
+    flip_odds: Annotated[
+        float, "Call a pose ambiguous if the odds of its second solution are larger than this."
+    ] = 1e-6,
+    sigma_margin: Annotated[float, "Allow for all σ being too small by up to this factor.", Opt(min=1, max=1000)] = 1.5,
+    equal_deg: Annotated[float, "Treat two solutions closer than this as one.", Opt(min=0, max=180)] = 1.0,
     max_sigma_deg: Annotated[float, "Reject a pose whose largest σ of rotation exceeds this."] = 2.0,
     max_sigma_mm: Annotated[
         float | None, "Reject a pose whose largest σ of position exceeds this; none by default."
@@ -160,7 +165,7 @@ def run(
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
-    """Find the pose of the target in each scene, with its 6×6 covariance, and accept, ambiguous or reject.
+    """Find the pose of the target in each scene, with its 6×6 covariance and a verdict: accept, ambiguous or reject.
 
     Exit code 3 when no pose is accepted.
     """
@@ -179,11 +184,12 @@ def run(
 
     if hand_eye and registration:
         raise InputError(
-            "E-OPTION-CONFLICT", f"--hand-eye {hand_eye}, --registration {registration}: two ways to one base; give one"
+            "E-OPTION-CONFLICT",
+            f"--hand-eye {hand_eye}, --registration {registration}: both lead to the base; give one",
         )
     chain = None
     if hand_eye is None and robot_poses:
-        raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, of a camera on the flange")
+        raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, for a camera on the flange")
     if hand_eye is None and registration is None and offset:
         raise InputError(
             "E-OPTION-NEEDS",

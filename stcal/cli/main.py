@@ -31,7 +31,7 @@ UsageError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "C
 
 app = typer.Typer(
     name="stcal",
-    help="Calibrate stereo targets from photographs of a single camera, and use them.",
+    help="Calibrate stereo targets from photographs of a single camera, and measure with them.",
     cls=Commands,
     **PLAIN,
 )
@@ -48,7 +48,9 @@ protect_outputs(app)
 @app.callback(invoke_without_command=True)
 def _version(
     version: bool = typer.Option(False, "--version", help="Print the version and exit."),
-    versions: bool = typer.Option(False, "--versions", help="Print versions of all that it is built on, and exit."),
+    versions: bool = typer.Option(
+        False, "--versions", help="Print the versions of stcal and of the packages that it uses, and exit."
+    ),
 ) -> None:
     if version:
         print(stcal.__version__)

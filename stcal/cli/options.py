@@ -31,16 +31,16 @@ CameraFile = Annotated[
 ]
 OptionalCamera = Annotated[
     Path | None,
-    "Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB; found "
-    "from the board's dots or the target's printed faces if not given.",
+    "Read the intrinsics from this file: COLMAP, OpenCV, ROS, Kalibr, mrcal, Metashape or MATLAB. If not given, they "
+    "are found from the board's dots or the target's printed faces.",
 ]
 CAMERA = "--camera"
 CameraName = Annotated[
-    str, "Take this camera of a --camera file of several: its name, or COLMAP's number.", Opt("--camera-name")
+    str, "Take this camera from a --camera file of several: its name, or COLMAP's number.", Opt("--camera-name")
 ]
 """Option that every command with ``--camera`` has."""
 Bayer = Annotated[
-    str, "Take images for mosaics of a sensor with this Bayer pattern: RGGB, BGGR, GRBG or GBRG.", Opt("--bayer")
+    str, "Treat images as raw mosaics of a sensor with this Bayer pattern: RGGB, BGGR, GRBG or GBRG.", Opt("--bayer")
 ]
 """Option that every command has that reads a folder of images."""
 TargetFile = Annotated[Path | None, "Read the target's design from this target.toml, in place of the reference design."]
@@ -56,27 +56,31 @@ FlatBoardFile = Annotated[Path, "Read the board from this file: dots, chessboard
 RobotFile = Annotated[Path, "Read the robot from this file (TOML); `stcal robot init` writes one.", Opt("--robot")]
 LayoutFile = Annotated[Path, "Read the target's tags from this file (TOML)."]
 JsonFile = Annotated[
-    Path | None, "Also write everything to this file (JSON); to standard output with `-`.", Opt("--json", writes=True)
+    Path | None,
+    "Also write all results to this file (JSON), or to standard output with `-`.",
+    Opt("--json", writes=True),
 ]
 ReportFile = Annotated[
     Path | None, "Also write a page with tables and plots to this file (HTML).", Opt("--report", writes=True)
 ]
 Exclude = Annotated[
     list[str] | None,
-    "Take this image out, by its name in results, such as 12/IMG_1003.jpg; again for each further one.",
+    "Ignore this image, by its name in results, such as 12/IMG_1003.jpg; repeat it for more images.",
     Opt(metavar="IMAGE"),
 ]
-Strict = Annotated[bool, "End with exit code 4 where a check has failed; results are written all the same."]
+Strict = Annotated[bool, "End with exit code 4 if a check has failed; results are written in any case."]
 StrictByDefault = Annotated[
     bool,
-    "End with exit code 4 where the answer is no, or with 0 all the same; results are written.",
+    "End with exit code 4 if the answer is no, or with 0 all the same. Results are written in any case.",
     Opt("--strict/--no-strict"),
 ]
 """Option of the commands that say whether a run may be used."""
-Overwrite = Annotated[bool, "Replace output files that are there.", Opt("--overwrite")]
+Overwrite = Annotated[bool, "Replace existing output files.", Opt("--overwrite")]
 """Option of every command that writes a file."""
-Quiet = Annotated[bool, "Say nothing but warnings and errors.", Opt("--quiet -q")]
-Verbose = Annotated[bool, "Say more: each step, the time that stages take, what images show.", Opt("--verbose -v")]
+Quiet = Annotated[bool, "Print only warnings and errors.", Opt("--quiet -q")]
+Verbose = Annotated[
+    bool, "Print more: each step, the time of each stage, and what is found in the images.", Opt("--verbose -v")
+]
 ALWAYS_NEW = ("export_database", "export_run")
 """Commands that never replace a file, as other programs work on their outputs."""
 WRITE_NOTHING = ("serve", "live", "dry_run")
@@ -88,9 +92,9 @@ MOST_SEED = 2**63 - 1
 Workers = Annotated[int | None, "Use this many processes; one per core if not given.", Opt(min=1, max=1024)]
 
 Scheduler = Annotated[
-    str | None, "Hand the images to the Dask cluster with the scheduler at this address, tcp://host:8786."
+    str | None, "Send the images to the Dask cluster with the scheduler at this address, tcp://host:8786."
 ]
-SendImages = Annotated[bool, "Send the images' content to the cluster, whose machines do not see their folder."]
+SendImages = Annotated[bool, "Send the content of the images to the cluster, whose machines cannot read their folder."]
 
 
 QuaternionOrder = Literal["wxyz", "xyzw"]
@@ -98,16 +102,17 @@ QuaternionOrder = Literal["wxyz", "xyzw"]
 
 
 Quaternions = Annotated[
-    QuaternionOrder, "Take quaternions as their columns are named, wxyz, or in the order in which these stand, xyzw."
+    QuaternionOrder,
+    "Read quaternions by the names of their columns (wxyz), or take the columns in their order as x, y, z, w (xyzw).",
 ]
 Rotation = Annotated[
     str | None,
-    "Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, yaskawa …, rotvec, xyz "
-    "(fixed axes), ZYX (turned axes).",
+    "Read angles in this convention, if the file does not name it: kuka-abc, fanuc-wpr, ur-rotvec, yaskawa …, "
+    "rotvec, xyz (fixed axes), ZYX (moving axes).",
 ]
 PayloadKg = Annotated[
     float | None,
-    "Take this mass at the flange in all rows, where no column payload_kg says it; by default the robot file's.",
+    "Take this mass at the flange for all rows without a column payload_kg; if not given, that of the robot file.",
     Opt(min=0, max=1e4),
 ]
 MinDiameter = Annotated[
@@ -119,16 +124,16 @@ MaxDiameter = Annotated[float, "Ignore circles larger than this, px.", Opt(min=8
 
 
 FirstTable = Annotated[
-    Path | None, "Read rows from this file (CSV), in place of the one named first, and join those of --b.", Opt("--a")
+    Path | None, "Read rows from this file (CSV), in place of PAIRS, and join those of --b.", Opt("--a")
 ]
-SecondTable = Annotated[Path | None, "Read what belongs to the rows of --a from this file (CSV).", Opt("--b")]
-Key = Annotated[str, "Match rows of --a and --b by this column; or by A=B, a column of --a and another one of --b."]
+SecondTable = Annotated[Path | None, "Read the values that belong to the rows of --a from this file (CSV).", Opt("--b")]
+Key = Annotated[str, "Match rows of --a and --b by this column, or by A=B: column A of --a and column B of --b."]
 
 
 ColumnsFile = Annotated[
     Path | None,
-    "Read the measurements, of --a and --b those of --b, with the columns, delimiter and lines to skip of "
-    "this file (TOML).",
+    "Read the measurements with the columns, delimiter and skipped lines of this file (TOML); with --a and --b it is "
+    "for --b.",
 ]
 
 
@@ -233,7 +238,7 @@ def require_usable(strict: bool, reasons: Sequence[str], page: Path | None = Non
         where = f"; see {page}" if page else ""
         raise ChecksFailed(
             "E-CHECKS-FAILED",
-            f"{'; '.join(reasons)}; results are written, do not use them, or end with 0 by --no-strict{where}",
+            f"{'; '.join(reasons)}; results are written, do not use them; --no-strict ends with 0{where}",
         )
 
 

@@ -22,31 +22,37 @@ def register(
         Path | None, "Read ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm of the same points from this file (CSV).", Arg("PAIRS")
     ] = None,
     model: Annotated[ModelName, "Fit a transform of this kind."] = "rigid",
-    method: Annotated[Method, "Fit it with this method; liu2017 is a published one, always affine."] = "robust",
+    method: Annotated[Method, "Fit with this method; liu2017 is the published one, always affine."] = "robust",
     threshold: Annotated[
         float | None,
-        "Count points nearer than this as inliers, mm; if not given estimated from the data, liu2017 0.2.",
+        "Count points nearer than this as inliers, mm. If not given, it is estimated from the data; for liu2017 it "
+        "is 0.2.",
         Opt("--threshold --threshold-mm"),
     ] = None,
     sample: Annotated[
-        int | None, "Draw samples of so many points, liu2017; 30 if not given.", Opt(min=4, max=100_000)
+        int | None, "Draw samples of this many points, for liu2017; 30 if not given.", Opt(min=4, max=100_000)
     ] = None,
     share: Annotated[
         float | None,
-        "Accept a sample when more than this share of the others are inliers, liu2017; 0.85.",
+        "Accept a sample if more than this share of the other points are inliers, for liu2017; 0.85 if not given.",
         Opt(min=1e-9, max=1),
     ] = None,
-    tries: Annotated[int | None, "Draw so many samples, liu2017; 1000 if not given.", Opt(min=1, max=1_000_000)] = None,
+    tries: Annotated[
+        int | None, "Draw this many samples, for liu2017; 1000 if not given.", Opt(min=1, max=1_000_000)
+    ] = None,
     orthogonality: Annotated[
         float | None,
-        "Reject a sample whose 3×3 part R has an entry of RᵀR − 1 beyond this, liu2017; 0.01.",
+        "Reject a sample if an entry of RᵀR − 1, with its 3×3 part R, is larger than this, for liu2017; 0.01 if not "
+        "given.",
         Opt(min=1e-12, max=1e6),
     ] = None,
     seed: Annotated[int, "Draw random samples and folds with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
     folds: Annotated[int, "Cross-validate with this many folds; 0 for none.", Opt(min=0, max=100_000)] = 6,
-    allow_ambiguous: Annotated[bool, "Answer even where another transform is about as good."] = False,
+    allow_ambiguous: Annotated[bool, "Answer even if another transform fits about as well."] = False,
     robot_file: Annotated[
-        Path | None, "Solve base and kinematics of this robot (TOML) together; PAIRS needs q1_deg ….", Opt("--robot")
+        Path | None,
+        "Solve for base and kinematics of this robot together (TOML); PAIRS needs q1_deg ….",
+        Opt("--robot"),
     ] = None,
     identified: Annotated[Path | None, "Write the robot identified with --robot to this file (TOML).", WRITES] = None,
     first: shared.FirstTable = None,
@@ -54,10 +60,10 @@ def register(
     key: shared.Key = "name",
     columns: shared.ColumnsFile = None,
     columns_a: shared.FirstColumns = None,
-    out: Annotated[Path | None, "Write everything to this file (JSON).", WRITES] = None,
+    out: Annotated[Path | None, "Write all results to this file (JSON).", WRITES] = None,
     report: shared.ReportFile = None,
 ) -> None:
-    """Find b_from_a from points measured in two frames, some of them wrong; with σ, outliers and where it holds."""
+    """Find b_from_a from points measured in two frames, with σ and outliers, and show systematic residuals."""
     from stcal.register import register as registered
     from stcal.register.core.liu2017 import Liu2017Options, sample_sizes
     from stcal.register.core.pairs import read_pairs

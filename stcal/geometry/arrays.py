@@ -50,8 +50,10 @@ else:
 
 
 class Brief:
-    """Base of results with many values, made with ``@dataclass(repr=False)``: their ``repr`` is one short line, with
-    plain values as they are and of all else how much there is of it."""
+    """Base of results with many values, made with ``@dataclass(repr=False)``.
+
+    Their ``repr`` is one short line with plain values, and the size of everything else.
+    """
 
     __slots__ = ()
 

@@ -472,7 +472,7 @@ def require_lens(flat: np.ndarray, width: float | None, height: float | None, wh
         raise InputError(
             "E-CAMERA-FOCAL",
             f"{where}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}) of an image "
-            f"of {width:g}×{height:g} px; px needed: are they mm, or shares of a side?",
+            f"of {width:g}×{height:g} px; pixels needed; check that they are not mm, or shares of a side",
         )
 
 

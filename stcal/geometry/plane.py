@@ -404,7 +404,7 @@ def poses_of_plane(xy_plane: np.ndarray, xy_normalised: np.ndarray) -> PlanePose
     determinant = float(np.linalg.det(jacobian))
     if determinant <= 0:
         raise DegenerateError(
-            "E-POINTS-MIRRORED", "plane: its points are seen mirrored; seen from behind, or numbered wrongly"
+            "E-POINTS-MIRRORED", "plane: its points appear mirrored: they are seen from behind, or numbered wrongly"
         )
     sight_point = homography[:2, 2] / homography[2, 2]
     camera_from_sight = _turn_to(np.append(sight_point, 1.0))

@@ -1,4 +1,4 @@
-"""Hand-eye calibration: where a camera sits on a robot's flange, or beside the robot, and how well that is known."""
+"""Hand-eye calibration: where a camera is mounted on a robot's flange, or stands in its base, with σ."""
 
 import lazy_loader
 

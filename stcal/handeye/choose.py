@@ -138,7 +138,7 @@ class _Outcome:
 def _solved(
     pairs: HandEyePoses, setup: Setup, method: str, views: Views | None, options: HandEyeOptions, rows: np.ndarray
 ) -> _Outcome | StcalError:
-    """Returns what a candidate makes of all poses and without those of each split, or the error if it fails."""
+    """Returns the results of a candidate from all poses and without those of each split, or the error if it fails."""
     try:
         solution = solved(pairs, setup, method, views, options)
         partial = tuple(solution.without(out) for out in rows)
@@ -205,7 +205,7 @@ class _Trial:
         return next(each for each in candidates if self._behind(each, best, rows) <= BY_CHANCE)
 
     def _behind(self, candidate: Candidate, other: Candidate, rows: np.ndarray) -> float:
-        """Returns the mean error of a candidate less that of another one, in standard errors of the difference."""
+        """Returns the mean error of a candidate minus that of another one, in standard errors of this difference."""
         difference = self.outcomes[candidate].error_mm - self.outcomes[other].error_mm
         excess, standard_error = _difference(difference, rows)
         return excess / max(standard_error, TINY_MM) if excess > 0 else 0.0
@@ -267,11 +267,13 @@ def choose(
     for out in rows:
         require_solvable_without(pairs, setup, options, out)
     candidates = [
-        each
-        for each in (BY_POSES if views is None else BY_VIEWS)
-        if (prior is not None or not each.camera) and not (options.four_dof and each in CLOSED_FORMS)
+        candidate
+        for candidate in (BY_POSES if views is None else BY_VIEWS)
+        if (prior is not None or not candidate.camera) and not (options.four_dof and candidate in CLOSED_FORMS)
     ]
-    jobs = [(pairs, setup, each.method, views, each.options(options, prior), rows) for each in candidates]
+    jobs = [
+        (pairs, setup, candidate.method, views, candidate.options(options, prior), rows) for candidate in candidates
+    ]
     finished: dict[int, _Outcome | StcalError] = {}
     for i, outcome in run_parallel(_solved, jobs, 1 if views is None else workers):
         if i == 0 and isinstance(outcome, StcalError):  # what the first one cannot use, the others should not
@@ -279,7 +281,8 @@ def choose(
         finished[i] = outcome
         progress(len(finished), len(jobs))
     outcomes = {candidate: finished[i] for i, candidate in enumerate(candidates)}
-    trial = _Trial({each: outcome for each, outcome in outcomes.items() if isinstance(outcome, _Outcome)}, rows)
+    succeeded = {candidate: outcome for candidate, outcome in outcomes.items() if isinstance(outcome, _Outcome)}
+    trial = _Trial(succeeded, rows)
     chosen = trial.best()
     errors_of_split = []
     for k, out in enumerate(rows):
@@ -287,20 +290,22 @@ def choose(
         errors = predicted(part, pairs[out], None if views is None else views[out])
         errors_of_split.append(errors | {"mount_from_camera": part.mount_from_camera.matrix()})
     held_out = HeldOutPoses(
-        rows, **{name: np.array([each[name] for each in errors_of_split]) for name in errors_of_split[0]}
+        rows, **{name: np.array([errors[name] for errors in errors_of_split]) for name in errors_of_split[0]}
     )
     tried = tuple(
-        Tried(each, outcome.error_mm) if isinstance(outcome, _Outcome) else Tried(each, np.zeros((0, 0)), str(outcome))
-        for each, outcome in outcomes.items()
+        Tried(candidate, outcome.error_mm)
+        if isinstance(outcome, _Outcome)
+        else Tried(candidate, np.zeros((0, 0)), str(outcome))
+        for candidate, outcome in outcomes.items()
     )
     rivals = {
-        each: outcome.result
-        for each, outcome in trial.outcomes.items()
-        if each != chosen and each not in CLOSED_FORMS and trial.as_good(each, chosen)
+        candidate: outcome.result
+        for candidate, outcome in trial.outcomes.items()
+        if candidate != chosen and candidate not in CLOSED_FORMS and trial.as_good(candidate, chosen)
     }
     # The scatter is that of one way of solving: where splits choose another, the answers jump, which no σ predicts.
-    own = np.array([part.mount_from_camera.matrix() for part in trial.outcomes[chosen].partial])
-    result = widened_by_scatter(trial.outcomes[chosen].result, replace(held_out, mount_from_camera=own))
+    of_splits = np.array([part.mount_from_camera.matrix() for part in trial.outcomes[chosen].partial])
+    result = widened_by_scatter(trial.outcomes[chosen].result, replace(held_out, mount_from_camera=of_splits))
     result, notes = _widened(result, chosen, rivals)
     measure = "translation_mm" if views is None else "board_mm"
     return Choice(tried, chosen, result, held_out, _sentence(tried, chosen, result, measure), notes)

@@ -26,8 +26,8 @@ from stcal.parallel import one_thread
 class Validated:
     """A result with its errors on poses held out.
 
-    ``held_out`` : errors, None where too few poses would be left; ``options`` : those of the way that was taken;
-    ``choice`` : all ways that were tried, where nobody named one; ``notes`` : why errors are missing.
+    ``held_out`` : errors, None if too few poses would be left; ``options`` : those of the way of solving that was
+    used; ``choice`` : all ways that were tried, if the user named none; ``notes`` : why errors are missing.
     """
 
     result: HandEye

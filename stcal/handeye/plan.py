@@ -120,7 +120,7 @@ def plan_poses(
         if not len(flange):
             raise InputError(
                 "E-PLAN-NO-VIEW",
-                f"plan: none of {CANDIDATES} views as near and as far as the board was seen holds all of it and "
+                f"plan: none of {CANDIDATES} views at the distances at which the board was seen shows all of it and "
                 f"{MARGIN:.0%} of the image around; take it from farther away, or give a smaller board",
             )
         unscaled = Poses(candidate_views.rotation, candidate_views.translation / result.scale)
@@ -199,10 +199,10 @@ def judged_at(board_mm: np.ndarray) -> np.ndarray:
     return middle + reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
 
 
-def _views(rng: np.random.Generator, seen: Poses, outline: np.ndarray, camera: Camera | None) -> Poses:
+def _views(rng: np.random.Generator, earlier: Poses, outline: np.ndarray, camera: Camera | None) -> Poses:
     """Returns random views of the board (camera_from_board): at the distances seen so far, tilted and turned."""
     middle = outline.mean(0)
-    places = seen.rotation @ middle + seen.translation
+    places = earlier.rotation @ middle + earlier.translation
     distance = np.linalg.norm(places, axis=1)
     if camera is None:
         sight = places[rng.integers(len(places), size=CANDIDATES)]
@@ -213,11 +213,12 @@ def _views(rng: np.random.Generator, seen: Poses, outline: np.ndarray, camera: C
     sight = sight / np.linalg.norm(sight, axis=1)[:, None]
     place = rng.uniform(distance.min(), distance.max(), (CANDIDATES, 1)) * sight
     # Start from a view that was seen, turn it to face the camera, roll it about the line of sight, then tilt it.
-    base = rng.integers(len(seen), size=CANDIDATES)
+    base = rng.integers(len(earlier), size=CANDIDATES)
     facing = (
-        seen.rotation[base, :, 2] * np.sign(np.einsum("ma,ma->m", seen.rotation[base, :, 2], places[base]))[:, None]
+        earlier.rotation[base, :, 2]
+        * np.sign(np.einsum("ma,ma->m", earlier.rotation[base, :, 2], places[base]))[:, None]
     )
-    straight = _turned_onto(facing, sight) @ seen.rotation[base]
+    straight = _turned_onto(facing, sight) @ earlier.rotation[base]
     roll = Rotation.from_rotvec(rng.uniform(-np.pi, np.pi, (CANDIDATES, 1)) * sight).as_matrix()
     across = np.cross(sight, rng.normal(size=(CANDIDATES, 3)))
     across /= np.linalg.norm(across, axis=1)[:, None]

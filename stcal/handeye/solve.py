@@ -146,10 +146,10 @@ def handeye(
     views: Views | None = None,
     options: HandEyeOptions | None = None,
 ) -> HandEye:
-    """Returns the result of one method, with σ as its own residuals tell them.
+    """Returns the result of one method, with σ estimated from its own residuals.
 
-    The parameters are those of :func:`stcal.handeye.handeye`, which chooses a method where none is named and widens σ
-    by what poses held out show; here the method is ``reprojection`` with views, else ``pose``, if None.
+    The parameters are those of :func:`stcal.handeye.handeye`, which chooses a method if none is named, and widens σ
+    by the errors on held-out poses; here the method is ``reprojection`` with views, else ``pose``, if None.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def solved(
     views: Views | None,
     options: HandEyeOptions | None,
 ) -> "Solved":
-    """Returns the result of :func:`handeye` with what solutions without some poses start from."""
+    """Returns the result of :func:`handeye` with the state from which solutions without some poses start."""
     method = method or ("pose" if views is None else "reprojection")
     if method not in METHODS:
         raise InputError(
@@ -264,7 +264,8 @@ def _by_equations(task: _Task, method: str) -> HandEye:
         if len(loop) < 3 or Observability.of(loop).useless:
             raise DegenerateError(
                 "E-HANDEYE-LARGE-TURNS",
-                f"hand-eye: without {left_out}, that turn by more than 170° against others, too few poses are left for "
+                f"hand-eye: without {left_out}, which turn by more than 170° relative to others, too few poses are "
+                "left for "
                 f"{method}; use method pose or shah",
             )
     if method in (*AX_XB, *AX_ZB):
@@ -358,7 +359,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
         return adjust_views(loop, flange, views, first, noise, intrinsics, options.with_scale, camera, options.arm)
 
     solution, contradicted = _by_true_robot(task, adjusted_by)
-    state, outliers, found = solution.state.of(0), ~solution.used[0], solution.found[0]
+    state, outliers, reprojection = solution.state.of(0), ~solution.used[0], solution.found[0]
     if solution.sigma_scale is not None:
         require_scale(state.scale, solution.sigma_scale, task.loop, task.pairs.where)
     x, z = state.mount_from_camera, state.stand_from_board
@@ -367,7 +368,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
         x, z, covariance, notes = _without_slide(task, x, z, solution.normal())
     if solution.camera_error is not None:
         covariance = solution.camera_error.covariance(covariance)
-    adjusted = replace(solution.loops[0], camera_from_board=resected(names, views, found))
+    adjusted = replace(solution.loops[0], camera_from_board=resected(names, views, reprojection))
     residuals = adjusted.residuals(x, z)
     notes += _remarks(task, x, outliers, residuals, solution.scale_hint)
     notes += of_camera_file(float(solution.camera_gain[0]), solution.sigma)
@@ -385,7 +386,7 @@ def _by_views(task: _Task, views: Views) -> Solved:
         sigma_scale=solution.sigma_scale,
         sigma=solution.sigma,
         estimated=solution.estimated,
-        reprojection=found,
+        reprojection=reprojection,
         observability=task.seen,
         notes=notes + remarks.of_rounds(solution.settled),
     )

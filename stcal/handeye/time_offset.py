@@ -151,7 +151,7 @@ def estimate_offset(
             raise DegenerateError(
                 "E-TIME-OFFSET-SIGMA",
                 f"{stream.where}: the time offset would have σ {sigma:.2g} s, {MOST_SIGMA_S:g} s allowed: the motions "
-                "at the images do not tell it; leave --time-offset out, or take images while the flange turns and "
+                "at the images do not determine it; leave --time-offset out, or take images while the flange turns and "
                 "moves",
             )
         offset += float(np.clip(step, -MOST_STEP_S, MOST_STEP_S))
@@ -180,8 +180,8 @@ def _require_motion(stream: Stream, seconds: np.ndarray) -> None:
     raise DegenerateError(
         "E-TIME-OFFSET-STANDSTILL",
         f"{stream.where}: the flange stands still at the images, {moved[1]:.2g} mm and {np.degrees(moved[0]):.2g}° "
-        f"within {WINDOW_S:g} s (RMS), where samples err by {noise[1]:.2g} mm and {np.degrees(noise[0]):.2g}°: no time "
-        "offset can be told; leave --time-offset out, or take images while the robot moves",
+        f"within {WINDOW_S:g} s (RMS), where samples err by {noise[1]:.2g} mm and {np.degrees(noise[0]):.2g}°: no "
+        "time offset can be determined; leave --time-offset out, or take images while the robot moves",
     )
 
 

@@ -36,7 +36,7 @@ several use it (https://github.com/python/cpython/issues/106905)."""
 
 @functools.cache
 def made_by() -> str:
-    """Return the versions of what results depend on, as a part of their keys."""
+    """Return the versions of the packages on which results depend, as a part of their keys."""
     return " ".join([stcal.__version__, *map(importlib.metadata.version, ("numpy", "scipy", "pycolmap"))])
 
 

@@ -195,8 +195,8 @@ def rings_of(rings: Sequence[Sequence[int]], rows: int, columns: int, quarters: 
     if told and told in (half, quarter):
         raise InputError(
             "E-BOARD-RINGS",
-            f"{where}: {len(told)} rings that look the same after a turn of the board; such that tell its ends apart "
-            "needed, else leave rings out",
+            f"{where}: {len(told)} rings that look the same after a turn of the board; choose rings that distinguish "
+            "its ends, or leave rings out",
         )
     return tuple(sorted(told))
 
@@ -379,7 +379,7 @@ def _require_inside(ids: list[str], xy: np.ndarray, radius: np.ndarray, outline:
     for name in (name for name, ok in zip(ids, inside & (gap >= 0), strict=True) if not ok):
         raise InputError(
             "E-TARGET-OUTLINE",
-            f"{where}: circle {name} reaches over outline_mm; corners in order around all circles needed",
+            f"{where}: circle {name} reaches beyond outline_mm; corners in order around all circles needed",
         )
 
 

@@ -103,7 +103,7 @@ class OpenCVSource:
             read += 1
             if not received or frame is None:
                 raise InputError(
-                    "E-DEVICE-NO-IMAGE", f"{self.name}: gives no image any more; check its cable and other programs"
+                    "E-DEVICE-NO-IMAGE", f"{self.name}: no longer gives images; check its cable and other programs"
                 )
         if frame is None:
             raise InputError("E-DEVICE-NO-IMAGE", f"{self.name}: gives no image; check it")

@@ -96,7 +96,8 @@ def _on_worker(function: Callable, files: ImageFile | list[ImageFile], *argument
         if file.content is None and not file.path.parent.is_dir():
             raise InputError(
                 "E-WORKER-PATH",
-                f"{file.path.parent}: not there on worker {socket.gethostname()}; give a path that all workers see, or "
+                f"{file.path.parent}: does not exist on worker {socket.gethostname()}; give a path that all workers "
+                "see, or "
                 "--send-images",
             )
     return function(files, *arguments)

@@ -458,7 +458,7 @@ def stated_size(data: bytes, name: str) -> tuple[int, int]:
                 return image.size
     except Image.DecompressionBombError as error:
         raise InputError(
-            "E-IMAGE-TOO-LARGE", f"{name}: more pixels than any camera has; send it as the camera took it"
+            "E-IMAGE-TOO-LARGE", f"{name}: more pixels than any camera has; send the file of the camera unchanged"
         ) from error
     except Exception as error:  # data that are no image fail in many ways
         raise InputError(

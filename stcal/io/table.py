@@ -194,7 +194,7 @@ class Table:
         if covariance is None:
             raise InputError(
                 "E-TABLE-COVARIANCE",
-                f"{self.where}: columns common1_… without columns cov_…, which must hold them; give both",
+                f"{self.where}: columns common1_… without columns cov_…, which must include them; give both",
             )
         for name in common_columns(count):
             if name not in self.columns:
@@ -423,7 +423,7 @@ def decimal_points(columns: dict[str, list[str]], between: str, where: str) -> t
         beside = f" beside {points[0]}" if points else ""
         raise InputError(
             "E-TABLE-DECIMAL",
-            f"{where}: {commas[0]}{beside}: the comma may be of a decimal or of thousands; give decimal_comma in a "
+            f"{where}: {commas[0]}{beside}: the comma may separate decimals or thousands; give decimal_comma in a "
             "file of --columns, or write points",
         )
     return columns | {n: [cell.replace(",", ".") for cell in cells] for n, cells in with_comma.items()}, True

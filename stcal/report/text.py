@@ -26,7 +26,7 @@ def number(value: float | None, digits: int) -> str:
 
 
 def significant(value: float | None, digits: int = 2) -> str:
-    """Return a number with so many significant digits, as uncertainties are stated (JCGM 100:2008, 7.2.6)."""
+    """Return a number with this many significant digits, as uncertainties are stated (JCGM 100:2008, 7.2.6)."""
     if not value or not math.isfinite(value):
         return number(value, digits)
     decimals = digits - 1 - int(f"{value:.{digits - 1}e}".partition("e")[2])

@@ -106,10 +106,10 @@ def run(
     reload_s
         Seconds after which the page of the report reloads itself, for a run that is repeated; never if None.
     checks
-        Checks of one's own: functions of the result that return a :class:`stcal.sfm.Check`, such as
+        Additional checks: functions of the result that return a :class:`stcal.sfm.Check`, such as
         :func:`stcal.sfm.judge` makes. They count in the answer and stand in the report like all others.
     every
-        Of a video: the sharpest of so many frames is used; by ``auto``, also the value if None, the sharpest of those
+        Of a video: the sharpest of this many frames is used; by ``auto``, also the value if None, the sharpest of those
         between which the view hardly changes.
 
     Returns
@@ -181,7 +181,7 @@ def run_on_files(
         raise InputError(
             "E-CAMERA-NEEDED",
             "missing option '--camera': circles without a board of dots need a camera file, which `stcal-sfm "
-            "calibrate-camera` makes; a board in view, or faces with a board or tags, tell the camera too",
+            "calibrate-camera` makes; the camera is also found if a board is in view, or if faces have a board or tags",
         )
     if options.compare:
         require_dots(known, f"--compare {options.compare}")
@@ -218,9 +218,7 @@ def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:
                 "E-CHECK-OWN", f"check {name}: returns {type(check).__name__}; a Check needed, such as judge returns"
             )
         if check.key in {other.key for other in (*result.checks, *checks)}:
-            raise InputError(
-                "E-CHECK-OWN", f"check {name}: key {check.key!r} is taken by another; choose one of its own"
-            )
+            raise InputError("E-CHECK-OWN", f"check {name}: key {check.key!r} is already used; choose another")
         checks.append(check)
     return checks
 
@@ -292,8 +290,9 @@ def _camera_of_dots(
     options: RunOptions,
     progress: Progress,
 ) -> CameraModel:
-    """Returns the camera by which the dots of the board lie on their grid, with the covariance of what any camera
-    fulfils: the adjustment of all groups estimates it again, from the same dots.
+    """Returns the camera calibrated from the dots of the board, with the weak prior of an unknown lens.
+
+    The adjustment of all groups estimates it again from the same dots, so that the σ of the calibration are not used.
 
     Raises
     ------
@@ -379,7 +378,7 @@ def _require_for_printed(options: RunOptions) -> None:
     for name in (name for name, is_given in given.items() if is_given):
         raise InputError(
             "E-OPTION-CONFLICT",
-            f"{name}: for targets of circles alone, and faces here have boards or tags; leave it out",
+            f"{name}: only for targets of circles, and faces of this one have boards or tags; leave it out",
         )
 
 

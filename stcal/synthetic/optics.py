@@ -104,7 +104,7 @@ def defocused(
     lens: ThinLens,
     blur_px: float,
 ) -> np.ndarray:
-    """Returns what is seen of a flat disc through apertures above it, out of focus: the mean over the lens.
+    """Returns the out-of-focus image of a flat disc through apertures above it: the mean over the lens.
 
     Parallel planes hold one outline each, and a ray is seen that lies in all of them. Through a point p of the lens
     each plane is seen as by a pinhole, but moved by p (1/z_f − 1/Z). On a plane 1/Z is linear in the image, with a

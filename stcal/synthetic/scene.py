@@ -353,7 +353,7 @@ def _check_convex(target: TargetDesign, target_from_face: dict[str, Rigid], marg
                 )
                 raise DegenerateError(
                     "E-SCENE-FACES",
-                    f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may cover it: "
+                    f"scene: face {face.id} reaches {height:.0f} mm in front of face {front.id} and may hide it: "
                     f"{plate} check the rough poses",
                 )
 

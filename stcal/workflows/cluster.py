@@ -131,7 +131,7 @@ def _require_same(found: dict[str, dict[str, str]], address: str) -> None:
                 raise InputError(
                     "E-CLUSTER-VERSIONS",
                     f"--scheduler {address}: worker {worker} has {name} {theirs[name] or 'none'}, {version or 'none'} "
-                    "here; results would not be the same, install the same versions",
+                    "here; results would differ; install the same versions",
                 )
 
 

@@ -233,7 +233,7 @@ def watch(
     images = Path(images)
     if not images.is_dir():
         raise InputError(
-            "E-IMAGES-FOLDER", f"image folder {images}: not there; give the folder that photographs come into"
+            "E-IMAGES-FOLDER", f"image folder {images}: does not exist; give the folder that receives the photographs"
         )
     processed: dict[str, tuple] = {}
     last_stamps: dict[str, tuple] = {}
@@ -241,7 +241,8 @@ def watch(
     while options.idle_s is None or idle_s < options.idle_s:
         if not images.is_dir():
             raise InputError(
-                "E-IMAGES-FOLDER", f"image folder {images}: gone while it was watched; put it back, and watch it again"
+                "E-IMAGES-FOLDER",
+                f"image folder {images}: it disappeared while it was watched; restore it, and watch it again",
             )
         stamps = _stamps(images)
         complete = {name: stamp for name, stamp in stamps.items() if last_stamps.get(name) == stamp}

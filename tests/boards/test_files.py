@@ -84,7 +84,7 @@ def test_opencvs_asymmetric_grid():
         (CORNERS.format("[0, 0], [0, 9], [9, 9], [9, 0]"), "tag 1: corners_mm turn the other way"),
         (CORNERS.format("[0, 0], [9, 9], [9, 0], [0, 9]"), "tag 1: corners_mm turn the other way, cross"),
         (CORNERS.format("[0, 0], [9, 0], [12, 0], [3, 0]"), "cross or lie on a line; top left"),
-        ('type = "boards"\n' + IN_A_SET, "several boards, not flat together; the file of a single board needed"),
+        ('type = "boards"\n' + IN_A_SET, "several boards that are not in one plane; the file of a single board needed"),
     ],
 )
 def test_mistakes_in_files_are_named(tmp_path, text, said):
@@ -118,11 +118,11 @@ def test_several_boards_in_one_frame(tmp_path):
     [
         (CHARUCO, "board 1 and board 2 look alike: both have tag 0 of DICT_5X5_50; other ids (first_id)"),
         (CHARUCO + "first_id = 30\n", "tags 30 … 53, DICT_5X5_50 has 0 … 49"),
-        ('type = "chessboard"\nrows = 4\ncolumns = 6\nsquare_mm = 20.0\n', "board 2 looks the same turned"),
+        ('type = "chessboard"\nrows = 4\ncolumns = 6\nsquare_mm = 20.0\n', "board 2 looks the same when turned"),
         ('type = "chessboard"\nrows = 4\ncolumns = 5\nsquare_mm = 20.0\n', "4×5 inner corners are seen in 5×7 too"),
         (
             'rows = 5\ncolumns = 7\npitch_mm = 9.0\nradius_mm = 2.0\npolarity = "dark"\n',
-            "board 2 looks the same turned",
+            "board 2 looks the same when turned",
         ),
         ('file = "none.toml"\n', "board 2: board file"),
         ('file = "b.toml"\nrows = 5\n', "rows beside file"),

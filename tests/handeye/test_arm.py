@@ -133,7 +133,7 @@ def test_photographs_and_joint_values(command, photographed, tmp_path):
     ("more", "says"),
     [
         (("--method", "pose"), "pose does not solve for the arm"),
-        (("--four-dof",), "--four-dof: one of them"),
+        (("--four-dof",), "--four-dof: give one of them"),
     ],
 )
 def test_options_that_do_not_go_with_it(command, photographed, more, says):

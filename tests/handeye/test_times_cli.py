@@ -125,7 +125,7 @@ def test_times_of_images_in_a_file(command, tmp_path):
     assert "left out c.png: no time in" in shown
     code, _, error = command(*given, "--dry-run")
     assert code == INPUT
-    assert "image a.png: its name is no time, for poses of the robot by time (robot.csv)" in error
+    assert "image a.png: its name is not a time, but the robot's poses are matched by time (robot.csv)" in error
     times.write_text("image,time_s\na,soon\n")
     code, _, error = command(*given, "--dry-run", "--image-times", times)
     assert (code, "time_s of a.png is 'soon', a number of seconds needed" in error) == (INPUT, True)

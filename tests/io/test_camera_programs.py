@@ -215,7 +215,7 @@ REFUSED = {
     ),
     "PhotoScan of old": (
         METASHAPE.replace("<f>910.25</f>", "<fx>910.25</fx><fy>910</fy>"),
-        "E-CAMERA-MODEL … fx and fy … export … anew",
+        "E-CAMERA-MODEL … fx and fy … export … again",
     ),
     "RealityCapture, table": (
         "#cameras 1\n#name,x,y,alt,yaw,pitch,roll,f,px,py,k1\na.jpg,1,2,3,4,5,6,24,0,0,0\n",

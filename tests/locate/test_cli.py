@@ -108,7 +108,7 @@ def test_limits_are_options(stcal, files):
     [
         (["--robot-poses", "x.csv"], "only with --hand-eye"),
         (["--offset", "x.json"], "only with --hand-eye or --registration"),
-        (["--hand-eye", "x.json", "--registration", "y.json"], "two ways to one base"),
+        (["--hand-eye", "x.json", "--registration", "y.json"], "both lead to the base"),
         (["--flip-odds", "2"], "odds between 0 and 1"),
         (["--s-dis", "3"], "S_dis 3"),
         (["--moved-px", "-1"], "moved_px -1"),

@@ -187,8 +187,8 @@ GRIP = 'child link="hand"/></joint><joint name="j" type="fixed"><parent link="l4
         (('type="continuous"', 'type="floating"'), {}, "joint a2 is floating; fixed, revolute, continuous, prismatic"),
         (('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>'), {}, "joint a2: its axis has no direction"),
         (('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><axis xyz="0 0 1"/>'), {}, "joint a2: axis 2 times"),
-        (('<axis xyz="0 1 0"/>', '<axis vector="0 1 0"/>'), {}, "joint a2: axis has vector, which is none of"),
-        (('rpy="', 'quat="1 0 0 0" rpy="'), {}, "origin has quat, which is none of URDF's xyz, rpy"),
+        (('<axis xyz="0 1 0"/>', '<axis vector="0 1 0"/>'), {}, "joint a2: axis has vector, which is not one of"),
+        (('rpy="', 'quat="1 0 0 0" rpy="'), {}, "origin has quat, which is not one of URDF's xyz, rpy"),
         (('rpy="0 1.5708 0"', 'rpy="0 90 0"'), {}, "rpy of 90, more than a turn: URDF is in radians"),
         (('<axis xyz="0 1 0"/>', '<axis xyz="0 1"/>'), {}, "joint a2: '0 1': finite numbers"),
         (('<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><mimic joint="a1"/>'), {}, "joint a2 mimics a1"),
@@ -225,7 +225,7 @@ def test_command_line(stcal_robot, tmp_path):
     for words, told in (
         ((toml, tmp_path / "c.toml"), "both are robot files; one of each needed"),
         ((toml, tmp_path / "c.txt"), "a name ending in .urdf or .toml needed"),
-        ((toml, tmp_path / "c.urdf", "--to-link", "a"), "only of a URDF that is read"),
+        ((toml, tmp_path / "c.urdf", "--to-link", "a"), "only for reading a URDF"),
     ):
         code, _, error = stcal_robot("convert", *words)
         assert (code, told in error) == (2, True)

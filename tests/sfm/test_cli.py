@@ -189,7 +189,7 @@ def test_simulate_says_which_faces_have_no_place(command, wedge, tmp_path):
     wedge[1].write_text("\n".join(lines))
     code, _, err = command("simulate", tmp_path / "data", *wedge)
     assert code == 2
-    assert "does not say where face flank is; add rough_pose = { origin_mm, x, normal }" in err
+    assert "does not say where face flank is; add approximate rough_pose = { origin_mm, x, normal }" in err
 
 
 @pytest.mark.slow

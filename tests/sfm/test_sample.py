@@ -94,7 +94,9 @@ def test_all_visible_circles_are_found_and_none_is_wrong(calibrated):
     visible = [
         c for g in calibrated.content()["groups"].values() for i in g["images"].values() for c in i["circles"].values()
     ]
-    assert labels == {"wrong": 0, "found": labels["visible"], "visible": sum(c["must_find"] for c in visible)}
+    images = sum(len(group["images"]) for group in calibrated.content()["groups"].values())
+    seen = {"wrong": 0, "found": labels["visible"], "visible": sum(c["must_find"] for c in visible)}
+    assert labels == {**seen, "images": images, "images_of_truth": images}
     assert labels["visible"] > 75 * len(list(calibrated.images.glob("*/*")))
 
 

@@ -46,10 +46,10 @@ class OuterLines:
 
 
 def told_by_lines(grey: np.ndarray, outer: OuterLines, cells: int) -> Displacement:
-    """Return what lines between cells say about the displacement of edges by sampling.
+    """Return the displacement of edges by sampling, estimated from the lines between cells.
 
-    The lines of a tag are evenly spaced, but for perspective and lens. Their scatter about that, beyond noise, is what
-    displaces each line for itself.
+    Apart from perspective and lens, the lines of a tag are evenly spaced. Their scatter about this, beyond noise, is
+    the independent displacement of each line.
     """
     square = np.broadcast_to(cells * SQUARE, outer.corners_px.shape)
     image_from_grid = fit_homographies(square, outer.corners_px, np.ones(outer.corners_px.shape[:2], bool))

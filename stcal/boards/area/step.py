@@ -67,7 +67,7 @@ class Displacement:
     """What lines say about the variance of the displacement of edges by sampling, px².
 
     ``square`` : (k,) estimates of the variance, which may be negative; ``noise`` : (k,) the mean of their part by other
-    errors; ``lines`` : (k,) the number of lines that each is worth.
+    errors; ``lines`` : (k,) the equivalent number of lines of each.
     """
 
     square: np.ndarray

@@ -37,11 +37,11 @@ def handeye(
     rotation: params.RotationOption = None,
     length_unit: params.LengthUnit = None,
     poses_are: params.PosesAre = None,
-    dry_run: Annotated[bool, "Print what was understood of the files, and solve and write nothing."] = False,
+    dry_run: Annotated[bool, "Print how the files were understood; solve and write nothing."] = False,
     method: Annotated[
         str | None,
-        "Use this method, or compare all. If not given, by poses and by corners, with camera and board as filed "
-        "and solved for: what predicts poses held out best.",
+        "Use this method, or compare all. If not given, poses and corners are both tried, with camera and board as "
+        "in their files and solved for; the one that predicts held-out poses best is used.",
     ] = None,
     sigma_robot_mm: Annotated[
         float | None, "Set σ of the flange's position, mm; needs --sigma-robot-deg.", Opt(min=0)
@@ -54,12 +54,14 @@ def handeye(
     ] = None,
     sigma_camera_deg: Annotated[float | None, "Set σ of the board's rotation.", Opt(min=0)] = None,
     sigma_px: Annotated[
-        float | None, "Set σ of a corner, px; of dots and tags, in units of their own σ.", Opt(min=1e-9)
+        float | None, "Set the σ of a corner, px; for dots and tags, as a factor of their own σ.", Opt(min=1e-9)
     ] = None,
     sigma_board_mm: Annotated[
-        float | None, "Set σ of a corner's place on the board, mm; 0 if exact.", Opt(min=0)
+        float | None, "Set the σ of a corner's position on the board, mm; 0 if exact.", Opt(min=0)
     ] = None,
-    refine_camera: Annotated[bool, "Adjust the intrinsics too, from the given ones with their σ."] = False,
+    refine_camera: Annotated[
+        bool, "Adjust the intrinsics too, starting from the given ones and weighted by their σ."
+    ] = False,
     with_scale: Annotated[bool, "Find the board's true size from the robot's motion."] = False,
     with_kinematics: Annotated[
         Path | None,
@@ -71,20 +73,20 @@ def handeye(
     ] = None,
     undo_flips: Annotated[
         bool,
-        "Replace poses of a flat target by the second pose of its plane, tilted the other way, where only that "
-        "agrees with the others; not with images.",
+        "Replace a pose of a flat target by its second solution, tilted the other way, if only that one agrees with "
+        "the other poses; not with images.",
     ] = False,
-    four_dof: Annotated[bool, "Solve for what a flange that turns about one axis only (SCARA) tells."] = False,
+    four_dof: Annotated[bool, "Solve only for what a flange determines that turns about one axis (SCARA)."] = False,
     held_out: Annotated[
-        int | None, "Hold out so many poses in each split; a quarter if not given.", Opt(min=1, max=100_000)
+        int | None, "Hold out this many poses in each split; a quarter of them if not given.", Opt(min=1, max=100_000)
     ] = None,
     splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
     seed: Annotated[int, "Draw the splits with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
     time_offset: Annotated[
-        bool, "Find the offset of the robot's clock from the camera's, of poses by time, and use it."
+        bool, "Find the offset between the clocks of robot and camera from poses with times, and apply it."
     ] = False,
     image_times: Annotated[
-        Path | None, "Read the times of the images from this file: image, time_s (CSV); their names if not given."
+        Path | None, "Read the times of the images from this file: image, time_s (CSV); if not given, from their names."
     ] = None,
     times_columns: Annotated[
         Path | None, "Read --image-times with the columns, delimiter … of this file (TOML)."
@@ -92,7 +94,7 @@ def handeye(
     time_tolerance: params.TimeTolerance = 0.02,
     motions_held_out: Annotated[
         int | None,
-        "Hold out so many last motions and predict them by the solution of those before, as the paper on "
+        "Hold out this many motions at the end, and predict them from the motions before, as the paper on "
         "differential evolution does with 6 of 24.",
         Opt(min=1, max=100_000),
     ] = None,
@@ -102,36 +104,47 @@ def handeye(
     opencv: Annotated[Path | None, "Write OpenCV's FileStorage to this file (YAML, mm).", WRITES] = None,
     export: Annotated[
         list[str] | None,
-        "Write the transform to this file, again for each further one; forms: ros2, moveit, moveit2, "
-        "easy-handeye, easy-handeye2, zivid, kuka, abb, ur, fanuc.",
+        "Write the transform to this file; repeat it for more files. Forms: ros2, moveit, moveit2, easy-handeye, "
+        "easy-handeye2, zivid, kuka, abb, ur, fanuc.",
         Opt(metavar="FORM=FILE"),
     ] = None,
     parent: Annotated[str, "Name the flange or base like this in ROS and URDF."] = "",
     child: Annotated[str, "Name the camera like this in ROS and URDF."] = "",
     camera_frame: Annotated[
         CameraFrameName,
-        "Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with the optical "
-        "frame in it.",
+        "Give ROS and URDF the camera's optical frame (Z forward), or its link (X forward) with the optical frame "
+        "below it.",
     ] = "optical",
     camera_out: Annotated[
         Path | None, "Write the camera of --refine-camera with σ to this file (cameras.txt).", WRITES
     ] = None,
     de_bounds_deg: Annotated[
         str | None,
-        "Begin --method de within ± this rotation about zero, about X,Y,Z,± (rotation vector) or closed-form,±; "
-        "180 if not given.",
+        "Begin --method de within this rotation: ± about zero, X,Y,Z,± about a rotation vector, or closed-form,± "
+        "about the closed form; ±180 if not given.",
     ] = None,
     de_bounds_mm: Annotated[
         str | None,
-        "Begin --method de within ± this translation, X,Y,Z,± or closed-form,±; the farthest pose if not given.",
+        "Begin --method de within this translation: ± about zero, X,Y,Z,± or closed-form,±; if not given, up to the "
+        "distance of the farthest pose.",
     ] = None,
-    de_population: Annotated[int | None, "Use M candidates; 30, the paper's.", Opt(min=4, max=100_000)] = None,
-    de_f: Annotated[float | None, "Use this mutation factor F; 0.5, the paper's.", Opt(min=1e-6, max=2)] = None,
-    de_cr: Annotated[float | None, "Use this crossover factor CR; 0.9, the paper's.", Opt(min=0, max=1)] = None,
+    de_population: Annotated[
+        int | None, "Use this many candidates M; if not given 30, the paper's.", Opt(min=4, max=100_000)
+    ] = None,
+    de_f: Annotated[
+        float | None, "Use this mutation factor F; if not given 0.5, the paper's.", Opt(min=1e-6, max=2)
+    ] = None,
+    de_cr: Annotated[
+        float | None, "Use this crossover factor CR; if not given 0.9, the paper's.", Opt(min=0, max=1)
+    ] = None,
     de_lambda: Annotated[
-        float | None, "Multiply translations, m, squared by λ; 1, the paper's.", Opt(min=1e-12, max=1e12)
+        float | None,
+        "Multiply squared translations in m² by this λ; if not given 1, the paper's.",
+        Opt(min=1e-12, max=1e12),
     ] = None,
-    de_generations: Annotated[int | None, "End after these; 100, the paper's.", Opt(min=0, max=100_000)] = None,
+    de_generations: Annotated[
+        int | None, "End after this many generations; if not given 100, the paper's.", Opt(min=0, max=100_000)
+    ] = None,
     de_seed: Annotated[int | None, "Draw the population with this seed.", Opt(min=0, max=shared.MOST_SEED)] = None,
     first: shared.FirstTable = None,
     second: shared.SecondTable = None,
@@ -144,7 +157,7 @@ def handeye(
     report: shared.ReportFile = None,
     strict: shared.Strict = False,
 ) -> None:
-    """Find where a camera sits on a robot's flange, or in its base, and how well that is known."""
+    """Find where a camera is mounted on a robot's flange, or in its base, with σ."""
     from stcal.handeye import HandEyeOptions, Noise
     from stcal.handeye.data.formats.record import Said
     from stcal.handeye.report.export import (
@@ -169,7 +182,10 @@ def handeye(
     noise = Noise(*robot, *seen, sigma_px, sigma_board_mm)
     statements = Said.of_options(rotation or [], length_unit or [], poses_are or [], setup)
     if times_columns is not None and image_times is None:
-        raise InputError("E-OPTION-NEEDS", f"--times-columns {times_columns}: of times of images; give --image-times")
+        raise InputError(
+            "E-OPTION-NEEDS",
+            f"--times-columns {times_columns}: it describes a table of image times; give --image-times",
+        )
     timing = Timing(time_tolerance, image_times, time_offset, times_columns)
     pairs = params.source_of(source, first, second, key, statements, quaternions, timing, columns, columns_a)
     folder = isinstance(pairs, Path) and pairs.is_dir()
@@ -279,11 +295,11 @@ def _require_arm(
     """Checks that the options of the arm are compatible."""
     if robot_out and not with_kinematics:
         raise InputError(
-            "E-OPTION-NEEDS", "--robot-out: only with --with-kinematics; the robot is as its file says else"
+            "E-OPTION-NEEDS", "--robot-out: only with --with-kinematics; otherwise the robot stays as in its file"
         )
     if with_kinematics and not folder:
         raise InputError(
-            "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, in which the arm is seen to err"
+            "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, which show the arm's errors"
         )
     if with_kinematics and method not in (None, "reprojection"):
         raise InputError(
@@ -292,7 +308,7 @@ def _require_arm(
     if with_kinematics and four_dof:
         raise InputError(
             "E-OPTION-CONFLICT",
-            "--with-kinematics, --four-dof: one of them; an arm that turns about one axis hides its own",
+            "--with-kinematics, --four-dof: give one of them; rotations about one axis do not determine the kinematics",
         )
 
 
@@ -306,10 +322,10 @@ def _require_fitting(
     if camera_out and not (refine_camera or with_arm):
         raise InputError(
             "E-OPTION-NEEDS",
-            "--camera-out: only with --refine-camera or --with-kinematics; the camera is as given else",
+            "--camera-out: only with --refine-camera or --with-kinematics; otherwise the camera stays as given",
         )
     if refine_camera and of_poses:
-        raise InputError("E-OPTION-NEEDS", "--refine-camera: only with images; poses tell nothing of the camera")
+        raise InputError("E-OPTION-NEEDS", "--refine-camera: only with images; poses do not determine the intrinsics")
     if camera_out and method not in (None, ALL, "reprojection"):
         raise InputError("E-OPTION-METHOD", f"--camera-out: {method} does not adjust the camera; leave --method out")
     if method not in (None, ALL, *METHODS):

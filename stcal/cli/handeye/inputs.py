@@ -25,8 +25,8 @@ SourceFile = Annotated[
 ]
 PosesFile = Annotated[
     Path | None,
-    "Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, ROS "
-    "…; or from this folder, a file for each image.",
+    "Read the robot's poses from this file: image, base_from_flange_… (CSV), 4×4 matrices, TUM, Zivid, ROS …; or "
+    "from this folder, with a file for each image.",
 ]
 OwnCamera = Annotated[Path | None, "Read the intrinsics from this file: COLMAP cameras.txt, OpenCV or ROS."]
 OwnBoard = Annotated[
@@ -36,26 +36,26 @@ OwnBoard = Annotated[
 ]
 SetupOption = Annotated[
     SetupName | None,
-    "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange; as the file says, or "
-    "eye-in-hand, if not given.",
+    "Choose eye-in-hand, camera on the flange, or eye-to-hand, board on the flange. If not given, the file decides; "
+    "if it does not say, eye-in-hand.",
 ]
 RotationOption = Annotated[
     list[str] | None,
-    "Read angles of unnamed convention like this: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, xyz (fixed "
-    "axes), ZYX (turned axes) …; robot=… or camera=… for one side.",
+    "Read angles in this convention, if the file does not name it: kuka-abc, fanuc-wpr, ur-rotvec, rpy …, rotvec, "
+    "xyz (fixed axes), ZYX (moving axes) …; robot=… or camera=… for one side.",
 ]
 LengthUnit = Annotated[
     list[str] | None,
-    "Take lengths in files that do not say it in this unit: mm, m, cm, um, in; robot=… or camera=… for one side.",
+    "Take lengths in this unit, if the file does not name it: mm, m, cm, um, in; robot=… or camera=… for one side.",
 ]
 PosesAre = Annotated[
     list[str] | None,
-    "Take poses in files that do not say it as base_from_flange or flange_from_base, or as "
+    "Take poses in this direction, if the file does not name it: base_from_flange or flange_from_base, and "
     "camera_from_board or board_from_camera; once for each side.",
 ]
 TimeTolerance = Annotated[
     float,
-    "Take the nearest of the robot's poses within this time, s, where none can be interpolated.",
+    "Take the robot's nearest pose within this time, s, if none can be interpolated.",
     Opt(min=0, max=3600),
 ]
 

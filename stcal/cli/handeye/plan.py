@@ -21,10 +21,10 @@ def plan(
     poses_are: params.PosesAre = None,
     robot_file: Annotated[
         Path | None,
-        "Plan only what this robot reaches within its joint limits (TOML), and name its joint values.",
+        "Plan only poses that this robot reaches within its joint limits (TOML), and give their joint values.",
         Opt("--robot"),
     ] = None,
-    count: Annotated[int, "Name so many poses.", Opt(min=1, max=100)] = 3,
+    count: Annotated[int, "Name this many poses.", Opt(min=1, max=100)] = 3,
     seed: Annotated[int, "Draw the candidates with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
     out: Annotated[Path | None, "Write the poses to this file (CSV).", WRITES] = None,
     first: shared.FirstTable = None,
@@ -36,7 +36,7 @@ def plan(
     workers: shared.Workers = None,
     json_file: shared.JsonFile = None,
 ) -> None:
-    """Name the robot poses that would lower the worst σ at the board most, after those of a hand-eye calibration."""
+    """Name further robot poses that would lower the worst σ of a hand-eye calibration, at the board, most."""
     from stcal.handeye.data.formats.record import Said
     from stcal.handeye.report.planned import planned_csv, planned_file, planned_report
     from stcal.io.table import require_pose_table_written

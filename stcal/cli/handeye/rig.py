@@ -16,7 +16,9 @@ def rig(
         "Read setup, board, the robot's poses, and the images and intrinsics of each camera from this file (TOML).",
         Arg("RIG.toml"),
     ],
-    refine_camera: Annotated[bool, "Adjust the intrinsics too, of each camera from its own with σ."] = False,
+    refine_camera: Annotated[
+        bool, "Adjust the intrinsics of each camera too, starting from its file and weighted by their σ."
+    ] = False,
     with_scale: Annotated[bool, "Find the board's true size from the robot's motion."] = False,
     rotation: RotationOption = None,
     length_unit: LengthUnit = None,
@@ -25,7 +27,7 @@ def rig(
     time_tolerance: TimeTolerance = 0.02,
     held_out: Annotated[
         int | None,
-        "Hold out so many poses of the robot in each split; a quarter if not given.",
+        "Hold out this many of the robot's poses in each split; a quarter of them if not given.",
         Opt(min=1, max=100_000),
     ] = None,
     splits: Annotated[int, "Cross-validate over this many splits; 0 for none.", Opt(min=0, max=100_000)] = 15,
@@ -36,7 +38,7 @@ def rig(
     report: shared.ReportFile = None,
     strict: shared.Strict = False,
 ) -> None:
-    """Find where several cameras sit on one flange, or in one base, and in each other, from one adjustment."""
+    """Find where several cameras are on one flange, or in one base, and relative to each other, in one adjustment."""
     from stcal.handeye.data.rig import read_rig_file
     from stcal.handeye.report.file import HandEyeRigFile
     from stcal.handeye.report.outcome import rig_judged

@@ -18,14 +18,14 @@ def axes(
     sweeps: Annotated[
         Path | None, "Read joint values and positions of reflectors in sweeps from this file (CSV).", Arg()
     ] = None,
-    out: Annotated[Path | None, "Write the robot that the axes make to this file (TOML).", WRITES] = None,
+    out: Annotated[Path | None, "Write the robot with these axes to this file (TOML).", WRITES] = None,
     still_deg: Annotated[
-        float, "Take joints that change by less than this as standing still, degrees.", Opt(min=1e-9, max=1.0)
+        float, "Treat joints that change by less than this as not moving, degrees.", Opt(min=1e-9, max=1.0)
     ] = 0.0015,
     orientations: Annotated[
         str,
-        "Use measured orientations too, as reflectors so far from the target, mm, where an error of rotation is "
-        "worth one of position; auto, by their stated σ and not without, or off.",
+        "Use measured orientations too, weighted like reflectors at this distance from the target, mm; auto uses "
+        "them by their stated σ, if there are any, and off ignores them.",
     ] = "auto",
     rotation: shared.Rotation = None,
     first: shared.FirstTable = None,
@@ -36,7 +36,7 @@ def axes(
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
-    """Find each joint's axis from sweeps of that joint alone, and the robot that follows (the axis method)."""
+    """Find the axis of each joint from sweeps of that joint alone, and the robot with these axes (the axis method)."""
     from stcal.robot.axes.model import robot_from_sweeps
     from stcal.robot.axes.report import axes_file, axes_report
     from stcal.robot.axes.sweeps import ring

@@ -15,22 +15,22 @@ ExportAs = Literal["joints", "poses"]
 def compensate(
     robot_file: Annotated[Path, "Read the identified robot from this file (TOML).", Opt("--robot")],
     targets: Annotated[Path | None, "Read commanded poses or joint values from this file (CSV).", Arg()] = None,
-    nominal: Annotated[Path | None, "Read the robot as its controller has it from this file (TOML)."] = None,
+    nominal: Annotated[Path | None, "Read the controller's model of the robot from this file (TOML)."] = None,
     out: Annotated[
-        Path | None, "Write joint values to send, with status and errors, to this file (CSV).", WRITES
+        Path | None, "Write the joint values to send, with status and errors, to this file (CSV).", WRITES
     ] = None,
     export: Annotated[
         list[str] | None,
-        "Write the points that are reached to this file, again for each further one; forms: yaskawa (JBI), "
-        "fanuc (LS), kuka (dat), abb (mod), ur (script).",
+        "Write the reachable points to this file; repeat it for more files. Forms: yaskawa (JBI), fanuc (LS), kuka "
+        "(dat), abb (mod), ur (script).",
         Opt(metavar="FORM=FILE"),
     ] = None,
     export_as: Annotated[
-        ExportAs, "Write joint values, or the poses of the nominal robot there, which the controller is told for them."
+        ExportAs, "Write joint values, or the poses of the nominal robot at these joint values, to command instead."
     ] = "joints",
     pulses_per_deg: Annotated[
         str | None,
-        "Write joint values for yaskawa by these pulses per degree of each joint, with commas between; poses if "
+        "Write joint values for yaskawa with these pulses per degree of each joint, separated by commas; poses if "
         "not given.",
     ] = None,
     quaternions: shared.Quaternions = "wxyz",
@@ -44,7 +44,7 @@ def compensate(
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
-    """Compute joint values that really reach commanded poses, beside the nominal ones."""
+    """Compute the joint values with which the real robot reaches the commanded poses."""
     from stcal.io.files import require_same
     from stcal.robot.export import require_form, robot_program
     from stcal.robot.kinematics.file import load_robot

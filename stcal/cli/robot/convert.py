@@ -22,18 +22,18 @@ def convert(
         Arg("A"),
     ],
     out: Annotated[Path, "Write the other form to this file: .toml or .urdf.", Arg("B", writes=True)],
-    from_link: Annotated[str, "Begin at this link of a URDF; at its root if not given."] = "",
+    from_link: Annotated[str, "Begin at this link of a URDF; if not given, at its root."] = "",
     to_link: Annotated[
         list[str] | None,
-        "End at this link of a URDF; at the only one that can be if not given. Repeat it for the hands of "
-        "several arms on a trunk.",
+        "End at this link of a URDF; if not given, at the only possible one. Repeat it for the hands of several arms "
+        "on a trunk.",
     ] = None,
-    convention: Annotated[ConventionName, "Write rows of Denavit and Hartenberg in this convention."] = "standard",
+    convention: Annotated[ConventionName, "Write Denavit-Hartenberg rows in this convention."] = "standard",
     nominal: Annotated[
         Path | None, "Add the deviations of a calibration.conf to the rows of this robot file (TOML)."
     ] = None,
 ) -> None:
-    """Write a robot file as URDF, or the joints of a URDF or an arm of Universal Robots as a robot file."""
+    """Write a robot file as URDF, or a URDF or the calibration of a Universal Robots arm as a robot file."""
     from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
     from stcal.robot.urdf.read import load_urdf
     from stcal.robot.urdf.universal import read_universal
@@ -43,10 +43,10 @@ def convert(
         raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
     made = None if source.suffix.lower() in (*XML, ".toml") else read_universal(source, nominal, convention)
     if made is None and nominal is not None:
-        raise InputError("E-OPTION-NEEDS", "--nominal: only of a calibration.conf; leave it out")
+        raise InputError("E-OPTION-NEEDS", "--nominal: only with a calibration.conf; leave it out")
     if made is not None:
         if from_link or to_link:
-            raise InputError("E-OPTION-NEEDS", "--from-link, --to-link: only of a URDF that is read; leave them out")
+            raise InputError("E-OPTION-NEEDS", "--from-link, --to-link: only for reading a URDF; leave them out")
         robot = made.robot
         say(f"robot {robot.name}: {len(robot.rows)} joints, of Universal Robots")
         print_each(f"note: {source}", made.notes)
@@ -72,7 +72,7 @@ def convert(
         return
     if from_link or to_link or convention != "standard":
         raise InputError(
-            "E-OPTION-NEEDS", "--from-link, --to-link, --convention: only of a URDF that is read; leave them out"
+            "E-OPTION-NEEDS", "--from-link, --to-link, --convention: only for reading a URDF; leave them out"
         )
     robot = load_robot(source)
     text = robot_urdf(robot)
@@ -95,7 +95,7 @@ def _is_xml(path: Path) -> bool:
 
 
 def init(
-    file: Annotated[Path, "Write the robot file here.", Arg(writes=True)] = Path("robot.toml"),
+    file: Annotated[Path, "Write the robot file to this file.", Arg(writes=True)] = Path("robot.toml"),
 ) -> None:
     """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
     from stcal.robot.kinematics.file import require_robot_written, robot_toml

@@ -26,7 +26,7 @@ def design(
     json_file: JsonFile = None,
     report: ReportFile = None,
 ) -> None:
-    """Choose measurement poses that show the robot's parameters best."""
+    """Choose the measurement poses that determine the robot's parameters best."""
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.use import design as stage
     from stcal.robot.use.report import design_report

@@ -13,12 +13,14 @@ RefitParts = Literal["none", "base", "tool", "base-tool"]
 
 
 def evaluate(
-    robot_files: Annotated[list[Path], "Read a robot from this file (TOML); give it again for others.", Opt("--robot")],
+    robot_files: Annotated[
+        list[Path], "Read a robot from this file (TOML); repeat it for more robots.", Opt("--robot")
+    ],
     data_file: Annotated[
-        Path | None, "Read joint values with what was measured there from this file (CSV).", Arg("DATA")
+        Path | None, "Read joint values, and the measurements at each, from this file (CSV).", Arg("DATA")
     ] = None,
     refit: Annotated[
-        RefitParts, "Fit this to the data with each robot's own axes; the rest is taken from its file."
+        RefitParts, "Fit this to the data, keeping each robot's own axes; everything else comes from its file."
     ] = "base-tool",
     out: Annotated[Path | None, "Write the residuals of each row to this file (CSV).", WRITES] = None,
     quaternions: shared.Quaternions = "wxyz",
@@ -31,7 +33,7 @@ def evaluate(
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
-    """Compare robot files on new measurements, and tell what their residuals go with."""
+    """Compare robot files on new measurements, and tell what their residuals depend on."""
     from stcal.robot.kinematics.file import load_robot
     from stcal.robot.kinematics.measurements import read_measurements
     from stcal.robot.use import report as shown
@@ -57,13 +59,13 @@ def evaluate(
 
 def verify(
     measured: Annotated[
-        Path | None, "Read commanded_x_mm … beside measured x_mm … from this file; set: before, after (CSV).", Arg()
+        Path | None, "Read commanded_x_mm …, measured x_mm … and set (before or after) from this file (CSV).", Arg()
     ] = None,
     plot: Annotated[Path | None, "Draw the error of each pose and set to this file (.png or .svg).", WRITES] = None,
     first: shared.FirstTable = None,
     seconds: Annotated[
         list[Path] | None,
-        "Read what was measured from this file (CSV); several are sets, called like them.",
+        "Read the measurements from this file (CSV); several files are sets, named after the files.",
         Opt("--b", metavar="<path>"),
     ] = None,
     key: shared.Key = "pose",
@@ -72,7 +74,7 @@ def verify(
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
-    """Compare distances of measured positions from the first with the commanded ones, before and after."""
+    """Compare distances of positions from the first one, measured and commanded, before and after compensation."""
     from stcal.io.join import stack
     from stcal.robot.use import verification as stage
     from stcal.robot.use.report import verification_report

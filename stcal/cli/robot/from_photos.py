@@ -13,25 +13,25 @@ def from_photos(
     images: Annotated[Path, "Read the photographs of this folder and of its subfolders.", Arg("VIEWS")],
     camera: CameraFile,
     faces: Annotated[Path, "Read the calibrated target from this faces.json."],
-    joints: Annotated[Path, "Read the joint values of each photograph from this file, by --key (CSV)."],
+    joints: Annotated[Path, "Read the joint values of each photograph from this file, matched by --key (CSV)."],
     robot_file: RobotFile,
     out: Annotated[
         Path,
-        "Write all results to this new folder; for more options give its poses.csv with the joint values to "
-        "robot axes and identify, its identified.toml to robot compensate.",
+        "Write all results to this new folder. For more options, use its poses.csv, which has the joint values, in "
+        "robot axes and identify, and its identified.toml in robot compensate.",
     ],
     targets: Annotated[
-        Path | None, "Compute joint values for the poses of this file, or in place of its joint values (CSV)."
+        Path | None, "Compute joint values for the poses in this file, or for the poses at its joint values (CSV)."
     ] = None,
     target: TargetFile = None,
-    board: Annotated[Path | None, "Tell the dots of the board of this board.toml apart, if it is in view."] = None,
-    model: Annotated[Model, "Take the arm as rigid, or as elastic; auto chooses by rows held out."] = "rigid",
-    partial: Annotated[bool, "Keep parameters nominal that the photographs leave open."] = False,
+    board: Annotated[Path | None, "Identify the dots of the board in this board.toml, if the board is in view."] = None,
+    model: Annotated[Model, "Take the arm as rigid, or as elastic; auto chooses by held-out rows."] = "rigid",
+    partial: Annotated[bool, "Keep parameters that the photographs do not determine nominal."] = False,
     key: Annotated[str, "Match photographs and joint values by this column."] = "image",
     columns: Annotated[Path | None, "Read --joints with the columns, delimiter … of this file (TOML)."] = None,
     workers: Workers = None,
 ) -> None:
-    """Measure the target on an arm in photographs, find axes and kinematics, and compensate targets: one folder."""
+    """Measure the target on an arm in photographs, find axes and kinematics, and compensate poses, in one folder."""
     load_ahead(workers)
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board, target_of

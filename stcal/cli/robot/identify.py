@@ -18,13 +18,15 @@ Model = Literal["rigid", "elastic", "auto"]
 def identify(
     robot_file: shared.RobotFile,
     data_file: Annotated[
-        Path | None, "Read joint values with what was measured there from this file (CSV).", Arg("DATA")
+        Path | None, "Read joint values, and the measurements at each, from this file (CSV).", Arg("DATA")
     ] = None,
     out: Annotated[Path | None, "Write the identified robot to this file (TOML).", WRITES] = None,
     offsets: Annotated[
         Path | None, "Write mastering offsets and differences of D-H values to this file (CSV).", WRITES
     ] = None,
-    observe: Annotated[Kind | None, "Use this of the measurements; the most that was measured if not given."] = None,
+    observe: Annotated[
+        Kind | None, "Use this part of the measurements; if not given, everything that was measured."
+    ] = None,
     sigma_mm: Annotated[
         float | None, "Set σ of a measured position, mm per axis; estimated if not given.", Opt(min=1e-9, max=1e4)
     ] = None,
@@ -33,17 +35,21 @@ def identify(
     ] = None,
     folds: Annotated[int, "Cross-validate with this many folds; 0 for none.", Opt(min=0, max=100_000)] = 6,
     seed: Annotated[int, "Divide the rows into folds with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
-    robust: Annotated[bool, "Give outliers less weight, or all rows the same.", Opt("--robust/--least-squares")] = True,
-    partial: Annotated[bool, "Keep parameters nominal that the data leave open, rather than refuse the data."] = False,
+    robust: Annotated[
+        bool, "Give outliers less weight, or weight all rows equally.", Opt("--robust/--least-squares")
+    ] = True,
+    partial: Annotated[
+        bool, "Keep parameters that the data do not determine nominal, instead of refusing the data."
+    ] = False,
     adjust: Annotated[
         str,
-        "Adjust base and tools (base,tool), also zero positions of joints (zeros), or their geometry, or all.",
+        "Adjust only base and tools (base,tool), also the zero positions of joints (zeros), or their geometry, or all.",
         Opt(metavar="WHAT"),
     ] = "all",
     model: Annotated[
         Model,
-        "Take the arm as rigid, or as elastic: links give way to gravity, gears turn unevenly; auto chooses by "
-        "rows held out.",
+        "Take the arm as rigid, or as elastic: links bend under gravity, gears have periodic errors. auto chooses by "
+        "held-out rows.",
     ] = "rigid",
     quaternions: shared.Quaternions = "wxyz",
     rotation: shared.Rotation = None,
@@ -56,7 +62,7 @@ def identify(
     json_file: shared.JsonFile = None,
     report: shared.ReportFile = None,
 ) -> None:
-    """Identify the kinematics from poses, positions or distances; σ not given are estimated."""
+    """Identify the kinematics from poses, positions or distances; estimate σ that are not given."""
     from stcal.robot.identification.prior import adjusted
     from stcal.robot.identification.report import identified_file, identified_report
     from stcal.robot.identification.result import IdentifyOptions, require_identified_written

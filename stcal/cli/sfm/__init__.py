@@ -7,7 +7,7 @@ from stcal.cli.sfm import budget, camera, capture, colmap, make, measure, run, s
 
 app = typer.Typer(
     name="stcal-sfm",
-    help="Calibrate a target from a folder of images. Any command takes --debug for a traceback.",
+    help="Calibrate a target from a folder of images. With --debug, any command prints a traceback.",
     cls=Commands,
     **PLAIN,
 )

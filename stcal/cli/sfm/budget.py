@@ -18,10 +18,10 @@ def budget(
     run: Run,
     statement: Annotated[
         Path | None,
-        "Read temperatures, expansion, the σ of the board's pitch and fields of the head from this file (TOML).",
+        "Read temperatures, expansion, the σ of the board's pitch and fields of the header from this file (TOML).",
     ] = None,
     field: Annotated[
-        list[str] | None, "Write NAME=VALUE into the head, such as operator='A. Smith'; may be given several times."
+        list[str] | None, "Write NAME=VALUE into the header, such as operator='A. Smith'; may be given several times."
     ] = None,
     check_lengths: Annotated[
         Path | None,
@@ -30,14 +30,14 @@ def budget(
     columns: Annotated[Path | None, "Read --check-lengths with the columns, delimiter … of this file (TOML)."] = None,
     lengths: Annotated[Path | None, "Compare the longest distances with the second calibration in this folder."] = None,
     lengths_statement: Annotated[
-        Path | None, "Read what is stated of that run from this file; --statement if not."
+        Path | None, "Read the statement of that second calibration from this file; if not given, --statement is used."
     ] = None,
     page: ReportFile = None,
-    pdf: Annotated[bool, "Also write the page as PDF, beside it (needs the extra `pdf`)."] = False,
+    pdf: Annotated[bool, "Also write the page as PDF beside it (needs the extra `pdf`)."] = False,
     out: JsonFile = None,
     strict: StrictByDefault = True,
 ) -> None:
-    """Compute the uncertainty budget of faces and of the target's longest distances (GUM), each contribution apart."""
+    """Compute the uncertainty budget (GUM) of the faces and of the target's longest distances, by contributions."""
     from stcal.report.page import pdf_of
     from stcal.sfm.budget.of_run import uncertainty_budget
     from stcal.sfm.budget.sources import fields_of

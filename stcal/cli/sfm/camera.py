@@ -17,14 +17,14 @@ app = typer.Typer()
 def calibrate_camera(
     images: Annotated[
         Path,
-        "Read photographs that show the board from this folder, or from IMAGES/<group>/ as run; with --rig from "
+        "Read photographs that show the board from this folder, or from IMAGES/<group>/ as run does; with --rig from "
         "IMAGES/<camera>/.",
         Arg(),
     ],
     out: Annotated[
         Path | None,
-        "Write the camera to this file, cameras.txt if not given; with --rig all cameras to this folder, which "
-        "must be new, rig if not given.",
+        "Write the camera to this file, cameras.txt if not given; with --rig, write all cameras to this new folder, "
+        "rig if not given.",
         WRITES,
     ] = None,
     target: TargetFile = None,
@@ -35,27 +35,27 @@ def calibrate_camera(
     ] = None,
     rig: Annotated[
         bool,
-        "Calibrate cameras that are fixed to each other: a folder of photographs for each, those of one instant "
-        "named alike.",
+        "Calibrate cameras that are fixed to each other. Each has a folder; photographs of the same instant have the "
+        "same name.",
     ] = False,
     model: Annotated[
         list[str] | None,
-        "Fit this model of COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV; of wide "
-        "lenses SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, THIN_PRISM_FISHEYE; or `auto`: the "
-        "simplest that foretells held-out views as well as the best. OPENCV if not given; with --rig also "
-        "CAMERA=MODEL, for each camera that differs.",
+        "Fit this model of COLMAP: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV (default) or FULL_OPENCV; "
+        "for wide lenses SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE or THIN_PRISM_FISHEYE. `auto` takes "
+        "the simplest model that predicts held-out views as well as the best one. With --rig, CAMERA=MODEL sets the "
+        "model of one camera.",
     ] = None,
     json_file: Annotated[
         Path | None,
-        "Write figures and checks to this file (JSON); to standard output with `-`; beside --out if not given.",
+        "Write figures and checks to this file (JSON), or to standard output with `-`; beside --out if not given.",
         Opt("--json", writes=True),
     ] = None,
     report: ReportFile = None,
     strict: Strict = False,
     workers: Workers = None,
 ) -> None:
-    """Calibrate the camera from views of the board, without any start: cameras.txt with σ and correlations, for run; or
-    the cameras of a rig, and where they sit."""
+    """Calibrate the camera from views of the board, without start values, and write cameras.txt with σ and
+    correlations; or calibrate the cameras of a rig with their poses on it."""
     from stcal.boards.file import load_flat_board
     from stcal.design import BoardDesign
     from stcal.io.design import board_of, target_of

@@ -25,26 +25,26 @@ def plan(
         float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=50, max=1e5)
     ] = 1000.0,
     width: Annotated[
-        int, "Take images of this width, px; 3:2 images of a 24 mm lens.", Opt(min=320, max=100_000)
+        int, "Take images of this width, px, in the ratio 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)
     ] = 5184,
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     noise: Annotated[float | None, "Assume this σ of every centre, px.", Opt(min=1e-5, max=10)] = None,
-    run: Annotated[Path | None, "Take the σ of centres from the finished run in this folder."] = None,
+    run: Annotated[Path | None, "Take the σ of the centres from the finished run in this folder."] = None,
     target: shared.TargetFile = None,
-    faces: Annotated[Path | None, "Place the faces of --target as in this faces.json of an earlier run."] = None,
+    faces: Annotated[Path | None, "Place the faces of --target as in the faces.json of an earlier run."] = None,
     board: shared.BoardFile = None,
     groups: Annotated[
         str | None, "Photograph these pairs of faces together, such as 12,14,15,23 or front-right,front-top."
     ] = None,
     refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
     one_board: Annotated[
-        bool, "Use one plate in all groups, or a new print for each.", Opt("--one-board/--own-boards")
+        bool, "Use one plate in all groups, instead of a new print for each.", Opt("--one-board/--own-boards")
     ] = True,
     seed: Annotated[int, "Place board and cameras at random with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
     margin: shared.PlateMargin = 15.0,
     out: shared.JsonFile = None,
 ) -> None:
-    """Forecast the σ before any photograph is taken, and what would help most; no Monte Carlo."""
+    """Forecast the σ before any photograph is taken, without Monte Carlo, and say what would help most."""
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
@@ -62,7 +62,7 @@ def plan(
         )
     if noise is not None and run is not None:
         raise InputError(
-            "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: two sources of one σ; give one of them"
+            "E-OPTION-CONFLICT", f"--noise {noise:g} and --run {run}: both give the σ of centres; give one of them"
         )
     if noise is not None:
         centre_noise, source = stated_noise(noise)
@@ -95,7 +95,7 @@ def advise(
     count: Annotated[int, "Advise this many views.", Opt(min=1, max=50)] = 5,
     out: shared.JsonFile = None,
 ) -> None:
-    """Compute from a run's own geometry which further photographs would lower the σ of its worst face most."""
+    """Compute which further photographs would lower the σ of the worst face of a run most."""
     shared.load_ahead(None)
     from stcal.sfm.planning.advise import advise as advice_for
     from stcal.sfm.planning.advise import doubts, known_of
@@ -115,26 +115,31 @@ def advise(
 @app.command()
 def watch(
     images: Annotated[
-        Path, "Follow this folder, IMAGES/<group>/*.jpg, png, tif, bmp; it may be empty at first.", Arg()
+        Path,
+        "Follow the photographs that come into this folder, IMAGES/<group>/*.jpg, png, tif, bmp; it may be empty "
+        "at first.",
+        Arg(),
     ],
     camera: shared.CameraFile,
-    out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
+    out: Annotated[Path, "Write the run to this folder, which must be new, empty, or of an earlier run."],
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,
     interval: Annotated[
-        float, "Look at the folder so often, s; files must stand still for it.", Opt(min=0.1, max=3600)
+        float,
+        "Look at the folder at this interval, s; a file is read once it no longer changes.",
+        Opt(min=0.1, max=3600),
     ] = 1.0,
     idle: Annotated[
-        float | None, "End when nothing has come for so long, s; by Ctrl-C if not given.", Opt(min=0.1, max=1e6)
+        float | None, "End when no file has come for this time, s; if not given, at Ctrl-C.", Opt(min=0.1, max=1e6)
     ] = None,
-    views: Annotated[int, "Compute so many views that would help; 0 for none.", Opt(min=0, max=50)] = 1,
+    views: Annotated[int, "Compute this many views that would help; 0 for none.", Opt(min=0, max=50)] = 1,
     refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
     min_diameter: shared.MinDiameter = None,
     max_diameter: shared.MaxDiameter = 450.0,
     workers: shared.Workers = None,
 ) -> None:
-    """Calibrate while photographs are taken: after each, what was found, the worst σ so far and the view that would
-    help most. RUN/report.html is kept up to date and reloads itself."""
+    """Calibrate while photographs are taken. After each, print what was found, the worst σ so far and the view that
+    would help most. RUN/report.html is kept up to date and reloads itself."""
     shared.load_ahead(workers)
     from stcal.sfm.runs.options import RunOptions
     from stcal.workflows.growing import WatchOptions
@@ -171,32 +176,34 @@ def _say_update(update: "Update") -> None:
 
 @app.command()
 def capture(
-    images: Annotated[Path, "Write photographs to this folder, IMAGES/<group>/IMG_0001.png; earlier ones stay.", Arg()],
+    images: Annotated[
+        Path, "Write photographs to this folder, IMAGES/<group>/IMG_0001.png; earlier ones are kept.", Arg()
+    ],
     camera: shared.CameraFile,
     out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
-    group: Annotated[str, "Name the group like this; between its photographs only the camera may move."],
+    group: Annotated[str, "Name the group like this; only the camera may move between its photographs."],
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,
-    device: Annotated[str, "Use this camera: a number, or a place such as /dev/video0 (V4L2, UVC)."] = "0",
+    device: Annotated[str, "Use this camera: a number, or a device such as /dev/video0 (V4L2, UVC)."] = "0",
     exposure: Annotated[
         float | None,
-        "Set this exposure, in the driver's unit; left to the camera if not given.",
+        "Set this exposure, in the driver's unit; if not given, the camera chooses it.",
         Opt(min=1e-9, max=1e9),
     ] = None,
     gain: Annotated[
-        float | None, "Set this gain, in the driver's unit; as it is if not given.", Opt(min=0, max=1e6)
+        float | None, "Set this gain, in the driver's unit; if not given, it stays as it is.", Opt(min=0, max=1e6)
     ] = None,
     settle: Annotated[
         float, "Give the camera this time before each photograph, s.", Opt("--settle-s", min=0, max=60)
     ] = 0.3,
     count: Annotated[
-        int | None, "End after so many; by Ctrl-C or Ctrl-D if not given.", Opt(min=1, max=100_000)
+        int | None, "End after this many photographs; if not given, at Ctrl-C or Ctrl-D.", Opt(min=1, max=100_000)
     ] = None,
     every: Annotated[
-        float | None, "Take one each so many seconds; at each Enter if not given.", Opt(min=0, max=86_400)
+        float | None, "Take a photograph at this interval, s; if not given, at each Enter.", Opt(min=0, max=86_400)
     ] = None,
     simulate: Annotated[
-        Path | None, "Use a simulated camera that sees this image, or those of this folder, in place of --device."
+        Path | None, "Use a simulated camera that shows this image, or those of this folder, in place of --device."
     ] = None,
     views: Annotated[int, "Compute so many views that would help; 0 for none.", Opt(min=0, max=50)] = 1,
     refine_camera: Annotated[bool, "Adjust the intrinsics too."] = False,
@@ -204,7 +211,7 @@ def capture(
     max_diameter: shared.MaxDiameter = 450.0,
     workers: shared.Workers = None,
 ) -> None:
-    """Take photographs with a camera of this machine and calibrate meanwhile: after each, what was found, blur,
+    """Take photographs with a camera of this machine and calibrate meanwhile. After each, print what was found, blur,
     saturation, the worst σ so far and the view that would help most."""
     shared.load_ahead(workers)
     from stcal.io.device import OpenCVSource, SimulatedSource

@@ -23,10 +23,10 @@ SHOWN_PAIRS = 10
 @app.command(name="export-database")
 def export_database(
     run: Run,
-    out: Annotated[Path, "Write the copy to this new file; nothing is overwritten.", Arg("OUT.db", writes=True)],
+    out: Annotated[Path, "Write the copy to this file, which must be new.", Arg("OUT.db", writes=True)],
     schema: Annotated[str, "Write for this version of COLMAP: 3.8, 3.9, 3.10, 3.11, 3.12, 3.13, 4.0 (and 4.1), 4.2."],
 ) -> None:
-    """Copy the run's database for another version of COLMAP to open; ids, orders and values stay."""
+    """Copy the run's database in the form of another version of COLMAP; ids, orders and values stay the same."""
     from stcal.sfm.interop.crosscheck import database_text
     from stcal.sfm.interop.export_database import export_database as export
 
@@ -36,10 +36,12 @@ def export_database(
 @app.command(name="export-model")
 def export_model(
     run: Run,
-    out: Annotated[Path, "Write here: a new file for ply and nvm, a new or empty folder for the others.", Arg("OUT")],
+    out: Annotated[
+        Path, "Write to this place: a new file for ply and nvm, a new or empty folder for the others.", Arg("OUT")
+    ],
     kind: Annotated[str, "Write this format: colmap-bin, colmap-txt, ply, nvm or bundler.", Opt("--format")],
 ) -> None:
-    """Write the run's final model, mm, target frame, for other programs; labels beside it."""
+    """Write the run's final model in mm, in the target frame, for other programs, with a file of labels."""
     from stcal.sfm.interop.crosscheck import model_text
     from stcal.sfm.interop.export_model import export_model as export
 
@@ -51,17 +53,18 @@ def export_run(
     run: Run,
     out: Annotated[
         Path,
-        "Write this new file; its suffix tells the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 and "
+        "Write this new file; its suffix selects the form: .urdf, .xacro, .yaml (tf2), .py and .launch (ROS 2 and "
         "1), .yml (OpenCV), .csv, .ply, .dxf, .gltf, .glb or .rrd (Rerun).",
         Arg("FILE", writes=True),
     ],
     form: Annotated[
         str,
-        "Take this form whatever the suffix: urdf, xacro, tf2, ros2, ros1, opencv, csv, ply, dxf, gltf, glb or rerun.",
+        "Write this form, whatever the suffix: urdf, xacro, tf2, ros2, ros1, opencv, csv, ply, dxf, gltf, glb or "
+        "rerun.",
     ] = "",
-    name: Annotated[str, "Name the target frame; faces are NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
+    name: Annotated[str, "Name the target frame NAME; faces are then NAME_FACE, circles NAME_FACE_CIRCLE."] = "target",
 ) -> None:
-    """Write faces and circles, with σ and cameras where the form holds them, for robots, drawings and viewers."""
+    """Write faces and circles for robots, drawings and viewers, with σ and cameras if the form can hold them."""
     from stcal.sfm.interop.crosscheck import export_text
     from stcal.sfm.interop.export import export_run as export
 
@@ -74,7 +77,7 @@ def crosscheck(
     colmap: Annotated[Path | None, "Run this native program; `colmap` on the PATH if not given."] = None,
     tolerance_sigma: Annotated[
         float,
-        "Accept differences of our answer from the native models up to this, in σ of faces and circles.",
+        "Accept differences between our result and the native models up to this, in σ of faces and circles.",
         Opt(min=0, max=1e6),
     ] = 0.5,
     tolerance_um: Annotated[
@@ -89,9 +92,9 @@ def crosscheck(
     camera_tolerance_mdeg: Annotated[
         float | None, "Accept differences of camera attitudes up to this, mdeg; any if not given.", Opt(min=0, max=1e6)
     ] = None,
-    timeout: Annotated[float, "Stop the native mapper after this time for one group, s.", Opt(min=1, max=1e6)] = 600.0,
+    timeout: Annotated[float, "Stop the native mapper after this time for a group, s.", Opt(min=1, max=1e6)] = 600.0,
 ) -> None:
-    """Map the same database with the native COLMAP and compare faces, circles and cameras, into the report."""
+    """Map the same database with the native COLMAP, compare faces, circles and cameras, and add this to the report."""
     from stcal.sfm.interop.crosscheck import comparison_text
     from stcal.sfm.interop.crosscheck import crosscheck as checked
     from stcal.sfm.runs.crosscheck import Tolerances
@@ -112,16 +115,16 @@ def crosscheck(
 
 @app.command()
 def faces(
-    model: Annotated[Path, "Read this COLMAP model, or the folder of several, of the run's database.", Arg("MODEL")],
-    run: Annotated[Path, "Read the run in this folder, whose database was mapped."],
-    out: Annotated[Path | None, "Also write the faces to this file, as faces.json.", WRITES] = None,
+    model: Annotated[Path, "Read this COLMAP model of the run's database, or a folder of several.", Arg("MODEL")],
+    run: Annotated[Path, "Read the run in this folder, from whose database the model was mapped."],
+    out: Annotated[Path | None, "Also write the faces to this file, in the form of faces.json.", WRITES] = None,
     solve: Annotated[
         Chained,
-        "Solve by chain, every way to a face weighed, or as in the paper: λ by rows, three-point frames, single "
-        "transforms.",
+        "Solve by chain, a weighted mean over all chains to a face; or as in the paper, λ by rows, three-point "
+        "frames and single transforms.",
     ] = "chain",
 ) -> None:
-    """Find scale and faces from a COLMAP model made or edited elsewhere; labels come by (image, keypoint)."""
+    """Find scale and faces of a COLMAP model made or edited elsewhere; its labels are found by image and keypoint."""
     from stcal.sfm.interop.crosscheck import faces_text
     from stcal.sfm.interop.external import calibrate_models
     from stcal.sfm.runs.saved import load_run
@@ -138,11 +141,11 @@ def faces(
 @app.command()
 def pairs(
     run: Run,
-    group: Annotated[str | None, "Show this group only."] = None,
+    group: Annotated[str | None, "Show only this group."] = None,
     everything: Annotated[bool, "Show all pairs; the first ten if not given.", Opt("--all")] = False,
     out: JsonFile = None,
 ) -> None:
-    """Rank the initial pairs, and show how each fares at every gate: ours, and COLMAP's as set and at its defaults."""
+    """Rank the initial pairs, and show which gates each passes: ours, and COLMAP's as set and at its defaults."""
     from stcal.sfm.interop.gates import PairsFile, initial_pairs, limits_text, pairs_table
     from stcal.sfm.runs.saved import load_run
 
@@ -158,14 +161,12 @@ def pairs(
 @app.command()
 def doctor(
     run: Run,
-    images: Annotated[
-        Path | None, "Read the photographs from this folder, if they are no longer where the run had them."
-    ] = None,
+    images: Annotated[Path | None, "Read the photographs from this folder, if they were moved after the run."] = None,
     everything: Annotated[bool, "Show all lines; the first forty if not given.", Opt("--all")] = False,
     out: JsonFile = None,
     workers: Workers = None,
 ) -> None:
-    """Explain every image and circle left out: the threshold that stopped it, its value, and what would let it in."""
+    """Explain why images and circles were left out: the threshold, the value, and what would let each in."""
     from stcal.sfm.diagnose import findings
     from stcal.sfm.diagnose.doctor import doctor as diagnosed
     from stcal.sfm.diagnose.findings import DoctorFile

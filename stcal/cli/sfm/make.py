@@ -23,14 +23,16 @@ CIRCLES, DICTIONARY = 10, "APRILTAG_36h11"
 @app.command()
 def draw(
     design: Annotated[Path, "Read this target.toml, or this board file of any kind.", Arg("DESIGN")],
-    out: Annotated[Path, "Write this file; its suffix tells the form: .pdf, .svg or .dxf.", WRITES],
+    out: Annotated[Path, "Write this file; its suffix selects the form: .pdf, .svg or .dxf.", WRITES],
     paper: Annotated[
         str,
-        "Print on sheets of this paper, as many as needed: A5 … A0, Letter, Legal or Tabloid; own for pages as "
-        "large as what they show. A4 for .pdf and own for the others if not given.",
+        "Print on as many sheets of this paper as needed: A5 … A0, Letter, Legal or Tabloid. With own, a page is as "
+        "large as its content. If not given, A4 for .pdf and own for the others.",
     ] = "",
-    margin: Annotated[float, "Add this around the outermost circles, mm.", Opt("--margin-mm", min=0, max=1e4)] = 10.0,
-    net: Annotated[bool, "Draw a target's plates as one net to fold, by outline_mm and rough_pose."] = False,
+    margin: Annotated[
+        float, "Add this margin around the outermost circles, mm.", Opt("--margin-mm", min=0, max=1e4)
+    ] = 10.0,
+    net: Annotated[bool, "Draw a target's plates as one net to fold, using outline_mm and rough_pose."] = False,
 ) -> None:
     """Draw a target or a board 1:1, with dimensions, cut marks and scale bars, to print, cut or mill."""
     from stcal.design import TargetDesign
@@ -45,41 +47,41 @@ def draw(
 
 @app.command()
 def design(
-    folder: Annotated[Path, "Write target.toml to this folder, and board.toml where there is none.", Arg()],
+    folder: Annotated[Path, "Write target.toml to this folder, and board.toml if there is none.", Arg()],
     size: Annotated[
         str,
-        "Make it for a box of this width, height and depth: W,H,D in mm; with --tags this width between "
+        "Make it for a box of this width, height and depth, W,H,D in mm; with --tags, give the width between "
         "opposite faces.",
     ],
-    tags: Annotated[TagBody | None, "Make a cube or dodecahedron with a tag on each face, no board."] = None,
+    tags: Annotated[TagBody | None, "Make a cube or dodecahedron with a tag on each face and no board."] = None,
     dictionary: Annotated[str, "Take the tags of --tags from this dictionary."] = DICTIONARY,
-    first_id: Annotated[int, "Count the tags of --tags up from this id.", Opt(min=0, max=100_000)] = 0,
+    first_id: Annotated[int, "Number the tags of --tags from this id.", Opt(min=0, max=100_000)] = 0,
     faces: Annotated[
         str,
-        "Place circles on these sides, of front, right, back, left and top; on all five if not given. The first "
+        "Place circles on these sides of front, right, back, left and top; on all five if not given. The first one "
         "is the reference face.",
     ] = "",
     circles: Annotated[int, "Place this many circles on each face.", Opt(min=9, max=40)] = CIRCLES,
     radius: Annotated[
         float | None,
-        "Draw the smaller circles with this radius; one that suits box and camera if not given.",
+        "Draw the smaller circles with this radius; if not given, it is chosen for box and camera.",
         Opt("--radius-mm", min=0.01, max=1e4),
     ] = None,
     distance: Annotated[
         float, "Place the camera at this distance.", Opt("--distance-mm --distance", min=50, max=1e5)
     ] = 1000.0,
     width: Annotated[
-        int, "Take images of this width, px; 3:2 images of a 24 mm lens.", Opt(min=320, max=100_000)
+        int, "Take images of this width, px, in the ratio 3:2, with a 24 mm lens.", Opt(min=320, max=100_000)
     ] = 5184,
     camera: Annotated[Path | None, "Read the camera from this file, in place of --width."] = None,
     bright: Annotated[
         bool, "Make bright circles on dark plates, or dark ones on bright.", Opt("--bright/--dark")
     ] = False,
     images: Annotated[int, "Plan this many images in each group.", Opt(min=2, max=500)] = 10,
-    seed: Annotated[int, "Draw everything random with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
 ) -> None:
-    """Make a target for a box: circles on its sides that name each face with any three hidden; or a cube or
-    dodecahedron of tags; and forecast its σ."""
+    """Make a target for a box, with circles that identify each face even if any three are hidden; or make a cube or
+    dodecahedron of tags. Forecast its σ."""
     from stcal.io.cameras.read import read_camera
     from stcal.sfm.detect.sightings import likeness_notes
     from stcal.sfm.make.box import faces_of, size_of

@@ -30,33 +30,33 @@ def measure(
     faces: Annotated[Path, "Read the calibrated target from this faces.json."],
     images: Annotated[
         Path | None,
-        "Read the images of this folder and of its subfolders; none with --serve, and with --live none, a stream's "
-        "URL or a video file.",
+        "Read the images of this folder and its subfolders. With --live, it may be the URL of a stream or a video "
+        "file; with --serve, give none.",
         Arg(),
     ] = None,
     target: shared.TargetFile = None,
     out: Annotated[Path, "Write the table of poses to this file (CSV).", WRITES] = Path("poses.csv"),
     json_file: Annotated[
         Path | None,
-        "Also write everything to this file, both solutions of an undecided image too (JSON); to standard "
-        "output with `-`.",
+        "Also write all results to this file, with both solutions of ambiguous images (JSON), or to standard output "
+        "with `-`.",
         Opt("--json", writes=True),
     ] = None,
     report: shared.ReportFile = None,
     joints: Annotated[
-        Path | None, "Add to the table the columns of this file, joint values say; it needs a column image (CSV)."
+        Path | None, "Add the columns of this file to the table, such as joint values; it needs a column image (CSV)."
     ] = None,
     columns: Annotated[Path | None, "Read --joints with the columns, delimiter … of this file (TOML)."] = None,
-    board: Annotated[Path | None, "Tell the dots of the board of this board.toml apart, if it is in view."] = None,
-    previous: Annotated[bool, "Decide between two solutions by the image before, as motions are small."] = False,
+    board: Annotated[Path | None, "Identify the dots of the board in this board.toml, if the board is in view."] = None,
+    previous: Annotated[bool, "Decide between two solutions by the previous image, assuming small motions."] = False,
     sequence: Annotated[
         bool,
-        "Follow the target from image to image of each folder, in order of name, and search an image as a whole "
-        "only where it is lost. An undecided pose is decided as with --previous.",
+        "Follow the target from image to image of each folder, in order of name, and search a whole image only after "
+        "the target was lost. An ambiguous pose is decided as with --previous.",
     ] = False,
     sigma_factor: Annotated[
         float | None,
-        "Multiply the centres' σ by this; by the factor of faces.json if not given.",
+        "Multiply the σ of the centres by this; if not given, by the factor in faces.json.",
         Opt(min=1e-3, max=1e3),
     ] = None,
     strict: shared.Strict = False,
@@ -66,27 +66,31 @@ def measure(
     scheduler: shared.Scheduler = None,
     send_images: shared.SendImages = False,
     serve: Annotated[
-        bool, "Answer images that programs send over HTTP, POST /measure, with a JSON each, until Ctrl-C."
+        bool, "Answer images that are sent over HTTP, POST /measure, with JSON for each, until Ctrl-C."
     ] = False,
     live: Annotated[
         bool,
         "Show a page with the pictures of a camera, or of the stream or video IMAGES, and the target's pose in each, "
-        "until Ctrl-C. A line is printed each second, each pose with `--json -`.",
+        "until Ctrl-C. One line is printed per second; with `--json -`, every pose is.",
     ] = False,
-    camera_index: Annotated[int, "Take the pictures of --live from the camera of this number.", Opt(min=0, max=99)] = 0,
-    host: Annotated[str, "Listen at this address with --serve or --live; other machines reach 0.0.0.0."] = "127.0.0.1",
+    camera_index: Annotated[
+        int, "Take the pictures of --live from the camera with this number.", Opt(min=0, max=99)
+    ] = 0,
+    host: Annotated[
+        str, "Listen at this address with --serve or --live; with 0.0.0.0, other machines can connect."
+    ] = "127.0.0.1",
     port: Annotated[
-        int, "Listen at this port with --serve or --live; at a free one with 0.", Opt(min=0, max=65535)
+        int, "Listen at this port with --serve or --live; 0 chooses a free one.", Opt(min=0, max=65535)
     ] = 8765,
     max_megabytes: Annotated[float, "Accept image files up to this size with --serve.", Opt(min=0.01, max=2000)] = 64.0,
     token: Annotated[
         str,
-        "Answer with --serve or --live only requests with `Authorization: Bearer` and this word; a browser gives it as "
-        "?token=.",
+        "Answer with --serve or --live only requests with `Authorization: Bearer` and this word; in a browser, add "
+        "?token= to the address.",
         Opt(envvar="STCAL_TOKEN"),
     ] = "",
 ) -> None:
-    """Measure the pose of a calibrated target in each image, from whatever faces it shows, with its 6×6 covariance."""
+    """Measure the pose of a calibrated target in each image, from the visible faces, with its 6×6 covariance."""
     ellipses = shared.ellipse_options(min_diameter, max_diameter)
     target = _design_beside(faces) if target is None else target
     if serve or live:
@@ -118,7 +122,9 @@ def measure(
     if images is None:
         raise InputError("E-OPTION-MISSING", "IMAGES: missing; give the folder of images, --serve or --live")
     if columns is not None and joints is None:
-        raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of joint values; give it with --joints")
+        raise InputError(
+            "E-OPTION-NEEDS", f"--columns {columns}: it describes a table of joint values; give it with --joints"
+        )
     shared.load_ahead(workers)
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera

@@ -33,57 +33,64 @@ Solve = Literal["joint", "chain", "paper"]
 @app.command()
 def run(
     images: shared.Images,
-    out: Annotated[Path, "Write the run to this folder: new, empty, or of an earlier run."],
+    out: Annotated[Path, "Write the run to this folder, which must be new, empty, or of an earlier run."],
     camera: shared.OptionalCamera = None,
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,
     solve: Annotated[
         Solve | None,
-        "Use joint, one adjustment over all groups, the default; chain, group by group; or paper, all of Zhang "
-        "& Wei (2017) as published, from detection on, for comparison.",
+        "Use joint, one adjustment over all groups (default); chain, group by group; or paper, the whole method of "
+        "Zhang & Wei (2017) as published, including detection, for comparison.",
     ] = None,
     frame: Annotated[
         Frame | None,
-        "Lay a face's frame by plane, Z from the plane of all its circles, the default; or by three-point, as "
-        "in the paper.",
+        "Define a face's frame by plane: Z is the normal of the plane of all its circles (default); or by "
+        "three-point, as in the paper.",
     ] = None,
     reference_face: Annotated[
         str | None, "Take the frame of this face as the target frame; the first if not given."
     ] = None,
     eccentricity: Annotated[
         bool,
-        "Correct the eccentricity of circles, or not: the uncorrected control, chained as in the paper.",
+        "Correct the eccentricity of circles. Without the correction, groups are chained as in the paper, as a "
+        "control.",
         Opt("--eccentricity/--no-eccentricity"),
     ] = True,
     max_angle: Annotated[
         float | None,
-        "Reject an initial pair with a larger median ray angle, degrees; 60, and the smallest beyond it, if not given.",
+        "Reject an initial pair with a larger median ray angle, degrees. If not given, it is 60, or the smallest "
+        "angle if all are larger.",
         Opt(min=2, max=170),
     ] = None,
-    flatness: Annotated[str, "Set σ of a circle about the plane of its face, mm, for --solve joint; or off."] = "0.02",
-    refine_camera: Annotated[bool, "Adjust the intrinsics too, from the given ones with their σ."] = False,
-    rim: Annotated[bool, "Compute the rim in front of circles, and give faces of the surface behind it."] = False,
-    board_only: Annotated[bool, "Take the board alone, though other circles are in view: λ and residuals."] = False,
+    flatness: Annotated[
+        str, "Set the σ of circles about the plane of their face, mm, for --solve joint; or off."
+    ] = "0.02",
+    refine_camera: Annotated[
+        bool, "Adjust the intrinsics too, starting from the given ones and weighted by their σ."
+    ] = False,
+    rim: Annotated[
+        bool, "Compute the height of rims in front of the circles, and give the faces of the surface behind them."
+    ] = False,
+    board_only: Annotated[bool, "Use only the board, even if other circles are in view: λ and residuals."] = False,
     compare: Annotated[
         ComparedWith | None,
-        "Solve the same photographs as published too, and show what each step from there is worth: paper.",
+        "Solve the same photographs as published too (paper), and show what each later step improves.",
     ] = None,
     pairs: Annotated[
         PairsChoice | None,
-        "Match all pairs of images, or sparse, as many as hold every circle together; sparse above 80 images if "
-        "not given.",
+        "Match all pairs of images, or a sparse set that connects every circle; sparse above 80 images if not given.",
     ] = None,
     exclude: shared.Exclude = None,
     every: Annotated[
         str | None,
-        "Take of a video in place of IMAGES the sharpest of so many frames, or, by auto, the default, of those "
-        "between which the view hardly changes.",
+        "Take frames from a video that is given as IMAGES: the sharpest of this many frames, or of each stretch in "
+        "which the view hardly changes (auto, the default).",
         Opt(metavar="FRAMES"),
     ] = None,
     expect_faces: Annotated[
         str | None,
-        "Answer no where one of these faces, such as 1,2, is not in the result; those that the groups are named "
-        "after, such as 12, if not given.",
+        "Answer no if one of these faces, such as 1,2, is missing from the result. If not given, the faces in the "
+        "names of the groups, such as 12, are expected.",
         Opt(metavar="FACES"),
     ] = None,
     strict: shared.StrictByDefault = True,
@@ -137,7 +144,9 @@ def detect(
     out: Annotated[Path, "Write detections.csv and overlays/ to this folder."] = Path("detect"),
     target: shared.TargetFile = None,
     board: shared.BoardFile = None,
-    solve: Annotated[Solve | None, "Detect as `run` does with the same option: paper, by the published rules."] = None,
+    solve: Annotated[
+        Solve | None, "Detect as `run` does with this option; paper detects by the published rules."
+    ] = None,
     exclude: shared.Exclude = None,
     min_diameter: shared.MinDiameter = None,
     max_diameter: shared.MaxDiameter = 450.0,
@@ -145,7 +154,7 @@ def detect(
     scheduler: shared.Scheduler = None,
     send_images: shared.SendImages = False,
 ) -> None:
-    """Detect circles alone: detections.csv and an overlay picture of every image."""
+    """Detect circles only, and write detections.csv and an overlay picture of every image."""
     shared.load_ahead(workers)
     from stcal.sfm.pipeline import detect_images
     from stcal.sfm.runs.options import RunOptions
@@ -166,7 +175,7 @@ def detect(
 
 @app.command()
 def verify(run: shared.Run, out: shared.JsonFile = None) -> None:
-    """Compare all files of a run's folder with the hashes that the run kept, and its version with this one."""
+    """Compare all files of a run's folder with the hashes that the run stored, and its version with this one."""
     from stcal.sfm.runs.verify import require_whole, verified_text
     from stcal.sfm.runs.verify import verify as verified
 
@@ -179,10 +188,10 @@ def verify(run: shared.Run, out: shared.JsonFile = None) -> None:
 @app.command()
 def report(
     run: shared.Run,
-    pdf: Annotated[bool, "Also write the page as PDF, beside it (needs the extra `pdf`)."] = False,
-    out: Annotated[Path | None, "Write the page to this file (HTML), not into the run's folder.", WRITES] = None,
+    pdf: Annotated[bool, "Also write the page as PDF beside it (needs the extra `pdf`)."] = False,
+    out: Annotated[Path | None, "Write the page to this file (HTML), instead of into the run's folder.", WRITES] = None,
 ) -> None:
-    """Write the report of a finished run again, from the files in its folder: the page, and a PDF of it."""
+    """Write the report of a finished run again from the files in its folder, as a page and as a PDF."""
     from stcal.sfm.runs.folder import report_again
 
     if pdf and out is not None:

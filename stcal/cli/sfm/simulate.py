@@ -25,7 +25,7 @@ app = typer.Typer()
 
 @app.command()
 def init(folder: Annotated[Path, "Write the two files to this folder.", Arg()]) -> None:
-    """Write target.toml and board.toml of the reference design, commented, to edit."""
+    """Write target.toml and board.toml of the reference design, with comments, to edit."""
     from stcal.design import reference_board, reference_target
     from stcal.io.design import save_design
 
@@ -42,7 +42,7 @@ def init(folder: Annotated[Path, "Write the two files to this folder.", Arg()]) 
 @app.command()
 def simulate(
     folder: Annotated[Path, "Write the data set to this new folder.", Arg()],
-    width: Annotated[int, "Render images of this width, px; 3:2 images.", Opt(min=320, max=50_000)] = 2592,
+    width: Annotated[int, "Render images of this width, px, in the ratio 3:2.", Opt(min=320, max=50_000)] = 2592,
     images: Annotated[int, "Render this many images in each group.", Opt(min=2, max=500)] = 6,
     distance: Annotated[
         float, "Place the camera at this distance, mm.", Opt("--distance --distance-mm", min=200, max=1e5)
@@ -50,52 +50,54 @@ def simulate(
     spread: Annotated[float, "Spread the views by ± this, degrees.", Opt(min=2, max=80)] = 40.0,
     fisheye: Annotated[
         float | None,
-        "Use an equidistant lens of this field over the diagonal, degrees, that looks past the target.",
+        "Use an equidistant lens with this field over the diagonal, degrees, that is not centred on the target.",
         Opt(min=60, max=170),
     ] = None,
     noise: Annotated[float, "Add noise of this fraction of full scale.", Opt(min=0, max=0.2)] = 0.01,
     blur: Annotated[float, "Blur by this standard deviation, px.", Opt(min=0, max=10)] = 0.7,
     f_number: Annotated[
-        float | None, "Use a thin lens of this f-number; all in focus if none.", Opt(min=0.5, max=100)
+        float | None, "Use a thin lens of this f-number; without it, everything is in focus.", Opt(min=0.5, max=100)
     ] = None,
     focus: Annotated[
         float | None,
-        "Set the lens's plane of focus at this depth; at --distance if none.",
+        "Set the lens's plane of focus at this depth; at --distance if not given.",
         Opt("--focus-mm", min=10, max=1e7),
     ] = None,
     focal: Annotated[
         float | None,
-        "Set the focal length of the thin lens; that on a 22.3 mm sensor if none.",
+        "Set the focal length of the thin lens; if not given, it follows from a sensor 22.3 mm wide.",
         Opt("--focal-mm", min=0.5, max=5000),
     ] = None,
     rim: Annotated[
-        float, "Set the height of rims before the faces' circles; raised if < 0.", Opt("--rim-mm", min=-20, max=20)
+        float,
+        "Set the height of rims in front of the faces' circles; with < 0 the circles are raised.",
+        Opt("--rim-mm", min=-20, max=20),
     ] = 0.0,
     clutter: Annotated[bool, "Add lamps, discs and a checkered wall.", Opt("--clutter/--clean")] = False,
     reflectance: Annotated[
         float | None,
-        "Add a table below that mirrors all of target and board.",
+        "Add a table below that reflects target and board with this reflectance.",
         Opt("--table-reflectance", min=0, max=1),
     ] = None,
     target: TargetFile = None,
     board: BoardFile = None,
     groups: Annotated[
         str | None,
-        "Photograph these pairs of faces together, such as 12,14 or front-right,front-top; all that show "
-        "together if none.",
+        "Photograph these pairs of faces together, such as 12,14 or front-right,front-top; if not given, all pairs "
+        "that are visible together.",
     ] = None,
     camera: Annotated[Path | None, "Render with the camera of this file, in place of --width."] = None,
     one_board: Annotated[
-        bool, "Photograph one board with all groups, as `plan` assumes, not another of its kind with each."
+        bool, "Photograph the same board with all groups, as `plan` assumes, instead of another copy with each."
     ] = False,
     second_design: Annotated[bool, "Use three faces, dark on white, and another board."] = False,
-    png: Annotated[bool, "Write PNG in place of JPEG."] = False,
+    png: Annotated[bool, "Write PNG instead of JPEG."] = False,
     sixteen_bit: Annotated[bool, "Write 16-bit PNG.", Opt("--16-bit")] = False,
-    seed: Annotated[int, "Draw everything random with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
+    seed: Annotated[int, "Draw all random numbers with this seed.", Opt(min=0, max=MOST_SEED)] = 0,
     margin: PlateMargin = 15.0,
     workers: Workers = None,
 ) -> None:
-    """Write a simulated data set with known truth, of the reference design or one's own: images, cameras.txt,
+    """Write a simulated data set with known truth, of the reference design or your own: images, cameras.txt,
     target.toml, board.toml, truth.json."""
     from stcal.boards.target import body_of
     from stcal.synthetic.body import BodyOptions
@@ -268,7 +270,7 @@ def compare(
     truth: Annotated[Path, "Read the truth from this truth.json.", Arg()],
     out: JsonFile = None,
 ) -> None:
-    """Compare a run with a known truth, as a table and as JSON."""
+    """Compare a run with the known truth, as a table and as JSON."""
     from stcal.sfm.report.compare import compare as against
     from stcal.sfm.report.compare import comparison_table
     from stcal.sfm.runs.transaction import COMPARISON, added_results
@@ -288,10 +290,12 @@ def compare(
 
 @app.command()
 def demo(
-    out: Annotated[Path | None, "Keep data set and run in this folder; a temporary one if not given."] = None,
+    out: Annotated[
+        Path | None, "Keep data set and run in this folder; if not given, a temporary folder is used."
+    ] = None,
     workers: Workers = None,
 ) -> None:
-    """Render a small data set with known truth, calibrate it, and print the faces against the truth."""
+    """Render a small data set with known truth, calibrate it, and compare the faces with the truth."""
     from stcal.sfm.report.compare import comparison_table
     from stcal.sfm.runs.text import run_text
     from stcal.workflows.demo import WHAT

@@ -348,7 +348,7 @@ def _unit(side: Side, name: str, path: Path, statements: Said) -> tuple[float, s
         raise InputError(
             "E-POSES-UNITS",
             f"{path}: {name}: {near} is {nearest:.3g} away and {far} {farthest:.3g}, as if in two units; write all in "
-            "one and give --length-unit mm or m",
+            "the same unit and give --length-unit mm or m",
         )
     if METRES_UP_TO < farthest < MILLIMETRES_FROM or farthest == 0:
         raise InputError(

@@ -32,7 +32,7 @@ class RigCamera(Brief):
     images : tuple of str
         Name of each view.
     prior : CameraPrior, optional
-        Prior of the intrinsics, which are exact where it is None.
+        Prior of the intrinsics; None if they are exact.
     """
 
     name: str
@@ -106,7 +106,8 @@ class RigPoses(Brief):
         for camera in self.cameras:
             if len(camera) and not (camera.rows.min() >= 0 and camera.rows.max() < m):
                 raise InputError(
-                    "E-RIG-ROW", f"{self.where}: camera {camera.name}: a row that none of {m} poses has; correct it"
+                    "E-RIG-ROW",
+                    f"{self.where}: camera {camera.name}: a row that does not exist among the {m} poses; correct it",
                 )
 
     def __len__(self) -> int:
@@ -194,7 +195,8 @@ def read_rig_file(path: Path) -> RigFiles:
             )
         if entry.name in [previous.name for previous in cameras]:
             raise InputError(
-                "E-RIG-CAMERAS", f"{WHAT} {path}: camera {number} is called {entry.name!r} as another is; one name each"
+                "E-RIG-CAMERAS",
+                f"{WHAT} {path}: camera {number} is called {entry.name!r} like another camera; give each its own name",
             )
         files = (folder / name for name in (entry.images, entry.camera, poses))
         times = folder / entry.times if entry.times else None

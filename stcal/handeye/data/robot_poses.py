@@ -128,7 +128,7 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: 
             require_own(path, quaternions)
         raise InputError(
             "E-OPTION-NEEDS",
-            f"robot poses {path}: its columns or keys say all; leave {', '.join(statements.options())} out",
+            f"robot poses {path}: its columns or keys state these; leave {', '.join(statements.options())} out",
         )
     if quaternions != "wxyz" and (path.is_dir() or path.suffix.lower() in YAML):
         raise InputError(

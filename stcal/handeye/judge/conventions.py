@@ -92,7 +92,7 @@ def check_conventions(
             raise InputError(
                 "E-HANDEYE-CONVENTION",
                 f"{contradict}, where they spread over {np.degrees(spread[0]):.3g}° and {spread[1]:.3g} mm (RMS), as "
-                f"if the two sides had nothing in common; {remedy}",
+                f"if poses of robot and camera did not belong together; {remedy}",
             )
     behind = loop.camera_from_board.translation[:, 2] <= 0
     if behind.all():
@@ -142,8 +142,8 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
 
 
 def _inverted_names(camera_from_board: Poses, by_images: bool) -> str:
-    """Returns the names that the poses of the inverted side should have. A board is in front of its camera, which tells
-    the side unless the poses have the board in front either way."""
+    """Returns the names that the poses of the inverted side should have. As a board is in front of its camera, the side
+    is known unless the poses have the board in front in both directions."""
     robot, camera = FRAMES["robot"][1], FRAMES["camera"][1]
     if by_images:
         return robot
@@ -154,10 +154,10 @@ def _inverted_names(camera_from_board: Poses, by_images: bool) -> str:
 
 
 def _other_units(loop: Loop, by_images: bool) -> dict[str, Loop]:
-    """Returns the loop with either side's lengths in the other unit, by what to do.
+    """Returns the loop with either side's lengths in the other unit; the key says what to do.
 
-    Residuals show the ratio of the two units alone: lengths of metres that are taken for mm look like those of mm that
-    are taken for metres on the other side. Lengths beyond :data:`HALL_MM` tell which it is.
+    Residuals show only the ratio of the two units: metres taken for mm on one side look like mm taken for metres on
+    the other. Lengths beyond :data:`HALL_MM` show which it is.
     """
     variants = {}
     for side, other in (("robot", "board"), ("board", "robot")):

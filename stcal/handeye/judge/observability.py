@@ -112,7 +112,7 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
             raise DegenerateError(
                 "E-HANDEYE-AXES",
                 f"{where}: the flange turns by {turns}° (RMS) about its principal axes, "
-                "that of a robot of four axes about one only; leave --four-dof (in Python four_dof) out",
+                "but a robot of four axes turns about one only; leave --four-dof (in Python four_dof) out",
             )
     elif observability.useless:
         slides = (
@@ -126,7 +126,7 @@ def check(loop: Loop, setup: Setup, where: str, four_dof: bool) -> Observability
 
 
 def scale_is_seen(scale: float, sigma: float, poses: int) -> bool:
-    """True if a scale, solved for with this σ, is more than what noise makes of it."""
+    """True if a scale that was solved for with this σ is larger than noise alone would make it."""
     return scale > 0 and (scale / sigma) ** 2 > SCALE_SEEN * poses
 
 

@@ -22,13 +22,13 @@ class Grave(str):
 
 
 class Aside(str):
-    """A note that takes nothing from the result, or whose subject the verdict judges by itself."""
+    """A note that does not weaken the result, or whose subject the verdict judges itself."""
 
     __slots__ = ()
 
 
 class SizeDoubt(Grave):
-    """A note that the board is of another size than stated, which a clock's lag can feign."""
+    """A note that the board's size differs from the stated one, which an offset of the clocks can also cause."""
 
     __slots__ = ()
 
@@ -105,7 +105,7 @@ def of_order(names: tuple[str, ...], residuals: np.ndarray, jacobian: np.ndarray
     """Returns a note if camera or board moved between two poses, or drifts along them.
 
     ``residuals`` : (m, 6) in the order of the poses, outliers too; ``jacobian`` : (m, 6, 12) by X and Z. A move is
-    named where it explains most of the residuals: errors of robot and camera go with the poses' order, too.
+    named only if it explains most of the residuals, as errors of robot and camera may vary with the order, too.
     """
     parts = residuals.reshape(-1, 2, 3)
     sigma = np.repeat(np.median(np.linalg.norm(parts, axis=2), axis=0), 3)

@@ -38,7 +38,7 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
     Between two poses, robot and camera turn by the same angle and advance by the same length along the axis, whatever X
     is. This tells which numberings belong together. The most common numbering is kept.
 
-    ``symmetries`` : all board_from_board but the identity that leave the look of the board as it is.
+    ``symmetries`` : all board_from_board except the identity that map the board onto itself.
 
     Raises DegenerateError: fewer than three poses.
     """

@@ -67,7 +67,7 @@ class Corners:
     arm: LinearArm | None = None
 
     def places(self) -> dict[str, slice]:
-        """Returns the places of the unknowns in a step; the slice of what is not solved for is empty."""
+        """Returns the slices of the unknowns in a step; those of what is not solved for are empty."""
         sizes = {"x": 6, "z": 6, "camera": self.basis.shape[1], "scale": int(self.with_scale)}
         sizes["arm"] = 0 if self.arm is None else len(self.arm.parameters)
         exact = self.robot is None and not self.sigma["robot_mm"]
@@ -251,7 +251,7 @@ class Corners:
         white, derivatives = self.seen(state)
         length = np.linalg.norm(white, axis=1)
         root = np.sqrt(huber_weights(length, CORNER))
-        at, own, white = self.places(), self._nothing(), white * root[:, None]
+        at, equations, white = self.places(), self._nothing(), white * root[:, None]
         everywhere = [name for name in ("x", "z", "camera", "scale", "arm") if at[name].stop > at[name].start]
         places = np.concatenate([np.arange(at[name].start, at[name].stop) for name in everywhere])
         by_kept = np.concatenate([derivatives[name] for name in everywhere], axis=2)
@@ -261,12 +261,12 @@ class Corners:
         by_kept *= root[:, None, None]
         by_corner = np.swapaxes(derivatives["board"] * root[:, None, None], 1, 2)
         k = self._corners()
-        cross = np.zeros((k, 3, len(own.gradient))) if k else None
+        cross = np.zeros((k, 3, len(equations.gradient))) if k else None
         for rows in np.split(np.arange(len(white)), np.flatnonzero(np.diff(self.view)) + 1):
             view, jacobian = self.view[rows[0]], by_kept[rows].reshape(2 * len(rows), -1)
             columns = np.concatenate([places, at["robot"].start + 6 * view + np.arange(6)]) if robot else places
-            own.normal[np.ix_(columns, columns)] += jacobian.T @ jacobian
-            own.gradient[columns] += jacobian.T @ white[rows].ravel()
+            equations.normal[np.ix_(columns, columns)] += jacobian.T @ jacobian
+            equations.gradient[columns] += jacobian.T @ white[rows].ravel()
             if cross is not None:
                 index, mixed = np.ix_(self.corner[rows], np.arange(3), columns), by_corner[rows] @ by_kept[rows]
                 if len(set(self.corner[rows].tolist())) == len(rows):  # ten times as fast
@@ -274,10 +274,10 @@ class Corners:
                 else:
                     np.add.at(cross, index, mixed)
         if k:
-            np.add.at(own.block, self.corner, by_corner @ np.swapaxes(by_corner, 1, 2))
-            np.add.at(own.slope, self.corner, np.einsum("nab,nb->na", by_corner, white))
+            np.add.at(equations.block, self.corner, by_corner @ np.swapaxes(by_corner, 1, 2))
+            np.add.at(equations.slope, self.corner, np.einsum("nab,nb->na", by_corner, white))
         cost = float((white**2).sum())
-        part = Part(white.size, replace(own, cost=cost, cross=cross))
+        part = Part(white.size, replace(equations, cost=cost, cross=cross))
         return Group(float(huber_cost(length, CORNER).sum()), {"corner_px": part})
 
     def in_front(self, state: Bundle) -> bool:
@@ -365,7 +365,7 @@ class RigCorners:
         return sigma_of_group
 
     def places(self) -> dict[str, slice]:
-        """Returns the places of the unknowns in a step: all X, Z, the intrinsics of all cameras, and the shared
+        """Returns the slices of the unknowns in a step: all X, Z, the intrinsics of all cameras, and the shared
         unknowns."""
         shared = self.each[0].places()
         sizes = {

@@ -86,8 +86,8 @@ def about_one_axis(loop: Loop, mount_axis: np.ndarray, with_scale: bool = False)
     if length < LEAST_LENGTH:
         raise DegenerateError(
             "E-HANDEYE-AXES",
-            "hand-eye: the flange turns about one axis at one place, so that the angle about it is open; move it "
-            "across the axis too, by a tenth of the board's distance or more",
+            "hand-eye: the flange turns about one axis only and does not move across it, so that the angle about it "
+            "is not determined; also move it across the axis by a tenth of the board's distance or more",
         )
     scale = length if with_scale else 1.0
     about = Rotation.from_rotvec(np.arctan2(sine, cosine) * mount_axis)

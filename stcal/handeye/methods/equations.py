@@ -1,7 +1,8 @@
 """Normal equations of an adjustment of corners, from which the corners of the board are eliminated.
 
-The board has hundreds of unknowns, three for each corner, which no observation joins with each other. All else has a
-hundred: poses of the robot, X, Z, intrinsics. Elimination (Schur complement) makes each step as cheap as the latter.
+The board has hundreds of unknowns, three for each corner, and no observation depends on two corners. There are about a
+hundred others: poses of the robot, X, Z, intrinsics. With the corners eliminated (Schur complement), a step costs as
+little as one for the others alone.
 """
 
 from collections.abc import Sequence

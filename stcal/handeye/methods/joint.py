@@ -87,7 +87,7 @@ class Adjusted:
 
     def without(self, out: np.ndarray) -> RigBundle:
         """Returns the solution without the poses ``out``, rows among all: by steps from the solution of all, with its
-        σ. Errors of a step from so near are squares of small moves (influence: Cook & Weisberg 1982)."""
+        σ. The error of such a step is of second order in a small change (influence: Cook & Weisberg 1982)."""
         keep = ~np.isin(self.rows, out)
         corners, state = self.corners.only(keep), self.state
         state = replace(state, base_from_flange=state.base_from_flange[keep])
@@ -321,8 +321,8 @@ def _camera_gains(corners: RigCorners, state: RigBundle) -> np.ndarray:
     """Returns (c,) the fall of the cost, per parameter of one camera, with its intrinsics among the unknowns as in
     :data:`UNKNOWN_LENS`. It is predicted by one step from the solution, and about 1 where the camera is right.
 
-    The worst camera is tested by itself, the next with the intrinsics of the worst free, since a wrong camera draws the
-    board and the robot of all to its side.
+    The worst camera is tested alone, and the next one with the intrinsics of the worst among the unknowns, since a
+    wrong camera biases the board and the robot's poses of all cameras.
     """
     wrong: list[int] = []
     gains, before = np.ones(len(corners.each)), 0.0

@@ -142,7 +142,7 @@ def judged(outcome: Outcome) -> Verdict:
 
 
 def _of_residuals(outcome: Outcome) -> Finding | None:
-    """Refuses residuals that no robot and no camera in order leave, however well they predict one another."""
+    """Refuses residuals that are too large for a sound robot and camera, even if they predict held-out poses well."""
     if outcome.pairs is None or not (used := ~outcome.result.outliers).any():
         return None
     turn, shift = outcome.result.rms()

@@ -368,8 +368,8 @@ def coverage_blocks(outcome: Outcome) -> list[Block]:
 
 def _turns(outcome: Outcome) -> list[Block]:
     """Returns what the rotations between poses tell of the transform."""
-    pairs, seen = outcome.pairs, outcome.result.observability
-    if seen is None:
+    pairs, observability = outcome.pairs, outcome.result.observability
+    if observability is None:
         return []
     picture = (
         "Left: the axes about which the flange turned between two poses each, in its own frame, on a half sphere seen "
@@ -377,15 +377,17 @@ def _turns(outcome: Outcome) -> list[Block]:
     )
     rows = [
         [str(i), *(number(v, 3) for v in axis), number(np.degrees(turn), 2)]
-        for i, (axis, turn) in enumerate(zip(seen.axes, seen.turns_rad, strict=True), 1)
+        for i, (axis, turn) in enumerate(zip(observability.axes, observability.turns_rad, strict=True), 1)
     ]
     return [
-        plot(lambda: turns_figure(turns_between(pairs), seen), "rotations between poses", picture) if pairs else None,
+        plot(lambda: turns_figure(turns_between(pairs), observability), "rotations between poses", picture)
+        if pairs
+        else None,
         Table(["axis", "x", "y", "z", "turn ° (RMS)"], rows),
         "The principal axes of all rotations between poses, in the flange's frame, and the RMS turn about each. The "
         "transform is known well where the second turn is large; where it is 0, the camera's place slides along the "
         "first axis. From poses of a common camera (1 mrad, 0.5 mm) these motions give σ of "
-        f"{np.degrees(seen.sigma_rad):.3f}° and {seen.sigma_mm:.2f} mm in the worst direction",
+        f"{np.degrees(observability.sigma_rad):.3f}° and {observability.sigma_mm:.2f} mm in the worst direction",
     ]
 
 

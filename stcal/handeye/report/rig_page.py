@@ -98,20 +98,20 @@ def rig_report(outcome: RigOutcome) -> Document:
 
 def _camera(outcome: RigOutcome, k: int) -> list[Block]:
     """Returns residuals, adjusted parameters, coverage and photographs of a camera of the rig."""
-    name, camera, own = outcome.rig.names[k], outcome.rig.cameras[k], outcome.cameras[k]
+    name, camera, camera_outcome = outcome.rig.names[k], outcome.rig.cameras[k], outcome.cameras[k]
     turn, shift = camera.rms()
-    errors = {} if own.held_out is None else own.held_out.means()
+    errors = {} if camera_outcome.held_out is None else camera_outcome.held_out.means()
     heads = ["<image", "rotation °", "mm", "x mm", "y mm", "z mm", "corners px", "<"]
-    parameters = Table(["<", "value", "± σ", "<unit"], adjusted(own) or [])
+    parameters = Table(["<", "value", "± σ", "<unit"], adjusted(camera_outcome) or [])
     caption = f"By how much the chain through each image of {name} misses the board"
     return [
         subheading(name),
         f"residuals (RMS): {np.degrees(turn):.4f}°, {shift:.3f} mm at the board's origin",
         f"held out: {means_text(errors)}" if errors else "",
-        *pose_blocks(camera, heads, caption, len(own.outliers())),
+        *pose_blocks(camera, heads, caption, len(camera_outcome.outliers())),
         fold("Camera, as adjusted (first pixel's centre at 0, 0)", parameters),
-        Html(lambda: html(*coverage_blocks(own))),
-        fold("Photographs with their corners", *photograph_blocks(own)),
+        Html(lambda: html(*coverage_blocks(camera_outcome))),
+        fold("Photographs with their corners", *photograph_blocks(camera_outcome)),
     ]
 
 

@@ -353,7 +353,7 @@ def _require_one_board(given: RigPoses, known: dict[int, _First]) -> None:
     camera = "both" if len(known) < 3 else name
     raise DegenerateError(
         "E-RIG-CONTRADICTS",
-        f"{given.where}: one board in one place needed, but {pair}; check images, intrinsics, board and poses of "
+        f"{given.where}: the board must be at one place, but {pair}; check images, intrinsics, board and poses of "
         f"{camera}, or leave one camera out",
     )
 

@@ -313,7 +313,7 @@ def _rays(lens: ForeignLens, width: int, height: int) -> tuple[np.ndarray, np.nd
     if sum(map(len, rays)) < AZIMUTHS:
         raise InputError(
             "E-CAMERA-NO-FIELD",
-            f"camera file {lens.source}: {lens.called} projects nearly nothing into {width}×{height} px; check it",
+            f"camera file {lens.source}: {lens.called} projects almost no point into {width}×{height} px; check it",
         )
     return np.concatenate(rays), np.concatenate(pixels), ends / len(around)
 

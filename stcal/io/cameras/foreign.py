@@ -348,7 +348,8 @@ def of_splines(name: str, numbers: list[float], width: float, height: float, sou
     if match is None:
         raise InputError(
             "E-CAMERA-MODEL",
-            f"camera file {source}: {name[:80]} is not splined in mrcal's words; write it anew with mrcal",
+            f"camera file {source}: {name[:80]} does not have mrcal's form of a splined model; write it again with "
+            "mrcal",
         )
     order, columns, rows, wide = (int(word) for word in match.groups())
     if columns <= MARGIN[order] + 1 or len(numbers) != 4 + 2 * columns * rows or not 0 < wide < 360:

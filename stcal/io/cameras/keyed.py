@@ -1,7 +1,7 @@
 """Camera files of keys and values, of many programs, by one table of their keys.
 
-A program is read by what its keys are called: ``ROLES`` of :mod:`stcal.io.cameras.keys` has the names in use, and
-:data:`TABLES` those that mean something else in one program. What is left goes through
+A file is read by the names of its keys. ``ROLES`` of :mod:`stcal.io.cameras.keys` has the names in use, and
+:data:`TABLES` those that have another meaning in one program. What is left goes through
 :func:`stcal.io.cameras.keys.require_known`.
 """
 
@@ -193,7 +193,7 @@ class _Reading:
             elif role in known and known[role] != value and role != IGNORED:
                 raise InputError(
                     "E-CAMERA-REPEATED",
-                    f"camera file {source}: {keys[role]} and {key} differ and mean the same; leave one in",
+                    f"camera file {source}: {keys[role]} and {key} mean the same and differ; leave one in",
                 )
             else:
                 known[role], keys[role] = value, key
@@ -205,15 +205,15 @@ class _Reading:
             elif allowed or of_roi:
                 raise InputError(
                     "E-CAMERA-KEY",
-                    f"camera file {source}: {key} = {unread[key]}, so that images are a part of the one that K is for; "
-                    "set it to 0 if your images have the file's full size, else calibrate at their size",
+                    f"camera file {source}: {key} = {unread[key]}, so that K is for a larger image of which yours is "
+                    "a part; set it to 0 if your images have the file's full size, else calibrate at their size",
                 )
         if "f" in known and "fy" not in known:  # else f, or K, has both
             for key in [each for each in unread if plain(each.split(".")[-1]) in ("aspectratio", "pixelaspectratio")]:
                 if not (is_neutral(unread[key]) or unread.pop(key) == 1):
                     raise InputError(
                         "E-CAMERA-KEY",
-                        f"camera file {source}: {key} makes fy, by × in one program and by ÷ in another; "
+                        f"camera file {source}: {key} gives fy, but one program multiplies by it and another divides; "
                         "write fx and fy",
                     )
         undistorted = known.keys().isdisjoint(("distortion", *RADIAL_TANGENTIAL))
@@ -312,7 +312,7 @@ class _Reading:
         if not matrix.any():
             raise self.fault(
                 "E-CAMERA-UNCALIBRATED",
-                f"{self.keys['matrix']} is all zero, which a driver publishes for a camera without calibration; "
+                f"{self.keys['matrix']} is all zero, as published by a driver for an uncalibrated camera; "
                 "calibrate it with `stcal-sfm calibrate-camera`, or load its calibration into the driver",
             )
         if (matrix[[1, 2, 2, 2], [0, 0, 1, 2]] != [0, 0, 0, 1]).any():
@@ -431,8 +431,8 @@ class _Reading:
         if self.number("k4") and not {"k5", "k6"} <= self.known.keys():
             raise self.fault(
                 "E-CAMERA-COEFFICIENTS",
-                f"k4 = {self.number('k4'):g} of a perspective lens without k5 and k6: OpenCV's stands below the "
-                "fraction, others' is of r⁸; calibrate without it",
+                f"k4 = {self.number('k4'):g} of a perspective lens without k5 and k6: in OpenCV it is in the "
+                "denominator, in other programs a term in r⁸; calibrate without it",
             )
         given = np.array([self.number(role) for role in RADIAL_TANGENTIAL])
         return given if given[5:].any() else given[:5]
@@ -443,7 +443,8 @@ class _Reading:
         if np.abs(given[2:]).max() > MOST_TANGENTIAL:
             raise self.fault(
                 "E-CAMERA-MODEL",
-                f"{key} has 4 coefficients and no model says of which lens: as tangential ones, {given[2]:g} and "
+                f"{key} has 4 coefficients without a lens model: for a perspective lens, the tangential ones "
+                f"{given[2]:g} and "
                 f"{given[3]:g} are larger than {MOST_TANGENTIAL:g}; add {model} if the lens is OpenCV's fisheye, else "
                 "distortion_model: plumb_bob",
             )

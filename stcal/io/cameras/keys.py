@@ -109,7 +109,7 @@ def plain(key: object) -> str:
 
 
 def role_of(key: str) -> str | None:
-    """Return what a key holds, by :data:`ROLES`; None if it is not known."""
+    """Return the role of a key, by :data:`ROLES`; None if it is not known."""
     bare = plain(PREFIX.sub("", key))
     return ROLES.get(plain(key)) or ROLES.get(f"camera{bare}") or ROLES.get(bare)
 
@@ -192,7 +192,7 @@ def require_known(unread: Mapping, source: str, harmless: Collection[str] = (), 
             raise InputError(
                 "E-CAMERA-KEY",
                 f"camera file {source}: {'.'.join(path)[:80]} = {_short(value)} may change the projection and is not "
-                f"taken here; {taken}remove it if the lens is right without it, or calibrate without it",
+                f"supported; {taken}remove it if the lens is right without it, or calibrate without it",
             )
     if unknown:
         more = f" and {len(unknown) - SHOWN} more" if len(unknown) > SHOWN else ""

@@ -78,8 +78,8 @@ def from_mat(content: bytes, choice: str, source: str) -> CameraModel | ForeignL
     if not structures:
         raise InputError(
             "E-CAMERA-CONTENT",
-            f"camera file {source}: no structure of a camera; save toStruct(cameraParams), since objects of MATLAB "
-            "can be read by MATLAB alone",
+            f"camera file {source}: no structure of a camera; save toStruct(cameraParams), since only MATLAB can read "
+            "its objects",
         )
     return from_structure(structures[one_of(list(structures), choice, source)], source)
 

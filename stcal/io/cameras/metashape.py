@@ -53,7 +53,7 @@ def from_calibration(root: ElementTree.Element, source: str) -> CameraModel | Fo
         raise InputError(
             "E-CAMERA-MODEL",
             f"camera file {source}: fx and fy, as PhotoScan before version 1.2 and Agisoft Lens wrote them, whose "
-            "other terms mean something else; open the project in Metashape and export the calibration anew",
+            "other terms have another meaning; open the project in Metashape and export the calibration again",
         )
     require_known(
         {key: text for key, text in (texts | root.attrib).items() if key not in (*names, *OTHER_KEYS)}, source, HARMLESS
@@ -134,7 +134,8 @@ def _with_covariance(camera: CameraModel, stated: ElementTree.Element, source: s
         ) from error
     if "b2" in names:
         raise InputError(
-            "E-CAMERA-MODEL", f"camera file {source}: b2 was adjusted, without place in OpenCV's model; fit without it"
+            "E-CAMERA-MODEL",
+            f"camera file {source}: b2 was adjusted, but OpenCV's model does not have it; fit without it",
         )
     camera = replace(camera, colmap_model=_model(camera.colmap_model, names))
     by_theirs = np.zeros((len(PARAMETER_NAMES), len(names)))

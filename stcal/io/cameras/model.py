@@ -180,14 +180,14 @@ def camera_model(flat: np.ndarray, colmap_model: str, width, height, path: Path)
         size = f" of an image of {width:g}×{height:g} px" if width and height else ""
         raise InputError(
             "E-CAMERA-FOCAL",
-            f"camera file {path}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}; px "
-            "needed: are they mm, or shares of a side?",
+            f"camera file {path}: focal length {flat[0]:g} and principal point ({flat[2]:g}, {flat[3]:g}){size}; "
+            "pixels needed; check that they are not mm, or shares of a side",
         )
     if width and height and (np.abs(flat[2:4]) < AT_CORNER * np.array([width, height])).all():
         raise InputError(
             "E-CAMERA-CENTRE",
             f"camera file {path}: principal point ({flat[2]:g}, {flat[3]:g}) px is at the corner of {width:g}×"
-            f"{height:g} px; px from the image's corner needed: are they from its middle?",
+            f"{height:g} px; pixels from the image's corner needed; check that they are not from its middle",
         )
     width, height = (None if side is None else int(side) for side in (width, height))
     return CameraModel(flat[:2], flat[2:4], flat[4:], colmap_model, width, height, str(path))

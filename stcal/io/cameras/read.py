@@ -142,8 +142,8 @@ def read_lens(path: str | Path, name: str = "") -> CameraModel | ForeignLens:
         if content.startswith(PICKLE):
             raise InputError(
                 "E-CAMERA-UNREADABLE",
-                f"camera file {path}: a pickle, which may hold a program and is not opened; write its arrays by "
-                "numpy.savez, or as JSON",
+                f"camera file {path}: a pickle, which is not opened since it may contain a program; write its arrays "
+                "with numpy.savez, or as JSON",
             ) from error
         raise _no_text(path) from error
     except (KeyError, ElementTree.ParseError, yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
@@ -214,7 +214,7 @@ def _no_text(path: Path) -> InputError:
         return InputError(
             "E-CAMERA-UNREADABLE",
             f"camera file {path}: a photograph; `stcal camera convert {path.name} cameras.txt` makes a start for "
-            "--refine-camera of its EXIF",
+            "--refine-camera from its EXIF",
         )
     return InputError(
         "E-CAMERA-UNREADABLE", f"camera file {path}: not a text file; give cameras.txt, or OpenCV's YAML or XML"

@@ -24,7 +24,7 @@ def demosaiced(mosaic: np.ndarray, pattern: str, name: str) -> np.ndarray:
     if word not in PATTERNS:
         raise InputError("E-OPTION-VALUE", f"--bayer {pattern[:20]}: one of {', '.join(PATTERNS)} needed")
     if mosaic.ndim != 2:
-        raise InputError("E-IMAGE-TYPE", f"{name}: an image in colour, and no mosaic; leave --bayer out")
+        raise InputError("E-IMAGE-TYPE", f"{name}: a colour image, not a mosaic; leave --bayer out")
     return cv2.cvtColor(mosaic, getattr(cv2, f"COLOR_Bayer{word}2GRAY"))
 
 

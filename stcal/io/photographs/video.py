@@ -149,7 +149,8 @@ def write_frames(video: str | Path, folder: str | Path, every: str | int = AUTO)
     if len(chosen) < LEAST_FRAMES:
         raise InputError(
             "E-VIDEO-VIEWS",
-            f"video {video}: {len(chosen)} sharp frames with another view, {LEAST_FRAMES} needed; move the target or "
+            f"video {video}: {len(chosen)} sharp frames with different views, {LEAST_FRAMES} needed; move the target "
+            "or "
             "the camera more, and slowly, or name a number of frames with --every",
         )
     blurred = len(written) - len(sharp_ones)

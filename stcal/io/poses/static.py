@@ -123,7 +123,8 @@ def ros1_launch(statics: Sequence[Static], said: Iterable[str] = ()) -> str:
         names = static.parent, static.child
         if spaced := [name for name in names if name.split() != [name]]:
             raise InputError(
-                "E-FRAME-NAME", f"frames: {spaced[0]!r} has white space, at which roslaunch splits; give another name"
+                "E-FRAME-NAME",
+                f"frames: {spaced[0]!r} has white space, where roslaunch would split it; give another name",
             )
         words = [
             *plain_numbers(metres(static.pose), METRE_DIGITS),

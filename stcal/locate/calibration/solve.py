@@ -461,7 +461,7 @@ def _turned_alike(images: Sequence[ImageCorners], symmetries: Sequence[Rigid]) -
         elif place_of_tag:
             raise DegenerateError(
                 "E-LAYOUT-UNLINKED",
-                f"layout: {image.name} shares no tag with the other images, and the board looks the same turned; "
+                f"layout: {image.name} shares no tag with the other images, and the board looks the same when turned; "
                 "show a tag of another image too, or use a board without symmetry",
             )
         else:
@@ -481,15 +481,15 @@ def _median_corners(images: Sequence[ImageCorners], count: int) -> np.ndarray:
     return np.nanmedian(places, axis=0)
 
 
-def _collected(plan, images, seen, start, adjusted: AdjustedLayout, left_out) -> CalibratedLayout:
+def _collected(plan, images, tag_rows, start, adjusted: AdjustedLayout, left_out) -> CalibratedLayout:
     """Returns the calibration in {obj}. The frame is defined by the corners of one tag, and depends on their errors."""
-    origin = int(np.flatnonzero(seen == plan.origin)[0])
+    origin = int(np.flatnonzero(tag_rows == plan.origin)[0])
     turn, shift = obj_from_plane(adjusted.corners_mm[origin])
     by_corner = _by_board_corners(adjusted.corners_mm, origin, turn)
     covariance = by_corner @ adjusted.covariance_mm2 @ by_corner.T
     layout = TargetLayout(
         plan.name,
-        tuple(plan.tags[row] for row in seen),
+        tuple(plan.tags[row] for row in tag_rows),
         adjusted.corners_mm @ turn.T + shift,
         (covariance + covariance.T) / 2,
         origin,
@@ -499,7 +499,7 @@ def _collected(plan, images, seen, start, adjusted: AdjustedLayout, left_out) ->
     )
     obj_from_board = Rigid(np.block([[turn, np.zeros((2, 1))], [np.zeros((1, 2)), 1.0]]), np.append(shift, 0.0))
     first_turn, first_shift = obj_from_plane(start[origin])
-    counts = np.bincount(np.concatenate([image.rows for image in images]), minlength=len(seen))
+    counts = np.bincount(np.concatenate([image.rows for image in images]), minlength=len(tag_rows))
     return CalibratedLayout(
         layout,
         start @ first_turn.T + first_shift,
@@ -507,8 +507,8 @@ def _collected(plan, images, seen, start, adjusted: AdjustedLayout, left_out) ->
         adjusted,
         tuple(image.name for image in images),
         counts,
-        tuple(row for row in range(len(plan.tags)) if row not in seen),
-        _deviation(plan.corners_mm[seen], layout.corners_mm),
+        tuple(row for row in range(len(plan.tags)) if row not in tag_rows),
+        _deviation(plan.corners_mm[tag_rows], layout.corners_mm),
         tuple(left_out),
     )
 

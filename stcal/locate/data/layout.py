@@ -34,11 +34,11 @@ class LayoutPlan(Brief):
     size_mm : (n,) array
         Side lengths, NaN if not given.
     origin : int
-        Row of the tag whose middle is the origin of {obj}.
+        Row of the tag whose centre is the origin of {obj}.
     corners_mm : (n, 4, 2) array
         Nominal corners in the plane of the target, NaN if a place is not given.
     unusual_size : bool
-        Whether sides that no hardware has in mm are meant as they stand.
+        True if unusually long or short sides are not a mistake of units.
     """
 
     name: str
@@ -79,7 +79,7 @@ class TargetLayout(Brief):
         σ due to print, lens and flatness, in addition to the measured σ of a corner: of each corner by itself, and of
         the four corners of a tag together. Estimated from the residuals of the calibration.
     unusual_size : bool
-        Whether sides that no hardware has in mm are meant as they stand.
+        True if unusually long or short sides are not a mistake of units.
     """
 
     name: str

@@ -311,7 +311,7 @@ def locate(
     pose = _answer(problem, minima, seen.rows[keep], tuple(outliers))
     if pose.sigma_rad() > MAX_SIGMA_RAD:
         raise DegenerateError(
-            "E-LOCATE-OPEN", f"{where}: its tags leave the rotation open; show more tags, or larger ones"
+            "E-LOCATE-OPEN", f"{where}: its tags do not determine the rotation; show more tags, or larger ones"
         )
     return pose
 
@@ -371,7 +371,7 @@ def _start(problem: PlanarProblem, where: str) -> Rigid:
         if np.isfinite(score[best]) and (sets is tags or len(tags) == 1 or distance[best].max() < 2 * START_PX):
             return poses[best]
     raise DegenerateError(
-        "E-LOCATE-NO-POSE", f"{where}: no pose shows the tags' corners so; check layout, camera file and tags"
+        "E-LOCATE-NO-POSE", f"{where}: no pose explains the tags' corners; check layout, camera file and tags"
     )
 
 

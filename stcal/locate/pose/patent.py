@@ -176,12 +176,12 @@ def locate_as_patent(
     options = options or PatentOptions()
     rows = layout.rows()
     listed = [[k for k, tag in enumerate(tags.tags) if tag in rows] for tags in exposures]
-    corners = [tags.corners_px[own] for tags, own in zip(exposures, listed, strict=True)]
+    corners = [tags.corners_px[of_layout] for tags, of_layout in zip(exposures, listed, strict=True)]
     if not any(listed):
         raise DegenerateError("E-LOCATE-NO-TAG", f"{where}: no tag of the layout; 1 needed")
     most = most_tags(corners)
     chosen = largest_area(corners, most, options.area_share)
-    results = {i: PatentExposure(i, len(own)) for i, own in enumerate(listed)}
+    results = {i: PatentExposure(i, len(of_layout)) for i, of_layout in enumerate(listed)}
     for i in most:
         results[i] = replace(results[i], area_px2=triangulated_area(corners[i].reshape(-1, 2)), candidate=i in chosen)
     for i in chosen:
@@ -196,15 +196,16 @@ def locate_as_patent(
         )
         results[i] = replace(results[i], poses=(first, second), errors_px=(low, high), det_j=plane_poses.determinant)
     solved = [
-        (each.errors_px, each.poses, each.det_j, i)
-        for i, each in results.items()
-        if each.errors_px is not None and each.poses is not None and each.det_j is not None
+        (result.errors_px, result.poses, result.det_j, i)
+        for i, result in results.items()
+        if result.errors_px is not None and result.poses is not None and result.det_j is not None
     ]
     if not solved:
         raise DegenerateError(
-            "E-LOCATE-NO-POSE", f"{where}: no exposure shows the tags' corners so; check layout and camera file"
+            "E-LOCATE-NO-POSE",
+            f"{where}: no pose explains the tags' corners in any exposure; check layout and camera file",
         )
-    errors, (first, second), det_j, i = min(solved, key=lambda each: each[0][0])
+    errors, (first, second), det_j, i = min(solved, key=lambda solution: solution[0][0])
     same = same_pose(first, second)
     verdict = gate(det_j, errors[0], errors[1] / max(errors[0], TINY_PX), same, options)
     return PatentPose(

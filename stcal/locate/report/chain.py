@@ -53,7 +53,7 @@ ROTATION_WITHIN = 1e-6
 class GoalChain:
     """Chain of transforms from the camera to the robot's base.
 
-    ``mount`` : flange_from_camera of a camera on the flange, base_from_camera of a fixed camera; ``moving`` : whether
+    ``mount`` : flange_from_camera for a camera on the flange, base_from_camera of a fixed camera; ``moving`` : whether
     the camera is on the flange; ``flange`` : base_from_flange by scene, empty for a fixed camera; ``offset`` :
     obj_from_goal, exact; ``source`` : origin of ``mount``, for messages.
     """
@@ -116,7 +116,7 @@ def read_chain(
         )
     if not moving and robot_poses is not None:
         raise InputError(
-            "E-OPTION-NEEDS", f"{where}: the camera is fixed; it needs no robot poses, leave --robot-poses away"
+            "E-OPTION-NEEDS", f"{where}: the camera is fixed and needs no robot poses; leave --robot-poses out"
         )
     flange = read_robot_poses(robot_poses, quaternions, key, columns) if robot_poses else {}
     return GoalChain(mount, moving, flange, _offset(offset))

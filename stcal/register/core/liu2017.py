@@ -1,11 +1,11 @@
 """Baseline: the method of Liu et al. (2017), "Research on coordinate transformation method between robot and laser
 tracker" (China Measurement & Test 43(11), 102–107), as written.
 
-Random samples of N point pairs; a 12-parameter affine transform by least squares (eqs. 5–6); solutions whose 3×3 part
-is not orthogonal are screened out (eq. 7); the points outside the sample that it brings within a limit are its inliers
-(eq. 8); it is acceptable when they are more than a given share; of the acceptable ones that of the smallest variance
-wins (eq. 9), and is the answer as it stands: from its sample, not from its inliers. The paper leaves open how
-orthogonal the 3×3 part must be and how many samples are drawn; both are options here.
+Random samples of N point pairs are drawn. Each gives a 12-parameter affine transform by least squares (eqs. 5–6).
+Transforms whose 3×3 part is not orthogonal are rejected (eq. 7). Points outside of the sample whose residuals are
+within a limit are inliers (eq. 8). A transform is acceptable if the share of inliers exceeds a limit. The acceptable
+transform of the smallest variance is the answer (eq. 9); it is not fitted again to its inliers. The paper does not
+state the limit for orthogonality and the number of samples; both are options here.
 """
 
 from dataclasses import dataclass, replace

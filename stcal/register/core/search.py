@@ -64,9 +64,9 @@ class Consensus:
 
 
 def by_scale(model: Model, count: int, total: float) -> Score:
-    """Returns the score by number of false alarms, a logarithm.
+    """Returns a score that minimises the logarithm of the number of false alarms.
 
-    ``total`` : square sum of the least-squares fit to all.
+    ``total`` : sum of squares of the least-squares fit to all points.
     """
     k = np.arange(model.sample, count)
     k = k[3 * k > model.parameters]  # sets too small to be trusted are scored, too; if one wins, the result is refused

@@ -62,7 +62,7 @@ def _distances(z: np.ndarray, origin: np.ndarray, sliding: np.ndarray) -> np.nda
 
 
 def require_like_nominal(where: str, frames: list[Rigid], nominal: Robot) -> None:
-    """Refuses mirrored positions, joints that count the other way, and another build."""
+    """Refuses mirrored positions, joints with reversed sign, and an arm of another build."""
     rotation, origin = joint_frames(nominal.chain(), np.zeros((1, len(frames))))
     wanted, directions = rotation[:, 0, :, 2], np.array([f.rotation[:, 2] for f in frames])
     places = np.array([f.translation for f in frames])
@@ -168,8 +168,8 @@ def remarks(data: Measurements, fits: list[AxisFit], robot: Robot, nominal: Robo
 def of_order(data: Measurements, robot: Robot) -> list[str]:
     """Returns a note if the instrument, the base or a reflector moved between two rows, or a joint lost its zero.
 
-    Errors of gears follow a sweep, and so the order of its rows; a move is named where it explains most of what is
-    left.
+    Gear errors vary along a sweep, and so with the order of its rows. A move is therefore named only if it explains
+    most of the residuals.
     """
     moved = moved_meanwhile(State(robot.chain(), dict(robot.tools)), observed(data, "position"), MOVED_SHARE)
     return [] if moved is None else [moved.sentence()]

@@ -285,7 +285,7 @@ class _AxisFitting:
         return float(np.sqrt((self.weights[:, None] * self.residuals() ** 2).sum() / max(self.redundancy(), 1)))
 
     def huber(self) -> np.ndarray:
-        """Returns weights (k,) by the lengths of the residuals."""
+        """Returns Huber weights (k,) from the lengths of the residuals."""
         length = np.linalg.norm(self.residuals(), axis=1)
         return huber_weights(length, HUBER * self.robust_sigma(length))
 
@@ -365,8 +365,9 @@ class _AxisFitting:
             if self.size < STANDS_STILL_MM:
                 raise DegenerateError(
                     "E-AXES-STILL",
-                    f"{self.where}: its reflectors stay within {self.size:.3g} mm of one place while its values "
-                    "change; did it move, was every position read anew? if so, put a reflector off its axis",
+                    f"{self.where}: its reflectors stay within {self.size:.3g} mm of one position while its values "
+                    "change; check that it moved and that each position was measured again, or put a reflector off "
+                    "its axis",
                 )
             raise DegenerateError(
                 "E-AXES-UNDETERMINED",

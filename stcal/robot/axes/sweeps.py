@@ -168,8 +168,8 @@ SEPARATOR = " point "
 
 
 def length_of(data: Measurements) -> float | None:
-    """Returns the distance, mm, at which the stated σ of rotations is worth that of positions; None if no σ are
-    stated."""
+    """Returns the distance, mm, at which the stated σ of rotations moves a point by the stated σ of positions; None if
+    no σ are stated."""
     if data.rotations is None or data.covariance is None:
         return None
     variance = np.einsum("mii->mi", np.asarray(data.covariance))
@@ -180,8 +180,8 @@ def length_of(data: Measurements) -> float | None:
 
 
 def ring(length_mm: float) -> np.ndarray:
-    """Returns places (3, 3) at ``length_mm`` from the target's origin; an error of rotation is worth one of position
-    there.
+    """Returns places (3, 3) at ``length_mm`` from the target's origin, where errors of rotation and position weigh
+    alike.
 
     Raises InputError: a length out of range.
     """

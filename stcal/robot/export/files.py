@@ -54,7 +54,7 @@ class Form:
 
     ``write`` : returns the text of points, below lines of comment; ``pose`` : how poses are written; ``axes`` : pattern
     of joint values in a text; ``values`` : returns joint values (m, n) in the file's unit, and their last digit;
-    ``refuses`` : returns why joint values cannot be written, or ""; ``unknown`` : what the file does not tell of a
+    ``refuses`` : returns why joint values cannot be written, or ""; ``unknown`` : what the file does not state about a
     pose.
     """
 

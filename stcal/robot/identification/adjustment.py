@@ -238,10 +238,10 @@ def solve(
 
 
 def curvature_of(solution: Solution, measured: Observed, weighting: Weighting) -> np.ndarray | None:
-    """Returns what products of compliance and moment take from the normal matrix by second derivatives, (k, k).
+    """Returns the part (k, k) of the normal matrix that the second derivatives by compliance and moment subtract.
 
-    Without them, descents along the curved valleys of these products take hundreds of steps. None for rigid arms, and
-    for distances, which are nonlinear by themselves.
+    Without it, descents along the curved valleys of products of compliance and moment take hundreds of steps. It is
+    None for rigid arms, and for distances, which are nonlinear themselves.
     """
     if not solution.state.elastic or measured.kind == "distance":
         return None

@@ -41,7 +41,7 @@ class Drawn:
 
 def joints_figure(shown: Drawn, findings: Iterable[Finding]):
     """Returns a figure of the residual along each joint's own motion against its value, for good rows that the joint
-    moves; with a fitted curve for joints that a finding names."""
+    moves; with a fitted curve for joints named by a finding."""
     observations, chain, tip = shown.seen, shown.state.chain, shown.tips()
     data = observations.data
     turned, origins = joint_frames(chain, data.q, data.conditions)

@@ -1,4 +1,4 @@
-"""Observability indices O1 … O5: how well a set of poses shows a robot's parameters."""
+"""Observability indices O1 … O5: how well a set of poses determines a robot's parameters."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

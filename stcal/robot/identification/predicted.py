@@ -30,7 +30,7 @@ class Predicted:
     """σ of the tool's position, mm (root of the summed variances of x, y, z), by the covariance of the parameters.
 
     ``here_mm`` : (m,) at the measured joint values; ``ranges_mm`` : (s,) at random ones over the joints' ranges (± half
-    a turn, or the reach, where unlimited), including ``left_mm``, the RMS of the effects that residuals go with;
+    a turn, or the reach, where unlimited), including ``left_mm``, the RMS of the effects found in the residuals;
     ``covariance`` : (k, k) of all parameters, including elasticity, rad and mm.
     """
 
@@ -83,7 +83,7 @@ def _sigma(
 def predicted_at(found: Predicted, state: State, kind: Kind, q: np.ndarray, targets: Sequence[str]) -> np.ndarray:
     """Returns σ (r,) of the tool's position at joint values (r, n) that were not measured, mm.
 
-    It includes the effects that residuals go with, and is nan for tools that were not measured.
+    It includes the effects found in the residuals, and is nan for tools that were not measured.
 
     ``found`` : prediction of the identification; ``state``, ``kind`` : the identified state, and the kind of
     observation that it was identified from; ``q`` : (r, n) joint values, rad and mm; ``targets`` : (r,) the tool of
@@ -105,10 +105,10 @@ def _over_ranges(robot: Robot, count: int) -> np.ndarray:
 
 
 def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted | None, tuple[str, ...]]:
-    """Returns the prediction with the effects that residuals go with in the σ over the ranges, and notes on it.
+    """Returns the prediction with the effects found in the residuals added to the σ over the ranges, and notes on it.
 
-    The rows show by how much the model fails among them. The covariance takes the model as true and does not include
-    this, so that values identified from other rows differ by more than it says.
+    These effects show how much the model is wrong. The covariance takes the model as true and does not include them,
+    so that values identified from other rows differ by more than it says.
     """
     if found is None or not left:
         return found, ()

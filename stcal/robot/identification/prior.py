@@ -187,10 +187,12 @@ def adjusted(text: str) -> Adjusted:
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """σ of a robot's dimensions about nominal: lengths (mm), twists (rad), and zero positions of joints (rad, mm). Also
-    σ of what links give way by at the usual torque about the joints' axes and across them, of gears, and of hysteresis
-    of joints (rad). The defaults are the values expected before the data are seen: some tenths of a millimetre and of a
-    degree."""
+    """σ of a robot's dimensions about nominal: lengths (mm), twists (rad), and zero positions of joints (rad, mm).
+
+    Also σ of the deflection of links at the usual torque, about the joints' axes and across them, of gears, and of
+    hysteresis of joints (rad). The defaults are the values expected before the data are seen: some tenths of a
+    millimetre and of a degree.
+    """
 
     length_mm: float = 0.5
     twist_rad: float = 1e-3
@@ -217,9 +219,9 @@ class NominalRows:
 
     Dimensions are the rows' a, alpha, d, theta, beta; for coaxial joints the offset along and across the nominal x
     replaces a and theta, its polar form. ``coaxial`` : (row of theta, row of the a that follows it) of each pair of
-    coaxial joints; ``jacobian`` : (n, 5, k) by the parameters of the axes (tools move no row), taken once, as it hardly
-    changes over factory deviations; ``free`` : (n, 5) mask of the dimensions that any parameter moves; ``group`` : (n,
-    5) group of σ of each dimension; ``elasticity`` : the prior of the elasticity where it is unknown.
+    coaxial joints; ``jacobian`` : (n, 5, k) by the parameters of the axes (tools move no row), computed once, as it
+    hardly changes over factory deviations; ``free`` : (n, 5) mask of the dimensions that any parameter moves;
+    ``group`` : (n, 5) group of σ of each dimension; ``elasticity`` : the prior of the elasticity if it is unknown.
     """
 
     nominal: Robot
@@ -380,7 +382,7 @@ def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, 
 
     def poses(at: State) -> Poses:
         robot = robot_from_chain(at.chain, at.tools, nominal)
-        stations = [each.inverse() for each in list(at.stations.values())[1:]]
+        stations = [station.inverse() for station in list(at.stations.values())[1:]]
         mounts = [] if robot.tree is None else [pose for _, pose in robot.tree.mounts.values()]
         return Poses.of([robot.world_from_base, *robot.tools.values(), *stations, *mounts])
 
@@ -405,4 +407,4 @@ def placed(state: State, kind: Kind, covariance: np.ndarray, units: np.ndarray, 
             f"mount of joint {i + 1} behind {'the base' if after < 0 else f'joint {after + 1}'}"
             for i, (after, _) in nominal.tree.mounts.items()
         ]
-    return tuple(Placed(*each) for each in zip(names, current, sigma, strict=True))
+    return tuple(Placed(*station) for station in zip(names, current, sigma, strict=True))

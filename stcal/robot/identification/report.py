@@ -271,7 +271,7 @@ def identified_file(result: Identified, nominal: Robot) -> IdentifiedFile:
 def identified_report(result: Identified, nominal: Robot) -> Document:
     """Returns the report of ``identify``."""
     kinds = ", ".join(f"{kind}s {rank}" for kind, rank in result.ranks.items())
-    errors = [[name, *(number(v, 4) for v in _statistics(each))] for name, each in _errors(result).items()]
+    errors = [[name, *(number(v, 4) for v in _statistics(residuals))] for name, residuals in _errors(result).items()]
     outliers = [[_place(result, i), number(error, 3), number(result.weights[i], 2)] for i, error in result.outliers()]
     sigma = [
         [name, f"{1000 * np.degrees(s):.3f} mdeg" if " r" in name else f"{1000 * s:.1f} µm"]
@@ -310,7 +310,7 @@ def identified_report(result: Identified, nominal: Robot) -> Document:
         if result.left is None
         else "nothing is seen that the residuals go with (joints, gravity, place)"
     )
-    left = [each.sentence() for each in result.left or ()] or [nothing]
+    left = [residuals.sentence() for residuals in result.left or ()] or [nothing]
     return Document(
         f"{nominal.name}: identified",
         f"robot {nominal.name}: {_observations(result)} from {result.seen.data.where}, {result.rank} parameters "
@@ -356,8 +356,8 @@ def _model(result: Identified) -> list[str]:
 def _elastic_blocks(result: Identified) -> list[Block]:
     """Returns a table with a row of each joint, with σ.
 
-    What its link gives way by at the torques of the measured rows (RMS), the amplitudes of its gear, and its hysteresis
-    if it was adjusted.
+    The columns are the deflection of its link at the torques of the measured rows (RMS), the amplitudes of its gear
+    error, and its hysteresis if it was adjusted.
     """
     elasticity, sigma = result.state.chain.elasticity, result.elasticity_sigma
     if elasticity is None or sigma is None:

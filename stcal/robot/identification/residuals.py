@@ -83,7 +83,7 @@ def observed(data: Measurements, kind: Kind | None = None) -> Observed:
     richest = "distance" if data.distances is not None else "position" if data.rotations is None else "pose"
     kind = kind or richest
     if WIDTH[kind] > WIDTH[richest]:
-        raise InputError("E-MEASURED-KIND", f"{data.where}: {richest}s were measured, {kind}s cannot be had from them")
+        raise InputError("E-MEASURED-KIND", f"{data.where}: {richest}s were measured; they do not give {kind}s")
     rows, none = np.arange(len(data)), np.zeros(0)
     if kind != "distance":
         return Observed(kind, data, rows, rows, none)

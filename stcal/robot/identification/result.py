@@ -44,7 +44,7 @@ class IdentifyOptions:
     Parameters
     ----------
     observe : {"pose", "position", "distance"}, optional
-        Kind of observation to use of the measurements; the richest one that was measured if not given.
+        Kind of observation to use; if not given, the richest one that was measured.
     sigma_mm, sigma_rad : float, optional
         σ of one coordinate of a position, mm, and of an orientation, rad; estimated where not given.
     robust : bool
@@ -62,8 +62,8 @@ class IdentifyOptions:
         Dimensions to adjust beside base and tools: all, all but the joints' zero positions, zero positions alone, or
         none. Dimensions that are fixed in the robot file stay in any case.
     model : {"rigid", "elastic", "auto"}
-        Whether links give way to gravity and gears turn unevenly; ``auto`` takes the elastic model if it predicts
-        held-out rows better by more than chance, else the rigid one.
+        ``elastic``: links bend under gravity and gears have periodic errors. ``auto`` takes the elastic model if it
+        predicts held-out rows better by more than chance, else the rigid one.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class IdentifyOptions:
         if self.model == "auto" and self.folds < LEAST_FOLDS:
             raise InputError(
                 "E-OPTION-RANGE",
-                f"folds is {self.folds}: models are compared by rows held out; {LEAST_FOLDS} or more folds needed",
+                f"folds is {self.folds}: models are compared on held-out rows; {LEAST_FOLDS} or more folds needed",
             )
 
 
@@ -126,13 +126,13 @@ class Gain:
 
     @property
     def beyond_chance(self) -> bool:
-        """Whether the gain is beyond chance."""
+        """True if the gain is larger than chance explains."""
         return self.gain_mm > BEYOND_CHANCE * self.sigma_mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjustment:
-    """A solution with the σ that go with it. ``notes`` : on iterations that did not converge."""
+    """A solution with its σ. ``notes`` : on iterations that did not converge."""
 
     solution: Solution
     weighting: Weighting
@@ -174,14 +174,14 @@ class Identified(Brief):
     placed : tuple of Placed
         Base and tools of the robot, with σ.
     left : tuple of Finding or None
-        Effects that the residuals go with; None if the observations are too few to tell.
+        Effects found in the residuals; None if there are too few observations for a test.
     dh_sigma : (n, 5) array
         σ of a, alpha, d, theta, beta; mm, rad.
     observability : ObservabilityIndices
         Indices of the determined parameters.
     deviations : dict of str to float or None
-        σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad. For elasticity: σ of what
-        links give way by at the usual torque, of gears and of hysteresis, rad.
+        σ of this robot's dimensions about nominal, as the data show them, by name; mm, rad. For elasticity: σ of the
+        deflection of links at the usual torque, of gears and of hysteresis, rad.
     elasticity_sigma : Elasticity or None
         σ of the robot's elasticity where it was adjusted.
     gain : Gain or None

@@ -216,7 +216,8 @@ def _still_joints(robot: Robot, data: Measurements, partial: bool) -> None:
         if move < (STILL_MM if prismatic else STILL_RAD) and not partial:
             raise DegenerateError(
                 "E-IDENTIFY-UNMOVED",
-                f"{data.where}: joint {i} never moved, so that its axis is not seen; measure with other values of "
+                f"{data.where}: joint {i} never moved, so that its axis is not determined; measure with other values "
+                "of "
                 f"q{i}, or keep its nominal values with --partial",
             )
 

@@ -1,5 +1,4 @@
-"""Start of an identification: base and tools by the nominal axes; and refusal of data that this robot cannot have
-made."""
+"""Start of an identification: base and tools fitted with the nominal axes; refuses data that do not fit the robot."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -154,7 +153,8 @@ def _moves(data: Measurements) -> None:
             raise DegenerateError(
                 "E-IDENTIFY-UNMOVED",
                 f"{data.where}: target {name or 'of all rows'} never moved ({moved:.2g} mm over {len(xyz)} rows, more "
-                f"than {STILL_MM} mm needed); was it on the robot, were positions read anew?",
+                f"than {STILL_MM} mm needed); check that it was on the robot, and that each position was measured "
+                "again",
             )
 
 
@@ -190,8 +190,8 @@ def _off_a_line(data: Measurements) -> None:
     if len(extents) < 2 or extents[1] <= STILL_MM:
         raise DegenerateError(
             "E-IDENTIFY-UNDETERMINED",
-            f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that it is not seen where the "
-            "instrument stands; move joints that take the target off it",
+            f"{data.where}: all positions lie on one line (within {STILL_MM} mm), so that the instrument's pose is "
+            "not determined; move joints that take the target off the line",
         )
 
 
@@ -212,8 +212,9 @@ def _base_and_points(
     except DegenerateError as error:
         raise DegenerateError(
             "E-IDENTIFY-UNDETERMINED",
-            f"{where}: by the robot file all joint values put the target on one line, so that it is not seen how the "
-            "instrument stands about it; move other joints, or give the tool in the robot file if it is off the axis",
+            f"{where}: according to the robot file, the target is on one line at all joint values, so that the "
+            "instrument's rotation about it is not determined; move other joints, or give the tool in the robot file "
+            "if it is off the axis",
         ) from error
     moving = (rows[:, None] == np.arange(len(points)))[:, None, :, None]
     spread = np.linalg.norm(positions - positions.mean(0), axis=1).max()
@@ -396,7 +397,7 @@ def _couplings(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, M
 
 
 def _inner(robot: Robot) -> list[int]:
-    """Returns revolute joints whose zeros neither base nor tool takes up: all but the first and the last."""
+    """Returns the revolute joints whose zeros neither base nor tool can absorb: all but the first and the last."""
     return [i for i in range(1, len(robot.rows) - 1) if robot.joints[i].type == "revolute"]
 
 

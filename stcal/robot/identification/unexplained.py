@@ -1,4 +1,4 @@
-"""F tests of what a model leaves unexplained: residuals that go with a joint's angle, gravity, place or order."""
+"""F tests of effects that a model leaves in the residuals: of a joint's angle, gravity, place, or order of the rows."""
 
 from dataclasses import dataclass, replace
 
@@ -30,7 +30,7 @@ TURNS = {1: "once a turn", 2: "twice a turn"}
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """An effect that the residuals go with.
+    """An effect found in the residuals.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def left(
     explained: np.ndarray,
     weights: np.ndarray | None = None,
 ) -> tuple[Finding, ...] | None:
-    """Returns the effects that the residuals of ``state`` go with.
+    """Returns the effects found in the residuals of ``state``.
 
     Candidates of a revolute joint are its zero; its angle, once and twice a turn, as a motion of that joint (an error
     of its gear or encoder) and as one of the tool along the base's axes; the direction from which it came; and the
@@ -127,7 +127,7 @@ class _Found:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rest:
-    """What is left of whitened residuals (N,) beside the fitted parameters.
+    """The part of whitened residuals (N,) that the fitted parameters do not explain.
 
     ``errors`` : (r, w) as they are; ``before`` : (N,) whitened; ``fitted`` : (N, k) basis; ``remaining`` : (N,);
     ``square`` : squared length of the remaining residuals at first; ``freedom`` : degrees of freedom; ``rows`` : number
@@ -153,7 +153,10 @@ class _Rest:
         measured: Observed,
         root: np.ndarray,
     ) -> "_Rest":
-        """Returns what is left of ``errors`` (r, w); ``root`` : (r,) roots of the weights, 0 for rows left out."""
+        """Returns the unexplained part of ``errors`` (r, w).
+
+        ``root`` : (r,) roots of the weights, 0 for rows left out.
+        """
 
         def white(values: np.ndarray) -> np.ndarray:
             return (root[:, None, None] * weighting.whiten(values, measured)).reshape(errors.size, -1)
@@ -256,7 +259,7 @@ def _basis(values: np.ndarray, least: float) -> np.ndarray:
 
 def _shared(state: State, measured: Observed) -> np.ndarray:
     """Returns shifts (r, w, c) of positions from which several distances start. The error of such a position is in all
-    of its distances, as if they went with place."""
+    of its distances, which looks like an effect of place."""
     starts = [row for row in np.unique(measured.second) if (measured.second == row).sum() >= SHARED]
     if measured.kind != "distance" or not starts:
         return np.zeros((len(measured), WIDTH[measured.kind], 0))

@@ -164,6 +164,6 @@ def oriented(table: Table, rotation: str | None = None) -> tuple[Poses | None, t
 
 
 def unread(table: Table, read: Iterable[str] = ()) -> tuple[str, ...]:
-    """Returns one note that lists the columns neither known nor in ``read``; no note if there are none."""
+    """Returns one note that lists the columns that are neither known nor in ``read``; no note if there are none."""
     ignored = [name for name in table.columns if name not in {*read} and not _KNOWN.fullmatch(name)]
     return (f"column{'s' * (len(ignored) > 1)} not read: {', '.join(ignored)}",) if ignored else ()

@@ -100,9 +100,9 @@ def robot_from_chain(chain: Chain, tools: Mapping[str, Rigid], nominal: Robot) -
 def _elasticity(robot: Robot, chain: Chain, elasticity: Elasticity, flange_from_loaded: Rigid) -> Elasticity:
     """Returns the elasticity of ``chain`` in the joint frames of the rigid ``robot``.
 
-    Those frames are turned about the joints' axes and slid along them: moments turn with them, and pivots keep the
-    places about which links give way, as a frame may be far from them (that of a joint that the next one crosses
-    elsewhere than its nominal row says). ``flange_from_loaded``: frame of the joint of ``chain`` that carries the load.
+    Those frames are rotated about the joints' axes and shifted along them. Moments rotate with them. Pivots keep the
+    points about which links bend, since a frame may be far from its point: the next axis may cross the joint's axis
+    elsewhere than in the nominal row. ``flange_from_loaded``: frame of the joint of ``chain`` that carries the load.
     """
     zero = np.zeros((1, len(chain)))
     of_rows, rows_at = joint_frames(robot.chain(), zero)

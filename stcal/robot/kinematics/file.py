@@ -178,7 +178,8 @@ def _tree(data: _RobotFile, where: str) -> Tree | None:
     if 0 in mounts:
         raise InputError(
             "E-ROBOT-BRANCH",
-            f"{where}: joint 1: after is for joints that begin another branch; leave it out, and give base",
+            f"{where}: joint 1: the first joint has no after, which is for joints that begin another branch; leave it "
+            "out, and give base",
         )
     carriers = {}
     for name, each in [("", data.tool), *((t.name, t) for t in data.target)]:

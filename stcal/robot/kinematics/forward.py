@@ -60,7 +60,7 @@ def jacobian(robot: Robot, q: ArrayLike, tool: str = "") -> np.ndarray:
     -------
     (m, 6, n) array
         Rotation vector (rad) over translation (mm) of the tool's origin, both in the axes of the base (left
-        perturbation), by rad or mm of each joint; what links give way by is taken as it is.
+        perturbation), by rad or mm of each joint. The deflection of links is taken as constant.
 
     Raises
     ------
@@ -237,8 +237,8 @@ def chain_parameters(chain: Chain) -> list[tuple[int, int]]:
     """Returns (joint, component) of the minimal parameters of the chain's axes; component 0–5 is rx, ry, rz, tx, ty,
     tz.
 
-    An axis is a line: of the six small motions of a joint's frame, turning about it and sliding along it are passed on
-    to what follows, and of a prismatic joint only its direction counts. With the six of one tool this makes the
+    An axis is a line. Of the six small motions of a joint's frame, rotation about the axis and shift along it belong to
+    the frames that follow, and of a prismatic joint only the direction counts. With the six of one tool this makes the
     complete, minimal and continuous set of 4 R + 2 P + 6 parameters (Zhuang, Roth & Hamano 1992 for the count;
     Okamura & Park 1996 for parameters local to each joint).
     """

@@ -194,12 +194,11 @@ LIMIT, UNREACHABLE = "limit", "unreachable"
 class Inverse(Brief):
     """Joint vectors found for m poses.
 
-    ``q`` : (m, n) values of the controller, rad or mm, always within the limits; where the pose is not reached, those
-    that come nearest of all that were tried; ``status`` : (m,) ``reached``; ``singular``: reached, where joints can
-    move without moving the tool or a branch ends, so that the values are not the only ones; ``orientation``: position
-    reached, orientation as near as fewer than six joints come; ``limit``: only joint vectors beyond the limits reach
-    it; ``unreachable``: none was found that does; ``error_mm``, ``error_rad`` : (m,) what remains, of position and
-    orientation.
+    ``q`` : (m, n) values of the controller, rad or mm, always within the limits; if the pose is not reached, the
+    nearest of all that were tried. ``status`` : (m,) ``reached``; ``singular``: reached, but the values are not unique,
+    as joints can move without moving the tool, or a branch ends; ``orientation``: position reached, and orientation as
+    near as fewer than six joints allow; ``limit``: reached only by joint vectors beyond the limits; ``unreachable``: no
+    joint vector was found. ``error_mm``, ``error_rad`` : (m,) remaining errors of position and orientation.
     """
 
     q: np.ndarray
@@ -228,11 +227,11 @@ def inverse(
 ) -> Inverse:
     """Returns joint vectors q that bring the tool to ``poses``: forward(robot, q) = base_from_tool.
 
-    Of all branches and turns within the joint limits, the one nearest to ``near`` (Euclidean distance, rad, prismatic
-    joints in shares of the reach). Where the step from ``near`` is so short that no other branch can be
-    as near (a bound by the Jacobian's smallest singular value), nothing else is tried; up to 0.1 rad others are sought
-    near by; beyond, all branches are.
-    Of an arm with more than six joints, whose solutions are not isolated, it is one near to ``near``.
+    Of all branches and turns within the joint limits, the one nearest to ``near`` is returned (Euclidean distance, rad,
+    prismatic joints in shares of the reach). If the step from ``near`` is so short that no other branch can be as near
+    (a bound from the Jacobian's smallest singular value), no other is tried. For steps up to 0.1 rad, other branches
+    are sought nearby; for longer ones, all branches are compared. The solutions of an arm with more than six joints are
+    not isolated; one near to ``near`` is returned.
 
     Parameters
     ----------
@@ -291,8 +290,8 @@ def inverse(
 def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     """Returns all joint vectors within the limits that bring the tool to ``pose``, one for each branch.
 
-    Turns by 2π are one branch: the value nearest to the middle of the limits stands for them. At a singular pose, where
-    there is a continuum of solutions, some of them. Found by many starts, the same ones every time.
+    Joint values that differ by 2π are one branch, with the value nearest to the middle of the limits. At a singular
+    pose, which has a continuum of solutions, only some are returned. The search has many starts, the same every time.
 
     Parameters
     ----------
@@ -311,7 +310,7 @@ def branches(robot: Robot, pose: Rigid, tool: str = "") -> Inverse:
     Raises
     ------
     InputError
-        More than six joints, of which there are endlessly many solutions; an unknown tool.
+        The arm has more than six joints, and so infinitely many solutions; or the tool is unknown.
     """
     problem = InverseProblem.of(robot, tool)
     _refuse_redundant(problem)
@@ -361,7 +360,7 @@ def _refuse_redundant(problem: InverseProblem) -> None:
     if n > 6:
         raise InputError(
             "E-ROBOT-REDUNDANT",
-            f"robot {problem.robot.name}: {n} joints reach a pose in endlessly many ways; "
+            f"robot {problem.robot.name}: {n} joints reach a pose in infinitely many ways; "
             "give the joint values to stay near to (columns q1_deg …)",
         )
 

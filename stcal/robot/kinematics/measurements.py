@@ -151,7 +151,7 @@ class Measurements(Brief):
         """Returns rows by a mask, slice or list. Distances cannot be selected, as they refer to one another."""
         if self.distances is not None:
             raise InputError(
-                "E-MEASURED-DISTANCES", f"{self.where}: distances refer to other rows, so that rows cannot be taken out"
+                "E-MEASURED-DISTANCES", f"{self.where}: distances refer to other rows, so that rows cannot be left out"
             )
         rows = np.arange(len(self))[index]
         optional = {name: getattr(self, name) for name in ("positions", "rotations", "covariance", "common")}
@@ -211,21 +211,22 @@ def read_measurements(
 ) -> Measurements:
     """Reads joint values with positions, poses or distances.
 
-    Poses of which their ``status`` says that another one fits the image as well, and copies of a row, are left out with
-    a note; columns that are not read are named in one.
+    Poses whose ``status`` says that another pose fits the image as well, and copies of a row, are left out with a note.
+    Another note names the columns that are not read.
 
     Parameters
     ----------
     path : str or Path
         Table (CSV; form: ``data_layout.md``).
     robot : Robot
-        Whose joints moved: their number and types, and the reach that positions are checked against.
+        The robot that was measured. Its number and types of joints are needed, and its reach, to check positions.
     quaternions : {"wxyz", "xyzw"}
-        As their columns are named, or x, y, z, w in the order in which these stand.
+        ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
     rotation : str, optional
-        Convention of angles whose columns do not say it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` … (``data_layout.md``).
+        Convention of angles, if their columns do not name it: ``kuka-abc``, ``ZYX-deg``, ``rotvec`` …
+        (``data_layout.md``).
     payload_kg : float, optional
-        Mass at the flange in all rows, where no column ``payload_kg`` says it.
+        Mass at the flange in all rows, if there is no column ``payload_kg``.
 
     Returns
     -------

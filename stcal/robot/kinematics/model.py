@@ -111,26 +111,26 @@ class Joint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Elasticity:
-    """What turns the links of n joints by a little more than the joints do: gravity, and gears.
+    """Small rotations of the links of n joints in addition to the joints' own: by gravity and by gears.
 
-    What joint i carries pulls with the torque T = M × g about its place, M being the sum of the moments of its link and
-    of all links that it carries, each as it is turned. The link gives way by the rotation c T, with one c about the
-    joint's axis and another across it. Gears add an angle with one and two periods a turn of the joint. A payload is a
-    mass at a place of the flange, and pulls with its weight at that place beside M.
+    Gravity acts on joint i with the torque T = M × g. M is the sum of the moments of its link and of all links that it
+    carries, each in its present orientation. The link deflects by the rotation c T, with one c about the joint's axis
+    and another across it. Gears add an angle with one and two periods per turn of the joint. A payload is a mass at a
+    point of the flange; its weight acts there, in addition to M.
 
     Parameters
     ----------
     compliance : (n, 2) rad/(N m): about the joint's axis, and across it
-    moment : (n, 3) N m: weight of the link times the vector from the joint to its centre of mass, what follows being
-        put at the next joint; in the frame of the joint that has moved. Of compliance and moment, poses show the
-        products alone.
+    moment : (n, 3) N m: weight of the link times the vector from the joint to its centre of mass, with all that follows
+        placed at the next joint; in the frame of the joint after its motion. Poses determine only the products of
+        compliance and moment.
     periodic : (n, 4) rad: of sin q, cos q, sin 2q, cos 2q of revolute joints
     gravity : (3,) its direction, of length 1: in the base of a robot, in the first joint's frame of a :class:`Chain`
-    hysteresis : (n,) rad: what revolute joints are turned farther by that came from below, and less by that came from
+    hysteresis : (n,) rad: added to the angle of revolute joints that came from below, subtracted if they came from
         above
-    pivot : (n, 3) place about which each link turns when it gives way, mm, in its joint's frame: on the joint's axis
-        for a revolute joint. The origin of that frame if not given; always so of a :class:`Chain`.
-    payload_kg : mass that is carried where nothing else is said of joint vectors
+    pivot : (n, 3) point about which each link turns when it deflects, mm, in its joint's frame: on the joint's axis
+        for a revolute joint. The origin of that frame if not given; always the origin in a :class:`Chain`.
+    payload_kg : mass that is carried if joint vectors do not state another
     payload_centre : (3,) its centre, mm: in the flange's frame of a robot, in that of the joint that carries it, as it
         has moved, of a :class:`Chain`
 
@@ -227,13 +227,13 @@ class Robot(Brief):
     world_from_base : Rigid
         Base in the frame of the measuring instrument, mm.
     tools : mapping of str to Rigid
-        flange_from_tool by name, mm; ``""`` is the one meant where none is named.
+        flange_from_tool by name, mm; ``""`` is the tool if none is named.
     elasticity : Elasticity, optional
         Rigid if not given.
     tree : Tree, optional
         Every joint is carried by the one before it, and tools by the last one, if not given.
     unusual_size : bool
-        Whether links that no arm has in mm are meant as they stand.
+        True if unusually long or short links are not a mistake of units.
 
     Raises
     ------
@@ -339,7 +339,7 @@ class Robot(Brief):
         return self.tools[name]
 
     def loaded(self, payload_kg: float) -> "Robot":
-        """The robot with another mass at its flange, kg, which a rigid one gives no way to.
+        """Returns the robot with another mass at its flange, kg; a rigid robot does not deflect under it.
 
         Raises InputError: a mass below 0, or beyond all that arms carry.
         """
@@ -349,8 +349,11 @@ class Robot(Brief):
         return replace(self, elasticity=replace(self.elasticity, payload_kg=float(payload_kg)))
 
     def chain(self) -> "Chain":
-        """The fixed transforms in order. Frames of joints stand at the pivots of the elasticity; a shift along the axis
-        of a joint, or of a sliding joint in any direction, leaves the rigid arm as it is."""
+        """Returns the fixed transforms in order.
+
+        The frames of joints are at the pivots of the elasticity. A shift along the axis of a joint, or of a prismatic
+        joint in any direction, does not change the rigid arm.
+        """
         gaps, ends = [], []
         pivots = np.zeros((len(self.rows), 3)) if self.elasticity is None else self.elasticity.pivot
         for i, row in enumerate(self.rows):
@@ -373,7 +376,8 @@ class Robot(Brief):
         return Chain(rotation, translation, ends[-1], self.prismatic, self.coupling, elasticity, grown)
 
     def carrier(self, joint: int) -> tuple[int, Rigid]:
-        """The joint, from 0, that carries another (−1: the base), and where the other's row begins behind its row."""
+        """Returns the joint, from 0, that carries another (−1: the base), and the start of the other's row after
+        its row."""
         found = None if self.tree is None else self.tree.mounts.get(joint)
         return found or (joint - 1, Rigid())
 
@@ -390,8 +394,8 @@ def longest_link(rows: Sequence[DHRow]) -> list[Length]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grown:
-    """A tree of joints: ``tree``; ``ends`` : (n,) where each joint's row ends, in the frame of the joint; and
-    ``flange_joint`` : whose row's end is the flange, where one is meant."""
+    """A tree of joints: ``tree``; ``ends`` : (n,) end of each joint's row in the frame of the joint; and
+    ``flange_joint`` : the joint whose row ends at the flange, if one is chosen."""
 
     tree: Tree
     ends: tuple[Rigid, ...]
@@ -405,7 +409,7 @@ class Chain:
     ``rotation``, ``translation`` : (n, 3, 3), (n, 3) of each joint's frame in that of the joint that carries it (the
     first: in the world); ``last_from_flange`` : flange in the frame of the joint that carries it; ``prismatic`` : (n,);
     ``coupling`` : (n, N), of all N values of the controller. Joint values turn about, or move along, z of the joint's
-    frame; ``elasticity`` : what links give way by; ``grown`` : where joints are a tree.
+    frame; ``elasticity`` : deflection of the links; ``grown`` : the tree, if joints form one.
     """
 
     rotation: np.ndarray
@@ -451,7 +455,7 @@ class Chain:
         return self.passed(np.eye(len(self))).T > 0
 
     def gathered(self, each: np.ndarray) -> np.ndarray:
-        """(n, …) of every joint: what it and those it carries have, summed."""
+        """Returns for every joint the sum, (n, …), over itself and the joints that it carries."""
         total = np.array(each)
         for i in range(len(self) - 1, -1, -1):
             if self.after(i) >= 0:
@@ -459,7 +463,7 @@ class Chain:
         return total
 
     def passed(self, each: np.ndarray) -> np.ndarray:
-        """(n, …) of every joint: what it and those that carry it have, summed."""
+        """Returns for every joint the sum, (n, …), over itself and the joints that carry it."""
         total = np.array(each)
         for i in range(len(self)):
             if self.after(i) >= 0:
@@ -467,7 +471,10 @@ class Chain:
         return total
 
     def branch(self, carrier: int) -> "Chain":
-        """The end of the row of ``carrier`` as flange; the other branches stay, as what they weigh bends this one."""
+        """Returns the chain with the end of the row of ``carrier`` as flange.
+
+        Other branches stay, as their weight bends this one.
+        """
         if self.grown is None:
             return self
         return replace(self, last_from_flange=self.grown.ends[carrier], grown=replace(self.grown, flange_joint=carrier))

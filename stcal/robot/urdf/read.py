@@ -286,7 +286,7 @@ def _read_joint(element: ElementTree.Element, where: str) -> UrdfJoint:
         if unknown := parts.get(tag, {}).keys() - known:
             raise InputError(
                 "E-URDF-CONTENT",
-                f"{where}: {tag} has {min(unknown)}, which is none of URDF's {', '.join(known)}; write it by these",
+                f"{where}: {tag} has {min(unknown)}, which is not one of URDF's {', '.join(known)}; use one of these",
             )
     parent, child = parts.get("parent", {}).get("link"), parts.get("child", {}).get("link")
     if not (name and parent and child):

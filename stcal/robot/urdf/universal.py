@@ -78,9 +78,9 @@ def robot_of_kinematics(content: Mapping, where: str, convention: Convention) ->
     """Returns the arm of the YAML of ur_calibration, and by how far (mm) a URDF with the same numbers is off at joint
     values of 0.
 
-    The program computes roll, pitch and yaw as turns about the axes X, Y, Z that turn with them, and URDF takes its
-    three as turns about fixed axes. The upper arm of every such file has a pitch of zero in the first reading alone.
-    The base is that of the controller; ROS's base_link is turned by half a turn about Z.
+    The program computes roll, pitch and yaw about moving axes X, Y, Z; URDF takes them about fixed axes. Only in the
+    first reading has the upper arm of every such file a pitch of zero. The base is that of the controller; ROS's
+    base_link is rotated by half a turn about Z.
 
     Raises InputError: a link is missing, or its values are no numbers.
     """
@@ -118,8 +118,8 @@ def robot_of_conf(text: str, where: str, nominal: Robot | None, convention: Conv
     The axes of upper arm, forearm and wrist are nearly parallel, so that the controller's rows have lengths of many
     metres that cancel. The same axes are written as rows with Hayati's angle.
 
-    Raises InputError: there is no nominal arm, it is no arm of six joints in the standard convention, or a list has not
-    six numbers.
+    Raises InputError: there is no nominal arm, it does not have six joints in the standard convention, or a list does
+    not have six numbers.
     """
     lists = {match["key"]: match["values"] for match in _LIST.finditer(text)}
     deltas = np.column_stack([_six(lists, f"delta_{name}", where) for name in DELTAS])

@@ -1,4 +1,4 @@
-"""The text of a URDF, and that it leads where the robot does."""
+"""Writes a robot as URDF, and verifies that the written file gives the same poses."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
@@ -52,7 +52,7 @@ def robot_urdf(robot: Robot) -> str:
     if robot.elasticity is not None:
         raise InputError(
             "E-ROBOT-ELASTICITY",
-            f"robot {robot.name}: a URDF has no place for its elasticity; remove [elasticity] for the axes alone, or "
+            f"robot {robot.name}: a URDF cannot hold its elasticity; remove [elasticity] for the axes alone, or "
             "export compensated points (`stcal robot compensate --export`)",
         )
     chain = replace(robot, world_from_base=Rigid()).chain()
@@ -89,7 +89,7 @@ def robot_urdf(robot: Robot) -> str:
 
 
 def coupled(robot: Robot) -> bool:
-    """Whether the controller's joint values are not the kinematic ones."""
+    """True if the controller's joint values differ from the kinematic ones."""
     return bool((robot.coupling != np.eye(len(robot.rows))).any())
 
 

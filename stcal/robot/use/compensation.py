@@ -71,10 +71,10 @@ def stayed(
     for k, i in enumerate(rows.tolist()):
         if not free.usable[k]:
             continue
-        said = _beyond(robot, free.q[k])
-        if not said or (inverse.usable[i] and np.abs(free.q[k] - inverse.q[i]).max() <= SAME_BRANCH):
+        reason = _beyond(robot, free.q[k])
+        if not reason or (inverse.usable[i] and np.abs(free.q[k] - inverse.q[i]).max() <= SAME_BRANCH):
             continue
-        beyond[i] = said
+        beyond[i] = reason
         if inverse.usable[i]:
             least, most = np.minimum(near[i], free.q[k]), np.maximum(near[i], free.q[k])
             limits = np.column_stack([least, most]).clip(*robot.limits().T[:, :, None])
@@ -132,16 +132,16 @@ class Compensated(Brief):
     nominal : Inverse or None
         By the nominal robot: what would be commanded without calibration.
     before_mm, before_rad : (m,) arrays
-        Error, by the identified robot, of the nominal joint values: what compensation takes away; empty without a
-        nominal robot.
+        Error of the nominal joint values by the identified robot, which compensation removes; empty without a nominal
+        robot.
     sliding : (n,) array
         Which joints are prismatic.
     reach_mm : float
         Of the arm.
     beyond : dict of int to str
-        Of rows that only joint values beyond the limits reach: which joints, and where they would be.
+        Joints, and their values, of rows that only joint values beyond the limits reach.
     doubts : tuple of str
-        Notes on targets that may be meant otherwise, and on tools and arms that are others in the nominal robot.
+        Notes on targets that may have another meaning, and on tools and arms that differ from the nominal robot.
     controller : Robot or None
         The nominal robot, with the tools that were taken.
     """
@@ -237,9 +237,10 @@ def _with_one_tool(identified: Robot, nominal: Robot, targets: Targets) -> tuple
 def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | None = None) -> Compensated:
     """Returns joint values for the commanded poses, by the identified robot and by the nominal one.
 
-    Of several branches the one nearest to the nominal joint values, or without a nominal robot to the commanded ones;
-    never another one because that is beyond a limit. Where neither is known the first pose gets the one nearest to the
-    middle of the joint limits and every other the one nearest to the pose before.
+    Of several branches, the one nearest to the nominal joint values is taken; without a nominal robot, the one nearest
+    to the commanded joint values. If this one is beyond a limit, no other is taken instead. If neither joint values are
+    known, the first pose gets the branch nearest to the middle of the joint limits, and every other pose the branch
+    nearest to that of the pose before.
 
     Parameters
     ----------
@@ -248,7 +249,7 @@ def compensate(identified: Robot, targets: Targets | Poses, nominal: Robot | Non
     targets : Targets or Poses
         m commanded poses base_from_tool; of files from :func:`read_targets`.
     nominal : Robot, optional
-        As its controller believes it to be.
+        The model in its controller.
 
     Returns
     -------
@@ -319,7 +320,7 @@ def _without_nominal(identified: Robot, targets: Targets) -> Compensated:
     if targets.poses is None:
         raise InputError(
             "E-TARGETS-NO-POSES",
-            f"{targets.where}: joint values without poses; only the nominal robot knows which poses they command, "
+            f"{targets.where}: joint values without poses; only the nominal robot can tell which poses they command; "
             "give its file with --nominal",
         )
     confirmed, doubts = on_targets(identified, targets)

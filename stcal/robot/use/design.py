@@ -1,7 +1,7 @@
-"""Measurement poses that show a robot's parameters well: D-optimal choice among random candidates.
+"""Measurement poses that determine a robot's parameters well: D-optimal choice among random candidates.
 
-Greedy choice, then exchange of single poses while that helps (Fedorov 1972; Mitchell 1974, DETMAX), with updates of the
-inverse information matrix by the few rows of a pose (Sherman, Morrison & Woodbury).
+A greedy choice is followed by exchanges of single poses while they help (Fedorov 1972; Mitchell 1974, DETMAX). The
+inverse information matrix is updated by the few rows of a pose (Sherman, Morrison & Woodbury).
 """
 
 import csv
@@ -173,13 +173,13 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
     q = _candidates(robot, options, rng)
     scale = parameter_scale(robot, options.observe, [options.tool])
     rows = identification_jacobian(robot, q, options.observe, options.sigma_mm, options.sigma_rad, options.tool) * scale
-    seen, basis = _seen_part(rows)
+    determined, basis = _seen_part(rows)
     rows = rows @ basis
-    needed = -(-seen // rows.shape[1])
+    needed = -(-determined // rows.shape[1])
     if options.count < needed:
         raise DegenerateError(
             "E-DESIGN-FEW",
-            f"design: {options.count} poses with {rows.shape[1]} values each for {seen} parameters; "
+            f"design: {options.count} poses with {rows.shape[1]} values each for {determined} parameters; "
             f"at least {needed} needed, some tens advisable",
         )
     chosen, exchanges = choose(rows, options.count)
@@ -189,7 +189,7 @@ def design(robot: Robot, options: DesignOptions | None = None) -> PoseDesign:
         q=q[chosen],
         poses=forward(robot, q[chosen], options.tool),
         parameters=len(scale),
-        seen=seen,
+        seen=determined,
         chosen=ObservabilityIndices.of_jacobian(rows[chosen]),
         random=tuple(ObservabilityIndices.of_jacobian(rows[s]) for s in sets),
         sigma_mm=_predicted_mm(rows[chosen], predict),
@@ -221,7 +221,7 @@ def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) 
         )
     low = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2 * np.pi, -np.pi))
     high = np.where(np.isfinite(high), high, low + 2 * np.pi)
-    found: list[np.ndarray] = []
+    batches: list[np.ndarray] = []
     count, drawn = 0, 0
     while count < options.candidates:
         if options.box is not None and drawn >= DRAWS * options.candidates:
@@ -236,9 +236,9 @@ def _candidates(robot: Robot, options: DesignOptions, rng: np.random.Generator) 
         if options.box is not None:
             at = forward(robot, q, options.tool).translation
             q = q[((at >= options.box[:3]) & (at <= options.box[3:])).all(axis=1)]
-        found.append(q)
+        batches.append(q)
         count += len(q)
-    return np.concatenate(found)[: options.candidates]
+    return np.concatenate(batches)[: options.candidates]
 
 
 def _seen_part(rows: np.ndarray) -> tuple[int, np.ndarray]:
@@ -252,8 +252,8 @@ def choose(rows: np.ndarray, count: int) -> tuple[np.ndarray, int]:
     """Chooses ``count`` of m candidates with rows (m, r, k) for a large det Σ JᵀJ. Returns them and the number of
     exchanges.
 
-    Greedy from next to no information (a millionth of the candidates' mean), then exchange of each pose for the best
-    other one until nothing helps. No pose is taken twice.
+    The greedy choice starts with almost no information (a millionth of the candidates' mean). Then each pose is
+    exchanged for the best other one until nothing helps. No pose is taken twice.
     """
     k = rows.shape[2]
     mean = np.einsum("mri,mrj->ij", rows, rows) / len(rows)

@@ -73,8 +73,8 @@ class Evaluated:
     residuals : (r, 3) measured minus modelled position in the base's axes, or distance; mm
     rotation_rad : (r,) errors of orientations; empty if none were measured
     placed : base and tools
-    left : what the residuals go with; None where rows are too few to tell
-    beyond : the same of what would be left by all parameters of the kinematics fitted to these rows
+    left : effects found in the residuals; None if there are too few rows for a test
+    beyond : the same for the residuals after a fit of all kinematic parameters to these rows
     """
 
     robot: Robot
@@ -118,7 +118,7 @@ class Evaluation:
     refit : what was fitted of each robot: base, tool, both or nothing
     seen : the r observations: positions or distances
     robots : in the order given
-    wrong : (r,) rows that no robot explains: wrong, or something that all models lack; nothing was fitted to them
+    wrong : (r,) rows that no robot explains: they are wrong, or all models lack an effect; nothing was fitted to them
     differences : the robot of least mean error against each other one, in order of their means
     """
 
@@ -145,16 +145,16 @@ def evaluate(robots: Mapping[str, Robot], data: Measurements, refit: Refit = "ba
     Parameters
     ----------
     robots : dict of Robot
-        Robots by the names that they are to have; mm, rad.
+        Robots by name; mm, rad.
     data : Measurements
-        Joint values with what was measured there, in the instrument's frame.
+        Joint values with the measurements made at them, in the instrument's frame.
     refit : {"none", "base", "tool", "base-tool"}
         What is fitted by least squares with each robot's own axes; the rest is as its file has it.
 
     Returns
     -------
     Evaluation
-        Errors by row, which robot is better, and what residuals go with; mm, in the axes of each robot's base.
+        Errors by row, the better robot, and the effects found in residuals; mm, in the axes of each robot's base.
 
     Raises
     ------

@@ -31,9 +31,9 @@ from stcal.robot.use.verification import Verification
 
 
 def verification_figure(result: Verification):
-    """Returns a plot of the absolute distance error of each pose and its mean, a line for each set (the paper's fig.
+    """Returns a plot of the absolute distance error of each pose, with its mean, a line for each set.
 
-    8).
+    It is figure 8 of Zhang & Wei (2017).
     """
     figure = new_figure(7.5, 3.4)
     axes = figure.add_axes((0.09, 0.16, 0.89, 0.7))
@@ -168,9 +168,9 @@ def _colours(count: int) -> list[str]:
 
 def design_report(result: PoseDesign, robot: Robot) -> Document:
     """Returns the report of ``design``: indices of the chosen poses against random ones, places, joint values."""
-    told = f"σ of predicted positions: {1000 * result.sigma_mm:.1f} µm per axis"
+    sigma_sentence = f"σ of predicted positions: {1000 * result.sigma_mm:.1f} µm per axis"
     if np.isfinite(result.random_sigma_mm):
-        told += (
+        sigma_sentence += (
             f", of random poses {1000 * result.random_sigma_mm:.1f} µm; to be as good these would have to be "
             f"{(result.random_sigma_mm / result.sigma_mm) ** 2:.2f} times as many"
         )
@@ -193,7 +193,7 @@ def design_report(result: PoseDesign, robot: Robot) -> Document:
             Section(
                 "Against random poses",
                 [
-                    told,
+                    sigma_sentence,
                     left_out if unseen else "",
                     Table(heads, _indices(result), over),
                     page_only(
@@ -386,15 +386,15 @@ def evaluated_csv(result: Evaluation) -> str:
     head += ["x_mm", "y_mm", "z_mm"] if points else ["distance_mm", "from_row"]
     head += [*(COLUMNS if turned else ()), "wrong"]
     modelled = []
-    for each in robots:
-        name = re.sub(r"\W+", "_", each.robot.name)
+    for evaluated in robots:
+        name = re.sub(r"\W+", "_", evaluated.robot.name)
         place = "commanded" if len(robots) == 1 else name
         if points:
             head += [*(f"{place}_{c}_mm" for c in "xyz"), *(f"{name}_residual_{c}_mm" for c in "xyz")]
         else:
             head.append(f"{name}_residual_mm")
         head += [f"{name}_error_mm", *([f"{name}_error_deg"] if turned else [])]
-        modelled.append(tips_of(each.state, data).translation)
+        modelled.append(tips_of(evaluated.state, data).translation)
     writer.writerow(head)
     turns = Poses(data.rotations, data.points()).quaternions() if data.rotations is not None else None
     place_of = {int(row): i for i, row in enumerate(result.seen.first)}
@@ -408,10 +408,10 @@ def evaluated_csv(result: Evaluation) -> str:
             cells += [*_cells(distances[[row]]), from_row[row] + 1]
         cells += [f"{v:.12f}" for v in turns[row]] if turns is not None else []
         cells.append("" if at is None else int(result.wrong[at]))
-        for each, there in zip(robots, modelled, strict=True):
-            left = each.residuals[at] if at is not None else np.zeros(each.residuals.shape[1])
-            cells += [*(_cells(there[row]) if points else ()), *_cells(left), *_cells([np.linalg.norm(left)])]
-            cells += _cells(np.degrees(each.rotation_rad[[row]])) if turned else []
+        for evaluated, there in zip(robots, modelled, strict=True):
+            residual = evaluated.residuals[at] if at is not None else np.zeros(evaluated.residuals.shape[1])
+            cells += [*(_cells(there[row]) if points else ()), *_cells(residual), *_cells([np.linalg.norm(residual)])]
+            cells += _cells(np.degrees(evaluated.rotation_rad[[row]])) if turned else []
         writer.writerow(cells)
     return stream.getvalue()
 
@@ -462,7 +462,7 @@ def evaluation_file(result: Evaluation) -> EvaluationFile:
 
 
 def evaluation_report(result: Evaluation) -> Document:
-    """Returns the report of ``evaluate``: errors of each robot, which is better, and what residuals go with."""
+    """Returns the report of ``evaluate``: errors of each robot, the better one, and the effects found in residuals."""
     points = result.seen.kind != "distance"
     heads, *rows = _table(result)
     answer: list[Block] = [

@@ -1,4 +1,4 @@
-"""Targets commanded by a file, and checks whether they and the nominal robot can be meant as stated."""
+"""Targets that a file commands, and checks that these and the nominal robot are plausible."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -120,13 +120,13 @@ def read_targets(
     path : str or Path or Table
         Table (CSV; form: ``data_layout.md``).
     robot : Robot
-        Whose tools they are of; its joints, where joint values are given.
+        The robot with the tools of the targets, and with the joints if joint values are given.
     quaternions : {"wxyz", "xyzw"}
-        As their columns are named, or x, y, z, w in the order in which these stand.
+        ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
     rotation : str, optional
-        Convention of angles whose columns do not say it, as of :func:`read_measurements`.
+        Convention of angles, if their columns do not name it; see :func:`read_measurements`.
     payload_kg : float, optional
-        Mass at the flange in all rows, where no column ``payload_kg`` says it.
+        Mass at the flange in all rows, if there is no column ``payload_kg``.
 
     Returns
     -------
@@ -148,7 +148,7 @@ def read_targets(
             f"{table.where}: neither poses x_mm … qz nor joint values q1_deg …; commanded poses are needed; "
             f"the header is {table.header()}",
         )
-    poses, columns, said = oriented(table, rotation) if has_poses else (None, (), ())
+    poses, columns, how_oriented = oriented(table, rotation) if has_poses else (None, (), ())
     if rotation is not None and not has_poses:
         raise InputError(
             "E-OPTION-NEEDS", f"{table.where}: --rotation {rotation}, but no positions with angles; leave it out"
@@ -174,7 +174,7 @@ def read_targets(
         poses,
         joint_values(table, robot) if has_joints else None,
         {column: tuple(table.text(column)) for column in NAMES if column in table},
-        said + unread(table, (*columns, PAYLOAD)),
+        how_oriented + unread(table, (*columns, PAYLOAD)),
         read_conditions(table, payload_kg),
     )
 

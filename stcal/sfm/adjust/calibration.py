@@ -46,7 +46,7 @@ class SigmaFactors:
 
     @property
     def of_target(self) -> float:
-        """The factor of all points of the target together: the larger one where it has circles and printed corners."""
+        """Returns the factor for all points of the target: the larger one if it has circles and printed corners."""
         return max(self.circles, self.printed) if self.printed_faces else self.circles
 
     def kinds(self, labels: Sequence[Label]) -> np.ndarray:
@@ -65,7 +65,7 @@ class Calibration(Brief):
     ``models`` : models that the result rests on, mm, target frame, without groups that are not linked to it;
     ``camera`` : refined camera if it was refined, else the given one; ``notes`` : faces without a frame and the
     reasons, and an adjustment that did not settle; ``rim_mm`` : heights of the rims behind which circles lie, if the
-    result is of the luminous surface, empty if it is of what is seen; ``rim_sigma_mm`` : σ of all of them together;
+    result is the luminous surface, empty if it is the visible outline; ``rim_sigma_mm`` : σ of all of them together;
     ``circle_sigma_px`` : σ of the centres of the target's circles and corners in the joint adjustment, RMS per axis.
     """
 
@@ -287,8 +287,8 @@ def _adjust_all(
     """Runs the joint adjustments from the chained result; returns the state of the last one and the factors on the
     centres' σ.
 
-    The eccentricity is computed anew before each adjustment. With refined intrinsics the factors are computed anew,
-    too: a wrong camera causes residuals of its own.
+    The eccentricity is computed again before each adjustment. With refined intrinsics, so are the factors, since a
+    wrong camera enlarges residuals.
     """
     radius = target.radius_of() | board.radius_of()
     covariances = [m.covariance_px2 for m in models]
@@ -314,9 +314,9 @@ def image_sigma_factors(models: Sequence[GroupModel], camera: Camera, printed: I
     """Returns the ratios of the residuals of adjusted free networks to the centres' own σ: variance components by kind
     (Förstner 1979).
 
-    ``printed`` : ids of printed faces, whose corners have a factor of their own. It and the factor of ``circles`` are
-    not below 1. σ of some centres hold what is uncertain of their corrections, and σ of printed corners what all
-    photographs share: neither is a residual, so that small residuals do not deny σ.
+    ``printed`` : ids of printed faces, whose corners have their own factor. This factor and that of ``circles`` are at
+    least 1, as their σ include errors that do not show in residuals: the uncertainty of corrections of centres, and
+    errors of printed corners that all photographs share.
     """
     start = SigmaFactors(1.0, 1.0, 1.0, 1.0, frozenset(printed))
     square, redundancy = np.zeros(3), np.zeros(3)

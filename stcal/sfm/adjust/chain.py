@@ -145,7 +145,7 @@ def measure_chains(faces: Sequence[FaceInGroup], calibrated: CalibratedTarget) -
 def _chains(faces: Sequence[FaceInGroup], start: str, goal: str) -> list[Way]:
     """Returns the simple ways from one face to another as (faces, groups), the shortest first.
 
-    None has more than one face more than the shortest.
+    Each has at most one face more than the shortest.
     """
     by_group: dict[str, list[str]] = {}
     for face in faces:
@@ -197,7 +197,7 @@ def _adjust(faces: Sequence[FaceInGroup], chains, reference: str) -> tuple[dict[
 
     Poses are perturbed on the right, so that the step of a face enters its residual with the factor −1.
     """
-    start = {face_id: _along(found[0], faces) for face_id, found in chains.items()}
+    start = {face_id: _along(ways[0], faces) for face_id, ways in chains.items()}
     groups = list(dict.fromkeys(face_in_group.group for face_in_group in faces))
     start_group = {}
     for face_in_group in sorted(faces, key=lambda f: len(chains[f.face][0][0])):
@@ -223,10 +223,10 @@ def _adjust(faces: Sequence[FaceInGroup], chains, reference: str) -> tuple[dict[
     def moved(poses: dict[tuple[str, str], Rigid], step: np.ndarray) -> dict[tuple[str, str], Rigid]:
         return poses | {name: poses[name] @ Rigid.exp(step[at]) for name, at in column.items()}
 
-    found = minimise(initial, linearise, moved)
+    solution = minimise(initial, linearise, moved)
     # Derivatives neglect the curvature of large residuals. If groups disagree, only damped steps lower the cost, and
     # iteration ends when they gain nothing.
-    poses = found.required("faces", "check that nothing but the camera moved in a group", accepted=UNKEPT).state
+    poses = solution.required("faces", "check that nothing but the camera moved in a group", accepted=UNKEPT).state
     return {f: poses["face", f] for f in (reference, *free)}, {g: poses["group", g] for g in groups}
 
 

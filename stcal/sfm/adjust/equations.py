@@ -259,7 +259,7 @@ FREE_DIRECTIONS = 6
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Places of circles, common shape and intrinsics among the shared unknowns, and the number of these."""
+    """Indices of circles, common shape and intrinsics among the shared unknowns, and the number of all of them."""
 
     circles: slice
     shape: slice
@@ -285,14 +285,14 @@ class Setting:
     bend_factor: float = 1.0
 
     def places(self, shared: Shared) -> "Places":
-        """Returns the places of the shared unknowns."""
+        """Returns the indices of the shared unknowns."""
         c = 3 * len(self.labels)
         s = c + (3 * len(shared.shape_mm) if self.common else 0)
         count = s + shared.basis.shape[1]
         return Places(slice(0, c), slice(c, s), slice(s, count), count)
 
     def outer(self, block: Block, shared: Shared) -> np.ndarray:
-        """Returns the places of a group's outer unknowns among all: circles, shape, intrinsics."""
+        """Returns the indices of a group's outer unknowns among all shared ones: circles, shape, intrinsics."""
         places = self.places(shared)
         circles = (3 * block.circle_place[:, None] + np.arange(3)).ravel()
         shape = places.shape.start + (3 * block.dot_place[:, None] + np.arange(3)).ravel()
@@ -383,7 +383,7 @@ def normal_equations(blocks: Sequence[Block], shared: Shared, setting: Setting):
 def add_knowledge(
     normal: np.ndarray, right: np.ndarray | None, shared: Shared, setting: Setting, intrinsics: slice
 ) -> None:
-    """Adds the knowledge beside photographs and board: the intrinsics' prior, the faces' flatness.
+    """Adds the knowledge that is not from photographs or board: the prior of the intrinsics, the flatness of faces.
 
     ``right`` : None if nothing is moved.
     """
@@ -436,11 +436,11 @@ def planes(shared: Shared, setting: Setting):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """The n points of a face of known shape against its design, laid over them with their weights.
+    """The n points of a face of known shape against its design, which is laid over them with their weights.
 
-    ``members`` : (n,) places among the circles; ``rotation`` : (3, 3) model_from_face; ``off_mm`` : (n, 3) points minus
-    design, face frame; ``weight`` : (n, 3) 1/σ²; ``by_pose`` : (3n, 7) derivative of ``off_mm`` by the pose and the
-    relative size of the print; ``size`` : that size less 1, of weight ``size_weight``, infinite if it is exact.
+    ``members`` : (n,) indices among the circles; ``rotation`` : (3, 3) model_from_face; ``off_mm`` : (n, 3) points
+    minus design, face frame; ``weight`` : (n, 3) 1/σ²; ``by_pose`` : (3n, 7) derivative of ``off_mm`` by the pose and
+    the relative size of the print; ``size`` : that size minus 1, of weight ``size_weight``, infinite if it is exact.
     """
 
     members: np.ndarray
@@ -481,8 +481,8 @@ class Shape:
         return float((self.weight * self.off_mm**2).sum()) + own
 
     def _to_pose(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the derivative (6, 3n) of the pose by the deviations, and the covariance (6, 6) of the pose; a row
-        more where the size is free."""
+        """Returns the derivative (6, 3n) of the pose by the deviations, and the covariance (6, 6) of the pose; with one
+        more row if the size is free."""
         weighted = self.weight.reshape(-1, 1) * self.by_pose
         normal = self.by_pose.T @ weighted
         if np.isfinite(self.size_weight):
@@ -511,8 +511,9 @@ class Shape:
         return (force.reshape(-1, 3) @ self.rotation.T).ravel()
 
     def leverage(self, covariance_mm2: np.ndarray) -> np.ndarray:
-        """Returns what the adjustment takes of each deviation's variance, (n, 3), of 1, from the covariance (3n, 3n)
-        of the points."""
+        """Returns the variance of each adjusted deviation over its stated variance, (n, 3), at most 1.
+
+        ``covariance_mm2`` : (3n, 3n) of the points."""
         n = len(self.members)
         turned = covariance_mm2.reshape(n, 3, n, 3)
         turned = np.einsum("ai,manb,bj->minj", self.rotation, turned, self.rotation, optimize=True)
@@ -531,7 +532,7 @@ SHAPE_STEPS, SHAPE_SETTLED = 20, 1e-13
 def shapes(shared: Shared, setting: Setting) -> Iterator[Shape]:
     """Yields the faces of known shape, with their stated σ in the plane and the flatness off it.
 
-    None of a state that a step has sent to infinity, whose images have no finite cost either.
+    Yields nothing for a state that a step has sent to infinity; the cost of its images is infinite, too.
     """
     if not np.isfinite(shared.xyz_model).all():
         return

@@ -51,7 +51,7 @@ class FaceInGroup:
 def missing_frame_circles(face: FaceDesign, mapped: Collection[str]) -> tuple[str, ...]:
     """Returns the ids of the circles that define the frame of the face but are not mapped.
 
-    None are missing of a face of known shape, whose frame is that of its whole design.
+    A face of known shape lacks none, as its frame is that of its whole design.
     """
     if face.sigma_mm is not None:
         return ()
@@ -158,7 +158,7 @@ def face_frames(
     length = np.linalg.norm(across, axis=1, keepdims=True)
     if (length[:, 0] < 1e-6 * np.linalg.norm(along_y, axis=1)).any():
         raise DegenerateError(
-            "E-FACE-COLLINEAR", f"face {face.id}: its frame circles are mapped in one line; check their labels"
+            "E-FACE-COLLINEAR", f"face {face.id}: its frame circles are mapped on one line; check their labels"
         )
     axis_y = across / length
     return Poses(np.stack([axis_x, axis_y, np.cross(axis_x, axis_y)], axis=2), origin)

@@ -103,10 +103,10 @@ class JointResult:
 
     @property
     def sigma_scale(self) -> float:
-        """Factor that the covariances hold: σ₀ where the residuals are larger than the σ of the observations, else 1.
+        """Factor that the covariances include: σ₀ if the residuals are larger than the σ of the observations, else 1.
 
-        The single groups have confirmed the centres' σ, and these are not smaller because a board is better than its
-        design says.
+        It is never below 1: the single groups have confirmed the σ of the centres, and a board that is better than
+        its design says does not make them smaller.
         """
         return scale_of(self.sigma0)
 
@@ -261,7 +261,7 @@ def covariance_of(
     common: float = 0.0,
     photographs: Mapping[str, np.ndarray] | None = None,
 ) -> JointResult:
-    """Returns what :func:`adjust_jointly` would report of models at their true places: nothing is moved, σ₀ is 1.
+    """Returns the result of :func:`adjust_jointly` for models at their true positions, which do not move; σ₀ is 1.
 
     The arguments are those of :func:`adjusted`; ``common`` : share of the board's variance that all groups have in
     common; ``photographs`` : results of :func:`photographs_of`, by group.

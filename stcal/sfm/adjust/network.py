@@ -78,7 +78,7 @@ class Network:
         return normal.sum(0) - weighted @ coupled.T, right.sum(0) - weighted @ self.point_right
 
     def score_by_image(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns :meth:`score` of parameters that every image has for itself: (m, q, q) and (m, q)."""
+        """Returns :meth:`score` of separate parameters for each image: (m, q, q) and (m, q)."""
         normal, right, to_points = self._by_image(columns)
         weighted = to_points @ self.covariance_mm2
         return normal - weighted @ np.swapaxes(to_points, 1, 2), right - weighted @ self.point_right
@@ -86,8 +86,8 @@ class Network:
     def score_of_image(self, image: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns :meth:`score` of one parameter for each coordinate that was observed in an image: (2k, 2k), (2k,).
 
-        They explain the image's residuals whatever they are, as if the image were taken out. The order is all of the
-        first coordinate, then all of the second.
+        These parameters can explain any residuals of the image, as if the image were left out. Those of the first
+        coordinate come first, then those of the second.
         """
         rows = self.model.rows_by_image()[image]
         k, p = len(rows), len(self.model.labels)

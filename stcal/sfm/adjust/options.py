@@ -29,8 +29,7 @@ class AdjustOptions:
     ------
     InputError
         A choice does not exist, σ is out of range, an option contradicts ``paper``, or intrinsics are to be refined
-        without
-        the joint adjustment.
+        without the joint adjustment.
     """
 
     reference_face: str

@@ -27,7 +27,7 @@ STEPS = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RadiusViews:
-    """The n observations of circles of one group as their radii show.
+    """The radii in n observations of circles of one group.
 
     ``point_index`` : (n,) of the model; ``design_mm`` : (n,) designed radius; ``ratio`` : (n,) measured over designed;
     ``size_px`` : (n,) designed radius in the image; ``blur_mm`` : (n,) correction of the radius for blur, which is in
@@ -44,7 +44,7 @@ class RadiusViews:
 
 @dataclass(frozen=True, slots=True)
 class Rim:
-    """Height of the rim in front of circles of one kind, mm, its σ, and the number of ``views`` that tell it."""
+    """Height of the rim in front of circles of one kind, mm, its σ, and the number of ``views`` that determine it."""
 
     height_mm: float
     sigma_mm: float
@@ -57,8 +57,8 @@ def radius_views(
     """Returns the radii from the areas of the ellipses and the positions and planes of the circles.
 
     The areas of the circles' images follow from the dual conic r²(I − n·nᵀ) − C·Cᵀ (Hartley & Zisserman, sec. 8.3),
-    with the estimated planes of the faces. A blur of σ takes σ²/2R off the radius R of a disc's image, and the fit
-    follows by about as much (``scripts/studies/defocus_study.py``); this is put back.
+    with the estimated planes of the faces. A blur of σ reduces the radius R of a disc's image by σ²/2R, and the
+    fitted radius by about as much (``scripts/studies/defocus_study.py``). The result is corrected for this.
     """
     focal = float(np.sqrt(camera.focal.prod()))
     rows = model.rows_by_image()
@@ -93,8 +93,9 @@ def radius_views(
 
 
 def lost_radius_mm(height_mm: float, tan_tilt: np.ndarray, radius_mm: float | np.ndarray) -> np.ndarray:
-    """Returns the radius that a rim of this height hides of a circle at these tilts, mm: that of the area in common of
-    two discs that are h tan τ apart, to second order."""
+    """Returns by how much a rim of this height reduces the radius of a circle at these tilts, mm.
+
+    The visible area is common to two discs that are h tan τ apart; to second order."""
     return height_mm * tan_tilt / np.pi + SECOND_ORDER * height_mm * abs(height_mm) * tan_tilt**2 / radius_mm
 
 
@@ -105,9 +106,8 @@ def find_rims(
 
     A kind with too few views is left out.
 
-    A disc of radius r behind a rim of the same radius and height h is seen as the area that both have in common; from a
-    tilt τ they are h tan τ apart. The area lies as if it stood h/2 in front of the disc, and its radius is less by
-    h tan τ/π.
+    The visible part of a disc of radius r behind a rim of the same radius and height h is the area common to both. At
+    a tilt τ they are h tan τ apart. The area appears h/2 in front of the disc, and its radius is smaller by h tan τ/π.
     """
     by_name = {image.name: image for image in images}
     parts: dict[str, list[tuple[np.ndarray, ...]]] = {"circles": [], "dots": []}

@@ -29,9 +29,9 @@ class Scale:
     ``board_from_world`` : similarity over all dots by least squares, unless λ by rows was requested; its scale is λ
     (mm per unit); ``rows_mm_per_unit`` : λ as in Zhang & Wei (2017) (first and last row, all pairs); ``rows`` : these
     two rows; ``labels`` : (n,) the dots; ``residuals_mm`` : (n, 3) reconstructed minus design, board frame;
-    ``sigma_mm_per_unit`` : σ of λ, from the stated σ of the dots' positions; ``source`` : what λ is from, ``board``,
-    ``faces`` of known shape (then ``labels`` and ``residuals_mm`` are of their corners, face frames), ``distances``, or
-    the ``drawing`` where no size is known.
+    ``sigma_mm_per_unit`` : σ of λ, from the stated σ of the dots' positions;     ``source`` : what determines λ:
+    ``board``, ``faces`` of known shape (then ``labels`` and ``residuals_mm`` are of their corners, face frames),
+    ``distances``, or the ``drawing`` if no size is known.
     """
 
     board_from_world: Similarity
@@ -152,7 +152,7 @@ def _of_distances(model: WorldModel, board: BoardDesign) -> Scale | None:
 
 
 def with_edge_sigma(board: BoardDesign, observations: Sequence[ImageObservations]) -> BoardDesign:
-    """Returns what the scale is taken from with the σ of printed sizes enlarged by what moves the edges of tags.
+    """Returns the board with the σ of printed sizes enlarged by the σ of a common shift of the edges of tags.
 
     Light, ink and the camera's response make all tags look larger or smaller alike, which no residual shows.
     """
@@ -180,8 +180,7 @@ def with_edge_sigma(board: BoardDesign, observations: Sequence[ImageObservations
 
 
 def known_points(labels: Sequence[Label], board: BoardDesign) -> list[tuple[FaceDesign, np.ndarray]]:
-    """Returns the faces of known shape with the indices of their points among ``labels``, of faces with three and
-    more."""
+    """Returns the faces of known shape with three points or more among ``labels``, and the indices of these."""
     faces = {face.id: face for face in faces_of_known_shape(board)}
     members: dict[str, list[int]] = {}
     for i, label in enumerate(labels):

@@ -99,8 +99,8 @@ def calibrated_target(
 ) -> CalibratedTarget:
     """Returns faces and circles of the adjusted target in the target frame, with their marginal covariances.
 
-    ``start`` gives the reference face and the side to which each face looks; ``state`` : of the adjustment, from which
-    follows what each kind of observation contributes to the positions; None for no such contributions.
+    ``start`` gives the reference face and the side to which each face looks; ``state`` : of the adjustment; if
+    None, the contributions of the kinds of observations to the σ of positions are not computed.
     """
     target_derivatives = derivatives(result, start, target, kind)
     return CalibratedTarget(
@@ -136,7 +136,7 @@ def _position_sources_mm(state: Adjusted, scale: float, own: Derivatives) -> dic
 def scale_sigma(xyz_model: np.ndarray, covariance_mm2: np.ndarray) -> float:
     """Returns the relative σ of the scale of the circles.
 
-    The scale is that of the similarity between the circles as adjusted and as they are.
+    The scale is that of the similarity between the adjusted and the true circles.
     """
     middle = xyz_model - xyz_model.mean(0)
     gradient = (middle / (middle**2).sum()).ravel()
@@ -309,7 +309,7 @@ def contributions_of(state: Adjusted) -> Contributions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Parts:
-    """What errors of the observations do to k quantities: ``covariance`` : (k, k) by kind, with the σ of the
+    """Effects of errors of the observations on k quantities: ``covariance`` : (k, k) by kind, with the σ of the
     observations; ``by_scale`` and ``by_intrinsics`` : (k,), (k, 16), as in :class:`Contributions`."""
 
     covariance: dict[str, np.ndarray]

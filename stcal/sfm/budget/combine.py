@@ -32,8 +32,8 @@ class Measurand:
 
     It is a face's position or rotation in the target frame (3 numbers, whose uncertainty is the root of the summed
     variances), or a distance between two circles. ``name`` : the face, or ``a – b``; ``length_mm`` : length of a
-    distance, else None; ``jacobian`` : (r, 3c) with respect to the circles, mm or rad; ``designed`` : (r, d) with
-    respect to the frame circles that were not mapped.
+    distance, else None; ``jacobian`` : (r, 3c) by the circles, mm or rad; ``designed`` : (r, d) by the frame
+    circles that were not mapped.
     """
 
     kind: Kind

@@ -163,7 +163,7 @@ def _require_size(budget: Budget) -> None:
     if not budget.conditions.size_known:
         raise InputError(
             "E-BUDGET-NO-SIZE",
-            "nothing of known size was in view of a run, and only its shape is known: its lengths cannot be compared; "
+            "a run saw nothing of known size, so that only its shape is known and its lengths cannot be compared; "
             "state one of the lengths with [[scale]] in target.toml, and run again",
         )
 

@@ -75,11 +75,13 @@ def uncertainty_budget(
         one that it belongs to.
     """
     if columns is not None and check_lengths is None:
-        raise InputError("E-OPTION-NEEDS", f"--columns {columns}: of a table of lengths; give it with --check-lengths")
+        raise InputError(
+            "E-OPTION-NEEDS", f"--columns {columns}: it describes a table of lengths; give it with --check-lengths"
+        )
     if lengths_statement is not None and lengths is None:
         raise InputError(
             "E-OPTION-NEEDS",
-            f"--lengths-statement {lengths_statement}: of a second calibration; give it with --lengths",
+            f"--lengths-statement {lengths_statement}: it is for a second calibration; give it with --lengths",
         )
     saved = saved_run(run)
     stated = statement_of(saved.board_design.stated, _path(statement), fields)

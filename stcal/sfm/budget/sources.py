@@ -129,7 +129,7 @@ class Source:
 
 
 def sources_of(
-    found: Contributions,
+    contributions: Contributions,
     camera: Camera,
     board: BoardDesign,
     flatness_mm: float | None,
@@ -137,37 +137,36 @@ def sources_of(
     statement: Statement,
     camera_given: bool = True,
 ) -> tuple[Source, ...]:
-    """Returns all rows of the budget, also of inputs of which nothing is known, so that the reader sees what is left
-    out.
+    """Returns all rows of the budget, also for inputs that are not stated, so that the reader sees what is left out.
 
     ``camera`` : the camera as given to the run, with the covariance that its file states; ``refined`` : True if its
     intrinsics were adjusted; ``camera_given`` : False if the photographs alone told it.
     """
-    zero = np.zeros_like(found.joint.covariance_mm2)
-    common = found.joint.board_common
+    zero = np.zeros_like(contributions.joint.covariance_mm2)
+    common = contributions.joint.board_common
     shape = f"{100 * common:.0f} % of it common to all groups" if common else "each group its own"
-    by_dots = f"sigma_mm of board.toml × σ₀ {found.joint.sigma_scale:.3f}; {shape}"
+    by_dots = f"sigma_mm of board.toml × σ₀ {contributions.joint.sigma_scale:.3f}; {shape}"
     corners = bool(faces_of_known_shape(board))
     centres = ("circle_centres", "corners and centres of faces" if corners else "centres of circles", CIRCLES)
     dots = ("dot_centres", "centres of dots", DOTS)
     rows = [
-        Source(key, title, "A", "estimated", "residuals; RMS per axis", found.centre_sigma_px[kind], "px",
-               found.covariance_mm2[kind])
+        Source(key, title, "A", "estimated", "residuals; RMS per axis", contributions.centre_sigma_px[kind], "px",
+               contributions.covariance_mm2[kind])
         for key, title, kind in (centres, dots)[: 2 if board.rows else 1]
     ]  # fmt: skip
     if board.rows:
-        sigma_um = 1e3 * board.sigma_mm * found.joint.sigma_scale
-        covariance = found.covariance_mm2[BOARD]
+        sigma_um = 1e3 * board.sigma_mm * contributions.joint.sigma_scale
+        covariance = contributions.covariance_mm2[BOARD]
         rows.append(Source("board_dots", "places of dots", "B", "stated", by_dots, sigma_um, "µm", covariance))
-    rows += _own_size(found, board)
-    if not corners or found.covariance_mm2[FLATNESS].any():
-        rows.append(_flatness(found, flatness_mm))
-    rows.append(_intrinsics(found, camera, refined, camera_given))
+    rows += _own_size(contributions, board)
+    if not corners or contributions.covariance_mm2[FLATNESS].any():
+        rows.append(_flatness(contributions, flatness_mm))
+    rows.append(_intrinsics(contributions, camera, refined, camera_given))
     if board.rows:
-        rows.append(_scale(found.by_scale, zero, statement))
-    grown = found.joint.xyz_model - found.joint.xyz_model.mean(0)
+        rows.append(_scale(contributions.by_scale, zero, statement))
+    grown = contributions.joint.xyz_model - contributions.joint.xyz_model.mean(0)
     for body, stated, effect in (
-        ("board", statement.board, found.by_scale),
+        ("board", statement.board, contributions.by_scale),
         ("target", statement.target, grown.ravel()),
     ):
         if board.rows:
@@ -175,13 +174,16 @@ def sources_of(
     return tuple(rows)
 
 
-def _own_size(found: Contributions, board: BoardDesign) -> Iterator[Source]:
+def _own_size(contributions: Contributions, board: BoardDesign) -> Iterator[Source]:
     """Yields the rows of faces of known shape and of known distances."""
-    factor = found.joint.sigma_scale
+    factor = contributions.joint.sigma_scale
     if faces := faces_of_known_shape(board):
-        within = max(face.sigma_mm or 0.0 for face in faces) * found.joint.print_factor * factor
-        words = f"sigma_mm of target.toml × {found.joint.print_factor * factor:.2f}, in the plane; off it --flatness"
-        yield Source("print", "print of faces", "B", "stated", words, 1e3 * within, "µm", found.covariance_mm2[PRINT])
+        print_factor = contributions.joint.print_factor
+        within = max(face.sigma_mm or 0.0 for face in faces) * print_factor * factor
+        words = f"sigma_mm of target.toml × {print_factor * factor:.2f}, in the plane; off it --flatness"
+        yield Source(
+            "print", "print of faces", "B", "stated", words, 1e3 * within, "µm", contributions.covariance_mm2[PRINT]
+        )
         largest = max(faces, key=lambda face: face.size_sigma)
         sigma, by_statement = largest.size_sigma, largest.size_sigma > 0 and largest.edge_share < 1
         stated: Origin = "stated" if by_statement else "assumed" if sigma else "not stated"
@@ -189,11 +191,11 @@ def _own_size(found: Contributions, board: BoardDesign) -> Iterator[Source]:
         if by_statement:
             words = "size_sigma_mm" + (", and what moves the edges of all tags alike" if largest.edge_share else "")
         ppm = 1e6 * sigma if sigma else None
-        yield Source("print_size", "size of print", "B", stated, words, ppm, "ppm", found.covariance_mm2[SIZES])
+        yield Source("print_size", "size of print", "B", stated, words, ppm, "ppm", contributions.covariance_mm2[SIZES])
     if known := known_distances(board):
         sigma_um = 1e3 * max(each.sigma_mm for each in known) * factor
         words = f"[[scale]] of target.toml, {len(known)} in all; the largest σ"
-        covariance = found.covariance_mm2[DISTANCES]
+        covariance = contributions.covariance_mm2[DISTANCES]
         if known[0].drawn:
             words = "nothing of known size was in view: only the shape is known"
             yield Source("distances", "size", "B", "not known", words, None, "µm", covariance)
@@ -201,30 +203,32 @@ def _own_size(found: Contributions, board: BoardDesign) -> Iterator[Source]:
         yield Source("distances", "known distances", "B", "stated", words, sigma_um, "µm", covariance)
 
 
-def _flatness(found: Contributions, flatness_mm: float | None) -> Source:
-    words = f"--flatness of the run × σ₀ {found.joint.sigma_scale:.3f}"
+def _flatness(contributions: Contributions, flatness_mm: float | None) -> Source:
+    words = f"--flatness of the run × σ₀ {contributions.joint.sigma_scale:.3f}"
     if flatness_mm is None:
         words = "--flatness off: faces need not be flat"
-    sigma = None if flatness_mm is None else 1e3 * flatness_mm * found.joint.sigma_scale
+    sigma = None if flatness_mm is None else 1e3 * flatness_mm * contributions.joint.sigma_scale
     origin: Origin = "not stated" if flatness_mm is None else "stated"
     if flatness_mm == FLATNESS_MM:
         origin, words = "assumed", f"the default of {words}"
-    return Source("flatness", "flatness of faces", "B", origin, words, sigma, "µm", found.covariance_mm2[FLATNESS])
+    return Source(
+        "flatness", "flatness of faces", "B", origin, words, sigma, "µm", contributions.covariance_mm2[FLATNESS]
+    )
 
 
-def _intrinsics(found: Contributions, camera: Camera, refined: bool, camera_given: bool) -> Source:
+def _intrinsics(contributions: Contributions, camera: Camera, refined: bool, camera_given: bool) -> Source:
     if not camera_given:
         words = "found from these photographs, without a camera file; adjusted with all else"
-        return _camera_row("estimated", words, found.covariance_mm2[INTRINSICS], "A")
+        return _camera_row("estimated", words, contributions.covariance_mm2[INTRINSICS], "A")
     stated = camera.covariance is not None
     origin: Origin = "stated" if stated else "assumed" if refined else "not stated"
     if refined:
         words = "adjusted; σ before that " + ("of the camera file" if stated else "of a calibration of some age")
-        return _camera_row(origin, words, found.covariance_mm2[INTRINSICS])
+        return _camera_row(origin, words, contributions.covariance_mm2[INTRINSICS])
     if camera.covariance is None:
         words = "fixed; no σ in the camera file"
-        return _camera_row(origin, words, np.zeros_like(found.joint.covariance_mm2))
-    effect = found.by_intrinsics @ intrinsic_basis(camera.colmap_model)
+        return _camera_row(origin, words, np.zeros_like(contributions.joint.covariance_mm2))
+    effect = contributions.by_intrinsics @ intrinsic_basis(camera.colmap_model)
     return _camera_row(origin, "fixed; σ of the camera file", effect @ camera.covariance @ effect.T)
 
 
@@ -327,7 +331,7 @@ def conditions_of(statement: Statement, board: BoardDesign) -> Conditions:
 
 
 def _growth(stated: StatedSize) -> float | None:
-    """Returns by what a body is larger, relatively, than at its reference temperature; None if it is not known."""
+    """Returns the relative expansion of a body since its reference temperature; None if it is not known."""
     warmer = warmer_k(stated)
     if 0.0 in (warmer, stated.expansion_ppm_per_k):
         return 0.0

@@ -89,7 +89,7 @@ def projection_jacobian(camera: Camera, colmap_model: str) -> np.ndarray:
     except ConvergenceError as error:
         raise DegenerateError(
             "E-CAMERA-FOLDED",
-            "camera: the distortion folds over inside the image, where no dots are; add views that fill the image "
+            "camera: the distortion folds over in a part of the image without dots; add views that fill the image "
             "to its corners, or choose a --model with fewer parameters",
         ) from error
     jacobian = camera.parameter_jacobian(ideal) @ intrinsic_basis(colmap_model)

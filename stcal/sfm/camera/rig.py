@@ -143,8 +143,8 @@ def _alone(names: Sequence[str], own: Sequence[Mapping[str, Sighting]], rest: li
     return DegenerateError(
         "E-RIG-UNLINKED",
         f"rig: camera {names[k]} shares no instant with {', '.join(rest)}: its images, such as {next(iter(own[k]))}, "
-        "show the board when theirs do not, or have other names; add images of one instant, named alike in both "
-        "folders, that show the board",
+        "show the board when theirs do not, or have other names; add images of the same instants that show the board, "
+        "with the same names in both folders",
     )
 
 
@@ -193,8 +193,9 @@ def _where(
     ):
         raise DegenerateError(
             "E-RIG-TURNED",
-            f"rig: camera {name}: {len(seen)} shared instants do not tell which way round it saw the board, which "
-            "looks the same after a turn; add instants with the board turned and tilted, or use a board with one "
+            f"rig: camera {name}: {len(seen)} shared instants do not determine the orientation in which it saw the "
+            "board, which looks the same after a turn; add instants with the board turned and tilted, or use a board "
+            "with one "
             "larger dot",
         )
     return _Where(relations[best], deviation[best].argmin(axis=1).tolist(), least[best].tolist(), limit)
@@ -346,11 +347,11 @@ def _result(
     names: tuple[str, ...],
     alone: tuple[CameraCalibration, ...],
     together: Together,
-    found: Adjusted,
+    adjusted: Adjusted,
     board: BoardDesign,
 ) -> RigCalibration:
-    state, setting = found.state, found.setting
-    covariance = np.linalg.inv(found.last.normal)
+    state, setting = adjusted.state, adjusted.setting
+    covariance = np.linalg.inv(adjusted.last.normal)
     covariance = (covariance + covariance.T) / 2
     pose_covariance = np.zeros((len(names), 6, 6))
     for k in range(1, len(names)):
@@ -359,7 +360,7 @@ def _result(
     for each in together.sightings:
         members.setdefault(each.instant, {})[names[each.camera]] = each.view.name
     shared = tuple(sum(len(m) > 1 and name in m for m in members.values()) for name in names)
-    intrinsics = [_of_camera(k, alone[k].intrinsics, found, covariance) for k in range(len(names))]
+    intrinsics = [_of_camera(k, alone[k].intrinsics, adjusted, covariance) for k in range(len(names))]
     return RigCalibration(
         names=names,
         cameras=tuple(rejudged(a, own, board) for a, own in zip(alone, intrinsics, strict=True)),
@@ -370,10 +371,10 @@ def _result(
         instants=dict(sorted(members.items())),
         rms_px=_rms_by_instant(state, together),
         apart=together.apart,
-        factor=found.factors.centres,
-        dots=found.factors.dots,
+        factor=adjusted.factors.centres,
+        dots=adjusted.factors.dots,
         redundancy=state.redundancy(setting.kept),
-        warnings=tuple(_warnings(names, shared, together, found)),
+        warnings=tuple(_warnings(names, shared, together, adjusted)),
     )
 
 

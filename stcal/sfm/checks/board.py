@@ -144,7 +144,7 @@ def rim_check(
 
     ``rims`` : by kind of circle; ``sigma_mm`` : largest σ of a face's position; a rim that moves the faces by less
     than this is seen and does no harm; ``allowed_mm`` : by kind of circle, the height that the result allows for, None
-    if it takes what is estimated here; 0 of other kinds; ``has_circles`` : False if there are corners alone.
+    if it uses the height estimated here, and 0 for other kinds; ``has_circles`` : False if there are only corners.
     """
     key, title = "rim", "Rim in front of the circles"
     if not has_circles:

@@ -2,7 +2,8 @@
 named first.
 
 A cause that all images share makes many checks fail, which each name something else. A hypothesis is a set of further
-parameters of the free networks (score test). It explains what it takes from the squared residuals beyond chance.
+parameters of the free networks (score test). It explains the part by which it reduces the squared residuals beyond
+chance.
 """
 
 from collections.abc import Callable, Sequence
@@ -124,7 +125,7 @@ def _fit(cause: _Cause, networks: Sequence[Network]) -> _Fitted | None:
 
 
 def _apart(cause: _Cause, network: Network) -> np.ndarray:
-    """Returns the columns with parameters of each image, or of the group, for itself."""
+    """Returns the columns with separate parameters for each image, or for the group."""
     columns = cause.columns(network)
     if cause.scope == "group":
         return columns
@@ -164,7 +165,7 @@ def _applies(fitted: _Fitted, networks: Sequence[Network]) -> bool:
 
 
 def _explained_by_few(fitted: _Fitted, networks: Sequence[Network]) -> float:
-    """Returns what the parameters of a quarter of the images explain, of those that explain most alone."""
+    """Returns how much the parameters of a quarter of the images explain, of the images that explain most."""
     equations = [network.score(_apart(fitted.cause, network)) for network in networks]
     gains = []
     for i, (network, (normal, right)) in enumerate(zip(networks, equations, strict=True)):
@@ -183,9 +184,9 @@ def _explained_by_few(fitted: _Fitted, networks: Sequence[Network]) -> float:
 
 
 def _explained_by_one(networks: Sequence[Network], left: float) -> float:
-    """Returns what any one image explains, if it is taken out.
+    """Returns how much leaving out one image explains, at most.
 
-    ``left`` : squared residual per degree of freedom that is not explained.
+    ``left`` : squared residual per degree of freedom that remains unexplained.
     """
     most = 0.0
     for network in networks:
@@ -222,7 +223,7 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
     def by(direction: np.ndarray) -> Callable[[Network], np.ndarray]:
         return lambda network: network.model.whiten(_by_parameters(network, camera) @ direction)
 
-    found = [
+    causes = [
         _Cause("the focal length is not that of the camera file", "zoom or focus is not as at the calibration, or the "
                f"file is of another lens: {ANEW}", _percent("focal length"), by(focal)),
         _Cause("the photographs are scaled against the camera file", "give the photographs in the size of the "
@@ -250,13 +251,13 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
                "them again", lambda value, _: "in more than one image", _by_motion, "image"),
     ]  # fmt: skip
     if np.abs(removed).max() > 0:
-        found.append(
+        causes.append(
             _Cause("the photographs are already undistorted", "the camera file has a distortion that they no longer "
                    "have: give the original photographs, or set the distortion in the camera file to 0",
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
                    "not in them", by(removed), whole=True)
         )  # fmt: skip
-        found.append(
+        causes.append(
             _Cause("the distortion of the camera file has its sign reversed", "its program undistorts where this one "
                    "distorts: change the signs of all coefficients in the camera file",
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the way",
@@ -265,12 +266,12 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
     for quarters in (1, 2, 3) if camera.width == camera.height else (2,):
         turned = _turned(camera, quarters)[:, None] - camera.parameters()[:, None]
         if np.abs(turned[2:4]).max() > LEAST_SHIFT_PX:
-            found.append(
+            causes.append(
                 _Cause(f"the photographs are turned by {90 * quarters}° against the camera file", "turn them back, as "
                        "the sensor has them, without the rotation that a viewer or converter applied",
                        lambda value, _: f"principal point {100 * value[0]:.0f} % of the way", by(turned), whole=True)
             )  # fmt: skip
-    return found
+    return causes
 
 
 def _turned(camera: Camera, quarters: int) -> np.ndarray:

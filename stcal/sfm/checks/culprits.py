@@ -1,4 +1,4 @@
-"""Who is guilty: a culprit is named only where leaving it out cures the result and leaving out another does not."""
+"""Culprits: one is named only if leaving it out cures the result, and leaving out another one does not."""
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -17,8 +17,9 @@ MOST = 0.5
 class Guilt:
     """Result of a search among suspects, which are the images of a group, or groups.
 
-    ``where`` : what the suspects are in, for sentences; ``culprits`` : the fewest whose leaving out cures the result,
-    none if others would cure it as well, or half of all or more are needed; ``rivals`` : those of which any cures it.
+    ``where`` : what the suspects are in, for sentences; ``culprits`` : smallest set of suspects without which
+    the result is sound, empty if another set cures it as well, or if half of all suspects or more are needed;
+    ``rivals`` : suspects of which leaving out any one cures the result.
     """
 
     where: str

@@ -103,7 +103,7 @@ def field_check(networks: Sequence[Network], camera: Camera) -> Check:
     """Tests for a residual field that is the same in all images: x and y are each a cubic of the place in the image.
 
     Wrong intrinsics cause such a field, too. A field that they do not explain is due to a lens or sensor that the
-    camera model does not describe. A field of 0.002 px RMS is allowed, as there is one in any images.
+    camera model does not describe. A field of 0.002 px RMS is allowed, as any images have one.
     """
     key, title = "residual-field", "Residuals over the image"
 
@@ -240,7 +240,7 @@ def moved_check(networks: Sequence[Network]) -> Check:
     test with six degrees of freedom.
     """
     trials: list[Trial] = []
-    found: dict[str, tuple[Network, np.ndarray, list[int]]] = {}
+    tested_by_group: dict[str, tuple[Network, np.ndarray, list[int]]] = {}
     for network in networks:
         model = network.model
         on_face = np.array([isinstance(label, CircleLabel) for label in model.labels])
@@ -259,13 +259,13 @@ def moved_check(networks: Sequence[Network]) -> Check:
                 shift_um = 1e3 * float(np.linalg.norm(test.estimate[3:]))
                 trials.append(Trial(name, shift_um, "µm", test.statistic, test.freedom, redundancy - test.freedom))
                 tested.append(i)
-        found[model.group] = network, columns, tested
+        tested_by_group[model.group] = network, columns, tested
     check = judge("moved", "Target against board, image by image", trials, "images", "")
     if not check.names or len(check.names) > max(NEARLY_ALL * check.tested, 1):
         return _take_out(check, "")
     guilt = [
         culprits_by_score(network, columns, tested, check.tested, f"group {group}")
-        for group, (network, columns, tested) in found.items()
+        for group, (network, columns, tested) in tested_by_group.items()
         if any(network.model.images[i] in check.names for i in tested)
     ]
     remedy = (

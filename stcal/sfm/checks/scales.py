@@ -1,4 +1,4 @@
-"""Check of what the size rests on: printed faces, known distances and the board against one another."""
+"""Check of the sources of the scale against one another: printed faces, known distances and the board."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ PPM = 1e6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Source:
-    """A source of the scale: ``log_scale`` of the model over what is known, its derivative by the points, (3p,), and
-    the variance of what is known."""
+    """A source of the scale: ``log_scale`` of the model over the known size, its derivative by the points, (3p,), and
+    the variance of the known size."""
 
     name: str
     log_scale: float

@@ -1,4 +1,4 @@
-"""Checks that residuals cannot fake: each asks a question that a wrong result with small residuals answers wrongly."""
+"""All checks of a run. Each tests for an error that small residuals may hide."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace

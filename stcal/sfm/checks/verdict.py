@@ -96,7 +96,7 @@ class Trial:
     name : str
         Image, label, face, group …
     value : float
-        For people; it grows with the root of ``statistic`` (if ``ratio``, its logarithm does).
+        Value to show. It grows with the root of ``statistic`` (if ``ratio``, its logarithm does).
     unit : str
         Of ``value``.
     statistic : float

@@ -95,15 +95,16 @@ def _largest_grid(candidates: Candidates, links, steps, seeds, free, board: Boar
 
 
 def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.ndarray]:
-    """Finds for each candidate, mapped to a circle of the board's radius, the dots one pitch away in the four
-    directions, of a hexagonal board six, that most neighbours agree on. Returns (n, 4 or 6) indices or −1, and
-    (n, 2, 2) whose columns are the two steps."""
+    """Finds the dots one pitch away from each candidate, in the directions on which most neighbours agree.
+
+    There are four directions, six on a hexagonal board. Distances are taken in coordinates that map the candidate to a
+    circle of the board's radius. Returns (n, 4 or 6) indices or −1, and (n, 2, 2) whose columns are the two steps."""
     n, sides = len(candidates), directions(board)
     k = min(NEIGHBOURS + 1, n)
-    near = candidates.tree.query(candidates.xy, k=k)[1][:, 1:]
+    neighbours = candidates.tree.query(candidates.xy, k=k)[1][:, 1:]
     inverse = np.linalg.inv(candidates.shape)
-    largest, smallest = singular_values(inverse[:, None] @ candidates.shape[near])
-    step = np.einsum("nij,nkj->nki", inverse, candidates.xy[near] - candidates.xy[:, None])
+    largest, smallest = singular_values(inverse[:, None] @ candidates.shape[neighbours])
+    step = np.einsum("nij,nkj->nki", inverse, candidates.xy[neighbours] - candidates.xy[:, None])
     length = np.linalg.norm(step, axis=2) * board.radius_mm / board.pitch_mm
     ok = (np.abs(length - 1) < STEP_TOLERANCE) & (largest < MAX_AXIS_RATIO) & (smallest > 1 / MAX_AXIS_RATIO)
     # Blur makes small dots look larger, and diagonal neighbours then pass for direct ones: the nearest tell.
@@ -119,7 +120,7 @@ def _links(candidates: Candidates, board: BoardDesign) -> tuple[np.ndarray, np.n
     for side in range(sides):
         cost = np.where(ok & (direction == side), error, np.inf)
         best = cost.argmin(1)
-        links[:, side] = np.where(np.isfinite(cost.min(1)), near[np.arange(n), best], -1)
+        links[:, side] = np.where(np.isfinite(cost.min(1)), neighbours[np.arange(n), best], -1)
     pitch = board.pitch_mm / board.radius_mm
     axes = np.stack([np.cos(agreed), -np.sin(agreed), np.sin(agreed), np.cos(agreed)], 1).reshape(n, 2, 2) * pitch
     return links, candidates.shape @ axes @ board.steps()
@@ -218,7 +219,7 @@ def _number(candidates: Candidates, cells, board: BoardDesign, image_corners) ->
 def by_rings(reading: BoardReading, board: BoardDesign, grey: np.ndarray, camera: Camera) -> BoardReading:
     """Returns the reading with the numberings that put the board's dots with a hole where the image shows holes.
 
-    A dot has a hole if its middle differs from its body by much of what bodies differ from the board.
+    A dot has a hole if its middle differs from its body by a large share of the contrast of bodies to the board.
 
     ``grey`` : (height, width) 8-bit image; ``camera`` : its camera.
     """
@@ -325,8 +326,10 @@ def _place(
 
 
 def _offsets(cells: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Shifts (k, 2) of cells (n, 2), more than ``MAX_UNEXPLAINED``, that leave no more than that many of them outside
-    of a board along each axis; row by row."""
+    """Returns the shifts (k, 2) of cells (n, 2) that leave at most ``MAX_UNEXPLAINED`` of them outside of the board at
+    each end of each axis, row by row.
+
+    n is larger than ``MAX_UNEXPLAINED``."""
     if len(cells) > size.prod() + MAX_UNEXPLAINED:
         return np.zeros((0, 2), int)
     in_order = np.sort(cells, axis=0)

@@ -41,8 +41,8 @@ class Focus:
 
     ``image`` : its name; ``focused_mm`` : distance of the plane of focus along the optical axis, None if the image does
     not determine it; ``depth_mm`` : depths of the nearest and the farthest circle; ``blur_px`` : blur (σ) at these;
-    ``shift_px`` : largest correction of a centre, 0 if none is needed; ``note`` : what the blur shows that defocus does
-    not explain, empty by default.
+    ``shift_px`` : largest correction of a centre, 0 if none is needed; ``note`` : blur that defocus does not explain,
+    in words; empty by default.
     """
 
     image: str
@@ -111,7 +111,7 @@ def correct_defocus(
     """Returns the images with centres at which a lens with blur that is the same everywhere would show them.
 
     Out of focus, blur varies with depth, and so across a tilted circle: a fit with one blur for each circle moves
-    towards the blurrier side. What is uncertain of the correction is added to the covariances.
+    towards the blurrier side. The uncertainty of the correction is added to the covariances.
 
     Parameters
     ----------
@@ -181,19 +181,19 @@ def _laws(views: Sequence[_Views]) -> list[_Law | None]:
     The curvature a² is a property of lens and aperture: that of each image is drawn towards the mean of all by as much
     as their scatter allows (DerSimonian & Laird 1986, Control. Clin. Trials 7).
     """
-    enough = [own for own in views if len(own.rows) >= MIN_CIRCLES]
+    enough = [circles for circles in views if len(circles.rows) >= MIN_CIRCLES]
     if not enough:
         return [None] * len(views)
-    unit = float(np.median([np.ptp(own.inverse_depth) for own in enough]))
+    unit = float(np.median([np.ptp(circles.inverse_depth) for circles in enough]))
     unit = unit if unit > 0 else 1.0
-    alone = [_law(own, unit) for own in enough]
+    alone = [_law(circles, unit) for circles in enough]
     curvature = np.array([law.coefficients[2] for law in alone])
     variance = np.array([law.covariance[2, 2] for law in alone])
     if len(enough) >= 3 and (variance > 0).all():
         prior = _mean_and_variance(curvature, variance)
-        alone = [_law(own, unit, prior) for own in enough]
+        alone = [_law(circles, unit, prior) for circles in enough]
     laws = iter(alone)
-    return [next(laws) if len(own.rows) >= MIN_CIRCLES else None for own in views]
+    return [next(laws) if len(circles.rows) >= MIN_CIRCLES else None for circles in views]
 
 
 def _mean_and_variance(values: np.ndarray, variances: np.ndarray) -> tuple[float, float]:

@@ -1,9 +1,9 @@
 """Faces of the target: the pattern is found in the face plane, after a homography, and the face named there.
 
-Document 000 walks along image directions and decides by dot products, which perspective breaks. Here two
-neighbouring candidates that may be two neighbouring circles of a design determine a map of the plane. The map is grown
-to all circles of a face, and all readings of the same candidates compete. A face is named only if one reading explains
-more circles than every other.
+Zhang & Wei (2017) walk along directions in the image and decide by scalar products, which perspective distorts. Here
+two neighbouring candidates that may be two neighbouring circles of a design determine a map of the plane. The map is
+extended to all circles of a face, and all readings of the same candidates compete. A face is named only if one reading
+explains more circles than every other.
 """
 
 from dataclasses import dataclass
@@ -164,19 +164,19 @@ def _pairs(target: TargetDesign) -> _Pairs:
     for number, face in enumerate(target.faces):
         distance = np.linalg.norm(face.xy_mm[:, None] - face.xy_mm, axis=2)
         for row in np.argsort(distance, axis=1, kind="stable"):
-            near = row[:width]
-            offset, radius = face.xy_mm[near] - face.xy_mm[near[0]], face.radius_mm[near]
+            nearest = row[:width]
+            offset, radius = face.xy_mm[nearest] - face.xy_mm[nearest[0]], face.radius_mm[nearest]
             same = (*np.round(offset, 6).ravel(), *np.round(radius, 6))
-            for second in range(1, min(NEIGHBOURS_IN_DESIGN, len(near) - 1) + 1):
-                occurrences.setdefault((second, *same), [offset, radius, []])[2].append((number, near))
+            for second in range(1, min(NEIGHBOURS_IN_DESIGN, len(nearest) - 1) + 1):
+                occurrences.setdefault((second, *same), [offset, radius, []])[2].append((number, nearest))
     offsets, radii = np.zeros((len(occurrences), width, 2)), np.ones((len(occurrences), width))
     exists = np.zeros((len(occurrences), width), bool)
     for i, (offset, radius, _) in enumerate(occurrences.values()):
         offsets[i, : len(radius)], radii[i, : len(radius)], exists[i, : len(radius)] = offset, radius, True
     uses = [use for _, _, uses in occurrences.values() for use in uses]
     circles = np.full((len(uses), width), -1)
-    for i, (_, near) in enumerate(uses):
-        circles[i, : len(near)] = near
+    for i, (_, nearest) in enumerate(uses):
+        circles[i, : len(nearest)] = nearest
     return _Pairs(
         offsets,
         radii,

@@ -94,8 +94,8 @@ def detect_files(
     ----------
     cache : folder for results by content
     progress : called with the name of each finished file, in any order
-    detector : what reads one image; ours where None
-    forms : whether one photograph in several forms, as PNG and JPEG, counts once, as files of one content always do
+    detector : function that reads one image; that of this package if None
+    forms : whether a photograph in several forms, such as PNG and JPEG, counts once; files of equal content always do
     pictures : whether a small picture of each image is kept, for overlays
 
     Raises
@@ -109,20 +109,20 @@ def detect_files(
     cache.mkdir(parents=True, exist_ok=True)
     settings = _fingerprint(detector, camera, target, board, options, pictures)
     jobs = [(file, camera, size_from, target, board, options, settings, detector, pictures) for file in files]
-    found: list[DetectedImage | Skipped | None] = [None] * len(files)
+    outcomes: list[DetectedImage | Skipped | None] = [None] * len(files)
     if any(cache.glob("*.npz")):
         with ThreadPoolExecutor() as pool:  # reading and hashing release the interpreter
-            found[:] = pool.map(lambda file: _kept(file, settings, cache), files)
-    pending = [i for i, each in enumerate(found) if each is None]
-    for file, each in zip(files, found, strict=True):
+            outcomes[:] = pool.map(lambda file: _kept(file, settings, cache), files)
+    pending = [i for i, each in enumerate(outcomes) if each is None]
+    for file, each in zip(files, outcomes, strict=True):
         if each is not None and progress:
             progress(file.name)
     for k, outcome in run_on_images(_detect_file, [jobs[i] for i in pending], workers, kept=True):
         i = pending[k]
-        found[i] = outcome if isinstance(outcome, Skipped) else _stored(files[i], cache, *outcome)
+        outcomes[i] = outcome if isinstance(outcome, Skipped) else _stored(files[i], cache, *outcome)
         if progress:
             progress(files[i].name)
-    images, skipped = _without_copies([f for f in found if f is not None], forms)
+    images, skipped = _without_copies([f for f in outcomes if f is not None], forms)
     if not images:
         first = skipped[0]
         raise InputError("E-IMAGES-NONE-USABLE", f"no usable image among {len(files)}: {first.name}: {first.reason}")
@@ -130,9 +130,9 @@ def detect_files(
 
 
 def seen_by(detection: DetectionResult, camera: Camera, target: TargetDesign) -> DetectionResult:
-    """Returns the detections of corners alone, made with a camera without distortion, for another camera.
+    """Returns detections of corners, made with a camera without distortion, converted to another camera.
 
-    It moves those of tags, see :func:`stcal.boards.faces.shift_by_curves`.
+    Corners of tags move, see :func:`stcal.boards.faces.shift_by_curves`.
     """
     images = []
     for image in detection.images:
@@ -148,7 +148,7 @@ def seen_by(detection: DetectionResult, camera: Camera, target: TargetDesign) ->
 
 
 def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera, str]:
-    """The camera, and what its size is from: a file of OpenCV may not say it, then most of the images do."""
+    """Returns the camera with its image size, and the source of the size: the file, or most images if it lacks one."""
     if camera_model.width and camera_model.height:
         return camera_model.sized(camera_model.width, camera_model.height), "the camera file"
     size, name = require_common_size(files)
@@ -234,7 +234,7 @@ def _stored(file: ImageFile, cache: Path, key: str, content: bytes) -> DetectedI
 
 
 def load_image(file: ImageFile, camera: Camera, size_from: str) -> tuple[bytes, np.ndarray] | Skipped:
-    """Content of a file and the grey image in it, or why it cannot be used; ``size_from`` : what the size is from.
+    """Returns the content of a file and its grey image, or why it cannot be used; ``size_from`` : source of the size.
 
     Raises
     ------
@@ -259,10 +259,10 @@ def _packed(detection: ImageDetection, key: str, digest: str, picture: np.ndarra
     meta = {
         "digest": digest,
         "scale": scale,
-        "faces": [each.face for each in detection.faces],
-        "printed": [each.face for each in detection.printed],
+        "faces": [sighting.face for sighting in detection.faces],
+        "printed": [sighting.face for sighting in detection.printed],
         "boards": len(detection.boards),
-        "open_faces": [[each.face for each in faces] for faces in detection.open_faces],
+        "open_faces": [[sighting.face for sighting in faces] for faces in detection.open_faces],
         "mirrored": detection.mirrored,
         "notes": detection.notes,
         "candidates": detection.candidates,
@@ -275,8 +275,8 @@ def _packed(detection: ImageDetection, key: str, digest: str, picture: np.ndarra
     for i, faces in enumerate(detection.open_faces):
         for k, face in enumerate(faces):
             arrays |= {f"open_rows_{i}_{k}": face.rows, f"open_circles_{i}_{k}": face.circles}
-    for i, each in enumerate(detection.boards):
-        arrays |= {f"board_{f.name}_{i}": getattr(each, f.name) for f in fields(BoardSighting)}
+    for i, sighting in enumerate(detection.boards):
+        arrays |= {f"board_{f.name}_{i}": getattr(sighting, f.name) for f in fields(BoardSighting)}
     return packed(key, {"thumbnail": picture, **arrays}, meta)
 
 
@@ -336,7 +336,7 @@ def look_again(
 
     An image that can no longer be read is left as it was after the first look; one that is gone is an error.
     """
-    found: dict[str, SecondLook] = {}
+    looks: dict[str, SecondLook] = {}
     pending: list[tuple[ImageFile, Camera, PredictedCircles, EllipseOptions]] = []
     paths: list[Path] = []
     for image, predicted in jobs:
@@ -346,12 +346,12 @@ def look_again(
             pending.append((image.file, camera, predicted, options))
             paths.append(path)
         else:
-            found[image.file.name] = known
+            looks[image.file.name] = known
     for k, look in run_on_images(_look_again, pending, workers, kept=True):
         if look is not None:
             keep(paths[k], _centre_arrays(look.centres), {"labels": look.labels, "missed": look.missed})
-            found[pending[k][0].name] = look
-    return found
+            looks[pending[k][0].name] = look
+    return looks
 
 
 def _predicted_key(digest: str, predicted: PredictedCircles, camera: Camera, options: EllipseOptions) -> str:
@@ -386,23 +386,25 @@ def copy_of(file: ImageFile, first: str, what: str = "") -> Skipped:
     return Skipped(file.name, f"the same image as {first}{what}", "copy")
 
 
-def _without_copies(found: list[DetectedImage | Skipped], forms: bool) -> tuple[list[DetectedImage], list[Skipped]]:
-    """A second copy of a photograph adds no information and would pass for it: of files with the same content the
-    plainest name stays, of one photograph in several ``forms`` the one without losses."""
-    every = [each for each in found if isinstance(each, DetectedImage)]
-    plain: dict[str, DetectedImage] = {}
-    for each in sorted(every, key=lambda each: _plainness(each.file)):
-        plain.setdefault(each.digest, each)
-    firsts = [(each, plain[each.digest]) for each in every]
-    gone = {each.file.name: copy_of(each.file, first.file.name) for each, first in firsts if each is not first}
-    for one, two in _in_two_forms([each for each, first in firsts if each is first] if forms else []):
-        first, second = sorted((one, two), key=lambda each: _plainness(each.file))
-        if {first.file.name, second.file.name} & gone.keys() or not _same_pixels(first.file, second.file):
+def _without_copies(outcomes: list[DetectedImage | Skipped], forms: bool) -> tuple[list[DetectedImage], list[Skipped]]:
+    """Returns the images without copies of photographs, and the files that are skipped.
+
+    A copy adds no information, but would count as a further observation. Of files with equal content, the one with the
+    plainest name is kept; of one photograph in several ``forms``, the lossless one."""
+    detected = [outcome for outcome in outcomes if isinstance(outcome, DetectedImage)]
+    plainest: dict[str, DetectedImage] = {}
+    for image in sorted(detected, key=lambda image: _plainness(image.file)):
+        plainest.setdefault(image.digest, image)
+    firsts = [(image, plainest[image.digest]) for image in detected]
+    copies = {image.file.name: copy_of(image.file, first.file.name) for image, first in firsts if image is not first}
+    for one, two in _in_two_forms([image for image, first in firsts if image is first] if forms else []):
+        first, second = sorted((one, two), key=lambda image: _plainness(image.file))
+        if {first.file.name, second.file.name} & copies.keys() or not _same_pixels(first.file, second.file):
             continue
-        gone[second.file.name] = copy_of(second.file, first.file.name, ", saved in another form")
-    images = [each for each in every if each.file.name not in gone]
-    skipped = [each if isinstance(each, Skipped) else gone.get(each.file.name) for each in found]
-    return images, [each for each in skipped if each is not None]
+        copies[second.file.name] = copy_of(second.file, first.file.name, ", saved in another form")
+    images = [image for image in detected if image.file.name not in copies]
+    skipped = [outcome if isinstance(outcome, Skipped) else copies.get(outcome.file.name) for outcome in outcomes]
+    return images, [reason for reason in skipped if reason is not None]
 
 
 def _plainness(file: ImageFile) -> tuple[bool, bool, int]:
@@ -411,8 +413,9 @@ def _plainness(file: ImageFile) -> tuple[bool, bool, int]:
 
 
 def _in_two_forms(images: list[DetectedImage]) -> Iterator[tuple[DetectedImage, DetectedImage]]:
-    """Pairs of images in different forms whose circles are at the same places, to some px. A camera that stands still
-    takes such pairs too, but in one form."""
+    """Yields pairs of images in different forms whose circles are at the same places, to some px.
+
+    A camera that does not move takes such pairs too, but all in the same form."""
     kinds = [each.file.path.suffix.lower()[:4].replace(".jpe", ".jpg") for each in images]
     if len(set(kinds)) < 2:
         return
@@ -443,7 +446,7 @@ def require_upright(images: tuple[DetectedImage, ...]) -> None:
     Raises
     ------
     DetectionError
-        Of the images that show a face more are mirrored than are not.
+        More than half of the images with a face are mirrored.
     """
     mirrored = [image for image in images if image.detection.mirrored]
     upright = [image for image in images if image.detection.faces and not image.detection.mirrored]
@@ -452,6 +455,6 @@ def require_upright(images: tuple[DetectedImage, ...]) -> None:
         raise DetectionError(
             "E-FACES-MIRRORED",
             f"{len(mirrored)} of {len(mirrored) + len(upright)} images with a face are mirrored, first "
-            f"{first.file.name}: face {', '.join(first.detection.mirrored)} is seen as in a mirror; turn the images "
-            "back, or use the files that the camera wrote",
+            f"{first.file.name}: face {', '.join(first.detection.mirrored)} appears mirrored; flip the images back, "
+            "or use the files that the camera wrote",
         )

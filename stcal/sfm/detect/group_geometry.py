@@ -62,7 +62,7 @@ class Arrangement:
 def arrange(
     images: Sequence[list[Readings]], patterns: dict[str, Pattern], step_mm: float, focal_px: float
 ) -> Arrangement:
-    """Returns the arrangement that explains most circles of one group, without what a mirror shows.
+    """Returns the arrangement that explains most circles of one group, without reflections in a mirror.
 
     Parameters
     ----------
@@ -112,8 +112,8 @@ Mirror = tuple[np.ndarray, np.ndarray]
 def _mirror_of_group(found: Arrangement, patterns: dict[str, Pattern], reach_mm: float) -> Mirror | None:
     """Returns the mirror that most images show, such as a shiny table; None without one.
 
-    A plane that one image shows at two places, each the mirror image of the other, is in a mirror at one of them. Of
-    the two worlds the one on the cameras' side is real, the other one has its handedness reversed.
+    If an image shows a plane at two places, each the mirror image of the other, one of them is a reflection. The real
+    one is on the same side of the mirror as the cameras; the reflection has its handedness reversed.
     """
     mirrors = []
     for i, contradicted in found.contradicted.items():
@@ -136,8 +136,8 @@ def _mirror_between(own: np.ndarray, other: np.ndarray, radius: np.ndarray, reac
     """Returns normal and a point of the mirror that shows the circles ``own`` as ``other``, (n, 3) each, in any order;
     None if there is none.
 
-    Nothing real lies on both sides of a mirror; a plane half way between a grid and the same grid numbered otherwise
-    cuts both.
+    Nothing real lies on both sides of a mirror. This excludes the plane half way between a grid and the same grid with
+    another numbering, which intersects both.
     """
     between = own.mean(0) - other.mean(0)
     length = float(np.linalg.norm(between))
@@ -384,12 +384,12 @@ def _together(found: list[tuple[int, PlaneView, Rigid]], reach_mm: float) -> np.
     return np.linalg.norm(corners[:, None] - corners, axis=3).max(2) < reach_mm
 
 
-def _adjusted(found: Arrangement, focal_px: float) -> Arrangement:
+def _adjusted(arrangement: Arrangement, focal_px: float) -> Arrangement:
     """Adjusts the poses of images and planes to least reprojection error over the accepted views."""
-    images, planes = list(found.camera_from_group), list(found.group_from_plane)
-    rows = [(a, planes.index(v.plane), v) for a, i in enumerate(images) for v in found.views[i]]
+    images, planes = list(arrangement.camera_from_group), list(arrangement.group_from_plane)
+    rows = [(a, planes.index(v.plane), v) for a, i in enumerate(images) for v in arrangement.views[i]]
     if not rows:
-        return found
+        return arrangement
     bundle = PlaneBundle(
         np.concatenate([np.full(len(v.rows), a) for a, _, v in rows]),
         np.concatenate([np.full(len(v.rows), b) for _, b, v in rows]),
@@ -398,11 +398,11 @@ def _adjusted(found: Arrangement, focal_px: float) -> Arrangement:
         focal_px,
     )
     poses, placed = bundle.adjusted(
-        PoseStack.of(*(found.camera_from_group[i] for i in images)),
-        PoseStack.of(*(found.group_from_plane[p] for p in planes)),
+        PoseStack.of(*(arrangement.camera_from_group[i] for i in images)),
+        PoseStack.of(*(arrangement.group_from_plane[p] for p in planes)),
     )
     return replace(
-        found,
+        arrangement,
         camera_from_group={i: poses.rigid(a) for a, i in enumerate(images)},
         group_from_plane={p: placed.rigid(b) for b, p in enumerate(planes)},
     )
@@ -442,8 +442,10 @@ def _without_reflections(found: Arrangement, patterns: dict[str, Pattern], reach
 
 
 def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, image: str, reach_mm: float) -> bool:
-    """Whether a plane is another one's image in a mirror: in most images its circles are those of the mirrored design,
-    radii included; they stand where a mirror shows them; and most images are taken from the other plane's side."""
+    """True if a plane is the mirror image of another one.
+
+    In most images its circles are those of the mirrored design, radii included. They are where the mirror would show
+    them, and most images are taken from the side of the other plane."""
     if not {real, image} <= found.group_from_plane.keys():
         return False
     seen = _circles_seen(found, patterns, image)
@@ -469,12 +471,12 @@ def _circles_seen(found: Arrangement, patterns: dict[str, Pattern], face: str) -
 
 
 def _in_most(seen: dict[int, set[int]], pairs: np.ndarray) -> bool:
-    """Whether most images show no circles but those of ``pairs``, the second places."""
+    """True if most images show only circles of ``pairs``, second column."""
     return 2 * sum(circles <= set(pairs[:, 1].tolist()) for circles in seen.values()) > len(seen)
 
 
 def _may_be_mirrored(found: Arrangement, patterns: dict[str, Pattern], face: str) -> bool:
-    """Whether what a group shows of a face may be the mirror image of any face, itself included."""
+    """True if the circles of a face in a group may be the mirror image of any face, itself included."""
     seen = _circles_seen(found, patterns, face)
     reals = [pattern for plane, pattern in patterns.items() if plane != BOARD]
     return any(_in_most(seen, pairs) for real in reals for pairs in mirrored_as(real, patterns[face]))

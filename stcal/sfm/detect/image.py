@@ -86,21 +86,21 @@ def _read_once(
     aside: np.ndarray | None,
 ) -> ImageReading:
     polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
-    found: dict[Polarity, Ellipses] = {p: _outside(find_ellipses(grey, p, options), aside) for p in polarities}
+    outlines: dict[Polarity, Ellipses] = {p: _outside(find_ellipses(grey, p, options), aside) for p in polarities}
     boards: list[BoardReading] = []
-    free = {p: np.ones(len(e), bool) for p, e in found.items()}
+    free = {p: np.ones(len(e), bool) for p, e in outlines.items()}
     if board is not None:
-        boards = find_boards(Candidates.of(found[board.polarity], camera), board, image_corners(camera))
+        boards = find_boards(Candidates.of(outlines[board.polarity], camera), board, image_corners(camera))
         if board.rings:
             boards = [by_rings(each, board, grey, camera) for each in boards]
         for each in boards:
             free[board.polarity][each.candidates] = False
-    all_free = found[target.polarity].select(free[target.polarity])
+    all_free = outlines[target.polarity].select(free[target.polarity])
     ellipses = all_free.select(np.sort(np.argsort(-all_free.radius_px(), kind="stable")[:MAX_FREE]))
     finder, candidates = FaceFinder(target), Candidates.of(ellipses, camera)
     faces = finder.find(candidates)
     mirrored = finder.find_mirrored(candidates, faces.faces)
-    return ImageReading(found, tuple(boards), ellipses, faces, mirrored, len(all_free) - len(ellipses))
+    return ImageReading(outlines, tuple(boards), ellipses, faces, mirrored, len(all_free) - len(ellipses))
 
 
 def _outside(ellipses: Ellipses, polygon: np.ndarray | None) -> Ellipses:
@@ -118,7 +118,7 @@ def detect_image(
     """Finds and measures all points of the target and the board in one grey image of the camera's size.
 
     Circles are searched where the design has any, outside of a board of corners; corners of printed faces and of such a
-    board are taken as they are found.
+    board are used as found.
 
     Raises
     ------
@@ -188,9 +188,12 @@ def _detect_circles(
     named, refused, boards = reading.faces.faces, reading.faces.refused, reading.boards
     of_board = board.polarity if board else target.polarity
     free, dots = reading.free, reading.found[of_board]
-    patterns = [_Pattern(target.polarity, free.select(each.used()), each.labels()) for each in named]
-    patterns += [_Pattern(target.polarity, free.select(own := each.used()), [NAMELESS] * len(own)) for each in refused]
-    patterns += [_Pattern(of_board, dots.select(own := each.candidates), [DOT] * len(own)) for each in boards]
+    patterns = [_Pattern(target.polarity, free.select(face.used()), face.labels()) for face in named]
+    for nameless in refused:
+        used = nameless.used()
+        patterns.append(_Pattern(target.polarity, free.select(used), [NAMELESS] * len(used)))
+    for grid in boards:
+        patterns.append(_Pattern(of_board, dots.select(grid.candidates), [DOT] * len(grid.candidates)))
     measured = _measured(grey, camera, patterns, reading.found)
     notes = [_untried_note(reading)] if reading.untried else []
     for pattern, centres in zip(patterns, measured, strict=True):
@@ -199,21 +202,21 @@ def _detect_circles(
     measured_rows = [(centres.ok, np.arange(*rows)) for centres, rows in zip(measured, pairwise(ends), strict=True)]
     first, second = len(named), len(named) + len(refused)
     faces, open_faces, board_sightings = [], [], []
-    for each, (ok, rows) in zip(named, measured_rows[:first], strict=True):
-        faces.append(FaceSighting(each.face.id, rows, np.flatnonzero(each.index >= 0)[ok]))
-    for each, (ok, rows) in zip(refused, measured_rows[first:second], strict=True):
+    for face, (ok, rows) in zip(named, measured_rows[:first], strict=True):
+        faces.append(FaceSighting(face.face.id, rows, np.flatnonzero(face.index >= 0)[ok]))
+    for nameless, (ok, rows) in zip(refused, measured_rows[first:second], strict=True):
         row = np.full(len(reading.free), -1)
-        row[each.used()[ok]] = rows
-        open_faces.append(tuple(_sighting(own, row) for own in each.readings))
-    for each, (ok, rows) in zip(boards, measured_rows[second:], strict=True):
-        board_sightings.append(BoardSighting(rows, each.numberings[:, ok], each.unlikely[:, ok]))
+        row[nameless.used()[ok]] = rows
+        open_faces.append(tuple(_sighting(face, row) for face in nameless.readings))
+    for grid, (ok, rows) in zip(boards, measured_rows[second:], strict=True):
+        board_sightings.append(BoardSighting(rows, grid.numberings[:, ok], grid.unlikely[:, ok]))
     return ImageDetection(
         Centres.concatenate(
             [centres.select(np.flatnonzero(centres.ok)) for centres in measured] or [_nothing(grey, camera, free)]
         ),
         tuple(faces),
         tuple(board_sightings),
-        tuple(each.face.id for each in reading.mirrored),
+        tuple(face.face.id for face in reading.mirrored),
         tuple(notes),
         sum(len(e) for e in reading.found.values()),
         tuple(open_faces),

@@ -151,7 +151,8 @@ def detect_circles(
 ) -> Detection:
     """Returns the labelled circles of one image.
 
-    A run decides by all images of a group what a single one leaves open, and looks a second time for what it missed.
+    A single image may leave labels open. A run decides them from all images of a group, and searches again for circles
+    that were missed.
 
     Parameters
     ----------

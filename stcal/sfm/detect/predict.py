@@ -85,7 +85,7 @@ def predict_circles(
 ) -> PredictedCircles | None:
     """Predicts the circles in view of an image from the arrangement; None if the arrangement lacks the image.
 
-    Circles with a larger tilt are left out. Circles not in ``seen`` are wanted.
+    Circles tilted by more than ``max_tilt_rad`` are left out. Circles that are not in ``seen`` are wanted.
     """
     pose = arrangement.camera_from_group.get(image)
     if pose is None:
@@ -110,26 +110,28 @@ def predict_circles(
     return PredictedCircles(tuple(labels), np.concatenate(centre), np.concatenate(shape), tuple(polarity), wanted)
 
 
-def contradictions(predicted: PredictedCircles, seen: ImageObservations, camera: Camera) -> dict[Label, str]:
+def contradictions(predicted: PredictedCircles, observed: ImageObservations, camera: Camera) -> dict[Label, str]:
     """Returns circles of the first look whose size contradicts the other circles of their plane, with the reasons.
 
     Such a circle is partly hidden, or something else. A common size ratio of a plane's circles is attributed to the
     design and accepted.
     """
     place = {label: i for i, label in enumerate(predicted.labels)}
-    rows = np.array([k for k, label in enumerate(seen.labels) if label in place], int)
-    predicted_rows = np.array([place[seen.labels[k]] for k in rows], int)
-    widest, narrowest = _stretch(predicted.shape_px[predicted_rows], seen.shape[rows], seen.centre[rows], camera)
-    planes = np.array([seen.labels[k].plane for k in rows], str)
+    rows = np.array([k for k, label in enumerate(observed.labels) if label in place], int)
+    predicted_rows = np.array([place[observed.labels[k]] for k in rows], int)
+    widest, narrowest = _stretch(
+        predicted.shape_px[predicted_rows], observed.shape[rows], observed.centre[rows], camera
+    )
+    planes = np.array([observed.labels[k].plane for k in rows], str)
     reasons: dict[Label, str] = {}
     for plane in dict.fromkeys(planes.tolist()):
         members = np.flatnonzero(planes == plane)
         size = float(np.median(np.sqrt(widest[members] * narrowest[members])))
         for k in members.tolist():
-            stretch, blur = (widest[k] / size, narrowest[k] / size), float(seen.blur_px[rows[k]])
+            stretch, blur = (widest[k] / size, narrowest[k] / size), float(observed.blur_px[rows[k]])
             reason = _disagreement(predicted.shape_px[predicted_rows[k]], 0.0, stretch, blur)
             if reason:
-                reasons[seen.labels[rows[k]]] = reason
+                reasons[observed.labels[rows[k]]] = reason
     return reasons
 
 

@@ -86,8 +86,9 @@ class PublishedPattern:
             raise InputError(
                 "E-TARGET-NOT-PUBLISHED",
                 f"target {target.name}: not read by the rules of Zhang & Wei (2017) ({error}); --solve paper needs "
-                "faces with large circles along X, Y and the diagonal, a small one beside the origin on each axis, and "
-                "a small one beside the diagonal's last whose direction names the face; use joint or chain",
+                "faces with large circles along X, Y and the diagonal, a small circle beside the origin on each axis, "
+                "and a small circle beside the last one of the diagonal, whose direction identifies the face; use "
+                "joint or chain",
             ) from error
 
     @classmethod
@@ -202,22 +203,23 @@ def detect_published(
     grey = cv2.GaussianBlur(grey_8bit(image), (SMOOTHING_PX, SMOOTHING_PX), 0)
     polarities: set[Polarity] = {target.polarity, board.polarity if board else target.polarity}
     ellipses = {polarity: contour_ellipses(grey, polarity, options) for polarity in sorted(polarities)}
-    start = dict(zip(ellipses, np.cumsum([0, *(len(each) for each in ellipses.values())]).tolist(), strict=False))
-    candidates = {polarity: Candidates.of(each, camera) for polarity, each in ellipses.items()}
+    counts = [len(of_polarity) for of_polarity in ellipses.values()]
+    start = dict(zip(ellipses, np.cumsum([0, *counts]).tolist(), strict=False))
+    candidates = {polarity: Candidates.of(of_polarity, camera) for polarity, of_polarity in ellipses.items()}
     boards, free = [], np.ones(len(ellipses[target.polarity]), bool)
     if board is not None:
-        for each in find_boards(candidates[board.polarity], board, image_corners(camera)):
-            boards.append(BoardSighting(start[board.polarity] + each.candidates, each.numberings, each.unlikely))
+        for grid in find_boards(candidates[board.polarity], board, image_corners(camera)):
+            boards.append(BoardSighting(start[board.polarity] + grid.candidates, grid.numberings, grid.unlikely))
             if board.polarity == target.polarity:
-                free[each.candidates] = False
+                free[grid.candidates] = False
     faces, notes = _Rules(pattern, target, candidates[target.polarity], ellipses[target.polarity]).find(free)
     first = start[target.polarity]
     return ImageDetection(
-        centres=Centres.concatenate([_centres(each, candidates[p]) for p, each in ellipses.items()]),
+        centres=Centres.concatenate([_centres(ellipses[p], candidates[p]) for p in ellipses]),
         faces=tuple(FaceSighting(face, first + rows, circles) for face, rows, circles in faces),
         boards=tuple(boards),
         notes=tuple(notes),
-        candidates=sum(len(each) for each in ellipses.values()),
+        candidates=sum(counts),
     )
 
 

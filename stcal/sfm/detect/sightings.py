@@ -314,7 +314,7 @@ def mirrored_as(face: FaceDesign | Pattern, other: FaceDesign | Pattern) -> tupl
     """Returns the circles of a face's mirror image that pass for circles of another, see
     :func:`~stcal.lookalikes.mirrored_circles`.
 
-    This is the only rule about mirror images: of a design before a photograph is taken, and of the faces of a group.
+    This rule serves for a design before photographs are taken, and for the faces of a group.
     """
     return _mirrored_as(*(a.tobytes() for a in (face.xy_mm, face.radius_mm, other.xy_mm, other.radius_mm)))
 

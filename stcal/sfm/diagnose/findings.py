@@ -145,7 +145,7 @@ def _rank(finding: Finding) -> int:
 
 
 def by_gate(findings: Iterable[Finding]) -> dict[str, GateCount]:
-    """Returns counts of what each gate stopped in images. Findings on the whole run do not count."""
+    """Returns how many outlines each gate stopped in images. Findings on the whole run do not count."""
     together: dict[str, list[Finding]] = {}
     for finding in findings:
         if finding.image:

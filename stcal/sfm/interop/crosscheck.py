@@ -111,7 +111,7 @@ def crosscheck(
     with added_results(saved.folder) as stage:
         if read_json(saved.folder / "report.json", "", AGAIN) != saved.report:
             raise InputError(
-                "E-RUN-REPLACED", f"run {saved.folder}: other results took their place meanwhile; cross-check it again"
+                "E-RUN-REPLACED", f"run {saved.folder}: its results were replaced meanwhile; cross-check it again"
             )
         check = _compared(saved, colmap, tolerances, timeout_s, progress)
         write_report(stage, judged(saved.report | {"crosscheck": check.model_dump()}), saved.folder)
@@ -208,7 +208,7 @@ def _native_model(folder: Path, group: str, native: NativeColmap, run: SavedRun,
     except InputError as error:
         raise MappingError(
             "E-COLMAP-NO-MODEL",
-            f"group {group}: what native COLMAP {native.version} made of the run's database is of no use: {error}",
+            f"group {group}: what native COLMAP {native.version} made from the run's database cannot be used: {error}",
         ) from error
 
 
@@ -223,8 +223,8 @@ def _own(folder: Path, place: Path, names, pair, group: str, run: SavedRun, ids)
     if reconstruction is None:
         raise MappingError(
             "E-COLMAP-NO-MODEL",
-            f"group {group}: pycolmap makes no model from the run's initial pair alone (the run registered its own "
-            "relative pose); there is nothing to cross-check",
+            f"group {group}: pycolmap makes no model from the run's initial pair alone (the run used its own relative "
+            "pose); a cross-check is not possible",
         )
     written = place / "own-model"
     written.mkdir()
@@ -237,11 +237,11 @@ def _comparison(
     native: NativeColmap,
     schema: str,
     external: Calibration,
-    own: Calibration,
+    of_pycolmap: Calibration,
     again: Calibration,
     tolerances: Tolerances,
 ) -> Crosscheck:
-    native_images, pycolmap_images = _images(external), _images(own)
+    native_images, pycolmap_images = _images(external), _images(of_pycolmap)
     images = ImagesRegistered(
         native=len(native_images),
         pycolmap=len(pycolmap_images),
@@ -251,10 +251,10 @@ def _comparison(
     )
     faces = run.faces.target_from_face_covariance
     mapping = MappingCompared(
-        faces=_faces(external.target.target_from_face, own.target.target_from_face, faces),
-        circles_um=_circles(external.target.circles, own.target.circles),
-        circles_sigmas=_circle_sigmas(external.target.circles, own.target.circles, run),
-        cameras=_cameras(external, own, run),
+        faces=_faces(external.target.target_from_face, of_pycolmap.target.target_from_face, faces),
+        circles_um=_circles(external.target.circles, of_pycolmap.target.circles),
+        circles_sigmas=_circle_sigmas(external.target.circles, of_pycolmap.target.circles, run),
+        cameras=_cameras(external, of_pycolmap, run),
     )
     result = ResultCompared(
         faces=face_differences(again.target, run),
@@ -269,7 +269,9 @@ def _comparison(
         schema=schema,
         tolerances=tolerances,
         images=images,
-        residual_rms_px=ResidualRms(native=_rms_px(external, run), pycolmap=_rms_px(own, run), run=_run_rms(run)),
+        residual_rms_px=ResidualRms(
+            native=_rms_px(external, run), pycolmap=_rms_px(of_pycolmap, run), run=_run_rms(run)
+        ),
         mapping=mapping,
         result=result,
         plain=FacesCompared(faces=face_differences(external.target, run)),

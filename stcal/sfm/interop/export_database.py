@@ -247,7 +247,7 @@ def copy_database(database: Path, out: Path, schema: str, run: SavedRun | None =
     """Writes the content of ``database`` to ``out`` in the schema of another COLMAP version.
 
     Ids, the order of keypoints, matches and pairs, and every blob stay the same. ``database`` is only read. Every blob,
-    name and reference in it must be valid; if ``run`` is given, the content must be what the run has labelled. ``out``
+    name and reference in it must be valid; if ``run`` is given, the content must be that of the run's labels. ``out``
     is compared with the database and with the published schema before it appears. It appears complete or not at all.
 
     ``database`` : database of pycolmap 4.2 that no other program has open; ``schema`` : name of a schema of
@@ -483,7 +483,7 @@ def _require_same_content(source: sqlite3.Connection, written: sqlite3.Connectio
                 raise StcalError(
                     "E-EXPORT-READ-BACK",
                     f"export for {wanted.name}: row {row} of {table.name} differs from the database; nothing is "
-                    "written; see that no other program is at the database, and try again",
+                    "written; check that no other program uses the database, and try again",
                 )
         for name in table.column_names():
             if name not in SOURCE.tables[table.name].column_names():

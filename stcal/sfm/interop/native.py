@@ -97,7 +97,8 @@ def map_natively(
     program = f"native COLMAP: `{native.program} mapper`"
     if code is None:
         raise MappingError(
-            "E-COLMAP-TIMEOUT", f"{program} still runs after {timeout_s:g} s; raise --timeout, or look at the program"
+            "E-COLMAP-TIMEOUT",
+            f"{program} is still running after {timeout_s:g} s; raise --timeout, or check the program",
         )
     if code != 0:
         raise MappingError("E-COLMAP-FAILED", f"{program} {_end(code, output)}; check the program")

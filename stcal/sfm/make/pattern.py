@@ -75,7 +75,7 @@ def make_pattern(
         if least > circles - HIDDEN - 1:
             raise InputError(
                 "E-MAKE-CIRCLES",
-                f"face {side.name}: {least} of {circles} circles fit another reading too, at most "
+                f"face {side.name}: {least} of {circles} circles also fit another interpretation, at most "
                 f"{circles - HIDDEN - 1} may; more --circles, a smaller --radius-mm, or another --seed",
             )
         faces.append(best)

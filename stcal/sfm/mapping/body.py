@@ -138,8 +138,8 @@ def place_body(corners: Corners, camera: Camera) -> Body:
     if not edges:
         raise MappingError(
             "E-BODY-UNLINKED",
-            f"target: {len(corners.faces)} faces of known shape, of which no image shows two together; add images that "
-            "show neighbouring faces, each by four corners at least",
+            f"target: {len(corners.faces)} faces of known shape, but no image shows two of them; add images that show "
+            "neighbouring faces with at least four corners each",
         )
     body_from_face, placed_faces = _tree(views, edges, len(corners.faces))
     camera_from_body, placed_images = _images(views, corners, body_from_face, placed_faces, camera)

@@ -109,7 +109,7 @@ def write_reconstruction(reconstruction: pycolmap.Reconstruction, folder: Path, 
     if not same:
         raise InputError(
             "E-OUTPUT-READ-BACK",
-            f"model {folder}: what stands in its files is not what was written; check the folder's space and rights, "
+            f"model {folder}: its files differ from what was written; check the folder's space and rights, "
             "or give another place",
         )
 

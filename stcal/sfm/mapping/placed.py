@@ -32,7 +32,7 @@ class PlacedBody:
     """A body with the faces and images that are placed.
 
     ``body_from_face`` : by face id; ``camera_from_body`` : by image; ``faces`` : designs of the placed faces;
-    ``camera`` : with the covariance of what was assumed of an unknown one; ``unlinked`` : faces that are seen, and
+    ``camera`` : with the covariance of the assumptions about an unknown one; ``unlinked`` : faces that are seen, and
     never with a placed one; ``contradictions`` : corners that lie elsewhere than the body has them.
     """
 
@@ -45,7 +45,7 @@ class PlacedBody:
 
 
 def unknown_lens(camera: Camera) -> Camera:
-    """Returns a camera with the covariance of what any camera fulfils, about its own values."""
+    """Returns a camera with the weak prior of an unknown lens, a covariance about its own values."""
     side = max(camera.width, camera.height)
     reach = float(np.hypot(camera.width, camera.height) / 2 / camera.focal.mean())
     radial, tangential = SIGMA_RADIAL / reach ** np.array([2.0, 4.0]), SIGMA_TANGENTIAL / reach
@@ -143,8 +143,8 @@ def model_of_body(body: PlacedBody, group: Sequence[ImageObservations], camera: 
     if len(placed) < 2:
         raise MappingError(
             "E-BODY-FEW-IMAGES",
-            f"group {group[0].group}: {len(placed)} of {len(group)} images show faces of known shape well enough, "
-            "2 needed; add images that show two faces each",
+            f"group {group[0].group}: {len(placed)} of {len(group)} images show faces of known shape well enough, 2 "
+            "needed; add images that each show two faces",
         )
     designed: dict[Label, np.ndarray] = {
         label: xyz

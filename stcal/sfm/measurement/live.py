@@ -124,7 +124,7 @@ def follow(
 
 
 def rows_of(pose: TargetPose) -> list[list[str]]:
-    """Returns what the page shows of a pose: names and values with their σ, camera_from_target in mm and degrees."""
+    """Returns the rows of the page for a pose: names and values with their σ, camera_from_target in mm and degrees."""
     turn = np.degrees(pose.camera_from_target.log()[:3])
     sigma = np.sqrt(np.diag(pose.covariance))
     sigma[:3] = np.degrees(sigma[:3])

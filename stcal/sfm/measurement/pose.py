@@ -279,7 +279,7 @@ def pose_from_circles(
                 "labels, and that camera file, faces.json and images belong together",
             )
         raise DegenerateError(
-            "E-MEASURE-OPEN", f"{where}: its circles leave the rotation open; show more of a face, off one line"
+            "E-MEASURE-OPEN", f"{where}: its circles do not determine the rotation; show more of a face, off one line"
         )
     return pose
 

@@ -151,7 +151,8 @@ def _joint_cells(joints: Table, header: list[str]) -> tuple[list[str], dict[str,
     conflicts = [name for name in further if name in header]
     if conflicts:
         raise InputError(
-            "E-TABLE-COLUMNS-CONFLICT", f"{joints.where}: column {conflicts[0]} is measured here; leave it out"
+            "E-TABLE-COLUMNS-CONFLICT",
+            f"{joints.where}: column {conflicts[0]} is an output of this command; leave it out",
         )
     names = joints.text(IMAGE)
     cells = [joints.columns[name] for name in further]
@@ -277,7 +278,7 @@ def measure_report(result: MeasureResult, where: str) -> Document:
     verdicts = any(fit_verdict(image.pose) != "passed" for image in result.images)
     statuses = {image.pose.status for image in result.images}
     colours = legend({s: c for s, c in COLOUR_OF.items() if s in statuses} if len(statuses) > 1 else {})
-    told = summary(result)
+    summary_lines = summary(result)
     heads = [
         "<image",
         "<faces",
@@ -302,13 +303,13 @@ def measure_report(result: MeasureResult, where: str) -> Document:
         contradicting = fold("Circles left out", contradicting)
     return Document(
         "Poses of the target",
-        f"{where}: {told[0]}",
+        f"{where}: {summary_lines[0]}",
         [
-            Section("", [Printed(_printed(result)), Printed(told[1:])], terminal=True),
+            Section("", [Printed(_printed(result)), Printed(summary_lines[1:])], terminal=True),
             Section(
                 "Path in the camera frame",
                 [
-                    alarms(told[1:]),
+                    alarms(summary_lines[1:]),
                     f"Origin of the target, mm. Ellipses: σ{f', {times:g} times enlarged' if times != 1 else ''}. "
                     "Lines join the images of a folder by name",
                     colours,

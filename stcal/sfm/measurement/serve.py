@@ -115,7 +115,7 @@ class MeasureServer:
             reason = getattr(error, "strerror", None) or error
             raise InputError(
                 "E-SERVICE-ADDRESS",
-                f"--host {options.host} --port {options.port}: cannot be listened at: {reason}; give another",
+                f"--host {options.host} --port {options.port}: cannot be opened: {reason}; give another",
             ) from error
         self.server_address: tuple = self._socket.getsockname()
 
@@ -195,7 +195,7 @@ class MeasureServer:
             stalest.refuse_at_once(reason)
 
     def pause_s(self, connection: "_Connection", count: int) -> float:
-        """Returns how long to wait before more is read from a connection that has sent so many bytes."""
+        """Returns how long to wait before more is read from a connection that has sent this many bytes."""
         if connection.known or not self.service.beside_others(connection.client):
             return 0.0
         now = time.monotonic()

@@ -156,7 +156,7 @@ def _joint(faces: FacesFile, labels: tuple[CircleLabel, ...]) -> np.ndarray | No
 def _covariance(
     labels, joint: np.ndarray | None, single: Mapping[Any, np.ndarray]
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Returns the most complete covariance (3c, 3c) available, and notes on what it lacks."""
+    """Returns the most complete covariance (3c, 3c) available, and notes on missing parts."""
     notes: tuple[str, ...] = ()
     if joint is None:
         joint = np.zeros((3 * len(labels), 3 * len(labels)))

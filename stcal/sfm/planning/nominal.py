@@ -32,8 +32,8 @@ def nominal_poses(target: TargetDesign, faces: str | Path | None) -> dict[str, R
         if missing := [face.id for face in target.faces if face.id not in rough]:
             raise InputError(
                 "E-TARGET-ROUGH-POSE",
-                f"target {target.name}: the design does not say where {_faces(missing)}; add {ROUGH_KEYS} to each "
-                "[[face]] of the target file, be it rough, or to `plan` give --faces, the faces.json of an earlier run",
+                f"target {target.name}: the design does not say where {_faces(missing)}; add approximate {ROUGH_KEYS} "
+                "to each [[face]] of the target file, or for `plan` give --faces, the faces.json of an earlier run",
             )
         return rough
     poses = read_result(faces, FacePoses, "faces", "give RUN/faces.json, the faces.json of a run").poses()

@@ -143,7 +143,8 @@ def pairs_of_faces(text: str, target: TargetDesign) -> tuple[tuple[str, str], ..
         if name not in pair_of_name:
             raise InputError(
                 "E-OPTION-VALUE",
-                f"--groups: {name!r} is no pair of faces; use such as {', '.join(list(pair_of_name)[:3])}: ids of one "
+                f"--groups: {name!r} is not a pair of faces; use for example {', '.join(list(pair_of_name)[:3])}: ids "
+                "of one "
                 "character beside each other, longer ones with a hyphen",
             )
     return tuple(pair_of_name[name] for name in names)

@@ -141,7 +141,7 @@ def _names(check: dict) -> str:
 
 
 def published_section(comparison: dict) -> list[Block]:
-    """Returns what each step from the published method to this result is worth."""
+    """Returns the gain of each step from the published method to this result."""
     heads, rows = comparison_cells(comparison)
     return [
         "The same photographs by the method of Zhang & Wei (2017) as published, and with one step of this package "

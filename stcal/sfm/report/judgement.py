@@ -101,7 +101,7 @@ class _Cause:
 
 
 def judged(report: dict) -> dict:
-    """Returns the content of ``report.json`` with its judgement made anew."""
+    """Returns the content of ``report.json`` with a new judgement."""
     return report | {"judgement": judgement_of(report).model_dump()}
 
 
@@ -211,7 +211,7 @@ def _absent(report: dict) -> list[str]:
 
 
 def _missing_faces(report: dict) -> list[str]:
-    """Returns the faces that the photographs were to show and that are not in the result."""
+    """Returns the faces that were expected from the photographs and are missing from the result."""
     expected = report["summary"].get("faces_expected") or []
     return [face for face in _absent(report) if face in expected]
 

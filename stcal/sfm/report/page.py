@@ -200,21 +200,21 @@ def _trust(report: dict, judgement: Judgement) -> list[Block]:
     summary, options = report["summary"], report["options"]
     pitch = "An error of the pitch as a whole (100 ppm is 4 K on aluminium) is not in them"
     if options["solve"] != "joint":
-        told = (
+        scope = (
             "No σ were computed, because the solve was group by group; look at the chains. All holds for the given "
             "intrinsics: an error of the camera calibration goes into the faces"
         )
     elif judgement.verdict == "no":
-        told = (
+        scope = (
             "No σ are shown, as they would not hold. What failed makes the result wrong by an amount that they do not "
             "have in them"
         )
     elif options.get("refine_camera", False):
-        told = (
+        scope = (
             f"σ hold for the given pitch of the board; the intrinsics were adjusted, and their σ are in them. {pitch}"
         )
     else:
-        told = (
+        scope = (
             "σ hold for the given intrinsics and the given pitch of the board. An error of the camera calibration, or "
             "of the pitch as a whole (100 ppm is 4 K on aluminium), is not in them"
         )
@@ -228,7 +228,7 @@ def _trust(report: dict, judgement: Judgement) -> list[Block]:
     single = [face for face, chains in report["chains"].items() if len(chains) == 1]
     one_way = "reached by one way only, so that no second way confirms them: face"
     return [
-        f"{told}, and residuals hardly show it",
+        f"{scope}, and residuals hardly show it",
         factor,
         Table(["<Check", "Value", "<Where", "<Remark"], _worst_values(report), css="text"),
         f"{one_way} {join(single)}" if single else "",

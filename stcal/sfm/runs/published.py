@@ -46,7 +46,7 @@ def require_comparable(options: AdjustOptions) -> None:
     if options.solve != "joint" or not options.eccentricity:
         raise InputError(
             "E-OPTION-CONFLICT",
-            f"--compare paper: compares the joint adjustment, the solve is {options.solve}"
+            f"--compare paper: compares with the joint adjustment, but --solve is {options.solve}"
             f"{'' if options.eccentricity else ' without eccentricity'}; leave --solve and --no-eccentricity out",
         )
 

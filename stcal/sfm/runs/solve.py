@@ -156,7 +156,7 @@ def require_usable(group: list[ImageObservations], board_alone: bool = False, ne
         raise MappingError(
             "E-GROUP-NO-FACE",
             f"{where}: no face of the target recognised in {len(group)} images; look at the overlays, "
-            "check target.toml (radii, polarity) and the exposure; of the board alone, use --board-only",
+            "check target.toml (radii, polarity) and the exposure; for the board alone, use --board-only",
         )
     if needs_board and not any(isinstance(label, DotLabel) for image in group for label in image.labels):
         raise MappingError(
@@ -278,8 +278,8 @@ def solve_body(
 ) -> tuple[list[GroupSolution], list[str]]:
     """Maps and refines the groups of a body that its faces of known shape have placed.
 
-    Returns the solutions, and the reasons why groups have none. Images that show no such face are resected by what the
-    others map.
+    Returns the solutions, and the reasons why groups have none. Images that show no such face are resected by the
+    points that the others map.
 
     Raises
     ------

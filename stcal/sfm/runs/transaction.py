@@ -102,8 +102,8 @@ DATABASE_SIDES = ("-wal", "-shm", "-journal")
 class RunFolder:
     """Folder of a run in progress.
 
-    ``out`` : the folder as requested; ``stage`` : folder to which results are written; ``cache`` : folder of what later
-    runs take up.
+    ``out`` : the folder as requested; ``stage`` : folder to which results are written; ``cache`` : folder of results
+    that later runs use again.
     """
 
     out: Path

@@ -109,7 +109,7 @@ def verify(run: AnyRun) -> VerifyFile:
         if name in present and known != (own_digest(content) if name == RUN_MARKER else digest_of(run / name))
     )
     if digest_of(run / RUN_MARKER) != before:
-        raise InputError("E-RUN-REPLACED", f"run {run}: other results took their place meanwhile; verify it again")
+        raise InputError("E-RUN-REPLACED", f"run {run}: its results were replaced meanwhile; verify it again")
     others = sorted(_printable(name) for name in present - marker.sha256.keys())
     added = [name for name in others if name.split("/")[0] in OWN]
     return VerifyFile(

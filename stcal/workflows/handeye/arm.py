@@ -121,9 +121,7 @@ def with_arm(
     """
     pairs, views, setup = outcome.pairs, outcome.views, outcome.result.setup
     if pairs is None or views is None:
-        raise InputError(
-            "E-OPTION-NEEDS", "--with-kinematics: only with images; the corners in them tell how the arm errs"
-        )
+        raise InputError("E-OPTION-NEEDS", "--with-kinematics: only with images, whose corners show the arm's errors")
     options, method = replace(options, arm=arm, intrinsics=prior, symmetries=()), "reprojection"
     result = handeye(pairs, setup, method, views, options)
     held_out, notes = None, outcome.notes

@@ -179,12 +179,12 @@ def _outcome(
         result, done = handeye(pairs, setup, None, views, options), partial(progress, "methods")
         compared = compare(pairs, setup, views, options, rows=rows, workers=validation.workers, progress=done)
         held_out = next(comparison.held_out for comparison in compared if comparison.method == result.method)
-        found = Validated(result if held_out is None else widened_by_scatter(result, held_out), held_out, options)
+        solution = Validated(result if held_out is None else widened_by_scatter(result, held_out), held_out, options)
     else:
         prior, done = given.prior if views is not None else None, partial(progress, "held out")
         asked, spread = None if method == AUTO else method, (rows, validation.workers, done)
-        found = validated(pairs, setup, asked, views, options, prior, *spread, choosing=method == AUTO)
-    result, options, notes = found.result, found.options, found.notes
+        solution = validated(pairs, setup, asked, views, options, prior, *spread, choosing=method == AUTO)
+    result, options, notes = solution.result, solution.options, solution.notes
     if len(rows) and (meant := better_setup(pairs, setup, options, rows)):
         notes = (*notes, meant)
     notes = (*notes, *_of_setup(given, setup, result))
@@ -202,7 +202,7 @@ def _outcome(
     outcome = Outcome(
         given.where,
         result,
-        found.held_out,
+        solution.held_out,
         compared,
         given.pitch_mm,
         model,
@@ -210,7 +210,7 @@ def _outcome(
         given.left_out,
         notes,
         motions,
-        found.choice,
+        solution.choice,
         understood=given.understood,
         unit_mm=given.unit_mm,
         pairs=pairs,

@@ -202,7 +202,7 @@ def read_input(
         return _from_images(source, robot_poses, poses, camera, board, workers, progress, None, arm)
     if robot is not None:
         raise InputError(
-            "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, in which the arm is seen to err"
+            "E-OPTION-NEEDS", "--with-kinematics: only with a folder of images, which show the arm's errors"
         )
     _require_no_images(source, poses, camera, board)
     _require_timed(source, timing)
@@ -267,7 +267,8 @@ def _require_timed(source: Source, timing: Timing) -> None:
 def _require_unsaid(statements: Said, where: str) -> None:
     if statements.options():
         raise InputError(
-            "E-OPTION-NEEDS", f"{where}: tables whose columns say all; leave {', '.join(statements.options())} out"
+            "E-OPTION-NEEDS",
+            f"{where}: the columns of the tables state these; leave {', '.join(statements.options())} out",
         )
 
 
@@ -546,7 +547,7 @@ def without_flips(given: HandEyeInput, options: HandEyeOptions | None = None) ->
     inputs, setup, options = given, given.setup or "eye-in-hand", options or HandEyeOptions()
     if inputs.views is not None:
         raise InputError(
-            "E-OPTION-NEEDS", "--undo-flips: only with poses; corners of images tell the tilt, leave it out"
+            "E-OPTION-NEEDS", "--undo-flips: only with poses; with images, the corners decide the tilt; leave it out"
         )
     pairs, undone = inputs.pairs, np.zeros(len(inputs.pairs), bool)
     for _ in range(MOST_ROUNDS):

@@ -56,7 +56,7 @@ def at_offset(
     if options.four_dof:
         raise InputError(
             "E-OPTION-CONFLICT",
-            "--time-offset: not with --four-dof, whose motions do not tell it; leave one of them out",
+            "--time-offset: not with --four-dof, whose motions do not determine it; leave one of them out",
         )
     pairs, views, notes = given.pairs, given.views, ()
     if options.symmetries:

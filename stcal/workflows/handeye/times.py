@@ -141,7 +141,8 @@ def _require_times(robot: RobotPoses, images: dict[str, Decimal] | None, samples
     if images is None:
         raise InputError(
             "E-IMAGE-NAME-TIME",
-            f"image {names[0]}: its name is no time, for poses of the robot by time ({robot.file}); name images by "
+            f"image {names[0]}: its name is not a time, but the robot's poses are matched by time ({robot.file}); "
+            "name images by "
             "seconds (1689.25.png), or give --image-times",
         )
     if samples is None or not isinstance(samples, list) or None in samples:

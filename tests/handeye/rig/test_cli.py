@@ -95,7 +95,7 @@ def test_poses_in_files_of_their_own_are_shared_where_they_are_equal(rig, files)
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('name = "right"', 'name = "left"', "camera 2 is called 'left' as another is; one name each"),
+        ('name = "right"', 'name = "left"', "camera 2 is called 'left' like another camera; give each"),
         ('poses = "robot.csv"\n', "", "camera left: no poses of the robot; add `poses`, here or for all"),
         ('setup = "eye-in-hand"', 'setup = "in hand"', "setup: 'in hand'"),
         ('images = "right"', 'image = "right"', "camera.2"),

@@ -138,7 +138,7 @@ def test_lengths_that_are_none(stcal_sfm, small_run, tmp_path, row, words):
 
 
 def test_a_statement_of_no_second_run(stcal_sfm, small_run, tmp_path):
-    words = "of a second calibration; give it with --lengths"
+    words = "for a second calibration; give it with --lengths"
     assert_error(
         stcal_sfm("budget", small_run, "--lengths-statement", tmp_path / "x.toml"), INPUT, "E-OPTION-NEEDS", words
     )

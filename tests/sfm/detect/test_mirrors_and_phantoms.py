@@ -198,7 +198,7 @@ def images(mirrored, upright, empty=0):
 @pytest.mark.parametrize(("mirrored", "upright", "empty"), [(1, 0, 0), (3, 2, 0), (3, 2, 40), (12, 0, 0)])
 def test_a_set_that_is_mostly_mirrored_is_refused(mirrored, upright, empty):
     """Images without a face say nothing of it."""
-    words = f"{mirrored} of {mirrored + upright} images with a face are mirrored, first m0: face 2, 5 is seen as in a"
+    words = f"{mirrored} of {mirrored + upright} images with a face are mirrored, first m0: face 2, 5 appears"
     with pytest.raises(DetectionError, match=words):
         require_upright(images(mirrored, upright, empty))
 

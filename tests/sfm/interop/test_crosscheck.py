@@ -347,7 +347,7 @@ FAILURES = {
     "writes an empty folder": ('mkdir "$models/0"', "group 12: native COLMAP 3.8 makes no model"),
     "writes something else": (
         'mkdir "$models/0"; for f in cameras images points3D; do echo hello > "$models/0/$f.bin"; done',
-        "group 12: what native COLMAP 3.8 made of the run's database is of no use: model ",
+        "group 12: what native COLMAP 3.8 made from the run's database cannot be used: model ",
     ),
     "writes to the end of the log": (
         "i=0; while [ $i -lt 500 ]; do echo 0123456789; i=$((i+1)); done; echo last words; exit 1",
@@ -407,7 +407,7 @@ def test_a_mapper_that_hangs_with_a_child(refused, tmp_path):
     pids = tmp_path / "pids"
     path = program(tmp_path, f'sleep 61 & echo $$ $! > "{pids}"; wait')
     start = time.monotonic()
-    refused(path, COMPUTATION, "mapper` still runs after 1 s; raise --timeout", more=("--timeout", 1))
+    refused(path, COMPUTATION, "mapper` is still running after 1 s; raise --timeout", more=("--timeout", 1))
     assert 1 < time.monotonic() - start < 30
     assert_all_ended(pids, 2)
 

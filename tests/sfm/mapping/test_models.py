@@ -781,7 +781,9 @@ def test_a_model_that_the_disk_does_not_take_is_said(small_run, tmp_path):
     command = [sys.executable, "-c", FULL_DISK, small_run / "target_model", *places]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     for place, line in zip(places, done.stdout.splitlines(), strict=True):
-        expected = "is not what was written; check the folder's space" if place.name.endswith("-1000") else "written"
+        expected = (
+            "differ from what was written; check the folder's space" if place.name.endswith("-1000") else "written"
+        )
         assert line.startswith(place.name)
         assert expected in line
 

@@ -520,7 +520,7 @@ def test_a_camera_of_other_images_is_refused(stcal_sfm, small_dataset, small_run
     ("text", "message"),
     [
         ("name,q1_deg\na,1\n", "column image is missing"),
-        ("image,x_mm\n12/IMG_1000.jpg,1\n", "column x_mm is measured here"),
+        ("image,x_mm\n12/IMG_1000.jpg,1\n", "column x_mm is an output of this command"),
         ("image,q1_deg\n12/IMG_1000.jpg,1\n12/IMG_1000.jpg,2\n", "a second time"),
         ("image,q1_deg\nIMG_1000.jpg,1\n", "none of its images was measured; names are like 12/IMG_1000.jpg"),
     ],

@@ -511,8 +511,8 @@ def test_plan_names_what_dominates():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--noise", 0.01, "--run", "anywhere"), "two sources of one σ"),
-        (("--groups", "12,17"), "'17' is no pair of faces"),
+        (("--noise", 0.01, "--run", "anywhere"), "both give the σ"),
+        (("--groups", "12,17"), "'17' is not a pair of faces"),
         (("--groups", "12,34"), "no group links face 3, 4 to reference face 1"),
         (("--run", "nowhere"), "not a run's folder"),
     ],

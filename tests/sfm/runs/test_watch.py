@@ -104,7 +104,7 @@ def test_an_empty_folder_ends_and_none_is_an_error(small_dataset, tmp_path):
 def test_a_folder_that_goes_is_told(small_dataset, tmp_path):
     folder = tmp_path / "images"
     folder.mkdir()
-    with fails_with("E-IMAGES-FOLDER … gone"):
+    with fails_with("E-IMAGES-FOLDER … disappeared"):
         list(watched(small_dataset, folder, tmp_path / "run", lambda _: folder.rmdir() if folder.is_dir() else None))
 
 

@@ -1,2 +1,2 @@
 """Readers of poses as other programs write them; the format of each file is recognised from its content. Read
-:mod:`.tell` first."""
+:mod:`.recognise` first."""

@@ -153,7 +153,7 @@ def _of_kitti(matrices: np.ndarray, places: tuple[str, ...], names: tuple[str, .
 
 
 def _without_counts(lines: list[Line], where: str) -> list[Line]:
-    """Returns the lines without a first one that holds the number of poses alone; a number alone before each matrix is
+    """Returns the lines without a first line that has only the number of poses. A single number before each matrix is
     its name.
 
     Raises InputError: there are not as many poses as the first line says.
@@ -266,7 +266,7 @@ def _tum(
     where: str,
 ) -> Content:
     """Returns poses from lines of timestamp tx ty tz qx qy qz qw. A comment may state another order of the quaternion,
-    as in EuRoC; whole nanoseconds without one are of programs that write w first, or of others.
+    as in EuRoC. Times in whole nanoseconds without such a comment leave the order open.
 
     Raises InputError: a row occurs twice, a quaternion is not of unit length, or its order must be stated.
     """

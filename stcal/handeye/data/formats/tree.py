@@ -110,16 +110,18 @@ def easy_handeye(value: Mapping, statements: Said, where: str) -> Content | None
 def camodocal(value: Mapping, where: str) -> Content | None:
     """Returns the pairs that handeye_calib_camodocal records: ``T1_0``, ``T2_0`` …, tip in base and tag in camera.
 
-    Raises InputError: a matrix is missing, is none, or ``frameCount`` is another number.
+    Raises InputError: a matrix is missing or not valid, or ``frameCount`` is another number.
     """
-    found = {key: match for key in value if (match := _CAMODOCAL.fullmatch(str(key)))}
-    if "frameCount" not in value or not found:
+    matches = {key: match for key in value if (match := _CAMODOCAL.fullmatch(str(key)))}
+    if "frameCount" not in value or not matches:
         return None
     count = value["frameCount"]
     sides = []
     for role, number in zip(ROLES, ("1", "2"), strict=True):
-        keys = sorted((key for key, match in found.items() if match[1] == number), key=lambda key: int(found[key][2]))
-        if [int(found[key][2]) for key in keys] != list(range(count if isinstance(count, int) else 0)):
+        keys = sorted(
+            (key for key, match in matches.items() if match[1] == number), key=lambda key: int(matches[key][2])
+        )
+        if [int(matches[key][2]) for key in keys] != list(range(count if isinstance(count, int) else 0)):
             raise InputError(
                 "E-POSES-COUNT",
                 f"{where}: {len(keys)} matrices T{number}_…, frameCount is {count}; as many from T{number}_0 on needed",
@@ -127,10 +129,12 @@ def camodocal(value: Mapping, where: str) -> Content | None:
         matrices = [numbers(value[key]) for key in keys]
         wrong = next((key for key, m in zip(keys, matrices, strict=True) if m is None or m.shape != (4, 4)), None)
         if wrong is not None:
-            raise InputError("E-POSE-VALUE", f"{where}: {wrong}: not a 4×4 matrix; record the pairs anew")
+            raise InputError("E-POSE-VALUE", f"{where}: {wrong}: not a 4×4 matrix; record the pairs again")
         rotation, translation = of_matrices(np.array(matrices), keys, where)
         frames = Frames(FRAMES[role][0], "as handeye_calib_camodocal writes it", False)
-        sides.append(Side(rotation, translation, tuple(f"pose {found[key][2]}" for key in keys), MATRICES, ROS, frames))
+        sides.append(
+            Side(rotation, translation, tuple(f"pose {matches[key][2]}" for key in keys), MATRICES, ROS, frames)
+        )
     return Content("pairs of handeye_calib_camodocal", tuple(sides))
 
 
@@ -329,7 +333,8 @@ def _listed(values: Sequence, statements: Said, where: str, frames: Frames | Non
             return None
         if single is None:
             raise InputError(
-                "E-POSE-VALUE", f"{where}: {place}: no pose like the one before it; correct it, or take it out"
+                "E-POSE-VALUE",
+                f"{where}: {place}: not a pose of the same form as the one before it; correct it, or take it out",
             )
         poses.append(single)
     return _side(poses, places, where, frames) if poses else None

@@ -22,14 +22,16 @@ MAX_CHANCE = 4.2
 """Largest ratio of one circle's squares to the median: exceeded by chance by one in a thousand (χ² of six degrees of
 freedom). It bounds the influence of a dirty circle."""
 SHARP_PX, SHARP = 1.5, 0.33
-"""Where the blur is wider than this, in pixels or in the ellipse's smaller radius, how the fit answers to a shift is
-asked of the image; below it that changed σ by 1 %, and it costs a tenth of the fit."""
+"""Blur, in pixels and in the ellipse's smaller radius, above which the response of the fit to a shift is computed from
+the image. Below it, this changed σ by 1 % only; it takes a tenth of the time of the fit."""
 
 
 def correlation(chance: np.ndarray) -> float:
-    """Factor of the covariances of independent pixels, from the squares of n circles' harmonics over what independent
-    pixels would make them; 1 of no circle. Few squares may be small by chance: their mean times ν/(ν−2), ν degrees of
-    freedom, keeps the expectation of squared errors over variances at one (mean of the F distribution)."""
+    """Returns the factor by which correlation between pixels enlarges covariances; 1 without circles.
+
+    ``chance`` : (n,) squared harmonics of the residuals of n circles, over their expectation for independent pixels.
+    The mean of few squares may be small by chance. With ν degrees of freedom, the factor ν/(ν−2) keeps the expectation
+    of squared errors over variances at one (mean of the F distribution)."""
     freedom = 2 * CHANCE_WAVES * len(chance)
     if not freedom:
         return 1.0
@@ -39,10 +41,10 @@ def correlation(chance: np.ndarray) -> float:
 def covariances(fits: Fits) -> tuple[np.ndarray, np.ndarray]:
     """Returns covariances of the centres, (n, 2, 2), for independent pixels, and :func:`_chance` over their noise.
 
-    The noise is that of the pixels where the centre's weight is: errors sit on the edge more than beside it. The
-    covariance is S·H·Sᵀ, H the inverse of the normal equations, S⁻¹ the share of a shift of the image that one step
-    answers with (Huber 1981, sec. 6.3). The step's own derivatives would make that share 1; it is less by what the
-    weights give away, and another where the edge is too wide for them, or not as the model has it.
+    The noise is that of the pixels that determine the centre, as errors are larger on the edge than beside it. The
+    covariance is S·H·Sᵀ, with H the inverse of the normal equations, and S⁻¹ the response of one step to a shift of the
+    image, as a share of the shift (Huber 1981, sec. 6.3). With exact derivatives the share would be 1. Robust weights
+    reduce it; a wide edge, or one that differs from the model, changes it.
     """
     pull = fits.scores[:, 0] ** 2 + fits.scores[:, 1] ** 2
     weight = np.where(fits.real > 0, fits.weight, 1)
@@ -64,8 +66,10 @@ def covariances(fits: Fits) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _chance(fits: Fits, edge: np.ndarray, total: np.ndarray) -> np.ndarray:
-    """Variance of a pixel from the residuals' :data:`CHANCE_WAVES` on the rim, of amplitudes ``edge`` and weighted
-    squares ``total``: an estimate from orthonormal series (Phillips 2005), less what the parameters took of these.
+    """Returns the variance of a pixel from :data:`CHANCE_WAVES` harmonics of the residuals along the rim.
+
+    It is an estimate from orthonormal series (Phillips 2005), corrected for the degrees of freedom of the fitted
+    parameters. ``edge`` : amplitudes of the harmonics at the pixels; ``total`` : their weighted squares.
     """
     wave = np.empty(edge.shape, np.complex64)
     wave.real, wave.imag = np.moveaxis(fits.direction(), 1, 0)
@@ -139,23 +143,23 @@ def measure_centres(
         pixels; one pattern if None
     """
     focal = float(np.sqrt(camera.focal.prod()))
-    found = _fitted(image, camera, ellipses, neighbours)
-    centre, uneven = found.centre / focal, found.uneven / focal
-    groups, ok = np.zeros(len(ellipses), int) if groups is None else groups, found.rim >= MIN_RIM
-    factor = np.array([correlation(found.chance[ok & (groups == i)]) for i in range(groups.max(initial=0) + 1)])
-    covariance = factor[groups, None, None] * found.covariance / focal**2
+    rims = _fitted(image, camera, ellipses, neighbours)
+    centre, uneven = rims.centre / focal, rims.uneven / focal
+    groups, ok = np.zeros(len(ellipses), int) if groups is None else groups, rims.rim >= MIN_RIM
+    factor = np.array([correlation(rims.chance[ok & (groups == i)]) for i in range(groups.max(initial=0) + 1)])
+    covariance = factor[groups, None, None] * rims.covariance / focal**2
     covariance += UNTRUSTED**2 * uneven[:, :, None] * uneven[:, None, :]
     distorted, jacobian = camera.distort_jacobian(centre)
     jacobian = jacobian * camera.focal[:, None]
     return Centres(
         centre_px=distorted * camera.focal + camera.centre,
         centre=centre,
-        shape=found.shape / focal,
+        shape=rims.shape / focal,
         covariance_px2=jacobian @ covariance @ np.swapaxes(jacobian, 1, 2),
-        blur_px=found.blur,
-        contrast=found.contrast,
-        noise=found.noise,
-        rim=found.rim,
+        blur_px=rims.blur,
+        contrast=rims.contrast,
+        noise=rims.noise,
+        rim=rims.rim,
         uneven_px=(jacobian @ uneven[..., None])[..., 0],
         ok=ok,
     )

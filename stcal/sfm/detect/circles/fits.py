@@ -42,7 +42,7 @@ class Fits:
     """The fits of n blurred ellipses side by side, ideal px.
 
     Pixels are rows of (n, …, m) arrays of single precision, which is enough as coordinates are taken from the start of
-    each centre; ``real`` is 1 where a pixel is, 0 behind the last one of an ellipse.
+    each centre; ``real`` is 1 for a pixel, and 0 after the last one of an ellipse.
     """
 
     def __init__(self, image, ellipses: Ellipses, half, to_ideal, intruders):
@@ -178,11 +178,11 @@ class Fits:
         """
         if not len(active):
             return np.zeros(0)
-        own = slice(None) if len(active) == len(self.blur) else active
-        grey, real, start = self.grey[own], self.real[own], self.start[own]
-        inverse_shape = self.inverse_shape[own].astype(np.float32)
-        blur = self.blur[own].astype(np.float32)[:, None]
-        offset = self.ideal[own] - (self.centre[own] - start).astype(np.float32)[..., None]
+        selection = slice(None) if len(active) == len(self.blur) else active
+        grey, real, start = self.grey[selection], self.real[selection], self.start[selection]
+        inverse_shape = self.inverse_shape[selection].astype(np.float32)
+        blur = self.blur[selection].astype(np.float32)[:, None]
+        offset = self.ideal[selection] - (self.centre[selection] - start).astype(np.float32)[..., None]
         on_unit = inverse_shape @ offset
         (p, q), (a, b) = np.moveaxis(offset, 1, 0), np.moveaxis(on_unit, 1, 0)
         rho = np.sqrt(a * a + b * b)
@@ -191,23 +191,23 @@ class Fits:
         reduced = (rho - 1) * rho / (slope_rho * blur)
         bell = np.exp(np.maximum(-0.5 * reduced * reduced, np.float32(-18)))  # products of smaller ones are denormal
         inside = _normal_above(reduced, bell)
-        x, y = np.moveaxis(offset / self.radius[own].astype(np.float32)[:, None, None], 1, 0)
-        count, each = PARAMETERS + 2 * len(WAVES) * len(waves), 2 * len(WAVES)
+        x, y = np.moveaxis(offset / self.radius[selection].astype(np.float32)[:, None, None], 1, 0)
+        count, per_side = PARAMETERS + 2 * len(WAVES) * len(waves), 2 * len(WAVES)
         jacobian = np.empty((len(active), count, rho.shape[1]), np.float32)
         planes = jacobian[:, 6:]
         planes[:, 0], planes[:, 1], planes[:, 2] = 1, x, y
         planes[:, 3], planes[:, 4], planes[:, 5] = inside, inside * x, inside * y
         around = _around(a, b) if waves else np.zeros((len(active), 0, rho.shape[1]), np.float32)
         for k, within in enumerate(waves):
-            planes[:, 6 + k * each : 6 + (k + 1) * each] = around * (inside if within else 1 - inside)[:, None]
-        levels = self.levels[own, : count - 6]
-        if (unlevelled := self.unlevelled[own]).any():
+            planes[:, 6 + k * per_side : 6 + (k + 1) * per_side] = around * (inside if within else 1 - inside)[:, None]
+        levels = self.levels[selection, : count - 6]
+        if (unlevelled := self.unlevelled[selection]).any():
             these, levels = slice(None) if unlevelled.all() else unlevelled, levels.copy()
-            levels[these] = _levels(planes[these], self.weight[own][these], grey[these])
-            self.unlevelled[own] = False
+            levels[these] = _levels(planes[these], self.weight[selection][these], grey[these])
+            self.unlevelled[selection] = False
         amplitude = levels[:, 3:4] + levels[:, 4:5] * x + levels[:, 5:6] * y
         for k, within in enumerate(waves):
-            varies = (levels[:, None, 6 + k * each : 6 + (k + 1) * each] @ around)[:, 0]
+            varies = (levels[:, None, 6 + k * per_side : 6 + (k + 1) * per_side] @ around)[:, 0]
             amplitude = amplitude + varies if within else amplitude - varies
         # d(distance)/d(rho) = rho/slope_rho; the change of the slope itself is of second order on the rim.
         density = amplitude * bell / (np.float32(np.sqrt(2 * np.pi)) * blur)
@@ -224,9 +224,9 @@ class Fits:
         if len(active) == len(self.blur) and count == self.scores.shape[1]:
             self.scores, self.inverse = weighted, inverse
         else:
-            self.scores[own, :count], self.inverse[own, :count, :count] = weighted, inverse
-        self.residual[own], self.weight[own] = residual, weight
-        self.reduced[own], self.on_unit[own] = reduced, on_unit
+            self.scores[selection, :count], self.inverse[selection, :count, :count] = weighted, inverse
+        self.residual[selection], self.weight[selection] = residual, weight
+        self.reduced[selection], self.on_unit[selection] = reduced, on_unit
         return self._apply(active, step, levels)
 
     def _apply(self, active, step, levels) -> np.ndarray:

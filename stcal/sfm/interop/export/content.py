@@ -164,7 +164,8 @@ def content_of(run: SavedRun, root: str) -> Content:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(
-            "E-FRAME-NAME", f"frames: {twice[0]} is the name of two; rename a face or a circle of the target"
+            "E-FRAME-NAME",
+            f"frames: {twice[0]} would be the name of two frames; rename a face or a circle of the target",
         )
     return content
 
