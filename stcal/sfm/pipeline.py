@@ -46,7 +46,13 @@ from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.mapping.placed import LENS, PlacedBody, place_and_find_camera, place_with_camera, unknown_lens
-from stcal.sfm.runs.detection import DetectedImages, detected_images, labelled_images, require_dots
+from stcal.sfm.runs.detection import (
+    DetectedImages,
+    detected_images,
+    labelled_images,
+    require_dots,
+    require_no_calibration,
+)
 from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
@@ -550,10 +556,7 @@ def detect_images(
     options, progress = options or RunOptions(), progress or (lambda *_: None)
     target_design = body_of(target)
     board_design = None if board is None and target_design.has_scale else board_of(board)
-    if (Path(out) / "faces.json").exists():
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
-        )
+    require_no_calibration(out)
     with mosaic_of(options.bayer) if options.bayer else nullcontext():
         if isinstance(images, Mapping):
             files, place = files_of_arrays(images, options.exclude), IN_MEMORY

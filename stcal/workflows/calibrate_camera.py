@@ -375,9 +375,10 @@ def files_of(rig: RigCalibration) -> tuple[dict[str, str], list[str]]:
 
 
 def require_rig_written(out: Path, files: Mapping[str, str], rig: RigCalibration) -> None:
-    """Read the camera files among ``files`` of :func:`files_of` in folder ``out`` again, and require the cameras."""
+    """Read the ``files`` of :func:`files_of` in folder ``out`` again, and require their content."""
     for number, (name, calibration) in enumerate(zip(rig.names, rig.cameras, strict=True)):
         require_camera_written(out / f"{name}.txt", calibration.intrinsics.camera)
+        require_result_written(out / f"{name}.json", CalibrationFile.of(calibration))
         if CHAIN_FILE in files:
             require_camera_written(out / CHAIN_FILE, calibration.intrinsics.camera, f"cam{number}")
     require_result_written(out / RIG_FILE, RigCalibrationFile.of(rig))

@@ -8,7 +8,7 @@ import numpy as np
 
 from tests.commands import CALLS, PLACES, Call, options_of
 from tests.fuzzing.judged import failures, hashes, in_process, lay_out
-from tests.fuzzing.mutations import REFUSED, mutations_of, not_permitted, pick
+from tests.fuzzing.mutations import MAY_BE_READ, REFUSED, mutations_of, not_permitted, pick
 from tests.shared import own_copy
 
 UNREAD = ("report.html", "detections.csv", "overlays", "compare.json", "no-colmap", "cache")
@@ -105,7 +105,7 @@ def _spoilt(stock: Path, read: Path, written: Path, call: Call, rng: np.random.G
     said = mutation(path, rng)
     place = str(path.relative_to(written if written in path.parents else read))
     # Of a folder that is read a file may be skipped.
-    refused = mutation in REFUSED and place in call.inputs and call.code == 0
+    refused = mutation in REFUSED and mutation not in MAY_BE_READ and place in call.inputs and call.code == 0
     return (), f"{place}: {said}", refused, mutation is not_permitted
 
 

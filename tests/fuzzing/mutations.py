@@ -149,6 +149,8 @@ def huge(path: Path, _) -> str:
 
 BYTES = (truncated, flipped, a_piece_twice, a_piece_of_junk, a_piece_of_zeros)
 TEXT = (byte_order_mark, other_line_ends, control_characters, a_long_line, latin_1)
+MAY_BE_READ = (utf_16,)
+"""Those of :data:`REFUSED` that some readers understand: UTF-16 and UTF-32 begin with a mark."""
 REFUSED = (utf_16, emptied, junk, a_folder, missing, a_broken_link, not_permitted, huge)
 PLACE = (a_link,)
 

@@ -73,11 +73,12 @@ def mistaken(stock: Path, folder: Path, name: str) -> Judged:
     before = hashes(folder)
     outcome = in_process(mistake.call, "stcal", folder)
     found = failures(mistake.call, folder, outcome, before, refused=False)
-    if not told(mistake, outcome, valid):
-        found.append(
-            ("no program could tell" if mistake.untold else "silent wrong", mistake.untold or outcome.said[-400:])
-        )
-    elif mistake.untold:
+    read_rightly = (outcome.code, outcome.said) == (valid.code, valid.said)
+    if mistake.untold and not told(mistake, outcome, valid):
+        found.append(("no program could tell", mistake.untold))
+    elif not read_rightly and not told(mistake, outcome, valid):
+        found.append(("silent wrong", outcome.said[-400:]))
+    elif mistake.untold and not read_rightly:
         found.append(("told", f"is told, though none could: {outcome.said[-200:]}"))
     return Judged(
         name, f"{mistake.call.command}: {name}", tuple(found), outcome.code, outcome.seconds, mistake.call.command

@@ -34,7 +34,7 @@ def test_charuco_photographs(script, shared_data, tmp_path):
     assert (errors < others).all()
     assert ours["method"] == "reprojection"
     assert "3-D at the board" in text
-    assert ours["sigma"]["corner_px"] < 0.1
+    assert 0.5 < ours["sigma"]["corner_px"] < 1.5  # factor on the corners' own σ
 
 
 @pytest.mark.full

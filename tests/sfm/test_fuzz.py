@@ -19,7 +19,8 @@ from tests.fuzzing.pool import mistaken, perform, went_through
 from tests.levels import sampled
 
 pytestmark = pytest.mark.slow
-SEED = int(os.environ.get("STCAL_SEED", "20"))
+KNOWN_SEED = 20
+SEED = int(os.environ.get("STCAL_SEED", KNOWN_SEED))
 """`scripts/full` draws another one each time."""
 CASES, PARTS = 360, 30
 IN_SAMPLE = range(0, PARTS, 4)
@@ -27,11 +28,11 @@ IN_SAMPLE = range(0, PARTS, 4)
 
 
 def spoiled(stock, folder, numbers, both=True) -> list[Judged]:
-    """Nothing but what must be, and where there are ``both`` some that go through and some that do not; ``--seed 20
-    --only c17`` of the study is the case 17, where it is not kept brief."""
+    """Nothing but what must be, and where there are ``both`` some that go through and some that do not, which is so by
+    chance with another seed; ``--seed 20 --only c17`` of the study is the case 17, where it is not kept brief."""
     found = [judged(stock, folder, SEED, n, brief=True) for n in numbers]
     assert [(each.name, each.said, each.failures) for each in found if each.failures] == []
-    assert not both or {0, 2} <= {each.code for each in found}
+    assert not both or SEED != KNOWN_SEED or {0, 2} <= {each.code for each in found}
     return found
 
 
@@ -92,9 +93,9 @@ def test_a_cache_that_is_believed_is_seen(stock, tmp_path, monkeypatch):
         kept, "CALLS", [call for call in CALLS if call.command == "sfm run" and "~run" in call.words][:1]
     )
     monkeypatch.setattr(kept, "_kept", lambda folder: sorted(folder.glob("cache/[0-9a-f]*.npz")))
-    assert kept.of_kept(stock, tmp_path / "case", SEED, 0).failures == ()
+    assert kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 0).failures == ()
     monkeypatch.setattr(io_cache, "_digest", lambda _: ALL_ARE_EQUAL)
-    assert [kind for kind, _ in kept.of_kept(stock, tmp_path / "case", SEED, 0).failures] == ["silent wrong"]
+    assert [kind for kind, _ in kept.of_kept(stock, tmp_path / "case", KNOWN_SEED, 0).failures] == ["silent wrong"]
 
 
 QUICK = [

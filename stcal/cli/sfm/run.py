@@ -157,6 +157,7 @@ def detect(
     """Detect circles only, and write detections.csv and an overlay picture of every image."""
     shared.load_ahead(workers)
     from stcal.sfm.pipeline import detect_images
+    from stcal.sfm.runs.detection import require_no_calibration
     from stcal.sfm.runs.options import RunOptions
     from stcal.sfm.runs.text import detection_text
 
@@ -166,6 +167,7 @@ def detect(
         workers=workers,
         exclude=tuple(exclude or ()),
     )
+    require_no_calibration(out)
     with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as progress:
         found = detect_images(images, camera, out, target, board, options, progress)
     print_each("note", found.notes)

@@ -12,6 +12,7 @@ from stcal.geometry.arrays import Brief, require_arguments
 from stcal.io.design import load_board, save_design
 from stcal.io.files import BOARD, TARGET
 from stcal.parallel import Progress
+from stcal.sfm.make.box import require_size
 from stcal.sfm.make.design import DesignOptions, Made, make_target
 from stcal.sfm.planning.bodies import plan_body
 from stcal.sfm.planning.noise import expected_noise
@@ -123,8 +124,10 @@ def design_tag_body(
     Raises
     ------
     InputError
-        The size is not above 0, a tag does not exist, ``target.toml`` exists, or the body does not fit into the image.
+        The size is not within 1 mm and 100 m, a tag does not exist, ``target.toml`` exists, or the body does not fit
+        into the image.
     """
+    require_size([size_mm], f"{size_mm:g}")
     path, _ = _free(out)
     target, (noise, source) = tag_body(kind, size_mm, dictionary, first_id), expected_noise(of_corners=True)
     forecast, reason = None, ""

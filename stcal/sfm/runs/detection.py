@@ -1,6 +1,7 @@
 """Detection in all images of a run, its first stage."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from stcal.boards.design import CornerBoard
 from stcal.design import BoardDesign, TargetDesign
@@ -40,6 +41,20 @@ class DetectedImages(Brief):
             )
             for image in self.labelled
         }
+
+
+def require_no_calibration(out: str | Path) -> None:
+    """Refuses a folder for detections that holds a finished calibration.
+
+    Raises
+    ------
+    InputError
+        It holds one.
+    """
+    if (Path(out) / "faces.json").exists():
+        raise InputError(
+            "E-OUTPUT-EXISTS", f"output folder {out}: holds a finished calibration; give another folder with --out"
+        )
 
 
 def require_dots(board: BoardDesign | None, option: str) -> None:
