@@ -42,7 +42,7 @@ from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.detect.board_alone import is_board_alone, label_boards
-from stcal.sfm.detect.files import DetectionResult, detect_files, require_upright, seen_by
+from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, detect_files, require_upright, seen_by
 from stcal.sfm.detect.labels import LabelledImage, label_images, label_once
 from stcal.sfm.detect.published import PublishedPattern, detect_published
 from stcal.sfm.mapping.body import MIN_CORNERS
@@ -57,8 +57,6 @@ from stcal.sfm.runs.transaction import MarkerFile, RunFolder, frames_folder, req
 
 IN_MEMORY = "images in memory"
 """What a run's folder states as the folder of its images where there is none."""
-PHOTOGRAPHS = "the photographs"
-"""Where a camera that was found is from, for messages."""
 FOUND_BY_DOTS = "no --camera: found by the dots of the board, f {:.0f} px"
 ASSUMED = (
     "no --camera, and no board of dots that tells one: a lens without distortion is assumed, and centres are good "
