@@ -213,7 +213,7 @@ def _renumbered(each: Sighting, board: BoardDesign, turn: Rigid) -> Sighting:
     """Returns the sighting with its dots numbered after a turn of the board."""
     labels = board.labels()
     _, nearest = KDTree(board.places_mm(labels)).query(turn @ board.places_mm(each.view.labels))
-    view = replace(each.view, labels=tuple(labels[i] for i in nearest.tolist()))
+    view = replace(each.view, labels=tuple(labels[i] for i in np.ravel(nearest).tolist()))
     return replace(each, view=view, camera_from_board=each.camera_from_board @ turn.inverse())
 
 
