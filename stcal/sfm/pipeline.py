@@ -41,7 +41,7 @@ from stcal.sfm.checks.suite import run_checks
 from stcal.sfm.checks.verdict import Check
 from stcal.sfm.data.model import by_group, detections_csv
 from stcal.sfm.detect.board_alone import is_board_alone
-from stcal.sfm.detect.files import DetectionResult, seen_by
+from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, seen_by
 from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
@@ -62,8 +62,6 @@ from stcal.sfm.runs.transaction import MarkerFile, RunFolder, frames_folder, req
 
 IN_MEMORY = "images in memory"
 """What a run's folder states as the folder of its images where there is none."""
-PHOTOGRAPHS = "the photographs"
-"""Where a camera that was found is from, for messages."""
 FOUND_BY_DOTS = "no --camera: found by the dots of the board, f {:.0f} px"
 ASSUMED = (
     "no --camera, and no board of dots that tells one: a lens without distortion is assumed, and centres are good "

@@ -88,7 +88,7 @@ def robot_of_kinematics(content: Mapping, where: str, convention: Convention) ->
     missing = [name for name in LINKS if name not in held] if isinstance(held, Mapping) else []
     if missing:
         raise InputError(
-            "E-ROBOT-FILE-LINKS",
+            "E-KEY-MISSING",
             f"{where}: kinematics without {', '.join(missing)}; an arm of Universal Robots has six links, "
             f"{', '.join(LINKS)}: extract its calibration anew with ur_calibration, or copy the whole file",
         )

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from stcal.boards.design import CornerBoard
 from stcal.design import BoardDesign
@@ -212,8 +212,8 @@ def _off_px(camera: Camera, expected: np.ndarray, observed: np.ndarray) -> np.nd
 def _renumbered(each: Sighting, board: BoardDesign, turn: Rigid) -> Sighting:
     """Returns the sighting with its dots numbered after a turn of the board."""
     labels = board.labels()
-    _, nearest = cKDTree(board.places_mm(labels)).query(turn @ board.places_mm(each.view.labels))
-    view = replace(each.view, labels=tuple(labels[i] for i in nearest.tolist()))
+    _, nearest = KDTree(board.places_mm(labels)).query(turn @ board.places_mm(each.view.labels))
+    view = replace(each.view, labels=tuple(labels[i] for i in np.ravel(nearest).tolist()))
     return replace(each, view=view, camera_from_board=each.camera_from_board @ turn.inverse())
 
 

@@ -41,6 +41,8 @@ from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetecti
 CACHE_VERSION = 9
 """Version of detection, which increases with every change of its results, so that older cached results are not used."""
 
+PHOTOGRAPHS = "the photographs"
+"""Where a camera that was found is from, for messages."""
 LOSSY = (".jpg", ".jpeg")
 COPY = re.compile(r"\b(copy|kopie|copie|copia|cópia)\b|\(\d+\)|~", re.IGNORECASE)
 """Additions of file managers to the name of a second copy."""
@@ -150,7 +152,8 @@ def seen_by(detection: DetectionResult, camera: Camera, target: TargetDesign) ->
 def sized_by(camera_model: CameraModel, files: list[ImageFile]) -> tuple[Camera, str]:
     """Returns the camera with its image size, and the source of the size: the file, or most images if it lacks one."""
     if camera_model.width and camera_model.height:
-        return camera_model.sized(camera_model.width, camera_model.height), "the camera file"
+        stated_by = MAJORITY if camera_model.source == PHOTOGRAPHS else "the camera file"
+        return camera_model.sized(camera_model.width, camera_model.height), stated_by
     size, name = require_common_size(files)
     camera_model.require_inside(*size, name)
     return camera_model.sized(*size), MAJORITY

@@ -1,16 +1,18 @@
 """Detections are kept by content and settings; what was damaged is detected again."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from stcal.design import reference_board, reference_target
 from stcal.errors import InputNote
+from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import read_camera
-from stcal.io.images import find_images
+from stcal.io.images import MAJORITY, find_images
 from stcal.sfm.detect.circles.candidates import EllipseOptions
-from stcal.sfm.detect.files import detect_files
+from stcal.sfm.detect.files import PHOTOGRAPHS, detect_files, sized_by
 from tests.outcome import fails_with
 
 IMAGE = "12/IMG_1000.jpg"
@@ -99,3 +101,9 @@ def test_no_usable_file_is_an_error(detected):
     (folder / IMAGE).write_bytes(b"not an image")
     with fails_with("E-IMAGES-NONE-USABLE … 1 … 12/IMG_1000.jpg"):
         detect()
+
+
+def test_a_camera_found_in_the_photographs_is_not_called_a_file():
+    found = CameraModel(np.full(2, 800.0), np.array([29.5, 19.5]), np.zeros(12), "PINHOLE", 60, 40, PHOTOGRAPHS)
+    assert sized_by(found, [])[1] == MAJORITY
+    assert sized_by(replace(found, source="cameras.txt"), [])[1] == "the camera file"
