@@ -148,7 +148,7 @@ def test_a_yaml_that_lacks_links():
     links = {name: UR5E[name] for name in LINKS[:2]}
     with pytest.raises(InputError, match=r"k\.yaml: kinematics without forearm, wrist_1") as caught:
         robot_of_kinematics(kinematics_content(yaml_of(links)), "k.yaml", "standard")
-    assert caught.value.code == "E-ROBOT-FILE-LINKS"
+    assert caught.value.code == "E-KEY-MISSING"
     assert kinematics_content("a: 1\n") is None
 
 
