@@ -503,7 +503,10 @@ class Shape:
         return np.einsum("ai,minj,bj->manb", self.rotation, blocks, self.rotation, optimize=True).reshape(3 * n, 3 * n)
 
     def by_size(self) -> np.ndarray:
-        """Returns the force (3n,) on the points, model frame, of an error of the stated size of one σ; 0 if exact."""
+        """Returns the right-hand side (3n,) of the normal equations by which the stated size, one σ off, moves the points.
+
+        Model frame; 0 for an exact size.
+        """
         if not np.isfinite(self.size_weight):
             return np.zeros(self.off_mm.size)
         weighted = self.weight.reshape(-1, 1) * self.by_pose
