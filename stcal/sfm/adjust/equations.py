@@ -503,7 +503,7 @@ class Shape:
         return np.einsum("ai,minj,bj->manb", self.rotation, blocks, self.rotation, optimize=True).reshape(3 * n, 3 * n)
 
     def by_size(self) -> np.ndarray:
-        """Returns the right-hand side (3n,) of the normal equations by which the stated size, one σ off, moves the points.
+        """Returns the right-hand side (3n,) of the normal equations that a stated size one σ off brings.
 
         Model frame; 0 for an exact size.
         """

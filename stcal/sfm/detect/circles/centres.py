@@ -102,7 +102,7 @@ def _exact_slope(fits: Fits, i: int, slope: np.ndarray) -> np.ndarray:
 
 
 def _residual_slope(fits: Fits, i: int) -> np.ndarray:
-    """Returns the gradient of one circle's residuals in the image, (2, pixels); zero if a neighbour is not in the band."""
+    """Returns the gradient of one circle's residuals, (2, pixels); zero if a neighbour is not in the band."""
     rows, columns = fits.rows[i], fits.columns[i]
     patch = np.full((fits.high[i] - fits.low[i])[::-1], np.nan, np.float32)
     patch[rows, columns] = fits.residual[i, : len(rows)]
