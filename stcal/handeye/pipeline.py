@@ -174,4 +174,4 @@ def handeye(
     choosing = method is None and not options.names_unknowns
     found = validated(pairs, asked, method, views, options, prior, rows, choosing=choosing)
     outcome = Outcome("", found.result, found.held_out, notes=found.notes, choice=found.choice, pairs=pairs)
-    return replace(found.result, verdict=judged(outcome))
+    return replace(found.result, judgement=judged(outcome))

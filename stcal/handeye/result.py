@@ -52,9 +52,8 @@ class HandEye(Brief):
         What the poses determine.
     notes : tuple of str
         Notes on the result, one line each.
-    verdict : Verdict, optional
-        Whether to use the result: its ``word`` is ``good``, ``use with care`` or ``do not use``, ``sentence()`` adds
-        the reasons, ``remedies()`` what to do. None of a single method's solution, which was not judged.
+    judgement : Verdict, optional
+        Whether to use the result; None of a single method's solution, which was not judged. See :attr:`verdict`.
     """
 
     method: str
@@ -73,7 +72,7 @@ class HandEye(Brief):
     reprojection: Reprojection | None = None
     observability: Observability | None = None
     notes: tuple[str, ...] = ()
-    verdict: Verdict | None = None
+    judgement: Verdict | None = None
 
     def __post_init__(self):
         m = len(self.names)
@@ -82,6 +81,19 @@ class HandEye(Brief):
         for name in ("covariance", "stand_covariance"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, frozen(getattr(self, name), (6, 6), name))
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether to use the result: its ``word`` is ``good``, ``use with care`` or ``do not use``.
+
+        ``sentence()`` adds the reasons, ``remedies()`` what to do. Raises InputError if nobody judged the result.
+        """
+        if self.judgement is None:
+            raise InputError(
+                "E-HANDEYE-NOT-JUDGED",
+                f"hand-eye: the solution of {self.method} alone has no verdict; handeye.handeye judges what it returns",
+            )
+        return self.judgement
 
     @property
     def transforms(self) -> dict[str, Rigid]:
