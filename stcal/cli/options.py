@@ -19,6 +19,7 @@ from stcal.errors import ChecksFailed, InputError, InputNote, StcalError
 from stcal.io.files import keep_apart
 
 if TYPE_CHECKING:
+    from stcal.design import BoardDesign
     from stcal.geometry.rigid import Order
     from stcal.io.table import Table
     from stcal.sfm.detect.circles.candidates import EllipseOptions
@@ -409,8 +410,11 @@ def assumed_designs(target: bool, board: bool) -> list[str]:
             f"the reference target, {len(reference.faces)} faces of {len(reference.faces[0].ids)} circles (no --target)"
         )
     if board:
-        words.append(
-            f"the reference board, {dots.rows}×{dots.columns} dots of radius {dots.radius_mm:g} mm, "
-            f"pitch {dots.pitch_mm:g} mm (no --board)"
-        )
+        words.append(f"the reference board, {board_in_words(dots)} (no --board)")
     return words
+
+
+def board_in_words(board: "BoardDesign") -> str:
+    """Returns the dots of a board in words."""
+    dots = f"{board.rows}×{board.columns} dots of radius {board.radius_mm:g} mm"
+    return f"{dots}, pitch {board.pitch_mm:g} mm"

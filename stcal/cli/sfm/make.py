@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from stcal.cli.declare import WRITES, Arg, Opt
-from stcal.cli.options import MOST_SEED
+from stcal.cli.options import MOST_SEED, board_in_words
 from stcal.cli.terminal import StageProgress, print_each, say
 from stcal.errors import InputError
 
@@ -111,6 +111,8 @@ def design(
     if made.made is not None:
         print_each("note", likeness_notes(made.target))
         say(made_text(made.made))
+        if made.board is not None:
+            say(f"board: {board_in_words(made.board)}")
     elif made.forecast is not None:
         say(body_text(made.target, made.forecast.setup.camera, distance))
     for path in made.files:
