@@ -8,6 +8,7 @@ import inspect
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -18,7 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 import stcal
-from stcal import locate, robot
+from stcal import locate, robot, synthetic
 from stcal.cli.main import app
 from stcal.io.files import json_text
 from stcal.robot.kinematics.model import mh80
@@ -181,3 +182,19 @@ def test_load_universal(tmp_path):
     (tmp_path / "none.yaml").write_text("a: 1\n", encoding="utf-8")
     with fails_with("E-ROBOT-FORM … none.yaml"):
         robot.load_universal(tmp_path / "none.yaml")
+
+
+def test_simulated_cameras(tmp_path):
+    own = stcal.Camera(640, 480, [450.0, 450.0], [319.5, 239.5], np.zeros(8))
+    options = synthetic.SceneOptions(width=640, height=426, images_per_group=2, groups=(("1", "2"),), distance_mm=500)
+    scene = synthetic.make_scene(options, camera=own)
+    np.testing.assert_array_equal(scene.camera.focal, own.focal)
+    words = "--images", 2, "--width", 640, "--distance", 500, "--groups", "12", "--fisheye", 120
+    call("sfm", "simulate", tmp_path / "wide", *words)
+    wide = replace(options, height=427, fisheye_deg=120.0)
+    synthetic.write_dataset(tmp_path / "own", synthetic.make_scene(wide))
+    assert (tmp_path / "own/cameras.txt").read_text() == (tmp_path / "wide/cameras.txt").read_text()
+    with fails_with("E-OPTION-CONFLICT … two cameras"):
+        synthetic.make_scene(wide, camera=own)
+    with fails_with("E-OPTION-RANGE … fisheye_deg 20"):
+        replace(options, fisheye_deg=20.0)
