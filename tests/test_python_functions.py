@@ -150,6 +150,10 @@ def test_evaluate_and_robot_program(tmp_path):
     call("robot", "evaluate", *files, "--json", tmp_path / "a.json")
     data = robot.read_measurements(tmp_path / "data.csv", arm)
     found = robot.evaluate({"arm": robot.load_robot(tmp_path / "arm.toml")}, data)
+    call("robot", "evaluate", *files, "--out", tmp_path / "a.csv")
+    assert robot.evaluated_csv(found) == (tmp_path / "a.csv").read_text(encoding="utf-8")
+    with fails_with("E-FIELD-TYPE … Evaluation"):
+        robot.evaluated_csv(data)
     assert json.loads(json_text(evaluation_file(found))) == json.loads(
         (tmp_path / "a.json").read_text(encoding="utf-8")
     )
@@ -165,8 +169,11 @@ def test_evaluate_and_robot_program(tmp_path):
         files[2],
         "--export",
         f"kuka={tmp_path / 'points.dat'}",
+        "--out",
+        tmp_path / "sent.csv",
     )
     sent = robot.compensate(arm, robot.read_targets(tmp_path / "q.csv", arm), arm)
+    assert robot.compensated_csv(sent, arm) == (tmp_path / "sent.csv").read_text(encoding="utf-8")
     assert robot.robot_program(sent, arm, "kuka", "points.dat").text == (tmp_path / "points.dat").read_text()
 
 
