@@ -30,5 +30,9 @@ from .io.cameras.read import load_camera as load_camera
 from .io.cameras.write import save_camera as save_camera
 from .io.device import OpenCVSource as OpenCVSource
 from .io.device import SimulatedSource as SimulatedSource
+from .io.join import join_tables as join_tables
+from .io.join import load_table as load_table
+from .io.join import stack_tables as stack_tables
+from .io.table import Table as Table
 
 __version__: str

@@ -8,6 +8,7 @@ import inspect
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -18,13 +19,15 @@ import pytest
 from typer.testing import CliRunner
 
 import stcal
-from stcal import locate, robot
+from stcal import handeye, locate, register, robot, synthetic
 from stcal.cli.main import app
 from stcal.io.files import json_text
+from stcal.locate.data.layout import layout_toml
 from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors
 from stcal.robot.use.report import evaluation_file
 from tests.commands import COMMANDS
+from tests.locate.drawn_target import CAMERA, LAYOUT, photo, tilted
 from tests.outcome import fails_with
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "howto" / "python.md"
@@ -147,6 +150,10 @@ def test_evaluate_and_robot_program(tmp_path):
     call("robot", "evaluate", *files, "--json", tmp_path / "a.json")
     data = robot.read_measurements(tmp_path / "data.csv", arm)
     found = robot.evaluate({"arm": robot.load_robot(tmp_path / "arm.toml")}, data)
+    call("robot", "evaluate", *files, "--out", tmp_path / "a.csv")
+    assert robot.evaluated_csv(found) == (tmp_path / "a.csv").read_text(encoding="utf-8")
+    with fails_with("E-FIELD-TYPE … Evaluation"):
+        robot.evaluated_csv(data)
     assert json.loads(json_text(evaluation_file(found))) == json.loads(
         (tmp_path / "a.json").read_text(encoding="utf-8")
     )
@@ -162,8 +169,11 @@ def test_evaluate_and_robot_program(tmp_path):
         files[2],
         "--export",
         f"kuka={tmp_path / 'points.dat'}",
+        "--out",
+        tmp_path / "sent.csv",
     )
     sent = robot.compensate(arm, robot.read_targets(tmp_path / "q.csv", arm), arm)
+    assert robot.compensated_csv(sent, arm) == (tmp_path / "sent.csv").read_text(encoding="utf-8")
     assert robot.robot_program(sent, arm, "kuka", "points.dat").text == (tmp_path / "points.dat").read_text()
 
 
@@ -181,3 +191,81 @@ def test_load_universal(tmp_path):
     (tmp_path / "none.yaml").write_text("a: 1\n", encoding="utf-8")
     with fails_with("E-ROBOT-FORM … none.yaml"):
         robot.load_universal(tmp_path / "none.yaml")
+
+
+def test_simulated_cameras(tmp_path):
+    own = stcal.Camera(640, 480, [450.0, 450.0], [319.5, 239.5], np.zeros(8))
+    options = synthetic.SceneOptions(width=640, height=426, images_per_group=2, groups=(("1", "2"),), distance_mm=500)
+    scene = synthetic.make_scene(options, camera=own)
+    np.testing.assert_array_equal(scene.camera.focal, own.focal)
+    words = "--images", 2, "--width", 640, "--distance", 500, "--groups", "12", "--fisheye", 120
+    call("sfm", "simulate", tmp_path / "wide", *words)
+    wide = replace(options, height=427, fisheye_deg=120.0)
+    synthetic.write_dataset(tmp_path / "own", synthetic.make_scene(wide))
+    assert (tmp_path / "own/cameras.txt").read_text() == (tmp_path / "wide/cameras.txt").read_text()
+    with fails_with("E-OPTION-CONFLICT … two cameras"):
+        synthetic.make_scene(wide, camera=own)
+    with fails_with("E-OPTION-RANGE … fisheye_deg 20"):
+        replace(options, fisheye_deg=20.0)
+
+
+def test_goals_in_the_base(tmp_path):
+    from PIL import Image
+
+    rng = np.random.default_rng(3)
+    photo_of = photo(tilted(30))
+    for name in ("one", "two"):
+        (tmp_path / "scenes" / name).mkdir(parents=True)
+        Image.fromarray(photo_of).save(tmp_path / "scenes" / name / "1.png")
+    (tmp_path / "layout.toml").write_text(layout_toml(LAYOUT), encoding="utf-8")
+    stcal.save_camera(tmp_path / "camera.txt", CAMERA, "colmap")
+    xyz = rng.uniform(-300, 300, (12, 3))
+    mount = stcal.Rigid.exp([0.1, 0.2, 0.3, 100, 20, 500])
+    (tmp_path / "points.csv").write_text(
+        "\n".join(
+            ["ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"]
+            + [",".join(map(str, row)) for row in np.hstack([xyz, mount @ xyz + rng.normal(0, 0.01, (12, 3))])]
+        ),
+        encoding="utf-8",
+    )
+    call("register", tmp_path / "points.csv", "--out", tmp_path / "register.json")
+    (tmp_path / "offset.json").write_text(json.dumps({"obj_from_goal": np.eye(4).tolist()}), encoding="utf-8")
+    words = "--layout", tmp_path / "layout.toml", "--camera", tmp_path / "camera.txt", "--out", tmp_path / "poses.csv"
+    led = "--registration", tmp_path / "register.json", "--offset", tmp_path / "offset.json"
+    call("locate", "run", tmp_path / "scenes", *words, *led)
+
+    camera = stcal.load_camera(tmp_path / "camera.txt")
+    layout = locate.load_layout(tmp_path / "layout.toml")
+    results = list(locate.run(locate.find_scenes(tmp_path / "scenes"), layout, camera))
+    pairs = register.read_pairs(tmp_path / "points.csv")
+    chain = locate.goal_chain(registration=register.register(pairs.xyz_a, pairs.xyz_b), offset=stcal.Rigid())
+    assert locate.poses_csv(results, chain) == (tmp_path / "poses.csv").read_text(encoding="utf-8")
+    found = locate.goals(results, chain)
+    assert (set(found.base_from_goal), found.notes) == ({"one", "two"}, ())
+    assert found.covariance["one"].shape == (6, 6)
+
+    flange = stcal.Rigid.exp([0, 0, 1, 400, 0, 300])
+    moving = locate.goal_chain(mount, robot_poses={"one": flange, "two": flange})
+    on_flange = locate.goals(results, moving).base_from_goal
+    np.testing.assert_allclose(
+        on_flange["one"].matrix(), (flange @ mount @ results[0].pose.camera_from_obj).matrix(), atol=1e-9
+    )
+    with fails_with("E-ROBOT-POSES-SCENE … none of scene two"):
+        locate.goals(results, locate.goal_chain(mount, robot_poses={"one": flange}))
+    with fails_with("E-OPTION-MISSING … registration needed"):
+        locate.goal_chain()
+    with fails_with("E-REGISTER-FILE … similarity"):
+        locate.goal_chain(registration=register.register(pairs.xyz_a, pairs.xyz_b * 1.1, model="similarity"))
+
+
+def test_a_hand_eye_result_leads_to_the_base():
+    rng = np.random.default_rng(5)
+    mount, board = stcal.Rigid.exp([0.1, 0.2, 0.3, 60, 20, 50]), stcal.Rigid.exp([0.3, 0, 0, 900, 0, 0])
+    flange = stcal.Poses.of([stcal.Rigid.exp([*rng.normal(0, 0.5, 3), *rng.normal(300, 80, 3)]) for _ in range(12)])
+    seen = (flange @ mount).inverse() @ board
+    found = handeye.handeye(flange, seen, setup="eye-in-hand", method="park-martin")
+    chain = locate.goal_chain(found, robot_poses={"one": flange[0]})
+    assert chain.moving
+    np.testing.assert_allclose(chain.mount.rigid.matrix(), mount.matrix(), atol=1e-6)
+    with fails_with("E-OPTION-MISSING … the camera is on the flange"):
+        locate.goal_chain(found)

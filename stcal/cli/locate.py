@@ -9,7 +9,6 @@ from stcal.cli import options as shared
 from stcal.cli.declare import WRITES, Arg, Opt
 from stcal.cli.help import PLAIN, Commands
 from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
-from stcal.errors import InputError
 
 app = typer.Typer(
     name="stcal locate",
@@ -178,27 +177,21 @@ def run(
     from stcal.locate.pipeline import run as located
     from stcal.locate.pose.patent import PatentOptions
     from stcal.locate.pose.verdict import VerdictOptions
-    from stcal.locate.report.chain import on_chain, read_chain, read_registered
+    from stcal.locate.report.base import goal_chain, goals
     from stcal.locate.report.located import LocatedFile
     from stcal.locate.report.page import accepted, poses_csv, run_report, uncertain
 
-    if hand_eye and registration:
-        raise InputError(
-            "E-OPTION-CONFLICT",
-            f"--hand-eye {hand_eye}, --registration {registration}: both lead to the base; give one",
-        )
     chain = None
-    if hand_eye is None and robot_poses:
-        raise InputError("E-OPTION-NEEDS", "--robot-poses: only with --hand-eye, for a camera on the flange")
-    if hand_eye is None and registration is None and offset:
-        raise InputError(
-            "E-OPTION-NEEDS",
-            "--offset: only with --hand-eye or --registration, which lead from the camera to the robot",
+    if hand_eye or registration or robot_poses or offset:
+        chain = goal_chain(
+            hand_eye,
+            registration,
+            robot_poses=robot_poses,
+            offset=offset,
+            key=key,
+            columns=columns,
+            quaternions=quaternions,
         )
-    if hand_eye:
-        chain = read_chain(hand_eye, robot_poses, offset, quaternions, key, columns)
-    elif registration:
-        chain = read_registered(registration, offset)
     target, model = load_layout(layout), read_camera(camera)
     limits = VerdictOptions(
         min_tags,
@@ -213,14 +206,10 @@ def run(
     )
     patent = PatentOptions(s_dis, j_lim, e_lim_px, e_ratio)
     scenes = find_scenes(exposures)
-    missing = chain.without_pose([scene.name for scene in scenes]) if chain else []
-    if missing:
-        raise InputError(
-            "E-ROBOT-POSES-SCENE",
-            f"robot poses {robot_poses}: none of scene {missing[0]}; add a row, or take the scene away",
-        )
+    if chain:
+        chain.require_poses([scene.name for scene in scenes])
     results = list(located(scenes, target, model, LocateOptions(method, limits, patent, moved_px, workers)))
-    doubts = on_chain(chain, {each.name: uncertain(each) for each in accepted(results)}) if chain else ()
+    doubts = goals(results, chain).notes if chain else ()
     document = run_report(results, scenes, target, model, chain)
     say(document.text())
     print_each("warning", doubts)

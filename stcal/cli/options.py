@@ -181,12 +181,13 @@ def several_tables(
             raise InputError("E-OPTION-NEEDS", f"--columns-a {columns_a}: only with --a; give --columns")
         if columns is None:
             return given
-        from stcal.io.poses.columns import read_mapped
+        from stcal.io.join import load_table
 
-        return read_mapped(given, columns, what, quaternions)
-    from stcal.io.join import join
+        return load_table(given, columns, quaternions, what)
+    from stcal.io.join import join_tables
 
-    joined = [join(str(first), str(second), key, prefixes, quaternions, columns, columns_a) for second in seconds]
+    of_both = key, prefixes, quaternions, columns, columns_a
+    joined = [join_tables(str(first), str(second), *of_both) for second in seconds]
     print_each("note", (note for each in joined for note in each.notes))
     return [each.table for each in joined]
 

@@ -104,11 +104,19 @@ def register(
         sections.append(sample_size_section(sample_sizes(pairs.xyz_a, pairs.xyz_b, limits, seed), limits))
     if robot_file:
         from stcal.robot.identification.result import require_identified_written
-        from stcal.robot.kinematics.file import robot_toml
-        from stcal.workflows.register_robot import compared, comparison_section, robot_part
+        from stcal.robot.kinematics.file import load_robot, robot_toml
+        from stcal.workflows.register_robot import comparison_section, register_with_robot, robot_part
 
         try:
-            beside = compared(pairs, source, robot_file, registration, options, folds)
+            beside = register_with_robot(
+                pairs,
+                registration,
+                load_robot(robot_file),
+                source,
+                threshold_mm=threshold,
+                liu2017_options=liu2017,
+                folds=folds,
+            )
             content = content.model_copy(update={"robot": robot_part(beside)})
             sections.append(comparison_section(beside))
             if identified:

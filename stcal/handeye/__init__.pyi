@@ -13,6 +13,7 @@ from .methods.noise import Noise as Noise
 from .pipeline import handeye as handeye
 from .plan import NextPoses as NextPoses
 from .plan import plan_poses as plan_poses
+from .report.planned import planned_csv as planned_csv
 from .result import HandEye as HandEye
 from .rig.solve import Rig as Rig
 from .rig.solve import RigOptions as RigOptions

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order
 from stcal.io.poses.columns import read_mapped
 from stcal.io.table import COVARIANCE, LENGTHS, POSE, Table, read_table
@@ -18,13 +19,52 @@ SHOWN = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Joined:
-    """A joined ``table``, and ``notes`` on the rows that occur in only one of the files."""
+    """Two tables in one.
+
+    Parameters
+    ----------
+    table : Table
+        Rows that both have, for any function that reads a table.
+    notes : tuple of str
+        On the rows that occur in only one of them.
+    """
 
     table: Table
     notes: tuple[str, ...]
 
 
-def join(
+@require_arguments
+def load_table(
+    path: str | Path, columns: str | Path | None = None, quaternions: Order = "wxyz", what: str = "table"
+) -> Table:
+    """Reads a table, with any names of its columns, delimiter, decimal sign and header.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV or another text file.
+    columns : str or Path, optional
+        Columns, delimiter … of the file (TOML; form: ``data_layout.md``), if they are not those of stcal.
+    quaternions : {"wxyz", "xyzw"}
+        ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
+    what : str
+        What the file holds, for messages.
+
+    Returns
+    -------
+    Table
+        For any function that reads a table. Units are in the names of its columns.
+
+    Raises
+    ------
+    InputError
+        The file is no table, a column is missing, or a row has another length.
+    """
+    return table_of(path, columns, what, quaternions)
+
+
+@require_arguments
+def join_tables(
     a: str | Path | Table,
     b: str | Path | Table,
     key: str,
@@ -33,17 +73,23 @@ def join(
     columns: str | Path | None = None,
     columns_a: str | Path | None = None,
 ) -> Joined:
-    """Return the rows of two CSV files that have the same ``key``, joined.
+    """Returns the rows of two tables that have the same key, side by side.
 
     Parameters
     ----------
-    a, b : files with a column ``key`` that holds each value once; or tables read from them
-    key : name of the key column; or ``image=Point Name``, that of ``a`` and that of ``b``
-    prefixes : prefix for the columns of a pose or a position in each file, ``x_mm`` to ``qz`` and covariances. Other
-        columns keep their names; if both files have a column of that name, the one of ``a`` is used.
-    quaternions : see :func:`~stcal.io.table.read_table`
-    columns : map of the columns of ``b``, see :func:`~stcal.io.poses.columns.read_mapped`
-    columns_a : map of the columns of ``a``
+    a, b : str, Path or Table
+        Tables with a column ``key`` that holds each value once.
+    key : str
+        Name of the key column; or ``image=Point Name``, that of ``a`` and that of ``b``.
+    prefixes : (str, str)
+        Prefix for the columns of a pose or a position in each table, ``x_mm`` to ``qz`` and covariances: ``("a", "b")``
+        for a registration, ``("base_from_flange_", "camera_from_board_")`` for hand-eye, ``("commanded_", "")`` to
+        verify a robot. Other columns keep their names; if both tables have a column of that name, the one of ``a`` is
+        used.
+    quaternions : {"wxyz", "xyzw"}
+        ``wxyz`` reads them by the names of their columns; ``xyzw`` takes x, y, z, w in the order of the columns.
+    columns, columns_a : str or Path, optional
+        Columns, delimiter … of ``b`` and of ``a``, if they are files (TOML).
 
     Returns
     -------
@@ -94,13 +140,30 @@ def join(
     return Joined(Table(where, joined, lines, tables[0].quaternions), tuple(notes))
 
 
-def stack(tables: Sequence[Table], names: Sequence[str], called: dict[str, str], column: str = "set") -> Table:
-    """Return several tables below each other, with the columns that all of them have.
+@require_arguments
+def stack_tables(
+    tables: Sequence[Table], names: Sequence[str], called: dict[str, str] | None = None, column: str = "set"
+) -> Table:
+    """Returns several tables below each other, with the columns that all of them have.
 
-    ``names`` : name of each table, written into the new column ``column``; ``called`` : second names of some columns,
-    which are added as copies.
+    Parameters
+    ----------
+    tables : sequence of Table
+    names : sequence of str
+        Name of each table, written into the new column ``column``.
+    called : dict of str, optional
+        Second names of some columns, by which copies of these are added: ``{"pose": "image"}``.
+    column : str
+        Name of the new column.
 
-    Raises InputError: a name occurs twice.
+    Returns
+    -------
+    Table
+
+    Raises
+    ------
+    InputError
+        A name occurs twice.
     """
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -116,7 +179,7 @@ def stack(tables: Sequence[Table], names: Sequence[str], called: dict[str, str],
         columns[name] = (
             np.concatenate(values_of_table) if numeric else [v for table in tables for v in table.text(name)]
         )
-    columns |= {second: columns[first] for second, first in called.items()}
+    columns |= {second: columns[first] for second, first in (called or {}).items()}
     columns[column] = [name for name, table in zip(names, tables, strict=True) for _ in range(len(table))]
     lines = [line for table in tables for line in table.lines]
     return Table(", ".join(table.where for table in tables), columns, lines, tables[0].quaternions)

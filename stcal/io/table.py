@@ -31,11 +31,22 @@ POSE = ("x_mm", "y_mm", "z_mm", *QUATERNION)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """The rows of a CSV file.
+    """The rows of a table, as of :func:`stcal.load_table`.
 
-    ``lines`` : (m,) line number of each row in the file, from 1; ``quaternions`` : order of quaternion components;
-    ``rows`` : (m,) text of the lines if all columns are numbers, since a name such as 01 must be kept; ``form`` : in
-    words, where it is not that of the package: ``; between columns, decimal commas``.
+    Parameters
+    ----------
+    where : str
+        Name of the file, for messages.
+    columns : dict of list of str or (m,) array
+        Cells by the name of the column, which holds the unit.
+    lines : sequence of m int
+        Line number of each row in the file, from 1.
+    quaternions : {"wxyz", "xyzw"}
+        Order of quaternion components.
+    rows : sequence of m str
+        Text of the lines if all columns are numbers, since a name such as 01 must be kept.
+    form : str
+        Form in words, where it is not that of the package: ``; between columns, decimal commas``.
     """
 
     where: str

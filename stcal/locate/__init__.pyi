@@ -20,3 +20,8 @@ from .pose.patent import PatentOptions as PatentOptions
 from .pose.patent import PatentPose as PatentPose
 from .pose.verdict import Verdict as Verdict
 from .pose.verdict import VerdictOptions as VerdictOptions
+from .report.base import Goals as Goals
+from .report.base import goal_chain as goal_chain
+from .report.base import goals as goals
+from .report.chain import GoalChain as GoalChain
+from .report.page import poses_csv as poses_csv

@@ -1,5 +1,6 @@
 from .axes.model import robot_from_sweeps as robot_from_sweeps
 from .export import robot_program as robot_program
+from .export.files import offsets_csv as offsets_csv
 from .identification.result import Identified as Identified
 from .identification.result import IdentifyOptions as IdentifyOptions
 from .identification.solve import identify as identify
@@ -21,9 +22,12 @@ from .urdf.universal import load_universal as load_universal
 from .urdf.write import robot_urdf as robot_urdf
 from .use.compensation import Compensated as Compensated
 from .use.compensation import compensate as compensate
+from .use.compensation import compensated_csv as compensated_csv
 from .use.design import DesignOptions as DesignOptions
 from .use.design import design as design
+from .use.design import design_csv as design_csv
 from .use.evaluation import evaluate as evaluate
+from .use.report import evaluated_csv as evaluated_csv
 from .use.targets import Targets as Targets
 from .use.targets import read_targets as read_targets
 from .use.verification import read_measured as read_measured

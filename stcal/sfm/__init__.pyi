@@ -17,6 +17,7 @@ from .make.target import design_tag_body as design_tag_body
 from .make.target import design_target as design_target
 from .measurement.images import MeasureOptions as MeasureOptions
 from .measurement.images import measure as measure
+from .measurement.report import poses_csv as poses_csv
 from .measurement.target import read_target as read_target
 from .measurement.tracker import Tracker as Tracker
 from .pipeline import detect_images as detect_images

@@ -9,3 +9,4 @@ from .render import RenderOptions as RenderOptions
 from .scene import Scene as Scene
 from .scene import SceneOptions as SceneOptions
 from .scene import make_scene as make_scene
+from .scene import second_design as second_design

@@ -62,7 +62,14 @@ def second_design() -> tuple[TargetDesign, BoardDesign, dict[str, Rigid]]:
     """Returns a cube with dark circles on three white faces, a board with one larger corner dot, and nominal poses.
 
     It shares nothing with the reference design: face and circle ids, pattern, number of circles, radii, polarity, frame
-    circles and board all differ. The poses are in the cube's own frame, with the origin at its centre.
+    circles and board all differ.
+
+    Returns
+    -------
+    target : TargetDesign
+    board : BoardDesign
+    poses : dict of Rigid
+        target_from_face by face id, mm. The target frame is the cube's own, with the origin at its centre.
     """
     x, y, z = np.eye(3)
     drawings = {

@@ -12,6 +12,7 @@ from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fiel
 from stcal.geometry.camera import FISHEYE, Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
+from stcal.io.cameras.read import camera_model
 from stcal.labels import CircleLabel
 from stcal.synthetic.designs import REFERENCE_GROUPS, nominal_target_from_face, second_design, three_point_frame
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
@@ -57,6 +58,9 @@ class SceneOptions:
         How far plates without ``outline_mm`` reach beyond the rims of their circles.
     one_board : bool
         Whether all groups show the same board, whose dots err alike; otherwise each has a board of its own.
+    fisheye_deg : float, optional
+        Field of an equidistant lens over the image's diagonal, 60° to 170°, that is not centred on the target. It has
+        a focal length and distortion of its own. By default the lens is perspective.
     """
 
     seed: int = 0
@@ -74,6 +78,7 @@ class SceneOptions:
     face_turn_deg: float = 0.5
     margin_mm: float = FACE_MARGIN_MM
     one_board: bool = False
+    fisheye_deg: float | None = None
 
     def __post_init__(self):
         require_fields(
@@ -92,6 +97,8 @@ class SceneOptions:
                 raise InputError("E-SIMULATE-OPTIONS", f"scene: {name} {getattr(self, name)}, a positive number needed")
         if self.spread_deg > 80:
             raise InputError("E-OPTION-RANGE", f"scene: spread_deg {self.spread_deg:g}, at most 80 possible")
+        if self.fisheye_deg is not None and not 60 <= self.fisheye_deg <= 170:
+            raise InputError("E-OPTION-RANGE", f"scene: fisheye_deg {self.fisheye_deg:g}, 60 to 170 possible")
         if len(self.distortion) > 8:
             raise InputError(
                 "E-CAMERA-COEFFICIENTS", f"scene: {len(self.distortion)} distortion coefficients, at most 8 possible"
@@ -178,6 +185,7 @@ def make_scene(
     target: TargetDesign | None = None,
     board: BoardDesign | None = None,
     nominal: dict[str, Rigid] | None = None,
+    camera: Camera | CameraModel | None = None,
 ) -> Scene:
     """Makes a scene; the same arguments give the same scene.
 
@@ -190,6 +198,8 @@ def make_scene(
         Design of the board; the reference board by default.
     nominal : dict of Rigid, optional
         Nominal pose of every face in one common frame, by face id; the rough poses of ``target`` by default.
+    camera : Camera, optional
+        The camera, in place of the one that the options describe.
 
     Returns
     -------
@@ -199,11 +209,17 @@ def make_scene(
     Raises
     ------
     InputError
-        A group names an unknown face, or a nominal pose is missing.
+        A group names an unknown face, a nominal pose is missing, or the camera states no image size or is given beside
+        ``fisheye_deg``.
     DegenerateError
         The faces do not bound a convex body, or a group cannot be photographed.
     """
     options = options or SceneOptions()
+    if camera is not None:
+        return _seen_by_camera(options, target, board, nominal, camera_model(camera))
+    if options.fisheye_deg is not None:
+        perspective = replace(wide_options(options), fisheye_deg=None)
+        return seen_wide(make_scene(perspective, target, board, nominal), options.fisheye_deg, options.seed)
     target, board = target or reference_target(), board or reference_board()
     nominal = nominal or target.rough_poses()
     missing = [face.id for face in target.faces if face.id not in nominal]
@@ -221,6 +237,23 @@ def make_scene(
             raise InputError("E-SCENE-GROUP", f"scene: group {group.name} occurs twice; give different pairs")
         groups[group.name] = group
     return Scene(target, board, camera, target_from_face, circles, groups, options.seed, options.margin_mm)
+
+
+def _seen_by_camera(
+    options: SceneOptions,
+    target: TargetDesign | None,
+    board: BoardDesign | None,
+    nominal: dict[str, Rigid] | None,
+    camera: CameraModel,
+) -> Scene:
+    if options.fisheye_deg is not None:
+        raise InputError(
+            "E-OPTION-CONFLICT", "scene: camera and fisheye_deg given, which are two cameras; give one of them"
+        )
+    if not (camera.width and camera.height):
+        raise InputError("E-CAMERA-SIZE", f"camera file {camera.source} states no image size; add it to the file")
+    scene = make_scene(seen_by(options, camera), target, board, nominal)
+    return replace(scene, camera=camera.calibrated(0, 0))
 
 
 def seen_by(options: SceneOptions, file: CameraModel) -> SceneOptions:

@@ -12,3 +12,5 @@ from .handeye.plan import plan_handeye as plan_handeye
 from .handeye.rig import calibrate_handeye_rig as calibrate_handeye_rig
 from .handeye.rig import read_handeye_rig as read_handeye_rig
 from .photographs import capture as capture
+from .register_robot import RegisteredRobot as RegisteredRobot
+from .register_robot import register_with_robot as register_with_robot

@@ -10,22 +10,23 @@ import numpy as np
 from stcal.cross_validation import dealt, held_out_errors
 from stcal.errors import InputError
 from stcal.geometry.align import align_rigid
+from stcal.geometry.arrays import Brief, require_arguments
 from stcal.geometry.robust import length_limit
 from stcal.io.table import Table, read_table
 from stcal.parallel import one_thread
 from stcal.register import register
+from stcal.register.core.liu2017 import Liu2017Options
 from stcal.register.core.pairs import WHAT, Pairs
-from stcal.register.core.result import ErrorFigures
+from stcal.register.core.result import ErrorFigures, Registration
 from stcal.register.report.file import FiguresRow, HeldOutBoth, MeanRmsMax, RobotPart
 from stcal.register.report.page import matrix_table
-from stcal.register.workspace.findings import Findings
+from stcal.register.workspace.findings import Findings, findings
 from stcal.report import document
 from stcal.report.text import number
 from stcal.robot.identification.residuals import State, tips
 from stcal.robot.identification.result import Identified, IdentifyOptions
 from stcal.robot.identification.solve import identify
 from stcal.robot.kinematics.conditions import read_conditions
-from stcal.robot.kinematics.file import load_robot
 from stcal.robot.kinematics.measurements import Measurements, joint_values, targets_of
 from stcal.robot.kinematics.model import Robot
 
@@ -38,12 +39,30 @@ SAME_MM = 0.01
 tool."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
-    """Errors on the same held-out rows, mm, by the transform and by base and kinematics together.
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class RegisteredRobot(Brief):
+    """A robot identified in the frame b of a registration, and errors of both on the same held-out rows.
 
-    ``rows`` : (m,) rows held out; ``transform_mm``, ``kinematics_mm`` : (m,); ``wild`` : (m,) outliers of both;
-    ``off_mm`` : RMS distance of a from the robot file's forward kinematics after a rigid fit.
+    Parameters
+    ----------
+    robot : Robot
+        The nominal robot.
+    identified : Identified
+        Base and kinematics solved together; ``identified.robot.world_from_base`` is b_from_base, mm.
+    model : str
+        Model of the transform.
+    lines : sequence of int
+        Lines of all rows, for messages.
+    folds : int
+        Number of folds of the cross-validation.
+    rows : (m,) int array
+        Rows held out.
+    transform_mm, kinematics_mm : (m,) arrays
+        Held-out errors by the transform, and by base and kinematics, mm.
+    wild : (m,) bool array
+        Outliers of both.
+    off_mm : float
+        RMS distance of the points a from the nominal robot's positions after a rigid fit, mm.
     """
 
     robot: Robot
@@ -72,23 +91,69 @@ class Comparison:
         return bool(len(transform) and kinematics.mean() < transform.mean())
 
 
+@require_arguments
 @one_thread()
-def compared(
-    pairs: Pairs, file: Path | Table, robot_file: Path, findings: Findings, options: dict, folds: int
-) -> Comparison:
-    """Identify base and kinematics from the joint values of ``file``, and compute held-out errors of both methods.
+def register_with_robot(
+    pairs: Pairs,
+    registration: Registration | Findings,
+    robot: Robot,
+    joints: Measurements | Table | str | Path,
+    *,
+    threshold_mm: float | None = None,
+    liu2017_options: Liu2017Options | None = None,
+    folds: int = 6,
+) -> RegisteredRobot:
+    """Identifies base and kinematics of the robot that carried the points, and compares them with the transform.
 
-    ``options`` : of :func:`stcal.register.pipeline`, by which ``findings`` was computed.
+    Points that the transform cannot explain because the arm bends them are no outliers of the kinematics.
 
-    Raises InputError: there are no joint values, or the robot does not fit them. Raises DegenerateError: too few points
-    for the robot's parameters.
+    Parameters
+    ----------
+    pairs : Pairs
+        Points in the frames a and b, of :func:`stcal.register.read_pairs`, mm; b is the instrument that measured them.
+    registration : Registration
+        Result of :func:`stcal.register.register` from these pairs, with ``allow_ambiguous`` where a bent arm looks like
+        two motions.
+    robot : Robot
+        The nominal robot, mm and rad.
+    joints : Measurements, str, Path or Table
+        Joint values at each pair, with targets and loads; or a table with columns ``q1_deg`` …, as the file of the
+        pairs may have. The positions are always those of ``pairs`` in b.
+    threshold_mm, liu2017_options : float, Liu2017Options, optional
+        Options of the registration, for the transforms of the cross-validation.
+    folds : int
+        Number of folds of the cross-validation; 0 for none.
+
+    Returns
+    -------
+    RegisteredRobot
+        ``identified`` and the held-out errors of both ways.
+
+    Raises
+    ------
+    InputError
+        There are no joint values, as many as pairs are needed, or the robot does not fit them.
+    DegenerateError
+        Too few points for the robot's parameters.
+    ConvergenceError
+        The identification reaches no minimum.
     """
-    robot = load_robot(robot_file)
-    data = _measurements(pairs, file, robot)
-    settings = IdentifyOptions("position", folds=0, seed=options["seed"], partial=True)
-    good = findings.registration.inliers.copy()
-    if findings.field is not None:
-        good[findings.field.taken_back] = True
+    if isinstance(registration, Registration):
+        known = pairs.weights, pairs.covariances
+        registration = findings(pairs.where, pairs.lines, pairs.xyz_a, pairs.xyz_b, registration, *known)
+    found, data = registration.registration, _measurements(pairs, joints, robot)
+    if not len(found) == len(data) == len(pairs):
+        raise InputError(
+            "E-ARRAY-SHAPE",
+            f"{pairs.where}: {len(pairs)} point pairs, a registration of {len(found)}, {len(data)} joint vectors; as "
+            "many of each needed",
+        )
+    options = {"model": found.model, "method": found.method, "threshold_mm": threshold_mm, "seed": found.seed}
+    options |= {"liu2017_options": liu2017_options} if liu2017_options else {}
+    settings = IdentifyOptions("position", folds=0, seed=found.seed, partial=True)
+    good = found.inliers.copy()
+    if registration.field is not None:
+        good[registration.field.taken_back] = True
     identified, used = grown(robot, data, good, settings)
 
     def by_transform(train: np.ndarray, test: np.ndarray) -> np.ndarray:
@@ -104,15 +169,15 @@ def compared(
         fitted = grown(robot, data[train], good[train], settings)[0].robot
         return np.linalg.norm(pairs.xyz_b[test] - positions(fitted, data[test]), axis=1)
 
-    parts = dealt(len(data), folds, np.random.default_rng([options["seed"], 4]))
+    parts = dealt(len(data), folds, np.random.default_rng([found.seed, 4]))
     done, rows, (by_one, by_both) = held_out_errors([by_transform, by_kinematics], parts)
-    outliers_of_both = ~(findings.registration.inliers | used)[rows]
+    outliers_of_both = ~(found.inliers | used)[rows]
     nominal = positions(robot, data)
     off_mm = float(np.sqrt(((pairs.xyz_a - align_rigid(pairs.xyz_a, nominal) @ nominal) ** 2).sum(1).mean()))
-    return Comparison(
+    return RegisteredRobot(
         robot,
         identified,
-        findings.registration.model,
+        found.model,
         pairs.lines,
         done,
         rows,
@@ -123,8 +188,14 @@ def compared(
     )
 
 
-def _measurements(pairs: Pairs, file: Path | Table, robot: Robot) -> Measurements:
-    table = read_table(file, WHAT)
+def _measurements(pairs: Pairs, joints: Measurements | Table | str | Path, robot: Robot) -> Measurements:
+    if isinstance(joints, Measurements):
+        if len(joints) != len(pairs):
+            return joints
+        return Measurements(
+            pairs.where, pairs.lines, joints.q, joints.targets, pairs.xyz_b, conditions=joints.conditions
+        )
+    table = read_table(joints, WHAT)
     try:
         q = joint_values(table, robot)
     except InputError as error:
@@ -157,7 +228,7 @@ def positions(robot: Robot, data: Measurements) -> np.ndarray:
     return tips(State(robot.chain(), tools), data.q, data.targets, data.conditions).translation
 
 
-def robot_part(beside: Comparison) -> RobotPart:
+def robot_part(beside: RegisteredRobot) -> RobotPart:
     """Returns the comparison as part of the registration's file."""
     result, lines = beside.identified, beside.lines
     return RobotPart(
@@ -184,7 +255,7 @@ def robot_part(beside: Comparison) -> RobotPart:
     )
 
 
-def comparison_section(beside: Comparison) -> document.Section:
+def comparison_section(beside: RegisteredRobot) -> document.Section:
     """Returns the comparison as a section of the report."""
     result = beside.identified
     told = (
@@ -197,7 +268,7 @@ def comparison_section(beside: Comparison) -> document.Section:
     return document.Section("Base and kinematics together", blocks, terminal=True)
 
 
-def _rows(beside: Comparison) -> list[list[str]]:
+def _rows(beside: RegisteredRobot) -> list[list[str]]:
     rows = []
     for name, transform, kinematics in beside.errors():
         for way, errors in ((f"{beside.model} transform", transform), ("base and kinematics together", kinematics)):
@@ -206,7 +277,7 @@ def _rows(beside: Comparison) -> list[list[str]]:
     return rows
 
 
-def _notes(beside: Comparison) -> list[str]:
+def _notes(beside: RegisteredRobot) -> list[str]:
     notes, open_ones = [], beside.identified.undetermined
     if open_ones:
         shown = ", ".join(open_ones[:FIRST_NAMES]) + (", …" if len(open_ones) > FIRST_NAMES else "")
@@ -224,7 +295,7 @@ def _notes(beside: Comparison) -> list[str]:
     return notes
 
 
-def _b_from_base(beside: Comparison) -> np.ndarray:
+def _b_from_base(beside: RegisteredRobot) -> np.ndarray:
     return beside.identified.robot.world_from_base.matrix()
 
 

@@ -6,11 +6,13 @@ import sys
 import numpy as np
 import pytest
 
+import stcal
 from stcal import workflows
 from stcal.cli.main import main
 from stcal.handeye.report.file import HandEyeFile
 from stcal.handeye.report.planned import planned_file
 from stcal.io.files import json_text
+from stcal.io.table import POSE, pose_cells
 from tests.handeye.test_plan_cli import NOISE, poses_file
 from tests.outcome import ended, fails_with
 from tests.support.handeye import simulated
@@ -40,6 +42,23 @@ def test_calibrate_handeye(written, poses):
         workflows.calibrate_handeye(poses)
     with fails_with("E-OPTION-VALUE … setup"):
         workflows.read_handeye(poses, setup="in hand")
+
+
+def test_two_files_of_poses(written, poses, tmp_path):
+    table = stcal.load_table(poses)
+    paths = []
+    for name, prefix in (("robot", "base_from_flange_"), ("camera", "camera_from_board_")):
+        rows = [f"p{i}," + ",".join(pose_cells(pose)) for i, pose in enumerate(table.poses(prefix))]
+        rows += [] if name == "robot" else ["p99," + rows[0].partition(",")[2]]
+        paths.append(tmp_path / f"{name}.csv")
+        paths[-1].write_text("\n".join([",".join(["image", *POSE]), *rows]), encoding="utf-8")
+    answer = written("--a", paths[0], "--b", paths[1], "--splits", 0, "--method", "pose", "--setup", "eye-in-hand")
+    given = workflows.read_handeye(paths[0], second=paths[1], setup="eye-in-hand")
+    found = workflows.calibrate_handeye(given, "pose", repeats=0)
+    assert json.loads(json_text(HandEyeFile.of(found, whole=True))) == answer
+    assert given.notes == (f"1 rows of {paths[1]} have no partner: image p99",)
+    with fails_with("E-OPTION-NEEDS … only with two files"):
+        workflows.read_handeye(poses, columns_a="columns.toml")
 
 
 def test_plan_handeye(written, poses):

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import stcal
+from stcal import register
 from stcal.cli.main import app
 from stcal.geometry.rigid import Rigid
-from stcal.io.join import join, stack
+from stcal.io.join import join_tables, stack_tables
 from stcal.register.core.pairs import read_pairs
 from tests.outcome import fails_with
 from tests.support.handeye import simulated
@@ -22,7 +24,7 @@ def written(path, text: str):
 def test_rows_of_one_key_stand_side_by_side(tmp_path):
     a = written(tmp_path / "poses.csv", "image,x_mm,y_mm,z_mm,status\np1,1,2,3,ok\np2,4,5,6,ok\np9,0,0,0,ok\n")
     b = written(tmp_path / "tracker.csv", "image,x_m,y_m,z_m,cov_x_x,status\np2,0.4,0.5,0.6,1,?\np1,0.1,0.2,0.3,1,?\n")
-    found = join(a, b, "image", ("a", "b"))
+    found = join_tables(a, b, "image", ("a", "b"))
     pairs = read_pairs(found.table)
     assert np.allclose(pairs.xyz_a, [[1, 2, 3], [4, 5, 6]])
     assert np.allclose(pairs.xyz_b, [[100, 200, 300], [400, 500, 600]])
@@ -30,6 +32,25 @@ def test_rows_of_one_key_stand_side_by_side(tmp_path):
     assert found.table.text("status") == ["ok", "ok"]
     assert "bcov_x_x" in found.table
     assert found.notes == (f"1 rows of {a} have no partner: image p9",)
+
+
+def test_pairs_of_two_files(tmp_path):
+    a = written(tmp_path / "a.csv", "name,x_mm,y_mm,z_mm\np1,1,2,3\np2,4,5,6\np9,0,0,0\n")
+    b = written(tmp_path / "b.csv", "P;X\np2;1\np1;2\n")
+    columns = written(
+        tmp_path / "b.toml", 'delimiter = "semicolon"\n[columns]\nname = "P"\nx_m = "X"\ny_m = "X"\nz_m = "X"\n'
+    )
+    pairs = register.read_pairs(a, b, columns=columns)
+    assert np.allclose(pairs.xyz_a, [[1, 2, 3], [4, 5, 6]])
+    assert np.allclose(pairs.xyz_b, [[2000] * 3, [1000] * 3])
+    assert pairs.notes == (f"1 rows of {a} have no partner: name p9",)
+    table = stcal.load_table(b, columns)
+    joined = stcal.join_tables(a, table, "name", ("a", "b"))
+    assert np.array_equal(register.read_pairs(joined.table).xyz_b, pairs.xyz_b)
+    both = stcal.stack_tables([table, table], ["first", "second"])
+    assert both.text("set") == ["first", "first", "second", "second"]
+    with fails_with("E-OPTION-NEEDS … only with two files"):
+        register.read_pairs(a, columns_a=columns)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +66,7 @@ def test_what_cannot_be_joined_says_why(tmp_path, second, key, said):
     a = written(tmp_path / "a.csv", "image,x_mm,y_mm,z_mm\np1,1,2,3\n")
     b = written(tmp_path / "b.csv", second)
     with fails_with(said):
-        join(a, b, key)
+        join_tables(a, b, key)
 
 
 def test_registration_of_two_files(tmp_path):
@@ -91,12 +112,12 @@ def test_files_of_one_kind_stand_below_each_other(tmp_path):
         written(tmp_path / "before.csv", "image,x_mm,y_mm,z_mm,only\np2,7,7,7,1\np1,8,8,8,1\n"),
         written(tmp_path / "after.csv", "image,x_mm,y_mm,z_mm\np1,9,9,9\n"),
     ]
-    joined = [join(a, file, "image", ("commanded_", "")).table for file in files]
-    found = stack(joined, ["before", "after"], {"pose": "image"})
+    joined = [join_tables(a, file, "image", ("commanded_", "")).table for file in files]
+    found = stack_tables(joined, ["before", "after"], {"pose": "image"})
     assert found.text("set") == ["before", "before", "after"]
     assert found.text("pose") == ["p1", "p2", "p1"]
     assert "only" not in found
     assert np.allclose(found.points(), [[8, 8, 8], [7, 7, 7], [9, 9, 9]])
     assert np.allclose(found.points("commanded_"), [[1, 2, 3], [4, 5, 6], [1, 2, 3]])
     with fails_with("E-TABLES-NAMES … after … set"):
-        stack(joined, ["after", "after"], {})
+        stack_tables(joined, ["after", "after"], {})

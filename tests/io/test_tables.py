@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.io.join import join
+from stcal.io.join import join_tables
 from stcal.io.table import COVARIANCE, LENGTHS, read_table
 from tests.outcome import fails_with
 
@@ -129,10 +129,10 @@ def test_a_unit_that_nothing_states_is_asked_for(tmp_path):
 def test_key_columns_of_two_names(tmp_path):
     (tmp_path / "a.csv").write_text("image,q1_deg\np2,20\np1,10\n")
     (tmp_path / "b.csv").write_text("Point Name;X [mm]\np1;1,5\np2;2,5\n")
-    found = join(tmp_path / "a.csv", tmp_path / "b.csv", "image=Point Name").table
+    found = join_tables(tmp_path / "a.csv", tmp_path / "b.csv", "image=Point Name").table
     np.testing.assert_array_equal(found.numbers("x_mm"), [2.5, 1.5])
     with fails_with("E-TABLE-COLUMN-MISSING … b.csv … image … image=NAME"):
-        join(tmp_path / "a.csv", tmp_path / "b.csv", "image")
+        join_tables(tmp_path / "a.csv", tmp_path / "b.csv", "image")
 
 
 def test_both_files_with_a_map(tmp_path):
@@ -143,7 +143,7 @@ def test_both_files_with_a_map(tmp_path):
     )
     (tmp_path / "b.toml").write_text('delimiter = "tab"\n[columns]\nimage = "Nr"\nx_m = "X"\n')
     maps = {"columns": tmp_path / "b.toml", "columns_a": tmp_path / "a.toml"}
-    found = join(tmp_path / "a.csv", tmp_path / "b.csv", "image", **maps).table
+    found = join_tables(tmp_path / "a.csv", tmp_path / "b.csv", "image", **maps).table
     assert (found.numbers("q1_deg")[0], found.quantity("x", LENGTHS)[0]) == (10.5, 1500.0)
 
 

@@ -6,13 +6,15 @@ import re
 import numpy as np
 import pytest
 
+from stcal import register, workflows
 from stcal.cli.main import main
 from stcal.geometry.rigid import Rigid
 from stcal.robot.kinematics.file import load_robot, robot_toml
 from stcal.robot.kinematics.forward import forward
+from stcal.robot.kinematics.measurements import Measurements
 from stcal.robot.kinematics.model import mh80
 from stcal.robot.simulated import joint_vectors, made, placed
-from tests.outcome import ended
+from tests.outcome import ended, fails_with
 from tests.support.arms import elastic
 
 HEAD = "ax_mm,ay_mm,az_mm,bx_mm,by_mm,bz_mm"
@@ -337,6 +339,24 @@ def test_joint_values_are_needed_for_a_robot(run, tmp_path, robot_pairs):
     code, _, err = run(bad_row, "--robot", folder / "robot.toml")
     assert code == 2
     assert "line 7" in err
+
+
+def test_the_function_has_the_commands_answer(run, tmp_path, robot_pairs):
+    folder, pairs, _ = robot_pairs
+    out, identified = tmp_path / "o.json", tmp_path / "identified.toml"
+    words = "--robot", folder / "robot.toml", "--folds", 0, "--out", out, "--identified", identified
+    assert run(pairs, *words)[0] == 0
+    read = register.read_pairs(pairs)
+    transform = register.register(read.xyz_a, read.xyz_b, folds=0, allow_ambiguous=True)
+    robot = load_robot(folder / "robot.toml")
+    found = workflows.register_with_robot(read, transform, robot, pairs, folds=0)
+    content = json.loads(out.read_text())["robot"]
+    assert found.identified.robot.world_from_base.matrix().tolist() == content["b_from_base"]
+    assert robot_toml(found.identified.robot) in identified.read_text()
+    with fails_with("E-ARRAY-SHAPE … 45 point pairs … 44 joint vectors"):
+        workflows.register_with_robot(
+            read, transform, robot, Measurements.from_arrays(np.zeros((44, 6)), read.xyz_b[1:])
+        )
 
 
 def test_a_transform_stands_where_the_kinematics_do_not(run, tmp_path, robot_pairs):

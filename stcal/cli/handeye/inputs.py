@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from stcal.cli.declare import Arg, Opt
 from stcal.cli.options import one_table
+from stcal.cli.terminal import print_each
 
 if TYPE_CHECKING:
     from stcal.geometry.rigid import Order
@@ -72,17 +73,16 @@ def source_of(
     columns_a: Path | None = None,
 ) -> "Source":
     """Returns the file or folder given as argument, or --a and --b joined, for any of the formats."""
-    from stcal.handeye.data.inputs import mapped_pairs
-    from stcal.workflows.handeye.inputs import two_files
+    from stcal.workflows.handeye.inputs import one_source
     from stcal.workflows.handeye.times import Timing
 
+    maps = columns_a, columns
     if source is None and first is not None and second is not None:
-        told = two_files(first, second, key, statements, quaternions, timing or Timing(), (columns_a, columns))
-        if told is not None:
-            return told
+        told, notes = one_source(first, second, key, statements, quaternions, timing or Timing(), maps)
+        print_each("note", notes)
+        return told
     if source is not None and columns is not None and source.is_file():
-        return mapped_pairs(source, columns, statements, key, quaternions)
+        return one_source(source, None, key, statements, quaternions, timing or Timing(), maps)[0]
     if source is not None and source.is_dir():
         columns = None  # of the robot's poses
-    prefixes = ("base_from_flange_", "camera_from_board_")
-    return one_table(source, first, second, key, "POSES|IMAGES", prefixes, quaternions, columns, columns_a)
+    return one_table(source, first, second, key, "POSES|IMAGES", columns=columns, columns_a=columns_a)

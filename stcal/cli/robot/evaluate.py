@@ -75,7 +75,7 @@ def verify(
     report: shared.ReportFile = None,
 ) -> None:
     """Compare distances of positions from the first one, measured and commanded, before and after compensation."""
-    from stcal.io.join import stack
+    from stcal.io.join import stack_tables
     from stcal.robot.use import verification as stage
     from stcal.robot.use.report import verification_report
 
@@ -84,10 +84,9 @@ def verify(
     tables = shared.several_tables(
         measured, first, seconds or [], key, "MEASURED", ("commanded_", ""), columns=columns, columns_a=columns_a
     )
-    source = (
-        tables if not isinstance(tables, list) else stack(tables, [path.stem for path in seconds or ()], {"pose": key})
-    )
-    result = stage.verify(stage.read_measured(source))
+    if isinstance(tables, list):
+        tables = stack_tables(tables, [path.stem for path in seconds or ()], {"pose": key})
+    result = stage.verify(stage.read_measured(tables))
     document = verification_report(result)
     say(document.text())
     print_each("note", result.notes)

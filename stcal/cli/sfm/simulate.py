@@ -243,25 +243,19 @@ def _scene(
     from stcal.io.cameras.read import read_camera
     from stcal.sfm.planning.nominal import nominal_poses
     from stcal.sfm.planning.session import pairs_of_faces
-    from stcal.synthetic.scene import make_scene, seen_by, seen_wide, wide_options
+    from stcal.synthetic.scene import make_scene
 
     target, board = designs
     poses = nominal_poses(target, None)
     if groups:
         options = replace(options, groups=pairs_of_faces(groups, target))
     if camera is None:
-        options = options if fisheye is None else wide_options(options)
-        scene = make_scene(options, target, board, poses)
-        return scene if fisheye is None else seen_wide(scene, fisheye, options.seed)
+        return make_scene(replace(options, fisheye_deg=fisheye), target, board, poses)
     if fisheye is not None:
         raise InputError(
             "E-OPTION-CONFLICT", f"--camera {camera} and --fisheye {fisheye:g}: two cameras; give one of them"
         )
-    file = read_camera(camera)
-    if not (file.width and file.height):
-        raise InputError("E-CAMERA-SIZE", f"camera file {camera} states no image size; add it to the file")
-    scene = make_scene(seen_by(options, file), target, board, poses)
-    return replace(scene, camera=file.calibrated(0, 0))
+    return make_scene(options, target, board, poses, read_camera(camera))
 
 
 @app.command()

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from stcal.geometry.arrays import require_arguments
 from stcal.handeye.plan import NextPoses
 from stcal.handeye.result import HandEye
 from stcal.io.json import Part, Pose, ResultFile
@@ -67,8 +68,23 @@ def planned_report(result: HandEye, planned: NextPoses, joints: dict[str, np.nda
     )
 
 
-def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray]) -> str:
-    """Returns the table of ``--out`` (form: ``data_layout.md``)."""
+@require_arguments
+def planned_csv(planned: NextPoses, joints: dict[str, np.ndarray] | None = None) -> str:
+    """Returns the table of the poses to take next.
+
+    Parameters
+    ----------
+    planned : NextPoses
+        Of :func:`~stcal.handeye.plan_poses`, k poses.
+    joints : dict of (k,) array, optional
+        Joint values of the poses by the name of their column, ``q1_deg`` …, degrees or mm.
+
+    Returns
+    -------
+    str
+        CSV with base_from_flange and camera_from_board, mm (form: ``data_layout.md``).
+    """
+    joints = joints or {}
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     frames = {"base_from_flange": planned.base_from_flange, "camera_from_board": planned.camera_from_board}

@@ -3,12 +3,13 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import Brief
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.geometry.uncertain import UncertainRigid
 from stcal.io.join import table_of
@@ -39,6 +40,40 @@ class RegistrationRead(Part):
     covariance: Matrix
 
 
+@runtime_checkable
+class HandEyeResult(Protocol):
+    """What is used of :class:`stcal.handeye.HandEye`."""
+
+    @property
+    def transforms(self) -> Mapping[str, Rigid]: ...
+
+    @property
+    def covariance(self) -> np.ndarray | None: ...
+
+
+class WithMatrix(Protocol):
+    """A transform of any kind."""
+
+    def matrix(self) -> np.ndarray: ...
+
+
+@runtime_checkable
+class RegistrationResult(Protocol):
+    """What is used of :class:`stcal.register.Registration`: a is the camera's frame, b the robot's base."""
+
+    @property
+    def model(self) -> str: ...
+
+    @property
+    def method(self) -> str: ...
+
+    @property
+    def b_from_a(self) -> WithMatrix: ...
+
+    @property
+    def covariance(self) -> np.ndarray: ...
+
+
 class OffsetFile(Part):
     """File of the goal's pose in the target's frame, which is exact."""
 
@@ -49,13 +84,24 @@ ROTATION_WITHIN = 1e-6
 """Largest element of RᵀR − 1 of a rotation. The file of a rigid registration holds all digits."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GoalChain:
-    """Chain of transforms from the camera to the robot's base.
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class GoalChain(Brief):
+    """Chain of transforms from the camera to the robot's base, made by :func:`~stcal.locate.goal_chain`.
 
-    ``mount`` : flange_from_camera for a camera on the flange, base_from_camera of a fixed camera; ``moving`` : whether
-    the camera is on the flange; ``flange`` : base_from_flange by scene, empty for a fixed camera; ``offset`` :
-    obj_from_goal, exact; ``source`` : origin of ``mount``, for messages.
+    Parameters
+    ----------
+    mount : UncertainRigid
+        flange_from_camera of a camera on the flange, base_from_camera of a fixed camera; mm.
+    moving : bool
+        Whether the camera is on the flange.
+    flange : dict of UncertainRigid
+        base_from_flange by scene, mm; empty for a fixed camera.
+    offset : Rigid
+        obj_from_goal, mm, which is exact.
+    source : str
+        Origin of ``mount``, for messages.
+    poses_source : str
+        Origin of ``flange``, for messages.
     """
 
     mount: UncertainRigid
@@ -63,6 +109,7 @@ class GoalChain:
     flange: dict[str, UncertainRigid]
     offset: Rigid
     source: str = "hand-eye file"
+    poses_source: str = "robot poses"
 
     def base_from_goal(self, scene: str, camera_from_obj: UncertainRigid) -> UncertainRigid:
         """Returns the goal's pose in the robot's base. Its covariance holds the errors of all links of the chain.
@@ -82,16 +129,24 @@ class GoalChain:
         """Returns the scenes without a robot pose."""
         return [scene for scene in scenes if self.moving and scene not in self.flange]
 
+    def require_poses(self, scenes: Sequence[str]) -> None:
+        """Refuses scenes without a robot pose, by InputError."""
+        if missing := self.without_pose(scenes):
+            raise InputError(
+                "E-ROBOT-POSES-SCENE",
+                f"{self.poses_source}: none of scene {missing[0]}; add a row, or take the scene away",
+            )
+
 
 def read_chain(
-    hand_eye: str | Path,
-    robot_poses: str | Path | None,
-    offset: str | Path | None = None,
+    hand_eye: HandEyeResult | Rigid | str | Path,
+    robot_poses: Mapping[str, Rigid] | str | Path | None,
+    offset: Rigid | str | Path | None = None,
     quaternions: Order = "wxyz",
     key: str = "scene",
     columns: str | Path | None = None,
 ) -> GoalChain:
-    """Reads the hand-eye file of ``stcal handeye``, the robot's poses by scene, and the offset.
+    """Reads what of the hand-eye transform, the robot's poses by scene, and the offset is a file.
 
     ``quaternions`` : order of the robot's quaternions, ``xyzw`` if their columns hold x, y, z, w in this order.
     ``key`` : column of the robot's poses that names the scenes; ``columns`` : map of their columns.
@@ -99,15 +154,9 @@ def read_chain(
     Raises InputError: a file does not follow ``data_layout.md``, or robot poses are missing, or are given for a fixed
     camera.
     """
-    mounted = read_result(hand_eye, HandEyeRead, "hand-eye file", "give the file of stcal handeye")
-    where = f"hand-eye file {hand_eye}"
-    either = {MOVING: mounted.flange_from_camera, FIXED: mounted.base_from_camera}
-    given = {name: matrix for name, matrix in either.items() if matrix is not None}
-    if len(given) != 1:
-        raise InputError("E-HANDEYE-FILE", f"{where}: {' and '.join(given) or 'neither'}; {MOVING} or {FIXED} needed")
-    [(name, matrix)] = given.items()
-    covariance = np.zeros((6, 6)) if mounted.covariance is None else mounted.covariance
-    mount = UncertainRigid(Rigid.from_matrix(matrix), covariance)
+    name, mount = _mounted(hand_eye, robot_poses)
+    source = "hand-eye file" if isinstance(hand_eye, str | Path) else "hand-eye"
+    where = f"{source} {hand_eye}" if isinstance(hand_eye, str | Path) else source
     moving = name == MOVING
     if moving and robot_poses is None:
         raise InputError(
@@ -118,19 +167,52 @@ def read_chain(
         raise InputError(
             "E-OPTION-NEEDS", f"{where}: the camera is fixed and needs no robot poses; leave --robot-poses out"
         )
-    flange = read_robot_poses(robot_poses, quaternions, key, columns) if robot_poses else {}
-    return GoalChain(mount, moving, flange, _offset(offset))
+    if robot_poses is None:
+        return GoalChain(mount, moving, {}, _offset(offset), source)
+    if isinstance(robot_poses, str | Path):
+        flange = read_robot_poses(robot_poses, quaternions, key, columns)
+        return GoalChain(mount, moving, flange, _offset(offset), source, f"robot poses {robot_poses}")
+    exact = {scene: UncertainRigid.exact(pose) for scene, pose in robot_poses.items()}
+    return GoalChain(mount, moving, exact, _offset(offset), source)
 
 
-def read_registered(registration: str | Path, offset: str | Path | None = None) -> GoalChain:
-    """Reads the file of ``stcal register`` for points that a fixed camera (a) and the robot (b, its base) measured.
+def _mounted(
+    hand_eye: HandEyeResult | Rigid | str | Path, robot_poses: Mapping[str, Rigid] | str | Path | None
+) -> tuple[str, UncertainRigid]:
+    """Returns the name of the camera's pose and the pose. Robot poses tell what a transform alone is."""
+    if isinstance(hand_eye, Rigid):
+        return FIXED if robot_poses is None else MOVING, UncertainRigid.exact(hand_eye)
+    if isinstance(hand_eye, str | Path):
+        mounted = read_result(hand_eye, HandEyeRead, "hand-eye file", "give the file of stcal handeye")
+        either = {MOVING: mounted.flange_from_camera, FIXED: mounted.base_from_camera}
+        given = {name: Rigid.from_matrix(matrix) for name, matrix in either.items() if matrix is not None}
+        if len(given) != 1:
+            raise InputError(
+                "E-HANDEYE-FILE",
+                f"hand-eye file {hand_eye}: {' and '.join(given) or 'neither'}; {MOVING} or {FIXED} needed",
+            )
+    else:
+        mounted = hand_eye
+        given = {name: pose for name, pose in hand_eye.transforms.items() if name in (MOVING, FIXED)}
+    [(name, pose)] = given.items()
+    return name, UncertainRigid(pose, np.zeros((6, 6)) if mounted.covariance is None else mounted.covariance)
+
+
+def read_registered(
+    registration: RegistrationResult | str | Path, offset: Rigid | str | Path | None = None
+) -> GoalChain:
+    """Reads the result of ``stcal register`` for points that a fixed camera (a) and the robot (b, its base) measured.
 
     Raises InputError: a file does not follow ``data_layout.md``, or the registration is not rigid.
     """
-    advice = "give the file of stcal register --out"
-    read = read_result(registration, RegistrationRead, "registration file", advice)
-    where = f"registration file {registration}"
-    linear = read.b_from_a[:3, :3]
+    if isinstance(registration, str | Path):
+        advice = "give the file of stcal register --out"
+        read = read_result(registration, RegistrationRead, "registration file", advice)
+        source, where, matrix = "registration file", f"registration file {registration}", read.b_from_a
+    else:
+        read, source, where = registration, "registration", "registration"
+        matrix = registration.b_from_a.matrix()
+    linear = matrix[:3, :3]
     residual = float(np.abs(linear.T @ linear - np.eye(3)).max())
     if read.covariance.shape != (6, 6) or residual > ROTATION_WITHIN or np.linalg.det(linear) < 0:
         kind = read.method if read.method == "liu2017" else read.model
@@ -139,13 +221,13 @@ def read_registered(registration: str | Path, offset: str | Path | None = None) 
             f"{where}: b_from_a is no rigid motion ({kind}: RᵀR is {residual:.2g} from 1); base_from_camera needs one, "
             "register with --model rigid",
         )
-    mount = UncertainRigid(Rigid.from_matrix(read.b_from_a), read.covariance)
-    return GoalChain(mount, False, {}, _offset(offset), "registration file")
+    mount = UncertainRigid(Rigid.from_matrix(matrix), read.covariance)
+    return GoalChain(mount, False, {}, _offset(offset), source)
 
 
-def _offset(offset: str | Path | None) -> Rigid:
-    if offset is None:
-        return Rigid()
+def _offset(offset: Rigid | str | Path | None) -> Rigid:
+    if offset is None or isinstance(offset, Rigid):
+        return offset or Rigid()
     read = read_result(offset, OffsetFile, "offset file", "a 4×4 matrix under the key obj_from_goal needed")
     return Rigid.from_matrix(read.obj_from_goal)
 

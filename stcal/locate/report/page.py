@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.geometry.uncertain import UncertainRigid
@@ -71,8 +72,22 @@ def accepted(results: Sequence[Located]) -> list[Located]:
     return [each for each in results if each.verdict.decision == "accept"]
 
 
+@require_arguments
 def poses_csv(results: Sequence[Located], chain: GoalChain | None = None) -> str:
-    """Returns a table of the accepted poses only, so that no robot moves to a rejected one; the others are comments."""
+    """Returns a table of the accepted poses only, so that no robot moves to a rejected one; the others are comments.
+
+    Parameters
+    ----------
+    results : sequence of Located
+        Results of :func:`~stcal.locate.run`.
+    chain : GoalChain, optional
+        Transforms to the robot's base, of :func:`~stcal.locate.goal_chain`, for further columns ``base_from_goal_…``.
+
+    Returns
+    -------
+    str
+        CSV with camera_from_obj, mm, and its covariance (form: ``data_layout.md``).
+    """
     out = io.StringIO()
     for scene in results:
         if scene.verdict.decision != "accept":

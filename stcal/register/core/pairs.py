@@ -9,7 +9,8 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.geometry.arrays import Array, Brief, freeze, require_arguments, require_fields
 from stcal.io.covariance import OF_POINT, first_fault
-from stcal.io.table import LENGTHS, Table, read_table
+from stcal.io.join import join_tables, table_of
+from stcal.io.table import LENGTHS, Table
 from stcal.register.core.models import Model, Transform, fit, rounding_mm, squares, whitened
 
 WHAT = "point pairs"
@@ -35,6 +36,8 @@ class Pairs(Brief):
         Weights, proportional to 1/σ².
     covariances : (n, 3, 3) or (n,) array, or None
         Covariances, or variances per axis, of b − b_from_a a in frame b, mm².
+    notes : tuple of str
+        On points of only one of two files.
 
     Raises
     ------
@@ -48,6 +51,7 @@ class Pairs(Brief):
     xyz_b: Array
     weights: np.ndarray | None = None
     covariances: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self):
         require_fields(self, "point pairs")
@@ -65,13 +69,26 @@ class Pairs(Brief):
 
 
 @require_arguments
-def read_pairs(path: str | Path | Table) -> Pairs:
+def read_pairs(
+    path: str | Path | Table,
+    second: str | Path | Table | None = None,
+    *,
+    key: str = "name",
+    columns: str | Path | None = None,
+    columns_a: str | Path | None = None,
+) -> Pairs:
     """Reads ``ax_mm, ay_mm, az_mm, bx_mm, by_mm, bz_mm`` and the stated noise (form: ``data_layout.md``).
 
     Parameters
     ----------
-    path : str or Path
-        A table.
+    path : str, Path or Table
+        A table of both; or of the points of a alone, as ``x_mm, y_mm, z_mm``.
+    second : str, Path or Table, optional
+        Table of the points of b alone, as ``x_mm, y_mm, z_mm``.
+    key : str
+        Column of both tables that names the points; or ``name=Point Name``, that of a and that of b.
+    columns, columns_a : str or Path, optional
+        Columns, delimiter … of the only file or that of b, and of that of a (TOML).
 
     Returns
     -------
@@ -83,7 +100,14 @@ def read_pairs(path: str | Path | Table) -> Pairs:
         If columns are missing or a row is invalid: text, values that are not finite, a repeated pair, weights or σ that
         are not positive. The message names the line.
     """
-    table = read_table(path, WHAT)
+    if second is None and columns_a is not None:
+        raise InputError("E-OPTION-NEEDS", f"--columns-a {columns_a}: only with two files; give --columns")
+    notes = ()
+    if second is not None:
+        joined = join_tables(path, second, key, ("a", "b"), columns=columns, columns_a=columns_a)
+        table, notes = joined.table, joined.notes
+    else:
+        table = table_of(path, columns, WHAT)
     xyz_a, xyz_b = table.points("a"), table.points("b")
     _no_pair_twice(table, np.hstack([xyz_a, xyz_b]))
     given = [
@@ -106,7 +130,7 @@ def read_pairs(path: str | Path | Table) -> Pairs:
         covariances = _positive(table, "sigma", table.quantity("sigma", LENGTHS)) ** 2
     elif given:
         covariances = _covariances(table)
-    return Pairs(table.where, table.lines, xyz_a, xyz_b, weights, covariances)
+    return Pairs(table.where, table.lines, xyz_a, xyz_b, weights, covariances, notes)
 
 
 def _no_pair_twice(table: Table, rows: np.ndarray) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.poses.columns import fixed, joined, without_comments
@@ -245,8 +246,22 @@ def zeros(result: Identified, nominal: Robot) -> tuple[np.ndarray, np.ndarray, n
     return change, sigma, (np.abs(back) > 0) @ open_ == 0
 
 
+@require_arguments
 def offsets_csv(result: Identified, nominal: Robot) -> str:
-    """Returns the table of ``--offsets`` (form: ``data_layout.md``)."""
+    """Returns the table of mastering offsets and differences of D-H values.
+
+    Parameters
+    ----------
+    result : Identified
+        The robot as identified, of :func:`~stcal.robot.identify`.
+    nominal : Robot
+        The robot from which it was identified.
+
+    Returns
+    -------
+    str
+        CSV in mm and degrees, with σ (form: ``data_layout.md``).
+    """
     before, values, sigma = dh_values(nominal) * SHOWN, dh_values(result.robot) * SHOWN, result.dh_sigma * SHOWN
     change, change_sigma, known = zeros(result, nominal)
     stream = io.StringIO()

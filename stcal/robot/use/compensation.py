@@ -354,8 +354,22 @@ def joint_cells(robot: Robot, q: np.ndarray) -> list[str]:
     return [f"{value:.9f}" for value in np.where(robot.prismatic, q, np.degrees(q))]
 
 
+@require_arguments
 def compensated_csv(result: Compensated, robot: Robot) -> str:
-    """Returns the table of ``--out`` (form: ``data_layout.md``). Joint values of poses not reached are empty."""
+    """Returns the table of compensated joint values; those of poses not reached are empty.
+
+    Parameters
+    ----------
+    result : Compensated
+        Of :func:`~stcal.robot.compensate`.
+    robot : Robot
+        The identified robot.
+
+    Returns
+    -------
+    str
+        CSV with joint values, degrees or mm, and what errors they leave, mm and degrees (form: ``data_layout.md``).
+    """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     columns = joint_columns(robot)

@@ -306,8 +306,22 @@ def _predicted_mm(rows: np.ndarray, predict: np.ndarray) -> float:
     return float(np.sqrt(np.mean(((predict @ vt.T / sigma) ** 2).sum(axis=2))))
 
 
+@require_arguments
 def design_csv(result: PoseDesign, robot: Robot) -> str:
-    """Returns the table of ``--out`` (form: ``data_layout.md``)."""
+    """Returns the table of the poses to measure.
+
+    Parameters
+    ----------
+    result : PoseDesign
+        Of :func:`~stcal.robot.design`.
+    robot : Robot
+        The robot for which they were designed.
+
+    Returns
+    -------
+    str
+        CSV with joint values, degrees or mm, and base_from_tool of the nominal robot, mm (form: ``data_layout.md``).
+    """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["pose", *joint_columns(robot), *(f"nominal_{c}" for c in POSE)])

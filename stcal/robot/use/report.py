@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.files import require_written
 from stcal.io.quaternions import COLUMNS
@@ -376,15 +377,25 @@ def left_lines(each: Evaluated) -> list[str]:
     return lines
 
 
+@require_arguments
 def evaluated_csv(result: Evaluation) -> str:
-    """Returns the table of ``--out`` (form: ``data_layout.md``)."""
-    data, robots = result.seen.data, result.robots
-    stream = io.StringIO()
+    """Returns the table of residuals, with a row for each measurement.
+
+    Parameters
+    ----------
+    result : Evaluation
+
+    Returns
+    -------
+    str
+        CSV in mm and degrees (form: ``data_layout.md``).
+    """
+    data, robots, stream = result.seen.data, result.robots, io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     turned, points = len(robots[0].rotation_rad) > 0, data.positions is not None
     head = ["line", "target", *joint_columns(robots[0].robot)]
-    head += ["x_mm", "y_mm", "z_mm"] if points else ["distance_mm", "from_row"]
-    head += [*(COLUMNS if turned else ()), "wrong"]
+    measured = ("x_mm", "y_mm", "z_mm") if points else ("distance_mm", "from_row")
+    head += [*measured, *(COLUMNS if turned else ()), "wrong"]
     modelled = []
     for evaluated in robots:
         name = re.sub(r"\W+", "_", evaluated.robot.name)
@@ -409,7 +420,7 @@ def evaluated_csv(result: Evaluation) -> str:
         cells += [f"{v:.12f}" for v in turns[row]] if turns is not None else []
         cells.append("" if at is None else int(result.wrong[at]))
         for evaluated, there in zip(robots, modelled, strict=True):
-            residual = evaluated.residuals[at] if at is not None else np.zeros(evaluated.residuals.shape[1])
+            residual = np.zeros(evaluated.residuals.shape[1]) if at is None else evaluated.residuals[at]
             cells += [*(_cells(there[row]) if points else ()), *_cells(residual), *_cells([np.linalg.norm(residual)])]
             cells += _cells(np.degrees(evaluated.rotation_rad[[row]])) if turned else []
         writer.writerow(cells)

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from stcal.errors import InputError
+from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Poses
 from stcal.io.json import Finite, Matrix6, NamedReason, Pair, Part, Pose, ResultFile
 from stcal.io.table import COVARIANCE, POSE, Table, common_columns, pose_cells, require_pose_table_written
@@ -99,12 +100,29 @@ IMAGE, FACES, CIRCLES, STATUS = "image", "faces", "circles", "status"
 QUALITY = ("rms_px", "chi2_per_dof")
 
 
+@require_arguments
 def poses_csv(result: MeasureResult, joints: Table | None = None) -> tuple[str, tuple[str, ...]]:
-    """Returns the text of ``poses.csv``, and notes on images that could not be joined.
+    """Returns the table of measured poses, and notes on images that could not be joined.
 
-    ``joints`` : further columns by image. Only images of this table are then written.
+    Parameters
+    ----------
+    result : MeasureResult
+        Of :func:`~stcal.sfm.measure`.
+    joints : Table, optional
+        Further columns by ``image``, of :func:`stcal.load_table`. Only images of this table are then written.
 
-    Raises InputError if the table has no column ``image``, an image twice, or a column of the name of a measured one.
+    Returns
+    -------
+    text : str
+        CSV with camera_from_target, mm, and its covariance, rad and mm (form: ``data_layout.md``).
+    notes : tuple of str
+        Images of only one of both.
+
+    Raises
+    ------
+    InputError
+        The table has no column ``image``, an image twice, a column of the name of a measured one, or no image that was
+        measured.
     """
     header = [IMAGE, FACES, CIRCLES, STATUS, *POSE, *COVARIANCE, *QUALITY]
     common = common_columns(result.common.shape[2])

@@ -20,7 +20,7 @@ from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.io.files import save
 from stcal.io.images import find_images
-from stcal.io.join import join, table_of
+from stcal.io.join import join_tables, table_of
 from stcal.io.table import POSE, Table, read_table
 from stcal.parallel import Progress
 from stcal.robot.axes.model import AxesResult, robot_from_sweeps
@@ -115,7 +115,7 @@ def read_joints(
     """
     values, nowhere = table_of(path, columns, "joints"), np.zeros(len(photographs))
     files = Table(PHOTOGRAPHS, {key: list(photographs)} | dict.fromkeys(POSE, nowhere), range(len(photographs)))
-    join(files, values, key)
+    join_tables(files, values, key)
     joint_values(values, nominal)
     remaining = {name: column for name, column in values.columns.items() if name not in (key, IMAGE)}
     return replace(values, columns={IMAGE: values.text(key)} | remaining, rows=())
@@ -136,7 +136,7 @@ def from_measured(
     with tempfile.TemporaryDirectory(prefix="stcal-photos-") as folder:
         poses_file = Path(folder) / POSES
         save(poses_file, poses_csv(measured)[0])
-        joined = join(replace(read_table(poses_file, "poses"), where=PHOTOGRAPHS), values, IMAGE)
+        joined = join_tables(replace(read_table(poses_file, "poses"), where=PHOTOGRAPHS), values, IMAGE)
     data = read_measurements(joined.table, nominal)
     axes, without = _axes(data, nominal)
     identified = identify(nominal, data, options)

@@ -13,7 +13,7 @@ from stcal.geometry.arrays import require_arguments
 from stcal.geometry.rigid import Order, Poses, Rigid
 from stcal.handeye import HandEyeOptions, HandEyePoses, View, Views, pairs_of_views, read_poses
 from stcal.handeye.data.formats.record import Said
-from stcal.handeye.data.inputs import Told, own_told, read_pairs, read_two, require_own
+from stcal.handeye.data.inputs import Told, mapped_pairs, own_told, read_pairs, read_two, require_own
 from stcal.handeye.data.pairs import SETUPS, Loop, Setup
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import TOLERANCE_S, Timed
@@ -24,6 +24,7 @@ from stcal.handeye.solve import handeye
 from stcal.io.cameras.model import CameraModel, CameraPrior, camera_prior, refinable
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import ImageFile, find_images
+from stcal.io.join import join_tables
 from stcal.io.table import Table
 from stcal.parallel import Progress, one_thread
 from stcal.robot import Robot
@@ -35,7 +36,9 @@ NOTHING_SAID = Said()
 WITHOUT_OPTIONS = Timing()
 PITCHES = ("pitch_mm", "square_mm", "spacing_mm")
 """Keys in board files for the distance by which a board's size is stated."""
+PREFIXES = "base_from_flange_", "camera_from_board_"
 Source = Path | Table | Told
+Maps = tuple[Path | None, Path | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +50,7 @@ class HandEyeInput:
     file that is not a table of the package; ``setup`` : where a file states it; ``unit_mm`` : approximate unit of a
     model without a unit, by which ``pairs`` are multiplied already; ``folder`` : of the images; ``arm`` : at the joint
     values of the ``pairs``, where its parameters are to be solved for; ``timed`` : times of the pairs in the robot's
-    stream, where its poses were taken by time.
+    stream, where its poses were taken by time; ``notes`` : on rows of only one of two files.
     """
 
     where: str
@@ -63,6 +66,7 @@ class HandEyeInput:
     folder: Path | None = None
     arm: Arm | None = None
     timed: Timed | None = None
+    notes: tuple[str, ...] = ()
 
 
 def two_files(
@@ -72,7 +76,7 @@ def two_files(
     statements: Said,
     quaternions: Order = "wxyz",
     timing: Timing = WITHOUT_OPTIONS,
-    columns: tuple[Path | None, Path | None] = (None, None),
+    columns: Maps = (None, None),
 ) -> Told | None:
     """Returns the robot's poses and the camera's, joined.
 
@@ -89,6 +93,22 @@ def two_files(
     return told
 
 
+def one_source(
+    source: Path, second: Path | None, key: str, statements: Said, quaternions: Order, timing: Timing, columns: Maps
+) -> tuple[Source, tuple[str, ...]]:
+    """Returns the poses of two files, or of one with the second map of ``columns``, as one source, and notes on rows
+    left out. Arguments and errors as :func:`two_files`."""
+    if second is not None:
+        told = two_files(source, second, key, statements, quaternions, timing, columns)
+        if told is not None:
+            return told, ()
+        joined = join_tables(str(source), str(second), key, PREFIXES, quaternions, columns[1], columns[0])
+        return joined.table, joined.notes
+    if columns[1] is not None and source.is_file():
+        return mapped_pairs(source, columns[1], statements, key, quaternions), ()
+    return source, ()
+
+
 @require_arguments
 def read_handeye(
     source: Source | str,
@@ -96,12 +116,15 @@ def read_handeye(
     camera: str | Path | None = None,
     board: str | Path | None = None,
     *,
+    second: str | Path | None = None,
+    key: str = "image",
     setup: Setup | None = None,
     rotation: Sequence[str] = (),
     length_unit: Sequence[str] = (),
     poses_are: Sequence[str] = (),
     quaternions: Order = "wxyz",
     columns: str | Path | None = None,
+    columns_a: str | Path | None = None,
     tolerance_s: float = TOLERANCE_S,
     image_times: str | Path | None = None,
     times_columns: str | Path | None = None,
@@ -115,11 +138,15 @@ def read_handeye(
     Parameters
     ----------
     source : str, Path or Table
-        Folder of the photographs; or a file of pairs of poses.
+        Folder of the photographs; a file of pairs of poses; or a file of the robot's poses, with ``second``.
     poses : str or Path, optional
         The robot's poses at the photographs: a file, or a folder with a file for each.
     camera, board : str or Path, optional
         Files of the camera and of the board, or boards, in the photographs.
+    second : str or Path, optional
+        File of the camera's poses.
+    key : str
+        Column by which rows of both files belong together, or ``image=Point Name``.
     setup : {"eye-in-hand", "eye-to-hand"}, optional
         What carries the camera; as a file says, or ``eye-in-hand``, if None.
     rotation : sequence of str
@@ -132,8 +159,9 @@ def read_handeye(
         ``camera_from_board`` or ``board_from_camera``.
     quaternions : {"wxyz", "xyzw"}
         As columns of quaternions are named, or x, y, z, w in the order in which they stand.
-    columns : str or Path, optional
-        Columns, delimiter … of the robot's poses beside photographs (TOML).
+    columns, columns_a : str or Path, optional
+        Columns, delimiter … (TOML) of the robot's poses beside photographs, of the only file, or of ``second``; and of
+        the first of two files.
     tolerance_s : float
         Time within which the nearest of the robot's poses is taken where none can be interpolated, s.
     image_times, times_columns : str or Path, optional
@@ -158,12 +186,20 @@ def read_handeye(
     InputError
         A file is missing or not of the required form, one file too many was given, or no image shows the board.
     """
-    statements = replace(Said.of_options(rotation, length_unit, poses_are, setup), columns=_path(columns))
+    statements = Said.of_options(rotation, length_unit, poses_are, setup)
     timing = Timing(tolerance_s, _path(image_times), time_offset, _path(times_columns))
-    place, told = Path(source) if isinstance(source, str) else source, progress or (lambda *_: None)
+    place, told, notes = Path(source) if isinstance(source, str) else source, progress or (lambda *_: None), ()
+    if isinstance(place, Path) and place.is_dir():
+        statements = replace(statements, columns=_path(columns))
+    elif second is None and columns_a is not None:
+        raise InputError("E-OPTION-NEEDS", f"--columns-a {columns_a}: only with two files; give --columns")
+    elif isinstance(place, Path):
+        maps = _path(columns_a), _path(columns)
+        place, notes = one_source(place, _path(second), key, statements, quaternions, timing, maps)
     files = _path(poses), _path(camera), _path(board)
     given = read_input(place, *files, workers, told, quaternions, statements, timing, robot)
-    return given if setup is None else replace(given, setup=setup_of(statements, given.setup, given.where))
+    chosen = given.setup if setup is None else setup_of(statements, given.setup, given.where)
+    return replace(given, setup=chosen, notes=notes)
 
 
 def _path(path: str | Path | None) -> Path | None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.io.join import join
+from stcal.io.join import join_tables
 from stcal.io.poses.columns import read_mapped
 from stcal.io.table import LENGTHS
 from tests.outcome import fails_with
@@ -50,7 +50,7 @@ def test_without_a_header_and_by_spaces(tmp_path):
 def test_joint_values_beside_it(tmp_path):
     read(tmp_path)
     (tmp_path / "joints.csv").write_text("image,q1_deg\np2,20\np1,10\n")
-    table = join(tmp_path / "joints.csv", tmp_path / "t.txt", "image", columns=tmp_path / "map.toml").table
+    table = join_tables(tmp_path / "joints.csv", tmp_path / "t.txt", "image", columns=tmp_path / "map.toml").table
     np.testing.assert_array_equal(table.numbers("q1_deg"), [20, 10])
     np.testing.assert_array_equal(table.numbers("y_mm"), [2.5, 1.5])
 
