@@ -16,6 +16,8 @@ MOST = 100_000
 """Largest number of candidates, and of generations."""
 EXACT = 1e-24
 """Gain of a step at which the minimum is reached, rad²: the objective is not in units of any σ."""
+FARTHEST = 1e9
+"""Largest number of bounds, mm or rad: a thousand kilometres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +27,7 @@ class Bounds:
     ``half_width`` : mm, or rad of the rotation vector; ``centre`` : (3,) centre of the bounds; where None, that of the
     closed-form solution (Park & Martin 1994).
 
-    Raises InputError: the half width is not positive, or a number is not finite.
+    Raises InputError: the half width is not positive, or a number is not finite or beyond :data:`FARTHEST`.
     """
 
     half_width: float
@@ -33,11 +35,11 @@ class Bounds:
 
     def __post_init__(self):
         require_fields(self, "differential evolution")
-        if not (0 < self.half_width < np.inf and np.isfinite(self.centre or 0).all()):
+        if not (0 < self.half_width <= FARTHEST and (np.abs(self.centre or 0) <= FARTHEST).all()):
             raise InputError(
                 "E-EVOLUTION-OPTIONS",
-                f"differential evolution: bounds of half width {self.half_width:g} about {self.centre}; finite numbers "
-                "and a positive half width needed",
+                f"differential evolution: bounds of half width {self.half_width:g} about {self.centre}; numbers up to "
+                f"{FARTHEST:g} and a positive half width needed",
             )
 
 

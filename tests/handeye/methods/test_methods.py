@@ -198,6 +198,8 @@ def test_wrong_options():
         EvolutionOptions(population=3)
     with fails_with("E-EVOLUTION-OPTIONS … -1"):
         Bounds(-1.0)
+    with fails_with("E-EVOLUTION-OPTIONS … 1e+308"):
+        Bounds(1e308)
     with fails_with("E-SIGMA-INCOMPLETE … σ_rot … σ_trans … robot"):
         Noise(robot_rad=1e-3)
     with fails_with("E-SIGMA-VALUE … 10 … 100"):
