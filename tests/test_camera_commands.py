@@ -11,6 +11,7 @@ from stcal.geometry.camera import Camera
 from stcal.io.cameras.difference import compare_cameras
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.io.cameras.read import read_camera
+from stcal.report.camera import shown
 from tests.outcome import fails_with
 
 CAMERA = Camera(1280, 960, [900.0, 905.0], [640.0, 475.0], [-0.1, 0.03, 1e-3, -2e-3, 0, 0, 0, 0])
@@ -76,3 +77,10 @@ def test_cameras_of_two_sizes_are_refused(folder):
     write_cameras_txt(folder / "b.txt", Camera.of(Camera(640, 480, [450, 450], [320, 240], np.zeros(8)), "PINHOLE"))
     with fails_with("E-CAMERA-SIZES-DIFFER … 1280 … 960 … 640 … 480"):
         call("compare", folder / "a.txt", folder / "b.txt")
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_camera_whose_image_has_no_ray_is_shown_with_that():
+    """A principal point far from the image: nothing is said of points that the lens moves, and no warning of NumPy."""
+    camera = Camera(640, 480, [650.0, 650.0], [320.0, 1e9], [-0.1, 0.01, 0, 0, 0, 0, 0, 0], False, "OPENCV")
+    assert shown(camera)[-1].startswith("warning: 100.0% of the image has no ray")

@@ -34,6 +34,8 @@ def shown(camera: Camera) -> list[str]:
         lines.append(
             f"warning: {share:.1%} of the image has no ray: the distortion folds over there, or leads beyond 89°"
         )
+        if share == 1:
+            return lines
     lines.append(f"the lens moves points by up to {np.nanmax(np.linalg.norm(moved, axis=2)):.2f} px")
     return lines
 

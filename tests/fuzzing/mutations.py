@@ -201,14 +201,14 @@ def csv_form(path: Path, rng: np.random.Generator) -> str:
 
 
 def text_number(path: Path, rng: np.random.Generator) -> str:
-    """One number of a text file, be it YAML, XML or a table of COLMAP."""
-    text, said = structures.number_replaced(path.read_text(), rng)
-    path.write_text(text)
+    """One number of a text file, be it YAML, XML or a table of COLMAP; or of what stands in a binary one's place."""
+    text, said = structures.number_replaced(path.read_text(errors="surrogateescape"), rng)
+    path.write_text(text, errors="surrogateescape")
     return said
 
 
 def text_line(path: Path, rng: np.random.Generator) -> str:
-    lines = path.read_text().splitlines() or [""]
+    lines = path.read_text(errors="surrogateescape").splitlines() or [""]
     i, j = rng.integers(len(lines), size=2).tolist()
     said = pick(rng, ["gone", "twice", "exchanged", "commented"])
     if said == "gone":
@@ -219,7 +219,7 @@ def text_line(path: Path, rng: np.random.Generator) -> str:
         lines[i], lines[j] = lines[j], lines[i]
     else:
         lines[i] = "#" + lines[i]
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", errors="surrogateescape")
     return f"line {i + 1} {said}"
 
 
