@@ -147,3 +147,10 @@ def test_without_the_extra_one_line_says_what_to_install(tmp_path, monkeypatch):
         site.build(tmp_path / "site")
     assert 'pip install ".[docs]"' in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+def test_the_pictures_are_drawn_from_the_sample(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["pictures.py", "found", "plates", "--out", str(tmp_path)])
+    load_script("pictures").main()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["found.jpg", "plates.svg"]
