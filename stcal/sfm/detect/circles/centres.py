@@ -151,11 +151,14 @@ def measure_centres(
     covariance += UNTRUSTED**2 * uneven[:, :, None] * uneven[:, None, :]
     distorted, jacobian = camera.distort_jacobian(centre)
     jacobian = jacobian * camera.focal[:, None]
+    covariance_px2 = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    # Far beyond any lens, as with k1 = 1e9, rounding leaves negative variances.
+    ok &= (np.diagonal(covariance_px2, axis1=1, axis2=2) > 0).all(1)
     return Centres(
         centre_px=distorted * camera.focal + camera.centre,
         centre=centre,
         shape=rims.shape / focal,
-        covariance_px2=jacobian @ covariance @ np.swapaxes(jacobian, 1, 2),
+        covariance_px2=covariance_px2,
         blur_px=rims.blur,
         contrast=rims.contrast,
         noise=rims.noise,
