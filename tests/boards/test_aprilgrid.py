@@ -66,6 +66,7 @@ def test_a_part_is_enough():
     assert np.abs(off_px(view, origin)).max() < CORNER_PX
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "said"),
     [

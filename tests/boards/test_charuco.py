@@ -77,6 +77,7 @@ def test_no_camera_changes_the_corners(sharp):
     assert np.array_equal(one.xy_px, other.xy_px)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("printed", "declared", "said"),
     [

@@ -21,6 +21,7 @@ def photograph() -> np.ndarray:
     return cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.uint8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(0, 0), (WIDTH, HEIGHT)])
 @pytest.mark.parametrize("orientation", [1, 6])
 def test_one_turned_photograph_in_front_drops_itself_alone(tmp_path, size, orientation):

@@ -101,6 +101,7 @@ BOARDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("board", BOARDS.values(), ids=BOARDS)
 def test_squares_and_tags_are_read_back(board):
     (part,) = board_parts(board, 10.0)

@@ -105,6 +105,7 @@ def test_sound_poses_are_taken_as_filed(seed):
     assert np.sqrt(found.result.covariance[3, 3] / by_pose.covariance[3, 3]) < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigmas", [-4.0, -2.0, 2.0, 4.0])
 def test_a_size_is_solved_for_where_the_poses_show_it(sigmas):
     """The same poses, with the size so many σ off its file; beyond 2.6 σ is 1 in 100 by chance."""

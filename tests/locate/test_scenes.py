@@ -194,6 +194,7 @@ def turned(angle_deg, flip=1.0, orientation=1.0) -> TargetLayout:
     return dataclasses.replace(LAYOUT, corners_mm=about + middle * [1, flip])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("layout", "remedy"),
     [

@@ -96,6 +96,7 @@ OF_IMAGES = {
 OF_IMAGES.pop("sfm doctor")  # it looks at images that were not mapped, of which the call's run has none
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OF_IMAGES)
 def test_mosaics_are_read_as_such(call, monkeypatch, name):
     """Each image, by every way in which a command comes to it; an image in grey stands for a mosaic."""

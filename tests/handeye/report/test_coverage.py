@@ -151,6 +151,7 @@ def test_a_board_behind_the_camera_is_nowhere(truth, outcome):
     assert outcome_report(replace(outcome, result=behind)).page()
 
 
+@pytest.mark.slow
 def test_overlays_of_the_worst_a_usual_and_the_best(outcome, tmp_path):
     outcome = with_images(outcome, tmp_path)
     found, missing = overlays(outcome)

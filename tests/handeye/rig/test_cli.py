@@ -113,6 +113,7 @@ def test_mistakes_in_the_file_are_named(rig, files, old, new, said):
     assert error.strip().splitlines()[-1].startswith("error: ")
 
 
+@pytest.mark.slow
 def test_a_camera_of_a_file_of_several_is_named(rig, files):
     (line,) = [line for line in (files / "cameras.txt").read_text().splitlines() if line[:1] == "1"]
     (files / "both.txt").write_text(f"{line}\n{line.replace('1', '2', 1)}\n")

@@ -121,6 +121,7 @@ def test_command(stcal_sfm, small_run, budget, tmp_path):
     assert len(two["lengths"]) == 10  # of four faces: six pairs and four within
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("row", "words"),
     [

@@ -284,6 +284,7 @@ def test_a_recording_that_no_disk_takes_leaves_nothing(small_run, tmp_path, monk
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_recording_is_written_by_parts_as_far_as_there_is_room(small_run, tmp_path):
     """In a process whose files may not grow: Rerun's own writer said nothing, or tried for ever."""
     code = (

@@ -100,6 +100,7 @@ def test_a_pattern_that_is_not_always_named_is_drawn_anew(monkeypatch):
     assert make_target(options).cases == 5 * 84
 
 
+@pytest.mark.slow
 def test_circles_are_seen_well_and_keep_apart(made):
     target, options = made.pattern.target, made.options
     px_per_mm = options.ideal_camera().focal[0] / (1.1 * options.distance_mm)

@@ -119,6 +119,7 @@ def test_poses_are_published(node_module, server, small_dataset, encoding):
         np.testing.assert_allclose(found[3:, 3:], covariance[:3, :3], rtol=0.3)
 
 
+@pytest.mark.slow
 def test_reasons_are_logged(node_module, server):
     FakeNode.url = server.url
     node = node_module.MeasureNode()

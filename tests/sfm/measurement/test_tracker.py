@@ -118,6 +118,7 @@ def test_an_image_without_the_target_is_an_error_and_the_next_is_searched(film, 
     assert tracker.searched
 
 
+@pytest.mark.slow
 def test_the_common_shift_is_found(film, frames, target, model):
     tracker = Tracker(target, model[1], film.board)
     pose = tracker.locate(frames[0])
