@@ -342,7 +342,8 @@ def _context() -> multiprocessing.context.BaseContext:
 
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([*LOADED_ONCE])  # without effect if a server is running
-        with contextlib.suppress(ChildProcessError):  # the server is of the process that forked this one
+        # The server may be of the process that forked this one, or TMPDIR too long a name for its socket.
+        with contextlib.suppress(OSError):
             ensure_running()
             return context
     return multiprocessing.get_context("spawn")

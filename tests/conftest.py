@@ -11,6 +11,7 @@ os.environ.update(dict.fromkeys(ONE_THREAD, "1"))  # before numpy is loaded; for
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # of a suite in the background: its commands could not be stopped
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+import multiprocessing.util
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -36,6 +37,8 @@ from tests.shared import Once, without_rights
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 SAMPLE = Path(__file__).parent / "data" / "sample"
 
+
+multiprocessing.util.get_temp_dir()  # kept for the process: not in the folder of a test that has one of its own
 
 # How long examples take is the machine's, and no fault of a test.
 # Examples are the same each time but where `scripts/full` draws a seed.
