@@ -17,7 +17,7 @@ from stcal.labels import BOARD, Label
 from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.board import BoardReading, by_rings, find_boards
 from stcal.sfm.detect.circles.candidates import Candidates, EllipseOptions, Ellipses, find_ellipses
-from stcal.sfm.detect.circles.centres import measure_centres
+from stcal.sfm.detect.circles.centres import MIN_RIM, measure_centres
 from stcal.sfm.detect.faces import FaceFinder, FaceFinding, FaceReading
 from stcal.sfm.detect.sightings import BoardSighting, FaceSighting, ImageDetection
 
@@ -260,8 +260,11 @@ def _nothing(image: np.ndarray, camera: Camera, ellipses: Ellipses) -> Centres:
 
 
 def _rim_note(label: Label | str, rim: float) -> str:
+    if rim >= MIN_RIM:
+        return f"{label}: σ of its centre is not determined, left out; check the distortion in the camera file"
     return (
-        f"{label}: {100 * rim:.0f} % of its rim follows an ellipse, 80 % needed; partly hidden or disturbed, left out"
+        f"{label}: {100 * rim:.0f} % of its rim follows an ellipse, {100 * MIN_RIM:.0f} % needed; partly hidden or "
+        "disturbed, left out"
     )
 
 

@@ -64,7 +64,7 @@ def report_html(
     if judgement.verdict == "no":
         report = without_sigma(report)
     colours = figures.group_colours([group["name"] for group in report["groups"]])
-    boards, views, bars = _drawn(figures.upright(report), colours)
+    boards, views, bars = _drawn(report, colours)
     summary = report["summary"]
     sections = [
         Section("Faces", _answer(report, colours, views), name="faces"),
@@ -166,8 +166,7 @@ def _answer(report: dict, colours: dict[str, str], views: list[tuple[str, str, s
             "Target, boards and cameras in space",
             [("target", "Target"), ("all", "With boards and cameras")],
         ),
-        "Axes of the face frames: x red, y green, z blue; the name of a face stands at the end of its Z. Up is as in "
-        "the photographs, or the target's Z where they were taken from all sides",
+        "Axes of the face frames: x red, y green, z blue; the name of a face stands at the end of its Z",
         legend(colours, "Groups:"),
     ]
     use = []

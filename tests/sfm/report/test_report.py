@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from stcal.report.figure import round_below
 from stcal.report.page import environment
 from stcal.report.text import number
+from stcal.sfm.report import figures
 from stcal.sfm.report.figures import FIRST_IMAGES, shown_overlays, upright
 from stcal.sfm.report.page import _factor_in_words, report_html
 
@@ -462,3 +463,13 @@ def test_the_picture_stands_as_the_cameras_did():
     for camera, angle in zip(report["scene"]["cameras"], (0, 2 * np.pi / 3, -2 * np.pi / 3), strict=True):
         camera["axes"] = Rotation.from_rotvec(angle * turn[2]).apply(turn)
     assert upright(report) is report
+
+
+def test_pictures_with_axes_are_of_the_target_frame(monkeypatch):
+    """Their numbers are coordinates; only the scene that turns stands as the cameras did."""
+    drawn = []
+    monkeypatch.setattr(figures, "target_view", lambda circles, faces, azimuth: drawn.append(circles) or "data:,")
+    report = make()
+    report_html(report, {NASTY: JPEG})
+    assert drawn
+    assert all(circles == report["scene"]["circles"] for circles in drawn)
