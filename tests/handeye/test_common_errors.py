@@ -50,7 +50,7 @@ def squared(found, truth) -> float:
 def test_sigma_hold_with_common_errors(method):
     """The mean of 6·n squared normal numbers lies within these limits in 998 of 1000 studies; without the common errors
     it is many times as large."""
-    draws = DRAWS if method else 8
+    draws = DRAWS if method else 3
     limits = chi2.ppf([0.001, 0.999], 6 * draws) / 6 / draws
     found = []
     for seed in range(draws):
