@@ -326,9 +326,11 @@ def _by_poses(task: _Task) -> Solved:
         notes += beyond
         if beyond and solution.variance_factor > 1:
             covariance = covariance * solution.variance_factor
+    common = None
     if task.loop.camera_common is not None:
-        error = in_common(task.loop, solution, task.loop.camera_common)
-        covariance, notes = error.covariance(covariance[:12, :12]), (*notes, Aside(IN_COMMON))
+        alone = covariance[:12, :12]
+        covariance = in_common(task.loop, solution, task.loop.camera_common).covariance(alone)
+        common, notes = (covariance - alone)[:6, :6], (*notes, Aside(IN_COMMON))
     if task.views is not None and options.camera is not None:
         error = of_poses(task.loop, solution, task.views, options.camera)
         covariance = error.covariance(covariance[:12, :12])
@@ -349,6 +351,7 @@ def _by_poses(task: _Task) -> Solved:
         estimated=tuple(solution.sigma),
         observability=task.seen,
         notes=notes + remarks.of_rounds(solution.settled),
+        common_covariance=common,
     )
     return Solved(task, result, solution)
 

@@ -409,8 +409,14 @@ def with_common_errors(result: HandEye, pairs: HandEyePoses, setup: Setup, optio
     for name, key in (("mount_from_camera", "covariance"), ("stand_from_board", "stand_covariance")):
         poses = Poses.of([getattr(part, name) for part in erring])
         moved = poses.difference(Poses.of([getattr(result, name)] * len(erring)))
-        covariances[key] = getattr(result, key) + moved.T @ moved
-    return replace(result, **covariances, notes=(*result.notes, Aside(IN_COMMON)))
+        covariances[key] = moved.T @ moved
+    return replace(
+        result,
+        covariance=result.covariance + covariances["covariance"],
+        stand_covariance=result.stand_covariance + covariances["stand_covariance"],
+        common_covariance=covariances["covariance"],
+        notes=(*result.notes, Aside(IN_COMMON)),
+    )
 
 
 SCATTERED = 1.5

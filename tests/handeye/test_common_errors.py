@@ -97,3 +97,12 @@ def test_they_are_read_from_what_measure_writes(tmp_path):
     step = 1e-4 * pairs.camera_from_board_common[:, :, 1]
     moved = board.moved(step).inverse().difference(board.inverse())
     assert np.allclose(1e-4 * inverse.camera_from_board_common[:, :, 1], moved, rtol=1e-3, atol=1e-9)
+
+
+def test_the_verdict_does_not_ask_for_more_poses():
+    pairs, _ = draw(0)
+    found = handeye(pairs)
+    assert found.verdict.word == "use with care"
+    assert "have in common" in found.verdict.sentence()
+    assert "more poses do not help" in found.verdict.reasons()[0].remedy
+    assert np.linalg.eigvalsh(found.covariance - found.common_covariance).min() > 0
