@@ -61,7 +61,7 @@ def charuco(
     folder = data / "charuco_handeye" / "test_set_charuco"
     file, board = folder / "cal_data.yaml", CHARUCO
     if adjusted is not None:
-        camera = Camera(1600, 1200, np.ones(2), np.zeros(2), np.zeros(8))
+        camera = Camera(1600, 1200, np.full(2, 1600.0), np.array([800.0, 600.0]), np.zeros(8))
         camera = camera.with_parameters(np.array(list(adjusted["camera"]["parameters"].values())))
         file = _camera_file(scratch, camera)
         board = board.replace("36.195", repr(adjusted["board"]["pitch_mm"]))

@@ -463,7 +463,7 @@ def _remarks(
     names = tuple(name for name, bad in zip(task.pairs.names, outliers, strict=True) if not bad)
     z = closed_form.mean_pose(task.loop[~outliers].chain(x))
     tilted = flips.flipped(task.loop, x, z, outliers)
-    notes = remarks.of_outliers(task.pairs.names, outliers, residuals, tilted)
+    notes = remarks.of_still(task.pairs) + remarks.of_outliers(task.pairs.names, outliers, residuals, tilted)
     notes += flips.note_of(task.pairs.names, tilted)
     moved = remarks.of_order(task.pairs.names, residuals, task.loop.jacobian(x)[:, :, :12])
     notes += moved or remarks.of_groups(names, residuals[~outliers])

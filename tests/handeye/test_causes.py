@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.geometry.rigid import Poses
+from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye import HandEyeOptions
 from stcal.handeye.data.pairs import HandEyePoses
 from stcal.handeye.data.stream import Timed
@@ -16,6 +16,7 @@ from stcal.workflows.handeye.calibrate import Splits, calibrate
 from stcal.workflows.handeye.inputs import HandEyeInput
 from stcal.workflows.handeye.offset import lag_tried
 from tests.outcome import fails_with
+from tests.support.handeye import BASE_FROM_CAMERA, FLANGE_FROM_BOARD, simulated
 from tests.support.handeye_stream import simulated_stream
 
 
@@ -68,6 +69,45 @@ def test_poses_of_the_flange_that_were_not_read_anew_are_refused():
         handeye(pairs)
 
 
+def drawn(count: int) -> HandEyePoses:
+    """Poses that follow one another at random."""
+    return simulated(np.random.default_rng(5), count, robot=(3e-4, 0.1), camera=(4e-4, 0.15)).pairs
+
+
+def nearly_stale(pairs: HandEyePoses, side: str, rows: np.ndarray) -> HandEyePoses:
+    """The pose of the row before in each of these rows, but for the micrometre of an encoder's noise."""
+    poses = getattr(pairs, side)
+    rotation, place = np.array(poses.rotation), np.array(poses.translation)
+    rotation[rows], place[rows] = rotation[rows - 1], place[rows - 1] + 1e-3
+    return replace(pairs, **{side: Poses(rotation, place)})
+
+
+@pytest.mark.parametrize(("side", "name"), [("base_from_flange", "flange"), ("camera_from_board", "board")])
+def test_a_side_that_was_hardly_read_anew_is_named(side, name):
+    pairs = drawn(20)
+    found = handeye(nearly_stale(pairs, side, np.array([7])))
+    (note,) = (note for note in found.notes if "hardly moved" in note)
+    assert f"the {name} hardly moved between pose 7 and pose 8 while" in note
+    assert not isinstance(note, Grave)
+    assert not any("hardly" in note for note in handeye(pairs).notes)
+
+
+def test_half_of_the_flange_hardly_read_anew_is_refused():
+    pairs = nearly_stale(drawn(24), "base_from_flange", np.arange(1, 24, 2))
+    with fails_with("E-POSES-IDENTICAL … the flange hardly moved between pose 1 and pose 2, and 11 times more"):
+        handeye(pairs)
+
+
+@pytest.mark.parametrize(
+    ("which", "flange", "board"), [("next", np.r_[:19], np.r_[1:20]), ("last", np.r_[1:20], np.r_[:19])]
+)
+def test_a_side_that_is_stored_a_pose_late_is_named(which, flange, board):
+    pairs = drawn(20)
+    late = HandEyePoses(pairs.base_from_flange[flange], pairs.camera_from_board[board])
+    with fails_with(f"E-HANDEYE-CONVENTION … beside the {which} one of the flange"):
+        handeye(late)
+
+
 def test_images_at_one_commanded_pose_are_used():
     """Twice each pose, with noise of the board between the two."""
     pairs = given_of(21, 0.0).pairs
@@ -104,3 +144,16 @@ def test_a_camera_far_off_the_flange_needs_its_setup_stated():
     assert any("--setup eye-to-hand" in note and isinstance(note, Grave) for note in outcome.notes)
     stated = calibrate(replace(given, setup="eye-in-hand"), "eye-in-hand", "pose", HandEyeOptions(), Splits(0))
     assert not any("--setup" in note for note in stated.notes)
+
+
+def test_a_board_at_the_base_needs_its_setup_stated():
+    """A camera near the robot, 0.5 m off its base: a bracket could be as long, but no board lies within a base."""
+    pairs = drawn(20)
+    camera = Rigid(BASE_FROM_CAMERA.rotation, [200.0, -50.0, 450.0])
+    flange = camera @ pairs.camera_from_board @ FLANGE_FROM_BOARD.inverse()
+    inverted = HandEyePoses(flange.inverse(), pairs.camera_from_board)
+    given = HandEyeInput("poses", inverted)
+    outcome = calibrate(given, "eye-in-hand", "pose", HandEyeOptions(), Splits(0))
+    assert any("off the base's origin" in note and "--setup eye-to-hand" in note for note in outcome.notes)
+    right = calibrate(HandEyeInput("poses", pairs), "eye-in-hand", "pose", HandEyeOptions(), Splits(0))
+    assert not any("--setup" in note for note in right.notes)

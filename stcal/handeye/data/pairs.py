@@ -164,12 +164,12 @@ class HandEyePoses(Brief):
         copies = [same for same in rows.values() if len(same) > 1]
         if not copies:
             return
-        usual = np.median(_apart(board, np.arange(len(self))), axis=0)
-        stale = [same for same in copies if (_apart(board, np.array(same)) > STALE * usual).all(1).any()]
+        usual = np.median(apart(board, np.arange(len(self))), axis=0)
+        stale = [same for same in copies if (apart(board, np.array(same)) > STALE * usual).all(1).any()]
         if stale:
             same = max(stale, key=len)
             named = ", ".join(self.names[i] for i in same[:3]) + (" …" if len(same) > 3 else "")
-            turn, shift = _apart(board, np.array(same)).max(0)
+            turn, shift = apart(board, np.array(same)).max(0)
             raise InputError(
                 "E-POSES-IDENTICAL",
                 f"{self.where}: {named}: the flange's pose is the same to the last digit in {len(same)} rows, while "
@@ -183,7 +183,7 @@ STALE = 0.2
 although the flange's pose is a copy. Noise of usable poses is some hundredths."""
 
 
-def _apart(poses: Poses, rows: np.ndarray) -> np.ndarray:
+def apart(poses: Poses, rows: np.ndarray) -> np.ndarray:
     """Returns angle (rad) and distance (mm) between each two of these rows, (k, 2)."""
     first, second = (rows[k] for k in np.triu_indices(len(rows), 1))
     turns = Rotation.from_matrix(np.swapaxes(poses.rotation[first], 1, 2) @ poses.rotation[second]).magnitude()

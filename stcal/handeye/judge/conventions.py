@@ -13,7 +13,7 @@ from stcal.errors import DegenerateError, InputError
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.handeye.data.formats.record import FRAMES
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
-from stcal.handeye.judge.remarks import Grave
+from stcal.handeye.judge.remarks import Grave, of_still
 from stcal.handeye.methods.closed_form import mean_pose
 from stcal.io.quaternions import INVERTED as CONJUGATED
 from stcal.io.quaternions import ORDERS, Reading
@@ -57,6 +57,9 @@ def check_conventions(
     if as_read[0] > WELL[0] or as_read[1] > WELL[1]:
         size = f"{np.degrees(as_read[0]):.3g}° and {as_read[1]:.3g} mm (median)"
         contradict = f"{pairs.where}: the poses contradict each other by {size}"
+        for still in of_still(pairs):
+            if isinstance(still, Grave):
+                raise InputError("E-POSES-IDENTICAL", f"{contradict}, as {still}")
         typical_of_variant = {
             convention: _typical_or_far(variant, guess, with_scale)
             for convention, variant in _variants(loop, setup, by_images).items()
@@ -128,6 +131,11 @@ def _variants(loop: Loop, setup: Setup, by_images: bool) -> dict[str, Loop]:
         **_other_units(loop, by_images),
         f"with one side mirrored: if {states} left-handed poses, {remedy}": replace(loop, camera_from_board=mirrored),
     }
+    for which, robot_rows, board_rows in (("next", slice(1, None), slice(-1)), ("last", slice(-1), slice(1, None))):
+        variants[
+            f"with each pose of the board beside the {which} one of the flange: if one side was stored a pose late, "
+            "move it by one row"
+        ] = Loop(hand[robot_rows], eye[board_rows], loop.inverted)
     for reading in (*ORDERS, CONJUGATED):
         robot, board = _read_as(reading, hand, loop.inverted), _read_as(reading, eye)
         kind = "conjugated" if reading.conjugated else "in another order"

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 from stcal.errors import StcalError
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
-from stcal.handeye.data.pairs import Loop, Setup
+from stcal.handeye.data.pairs import STALE, HandEyePoses, Loop, Setup, apart
 from stcal.handeye.judge.observability import LEAST_POSES, LEAST_TURN, Observability, scale_is_seen, unit_of
 from stcal.handeye.methods.closed_form import robust
 from stcal.handeye.methods.noise import Noise
@@ -45,6 +45,11 @@ LEAST_IN_GROUPS, APART = 10, 0.9
 halves of normal errors explain 0.64 (2/π), and at most 0.8 of a dozen of them."""
 MOVED_LEVEL, MOVED_SHARE = 0.01, 0.5
 """Probability that a move along the order of sound poses is named, and least share of the squares that it explains."""
+STILL = 0.005
+"""Share of the usual turn, and of the usual way, between two poses, below both of which a side did not move: a robot's
+feedback at rest repeats to micrometres."""
+FEW = 200
+"""Largest number of poses of which all pairs are compared for what is usual."""
 NEAR_MM = 20.0
 """Distance, in mm, below which no camera sees a board."""
 
@@ -75,6 +80,27 @@ def of_outliers(
             )
         )
     return tuple(notes)
+
+
+def of_still(pairs: HandEyePoses) -> tuple[str, ...]:
+    """Returns a note if one side hardly moved between rows that follow each other, while the other side did: its pose
+    was not measured anew, or, of a robot at rest, board or camera was moved."""
+    sides = {"flange": pairs.base_from_flange, "board": pairs.camera_from_board}
+    steps = {}
+    for side, poses in sides.items():
+        usual = np.median(apart(poses, np.linspace(0, len(pairs) - 1, min(len(pairs), FEW)).astype(int)), axis=0)
+        between = poses[1:].difference(poses[:-1]).reshape(-1, 2, 3)
+        steps[side] = np.linalg.norm(between, axis=2) / np.maximum(usual, 1e-12)
+    for side, other in (("flange", "board"), ("board", "flange")):
+        rows = np.flatnonzero((steps[side] < STILL).all(1) & (steps[other] > STALE).all(1))
+        if len(rows):
+            first, many = int(rows[0]), len(rows) > MANY * len(pairs)
+            said = f"the {side} hardly moved between {spoken(pairs.names[first])} and {spoken(pairs.names[first + 1])}"
+            said += f", and {len(rows) - 1} times more," if len(rows) > 1 else ""
+            said += f" while the {other} did: read the {side}'s pose anew with each image"
+            said += " (or was the board moved?)" if side == "flange" else ""
+            return (Grave(said) if many else said,)
+    return ()
 
 
 def of_groups(names: tuple[str, ...], residuals: np.ndarray) -> tuple[str, ...]:

@@ -274,8 +274,8 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
     """Raises an error that says what is wrong with the data, or with the robot file."""
     says = f"{data.where}: robot {robot.name} misses the measurements by {misfit:.3g} mm RMS, "
     says += f"{FITS:.0%} of their spread of {extent:.3g} mm allowed; "
-    thinned = data if data.positions is None else data[np.unique(np.linspace(0, len(data) - 1, GUESS_ROWS).astype(int))]
-    singles = chain([("", robot, data)], _guesses(robot, thinned), _arms(robot, thinned))
+    thinned = _thinned(data)
+    singles = chain([("", robot, data)], _guesses(robot, thinned), _arms(robot, thinned), _late(robot, data))
     for guesses in (singles, _pairs_of_mistakes(robot, thinned)):
         fitting = []
         for reason, variant, guess in guesses:
@@ -294,6 +294,22 @@ def _explain(robot: Robot, data: Measurements, tools: dict[str, Rigid], misfit: 
     raise InputError(
         "E-IDENTIFY-MISFIT", f"{says}check D-H rows and convention, the order and zero of joints, coupling, and units"
     )
+
+
+def _thinned(data: Measurements) -> Measurements:
+    """Returns enough rows of positions to judge a guess; distances, which refer to one another, as they are."""
+    if data.positions is None:
+        return data
+    return data[np.unique(np.linspace(0, len(data) - 1, GUESS_ROWS).astype(int))]
+
+
+def _late(robot: Robot, data: Measurements) -> Iterator[tuple[str, Robot, Measurements]]:
+    """Yields joint values that stand one row from the positions they belong to."""
+    if data.positions is None or len(data) < 3:
+        return
+    reason = "joint values stood one row further {}; pair each position with the joint values of its moment"
+    for way, joints, places in (("up", slice(1, None), slice(-1)), ("down", slice(-1), slice(1, None))):
+        yield reason.format(way), robot, _thinned(replace(data[places], q=data.q[joints]))
 
 
 def _fitting(robot: Robot, data: Measurements, tools: dict[str, Rigid]) -> tuple[float, np.ndarray]:

@@ -145,16 +145,21 @@ def calibrate(
 FAR_MM, TOO_FAR_MM = 600.0, 1000.0
 """Distances of a camera from the flange that carries it that are doubted, and that are called wrong unless the setup is
 stated; brackets are shorter."""
+LONG_MM, NEARER = 250.0, 0.5
+"""Distance of a camera from the flange, and share of it within which the board lies of the base's origin, from which
+on the two seem to be exchanged: a board stands farther from the robot's base than a camera from its flange."""
 
 
 def _of_setup(given: HandEyeInput, setup: Setup, result: HandEye) -> tuple[str, ...]:
     """Returns a note if a setup that nobody stated puts the camera where no flange carries it. Poses of the other setup
     that were inverted before fit as well, so that no residual tells."""
-    away = float(np.linalg.norm(result.mount_from_camera.translation))
-    if setup != "eye-in-hand" or given.setup is not None or away < FAR_MM:
+    away, board = (float(np.linalg.norm(t.translation)) for t in (result.mount_from_camera, result.stand_from_board))
+    exchanged = away > LONG_MM and board < NEARER * away
+    if setup != "eye-in-hand" or given.setup is not None or (away < FAR_MM and not exchanged):
         return ()
+    why = f"and the board only {board:.0f} mm off the base's origin" if exchanged else "farther than brackets reach"
     said = (
-        f"the camera is {away:.0f} mm off the flange, farther than brackets reach, and no residual tells the setup: "
+        f"the camera is {away:.0f} mm off the flange, {why}, and no residual tells the setup: "
         "give --setup eye-to-hand if the camera stood beside the robot, --setup eye-in-hand if the flange carried it"
     )
     return (Grave(said) if away > TOO_FAR_MM else said,)

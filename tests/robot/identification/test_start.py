@@ -109,6 +109,8 @@ def test_mistakes_in_the_rows_are_named(mistaken, named):
     [
         (lambda q: q[:, [0, 2, 1, 3, 4, 5]], "columns q2 and q3 were exchanged"),
         (lambda q: q[:, ::-1], "opposite order"),
+        (lambda q: np.roll(q, 1, axis=0), "one row further up"),
+        (lambda q: np.roll(q, -1, axis=0), "one row further down"),
         (lambda q: q * [1, -1, 1, -1, 1, 1], "joints 2, 4 had the opposite sign"),
         (lambda q: q + q[:, [1]] * [0, 0, 1, 0, 0, 0], "joint 3 were coupled to joint 2 by -1"),
         (lambda q: q - q[:, [1]] * [0, 0, 1, 0, 0, 0], "joint 3 were coupled to joint 2 by +1"),
