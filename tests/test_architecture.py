@@ -266,7 +266,7 @@ CAUGHT = [
     ("io/design.py", "import cv2"),
     ("handeye/data/pairs.py", "import cv2"),
     ("handeye/report/page.py", "from stcal.sfm.detect.image import detect_image"),
-    ("handeye/report/export/files.py", "from stcal.workflows.board_views import detect_boards"),
+    ("handeye/report/export.py", "from stcal.workflows.board_views import detect_boards"),
     ("workflows/board_views.py", "import cv2"),
     ("workflows/board_views.py", "from stcal.cli.main import main"),
     ("boards/tags.py", "from stcal.locate.pose import estimate"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stcal.boards.aprilgrid import find_aprilgrid
+from stcal.boards.tags import find_aprilgrid
 from stcal.boards.charuco import find_charuco
 from stcal.boards.chessboard import find_chessboard
 from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, CharucoDesign, ChessboardDesign, TagLayout
