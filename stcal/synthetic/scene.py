@@ -14,10 +14,10 @@ from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.labels import CircleLabel
-from stcal.synthetic.designs import REFERENCE_GROUPS, nominal_target_from_face, second_design, three_point_frame
+from stcal.synthetic.designs import REFERENCE_GROUPS, second_design, three_point_frame
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 
-__all__ = ["Group", "Scene", "SceneOptions", "make_scene", "nominal_target_from_face", "second_design"]
+__all__ = ["Group", "Scene", "SceneOptions", "make_scene", "second_design"]
 
 FACE_MARGIN_MM = 15.0
 """How far a plate of which the design states no outline is assumed to reach beyond the rims of its circles."""
