@@ -42,9 +42,9 @@ INSIDE = {
         ("make",),
         (".",),
     ),
-    "robot": (("kinematics",), ("identification", "urdf"), ("axes",), ("use",), ("export",), (".",)),
-    "register": (("core",), ("judge", "workspace"), (".",), ("report",)),
-    "handeye": (("data",), ("methods",), ("judge",), (".",), ("rig",), ("report",)),
+    "robot": (("kinematics",), ("identification", "urdf"), ("axes",), ("use",), (".",)),
+    "register": (("core",), ("judge",), (".",), ("report",)),
+    "handeye": (("data",), ("methods",), ("judge",), (".",), ("report",)),
     "locate": (("data",), ("pose", "calibration"), (".",), ("report",)),
 }
 """Folders of each system, from below; ``.`` stands for the files beside them. Folders of one layer know nothing of each

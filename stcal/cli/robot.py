@@ -522,8 +522,7 @@ def from_photos(
     from stcal.robot.kinematics.file import load_robot
     from stcal.sfm.measurement.images import MeasureOptions
     from stcal.sfm.measurement.target import read_target
-    from stcal.workflows.from_photos.result import files_of, require_files_written, story
-    from stcal.workflows.from_photos.run import robot_from_photos
+    from stcal.workflows.from_photos import files_of, require_files_written, robot_from_photos, story
 
     require_new_folder(out, images)
     design = target_of(target)
