@@ -9,7 +9,7 @@ import numpy as np
 from stcal.boards.design import AprilGridDesign, BoardView, TagLayout, view_of
 from stcal.boards.dictionaries import FAMILIES, cells_of, dictionary_of, find_family
 from stcal.boards.edges import corners_by_edges, corners_from_edges
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze, frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.plane import apply_homography, fit_homography
@@ -53,9 +53,9 @@ class Tags:
     joint_px2: np.ndarray | None = None
 
     def __post_init__(self):
-        object.__setattr__(self, "corners_px", frozen(self.corners_px, (len(self.tags), 4, 2), "tags' corners"))
+        freeze(self, "corners_px", (len(self.tags), 4, 2), "tags' corners")
         shape = (len(self.tags), 4, 2, 2)
-        object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, shape, "corners' covariances"))
+        freeze(self, "covariance_px2", shape, "corners' covariances")
         share = np.zeros(len(self.tags)) if self.saturated is None else self.saturated
         object.__setattr__(self, "saturated", frozen(share, (len(self.tags),), "saturated shares"))
         joint = block_diagonal(self.covariance_px2) if self.joint_px2 is None else self.joint_px2

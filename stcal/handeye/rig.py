@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from stcal.errors import DegenerateError, InputError, StcalError
-from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
+from stcal.geometry.arrays import Brief, freeze, require_arguments, require_fields
 from stcal.geometry.rigid import Poses, Rigid, skew
 from stcal.handeye.data.pairs import Loop, Setup
 from stcal.handeye.data.rig import RigPoses
@@ -62,8 +62,8 @@ class Rig(Brief):
 
     def __post_init__(self):
         size = POSE * (len(self.names) + 1)
-        object.__setattr__(self, "covariance", frozen(self.covariance, (size, size), "covariance"))
-        object.__setattr__(self, "outliers", frozen(self.outliers, (len(self.poses),), "outliers", bool))
+        freeze(self, "covariance", (size, size), "covariance")
+        freeze(self, "outliers", (len(self.poses),), "outliers", bool)
 
     @property
     def setup(self) -> Setup:
@@ -496,9 +496,9 @@ class RigHeldOut:
     mount_from_camera: np.ndarray
 
     def __post_init__(self):
-        object.__setattr__(self, "rows", frozen(self.rows, (None, None), "held-out poses", int))
+        freeze(self, "rows", (None, None), "held-out poses", int)
         shape = len(self.rows), len(self.cameras), 4, 4
-        object.__setattr__(self, "mount_from_camera", frozen(self.mount_from_camera, shape, "solutions"))
+        freeze(self, "mount_from_camera", shape, "solutions")
 
 
 @one_thread()

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.labels import Label
 from stcal.synthetic.scene import Scene
@@ -44,8 +44,8 @@ class ImageCircles:
             "tilt_rad": (n,),
             "centre_px": (n, 2),
         }.items():
-            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
-        object.__setattr__(self, "must_find", frozen(self.must_find, (n,), "must_find", bool))
+            freeze(self, name, shape, name)
+        freeze(self, "must_find", (n,), "must_find", bool)
 
     def select(self, rows: np.ndarray) -> "ImageCircles":
         """Returns the circles of a mask (n,)."""

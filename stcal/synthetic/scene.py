@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
+from stcal.geometry.arrays import Brief, freeze, frozen, require_arguments, require_fields
 from stcal.geometry.camera import FISHEYE, Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
@@ -122,8 +122,8 @@ class Group:
     camera_from_target: tuple[Rigid, ...]
 
     def __post_init__(self):
-        object.__setattr__(self, "axes", frozen(self.axes, (3, 3), "axes"))
-        object.__setattr__(self, "board_circles_target", frozen(self.board_circles_target, (None, 3), "board circles"))
+        freeze(self, "axes", (3, 3), "axes")
+        freeze(self, "board_circles_target", (None, 3), "board circles")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

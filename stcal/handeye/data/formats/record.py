@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.io.poses.rotations import proper, require_finite
 from stcal.io.table import LENGTHS
 
@@ -76,8 +76,8 @@ class Side:
 
     def __post_init__(self):
         m = len(self.places)
-        object.__setattr__(self, "rotation", frozen(self.rotation, (m, 3, 3), "rotations"))
-        object.__setattr__(self, "translation", frozen(self.translation, (m, 3), "translations"))
+        freeze(self, "rotation", (m, 3, 3), "rotations")
+        freeze(self, "translation", (m, 3), "translations")
 
     def __len__(self) -> int:
         return len(self.places)
