@@ -3,7 +3,6 @@
 import numpy as np
 
 
-
 def circle_image_offset(xyz_camera: np.ndarray, normal_camera: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
     """Return points whose ordinary projection is the centre of the ellipse that each circle projects to.
 

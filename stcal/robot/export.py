@@ -61,10 +61,6 @@ class Points:
     def __len__(self) -> int:
         return len(self.labels)
 
-    def with_poses(self, poses: Poses) -> "Points":
-        """Returns the points with ``poses`` in place of joint values."""
-        return replace(self, poses=poses)
-
 
 @dataclass(frozen=True, slots=True)
 class Form:
@@ -391,7 +387,7 @@ def robot_program(
     head = [f"stcal {stcal.__version__}: robot {robot.name}, {len(rows)} of {len(result)} points"]
     if wanted == "poses":
         poses, description = _poses(result, rows, where)
-        points, head = points.with_poses(poses), [*head, description]
+        points, head = replace(points, poses=poses), [*head, description]
         notes.append(f"{description}; {controller.unknown}")
     else:
         reason = controller.refuses(points)
