@@ -342,7 +342,7 @@ def verify(
 ) -> None:
     """Compare distances of positions from the first one, measured and commanded, before and after compensation."""
     from stcal.io.join import stack_tables
-    from stcal.robot.use import verification as stage
+    from stcal.robot.use import verification
     from stcal.robot.use.report import verification_report
 
     if plot and plot.suffix.lower() not in (".png", ".svg"):
@@ -352,7 +352,7 @@ def verify(
     )
     if isinstance(tables, list):
         tables = stack_tables(tables, [path.stem for path in seconds or ()], {"pose": key})
-    result = stage.verify(stage.read_measured(tables))
+    result = verification.verify(verification.read_measured(tables))
     document = verification_report(result)
     say(document.text())
     print_each("note", result.notes)
@@ -361,7 +361,7 @@ def verify(
         from stcal.robot.use.report import figure_bytes, verification_figure
 
         write(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
-    write_if(json_file, lambda: stage.verification_file(result))
+    write_if(json_file, lambda: verification.verification_file(result))
     write_if(report, document.page)
 
 
@@ -405,7 +405,7 @@ def compensate(
     from stcal.io.files import require_same
     from stcal.robot.export import require_form, robot_program
     from stcal.robot.kinematics.file import load_robot
-    from stcal.robot.use import compensation as stage
+    from stcal.robot.use import compensation
     from stcal.robot.use.report import compensation_report
     from stcal.robot.use.targets import read_targets
 
@@ -415,15 +415,15 @@ def compensate(
         targets, first, second, key, "TARGETS", quaternions=quaternions, columns=columns, columns_a=columns_a
     )
     wanted = read_targets(source, identified, quaternions, rotation, payload_kg)
-    result = stage.compensate(identified, wanted, load_robot(nominal) if nominal else None)
+    result = compensation.compensate(identified, wanted, load_robot(nominal) if nominal else None)
     document = compensation_report(result, identified)
     say(document.text())
     print_each(f"note: {wanted.where}", wanted.notes)
     print_each(f"warning: {wanted.where}", result.notes())
-    write_if(out, lambda: stage.compensated_csv(result, identified))
+    write_if(out, lambda: compensation.compensated_csv(result, identified))
     if out:
-        stage.require_compensated_written(out, result, identified)
-    write_if(json_file, lambda: stage.compensation_file(result, identified))
+        compensation.require_compensated_written(out, result, identified)
+    write_if(json_file, lambda: compensation.compensation_file(result, identified))
     write_if(report, document.page)
     for form, path in exports if result.found.usable.any() else ():
         exported_file = robot_program(result, identified, form, path, export_as, pulses)
@@ -465,22 +465,22 @@ def design(
 ) -> None:
     """Choose the measurement poses that determine the robot's parameters best."""
     from stcal.robot.kinematics.file import load_robot
-    from stcal.robot.use import design as stage
+    from stcal.robot.use import design as pose_design
     from stcal.robot.use.report import design_report
 
-    options = stage.DesignOptions(
+    options = pose_design.DesignOptions(
         count, seed, observe, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target
     )
     robot = load_robot(robot_file)
-    result = stage.design(robot, options)
+    result = pose_design.design(robot, options)
     document = design_report(result, robot)
     say(document.text())
     also = f" and {sigma_rad:g} rad" if observe == "pose" else ""
     say(f"for an instrument whose {observe}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
-    write_if(out, lambda: stage.design_csv(result, robot))
+    write_if(out, lambda: pose_design.design_csv(result, robot))
     if out:
-        stage.require_design_written(out, result, robot, target)
-    write_if(json_file, lambda: stage.design_file(result))
+        pose_design.require_design_written(out, result, robot, target)
+    write_if(json_file, lambda: pose_design.design_file(result))
     write_if(report, document.page)
 
 
