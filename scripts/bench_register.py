@@ -26,7 +26,7 @@ from stcal.register import register
 from stcal.register.core.pairs import read_pairs
 from stcal.register.report.file import RegistrationFile
 from stcal.register.report.page import registration_report
-from stcal.register.workspace.findings import findings
+from stcal.register.workspace import findings
 from tests.support.point_pairs import make_scene
 
 SHARES = (0.0, 0.2, 0.45)

@@ -26,7 +26,7 @@ from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
-from stcal.synthetic.scene import SceneOptions, make_scene, nominal_target_from_face
+from stcal.synthetic.scene import SceneOptions, make_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 BLUE, RED, GREEN = COLOURS[:3]
@@ -92,7 +92,7 @@ def residuals():
         target, board = reference_target(), reference_board()
         target = replace(target, faces=tuple(replace(face, radius_mm=size * face.radius_mm) for face in target.faces))
         board = replace(board, radius_mm=size * board.radius_mm)
-        scene = make_scene(SceneOptions(seed=1), target, board, nominal_target_from_face())
+        scene = make_scene(SceneOptions(seed=1), target, board, reference_target().rough_poses())
         plain = [
             m.in_world(Similarity(1.0, Rigid()))
             for m in true_models(scene, observe(scene, NOISE_PX, np.random.default_rng(1)))

@@ -42,9 +42,9 @@ INSIDE = {
         ("make",),
         (".",),
     ),
-    "robot": (("kinematics",), ("identification", "urdf"), ("axes",), ("use",), ("export",), (".",)),
-    "register": (("core",), ("judge", "workspace"), (".",), ("report",)),
-    "handeye": (("data",), ("methods",), ("judge",), (".",), ("rig",), ("report",)),
+    "robot": (("kinematics",), ("identification", "urdf"), ("axes",), ("use",), (".",)),
+    "register": (("core",), ("judge",), (".",), ("report",)),
+    "handeye": (("data",), ("methods",), ("judge",), (".",), ("report",)),
     "locate": (("data",), ("pose", "calibration"), (".",), ("report",)),
 }
 """Folders of each system, from below; ``.`` stands for the files beside them. Folders of one layer know nothing of each
@@ -266,7 +266,7 @@ CAUGHT = [
     ("io/design.py", "import cv2"),
     ("handeye/data/pairs.py", "import cv2"),
     ("handeye/report/page.py", "from stcal.sfm.detect.image import detect_image"),
-    ("handeye/report/export/files.py", "from stcal.workflows.board_views import detect_boards"),
+    ("handeye/report/export.py", "from stcal.workflows.board_views import detect_boards"),
     ("workflows/board_views.py", "import cv2"),
     ("workflows/board_views.py", "from stcal.cli.main import main"),
     ("boards/tags.py", "from stcal.locate.pose import estimate"),

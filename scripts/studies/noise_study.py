@@ -25,7 +25,7 @@ from stcal.sfm.adjust.calibration import Calibration, calibrate
 from stcal.sfm.adjust.refine import adjust, eccentricity_px
 from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.runs.options import RunOptions
-from stcal.synthetic.scene import Scene, SceneOptions, make_scene, nominal_target_from_face
+from stcal.synthetic.scene import Scene, SceneOptions, make_scene
 from stcal.workflows.cluster import executor_of
 
 
@@ -62,7 +62,7 @@ def one_run(seed: int, point: Point) -> np.ndarray:
     position error of the control (µm²)."""
     target, board = designs(point.radius)
     scene_options = SceneOptions(seed=seed, images_per_group=point.views, spread_deg=point.spread_deg)
-    scene = make_scene(scene_options, target, board, nominal_target_from_face())
+    scene = make_scene(scene_options, target, board, reference_target().rough_poses())
     noise_px = point.noise_px / np.sqrt(point.radius)
     observations = observe(scene, noise_px, np.random.default_rng([seed, 41]))
     measured = [m.in_world(Similarity(1.0, Rigid())) for m in true_models(scene, observations)]

@@ -25,8 +25,9 @@ from stcal.sfm.mapping.database import write_database
 from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.solve import solve_groups
-from stcal.synthetic.observe import image_circles, simulate_centres
+from stcal.synthetic.observe import image_circles
 from stcal.synthetic.scene import Scene, SceneOptions, make_scene
+from tests.support.circle_images import simulate_centres
 
 NOISE_PX = 0.02
 MISSING = 0.1

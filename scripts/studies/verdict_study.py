@@ -23,7 +23,7 @@ import numpy as np
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import StcalError
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_conic, circle_image_offset, ellipse_of_conic
+from stcal.geometry.conic import circle_image_offset
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.cameras.read import read_camera
 from stcal.io.images import find_images
@@ -43,6 +43,7 @@ from stcal.sfm.planning.nominal import observe, true_models
 from stcal.sfm.report.judgement import CAUSE
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.scene import Group, Scene, SceneOptions, make_scene, second_design
+from tests.support.circle_images import circle_conic, ellipse_of_conic
 from tests.support.photograph import read_set
 
 ROOT = Path(__file__).resolve().parents[2]

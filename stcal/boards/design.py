@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from stcal.boards.dictionaries import known_tags
 from stcal.design import POINT_RADIUS_MM, BoardDesign, Polarity
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, frozen, require_fields
+from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.labels import DotLabel, Label, dot_cells
 from stcal.lengths import require_millimetres, side
@@ -145,7 +145,7 @@ class TagLayout(Brief):
     def __post_init__(self):
         require_fields(self, "tag layout", sigma_mm=0)
         object.__setattr__(self, "tags", known_tags(self.tags, "tag layout"))
-        object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (len(self.tags), 4, 2), "tags' corners"))
+        freeze(self, "corners_mm", (len(self.tags), 4, 2), "tags' corners")
         require_tags(self.tags, self.corners_mm, self.unusual_size, "tag layout")
 
     @classmethod
@@ -500,13 +500,13 @@ class BoardView:
 
     def __post_init__(self):
         k = len(self.ids)
-        object.__setattr__(self, "ids", frozen(self.ids, (k,), "ids", int))
-        object.__setattr__(self, "xyz_board", frozen(self.xyz_board, (k, 3), "board points"))
-        object.__setattr__(self, "xy_px", frozen(self.xy_px, (k, 2), "image points"))
+        freeze(self, "ids", (k,), "ids", int)
+        freeze(self, "xyz_board", (k, 3), "board points")
+        freeze(self, "xy_px", (k, 2), "image points")
         if self.covariance_px2 is not None:
-            object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (k, 2, 2), "covariances"))
+            freeze(self, "covariance_px2", (k, 2, 2), "covariances")
         if self.normal is not None:
-            object.__setattr__(self, "normal", frozen(self.normal, (k, 3), "normals"))
+            freeze(self, "normal", (k, 3), "normals")
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -6,15 +6,16 @@ import cv2
 import numpy as np
 from scipy.special import ndtr
 
-from stcal.boards.area.grid_lines import OuterLines, told_by_lines
-from stcal.boards.area.step import (
+from stcal.boards.area import (
     PIXEL_VARIANCE,
     PRIOR_PX,
     Displacement,
+    OuterLines,
     displacement_variance,
     integrated_step,
     of_sampling,
     solved,
+    told_by_lines,
 )
 from stcal.geometry.least_squares import block_diagonal
 from stcal.geometry.robust import median_length

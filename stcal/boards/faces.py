@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from stcal.boards.aprilgrid import find_aprilgrid
 from stcal.boards.charuco import find_charuco
 from stcal.boards.chessboard import find_chessboard, why_no_chessboard
 from stcal.boards.design import AprilGridDesign, BoardView, CharucoDesign, ChessboardDesign, FlatBoard, TagLayout
 from stcal.boards.edges import ALONG, POINTS
-from stcal.boards.tags import find_tags, other_dictionaries, view_of_tags
+from stcal.boards.tags import find_aprilgrid, find_tags, other_dictionaries, view_of_tags
 from stcal.boards.target import tags_on
 from stcal.design import FaceDesign
 from stcal.errors import StcalError

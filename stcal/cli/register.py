@@ -69,7 +69,7 @@ def register(
     from stcal.register.core.pairs import read_pairs
     from stcal.register.report.file import RegistrationFile, require_registration_written
     from stcal.register.report.page import registration_report, sample_size_section
-    from stcal.register.workspace.findings import findings
+    from stcal.register.workspace import findings
 
     if identified and not robot_file:
         raise InputError("E-OPTION-NEEDS", f"--identified {identified}: only with --robot FILE")

@@ -264,3 +264,8 @@ def freeze(
         As :func:`frozen`.
     """
     object.__setattr__(instance, field, frozen(getattr(instance, field), shape, what, dtype))
+
+
+def rms(values: np.ndarray) -> float:
+    """Return the root of the mean square of all values."""
+    return float(np.sqrt((values**2).mean()))

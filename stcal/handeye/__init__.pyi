@@ -15,9 +15,9 @@ from .plan import NextPoses as NextPoses
 from .plan import plan_poses as plan_poses
 from .report.planned import planned_csv as planned_csv
 from .result import HandEye as HandEye
-from .rig.solve import Rig as Rig
-from .rig.solve import RigOptions as RigOptions
-from .rig.solve import handeye_rig as handeye_rig
+from .rig import Rig as Rig
+from .rig import RigOptions as RigOptions
+from .rig import handeye_rig as handeye_rig
 from .solve import METHODS as METHODS
 from .solve import HandEyeOptions as HandEyeOptions
 from .validate import Compared as Compared

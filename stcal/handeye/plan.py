@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, frozen, require_arguments
+from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
@@ -50,8 +50,8 @@ class NextPoses(Brief):
 
     def __post_init__(self):
         k = len(self.base_from_flange)
-        object.__setattr__(self, "sigma_mm", frozen(self.sigma_mm, (k + 1,), "σ"))
-        object.__setattr__(self, "turn_rad", frozen(self.turn_rad, (k,), "turns"))
+        freeze(self, "sigma_mm", (k + 1,), "σ")
+        freeze(self, "turn_rad", (k,), "turns")
 
 
 @require_arguments

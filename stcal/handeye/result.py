@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, frozen
+from stcal.geometry.arrays import Brief, freeze
 from stcal.geometry.rigid import Rigid
 from stcal.handeye.data.pairs import FRAMES, Setup
 from stcal.handeye.judge.observability import Observability
@@ -80,11 +80,11 @@ class HandEye(Brief):
 
     def __post_init__(self):
         m = len(self.names)
-        object.__setattr__(self, "residuals", frozen(self.residuals, (m, 6), "residuals"))
-        object.__setattr__(self, "outliers", frozen(self.outliers, (m,), "outliers", bool))
+        freeze(self, "residuals", (m, 6), "residuals")
+        freeze(self, "outliers", (m,), "outliers", bool)
         for name in ("covariance", "stand_covariance", "common_covariance"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name), (6, 6), name))
+                freeze(self, name, (6, 6), name)
 
     @property
     def verdict(self) -> Verdict:

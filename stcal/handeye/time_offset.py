@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.errors import ConvergenceError, DegenerateError, InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import HandEyePoses, Loop, Setup
@@ -63,8 +63,8 @@ class TimeOffset:
     speed_mm_s: float
 
     def __post_init__(self):
-        object.__setattr__(self, "slope", frozen(self.slope, (UNKNOWNS,), "slope"))
-        object.__setattr__(self, "kept", frozen(self.kept, (None,), "kept", bool))
+        freeze(self, "slope", (UNKNOWNS,), "slope")
+        freeze(self, "kept", (None,), "kept", bool)
 
     def in_words(self) -> str:
         """Returns the offset with its sign, σ, and the speed of the flange as one sentence."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from stcal.cross_validation import repeated_splits
 from stcal.errors import DegenerateError, InputError, StcalError
-from stcal.geometry.arrays import Brief, frozen, require_arguments
+from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import generalised_inverse
 from stcal.geometry.rigid import Poses, Rigid
@@ -57,13 +57,12 @@ class HeldOutPoses(Brief):
     mount_from_camera: np.ndarray | None = None
 
     def __post_init__(self):
-        object.__setattr__(self, "rows", frozen(self.rows, (None, None), "held-out poses", int))
+        freeze(self, "rows", (None, None), "held-out poses", int)
         for name in ("rotation_rad", "translation_mm", "board_mm", "pose_mm"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name), self.rows.shape, name))
+                freeze(self, name, self.rows.shape, name)
         if self.mount_from_camera is not None:
-            matrices = frozen(self.mount_from_camera, (len(self.rows), 4, 4), "solutions")
-            object.__setattr__(self, "mount_from_camera", matrices)
+            freeze(self, "mount_from_camera", (len(self.rows), 4, 4), "solutions")
 
     def means(self, of: np.ndarray | None = None) -> dict[str, float]:
         """Returns the mean of every available error over all splits, by name.
@@ -507,7 +506,7 @@ class HeldOutMotions(Brief):
 
     def __post_init__(self):
         for name in ("rotation_rad", "translation_mm"):
-            object.__setattr__(self, name, frozen(getattr(self, name), (len(self.names),), name))
+            freeze(self, name, (len(self.names),), name)
 
 
 def motion_errors(mount_from_camera: Rigid, motions: Motions) -> np.ndarray:

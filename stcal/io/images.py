@@ -20,12 +20,11 @@ from PIL import ExifTags, Image
 
 from stcal.errors import InputError, InputNote
 from stcal.io.files import IMAGE_BYTES, RUN_MARKER, read_bytes
-from stcal.io.photographs import extras
-from stcal.io.photographs.intact import ends_properly, is_png, png_intact
-from stcal.io.photographs.mosaic import PATTERNS, demosaiced, patterns_seen
+from stcal.io.photographs import decoding
+from stcal.io.photographs.decoding import PATTERNS, demosaiced, ends_properly, is_png, patterns_seen, png_intact
 
 USUAL = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
-SUFFIXES = (*USUAL, *extras.readable())
+SUFFIXES = (*USUAL, *decoding.readable())
 """Suffixes of the images that are read, some of them by optional packages."""
 UNPACKED = (".png", ".tif", ".tiff", ".bmp")
 """Forms in which programs of industrial cameras write pixels as the sensor gave them."""
@@ -216,7 +215,7 @@ def find_images(folder: str | Path) -> tuple[list[ImageFile], list[Skipped]]:
             _sort_in(path, path.name, TOP_GROUP, files, skipped)
     if not files:
         # A nested folder is the most helpful hint: the images lie deeper than they should.
-        photographs = {extras.reason_unread(suffix) for suffix in extras.EXTRAS}
+        photographs = {decoding.reason_unread(suffix) for suffix in decoding.EXTRAS}
         most_telling = sorted(
             skipped, key=lambda s: (s.reason not in photographs, s.gate != "folder", HOLDS_IMAGES not in s.reason)
         )[:1]
@@ -274,7 +273,7 @@ def _sort_in(path: Path, name: str, group: str, files: list, skipped: list) -> N
         skipped.append(Skipped(plain, reason, "folder"))
     elif path.suffix.lower() not in SUFFIXES:
         kinds, suffix = ", ".join(USUAL), path.suffix.lower()
-        reason = extras.reason_unread(suffix) if suffix in extras.EXTRAS else "not an image file"
+        reason = decoding.reason_unread(suffix) if suffix in decoding.EXTRAS else "not an image file"
         skipped.append(Skipped(plain, reason, "file_type", path.suffix or "no suffix", kinds))
     elif plain != name or name_fault(name):
         # Result files cannot store such a name.
@@ -310,10 +309,10 @@ def decode(data: bytes, name: str, size: tuple[int, int] | None = None) -> np.nd
         raise InputError("E-IMAGE-TRUNCATED", f"{name}: truncated ({len(data)} bytes); copy it again")
     if is_png(data) and not png_intact(data):
         raise InputError("E-IMAGE-DAMAGED", f"{name}: damaged (a checksum is wrong); copy it again")
-    if extras.is_heic(data):
-        image = extras.heic_grey(data, name)
-    elif name.lower().endswith(extras.RAW) or extras.is_dng(data):
-        image = extras.raw_grey(data, name)
+    if decoding.is_heic(data):
+        image = decoding.heic_grey(data, name)
+    elif name.lower().endswith(decoding.RAW) or decoding.is_dng(data):
+        image = decoding.raw_grey(data, name)
     else:
         image = _decoded(data, name)
     if image.dtype not in (np.uint8, np.uint16):

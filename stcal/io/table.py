@@ -282,7 +282,7 @@ def read_table(path: "str | Path | Table", what: str, quaternions: Order = "wxyz
         ) from error
     names, used = _with_units_of_a_row(names, used, between)
     names = canonical(names if names[0] else ["index", *names[1:]], comments)  # pandas writes its index without a name
-    if 2 * sum(_is_number(name.replace(",", ".")) for name in names) > len(names):
+    if 2 * sum(np.isfinite(_number(name.replace(",", "."))) for name in names) > len(names):
         raise InputError(
             "E-TABLE-HEADER",
             f"{where}: line {used[0][0]} is numbers, a header with names and units needed, like x_mm,y_mm; or give "
@@ -523,10 +523,6 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         return np.nan
-
-
-def _is_number(text: str) -> bool:
-    return np.isfinite(_number(text))
 
 
 LEVER_MM = 1000.0

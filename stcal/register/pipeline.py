@@ -29,9 +29,17 @@ from stcal.register.core.robust import (
 from stcal.register.core.search import LEAST_SHARE
 from stcal.register.judge.degeneracy import check_extent, check_supports, row_name
 from stcal.register.judge.groups import Shifted, shifted_rows, two_groups
-from stcal.register.judge.mistakes import Wider, check_mirrored, check_units, mirrored_error, mirrored_ratio, wider
+from stcal.register.judge.mistakes import (
+    Wider,
+    check_mirrored,
+    check_units,
+    mirrored_error,
+    mirrored_ratio,
+    moved_meanwhile,
+    order_note,
+    wider,
+)
 from stcal.register.judge.notes import Subject, notes_of
-from stcal.register.judge.order import moved_meanwhile, order_note
 
 METHODS = ("robust", "least-squares", "liu2017")
 NEAREST_MM = 1e-9

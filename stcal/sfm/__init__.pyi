@@ -23,9 +23,9 @@ from .measurement.tracker import Tracker as Tracker
 from .pipeline import detect_images as detect_images
 from .pipeline import run as run
 from .planning.advise import advise as advise
+from .planning.advise import noise_of_run as noise_of_run
 from .planning.bodies import plan as plan
 from .planning.forecast import CentreNoise as CentreNoise
-from .planning.noise import noise_of_run as noise_of_run
 from .planning.session import PlanOptions as PlanOptions
 from .report.compare import compare as compare
 from .runs.crosscheck import Tolerances as Tolerances

@@ -48,6 +48,7 @@ from stcal.sfm.mapping.pairs import image_graph
 from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, unknown_lens
 from stcal.sfm.runs.detection import (
     DetectedImages,
+    Task,
     detected_images,
     labelled_images,
     require_dots,
@@ -66,7 +67,7 @@ from stcal.sfm.runs.solve import (
     unseen_board,
     usable_groups,
 )
-from stcal.sfm.runs.transaction import MarkerFile, RunFolder, frames_folder, require_ours, run_folder
+from stcal.sfm.runs.transaction import MarkerFile, frames_folder, require_ours, run_folder
 
 IN_MEMORY = "images in memory"
 """What a run's folder states as the folder of its images where there is none."""
@@ -186,10 +187,10 @@ def run_on_files(
     given = {"images": images, "--camera": camera, "--target": target, "--board": board}
     target_design = body_of(target)
     known = None if board is None and target_design.has_scale else board_of(board)
-    designs = target_design, scale_reference(known, target_design)
+    board_design = scale_reference(known, target_design)
     if target_design.with_faces(printed=True).faces:
         _require_for_printed(options)
-    if model is None and not (designs[1].rows or target_design.with_faces(printed=True).faces):
+    if model is None and not (board_design.rows or target_design.with_faces(printed=True).faces):
         raise InputError(
             "E-CAMERA-NEEDED",
             "missing option '--camera': circles without a board of dots need a camera file, which `stcal-sfm "
@@ -199,14 +200,13 @@ def run_on_files(
         require_dots(known, f"--compare {options.compare}")
     options = replace(options, bayer=next((file.bayer for file in files[0] if file.bayer), "")).settled(target_design)
     if options.compare:
-        require_comparable(options.adjustment(designs[0]))
+        require_comparable(options.adjustment(target_design))
     with kept_processes(options.workers), run_folder(out, MarkerFile.of(images, options), given) as folder:
-        is_assumed = board is None and not target_design.has_scale
-        result = _calibrated(files, model, folder, *designs, options, progress, is_assumed)
+        task = Task(files, folder, target_design, board_design, options, progress)
+        result = _calibrated(task, model, board is None and not target_design.has_scale)
         result = replace(result, camera_given=model is not None and not is_rough(model, options))
         if options.compare and result.target.target_from_face and model is not None:
-            published = _published(files, model, folder, *designs, options, progress)
-            result = replace(result, comparison=compare_with_paper(result, published))
+            result = replace(result, comparison=compare_with_paper(result, _published(task, model)))
         result = replace(result, checks=run_checks(result.evidence(camera_prior(result.camera)), progress))
         result = replace(result, calibration=_on_surface(result))
         result = replace(result, checks=(*result.checks, *own_checks(result, checks)))
@@ -235,50 +235,36 @@ def own_checks(result: RunResult, makers: Sequence[OwnCheck]) -> list[Check]:
     return checks
 
 
-def _calibrated(
-    files: ImageFiles,
-    model: CameraModel | None,
-    folder: RunFolder,
-    target: TargetDesign,
-    board: BoardDesign,
-    options: RunOptions,
-    progress: Progress,
-    is_board_assumed: bool,
-) -> RunResult:
+def _calibrated(task: Task, model: CameraModel | None, is_board_assumed: bool) -> RunResult:
+    target, options = task.target, task.options
     if model is None and target.with_faces(printed=True).faces:
-        detection, labelled, model = _with_found_camera(files, folder, target, board, options, progress)
+        detection, labelled, model = _with_found_camera(task)
     else:
-        if model is None or (board.rows and is_rough(model, options)):
-            model = _camera_of_dots(files, model, folder, target, board, options, progress)
-        detection, labelled = labelled_images(files, model, folder, target, board, options, progress)
+        if model is None or (task.board.rows and is_rough(model, options)):
+            model = _camera_of_dots(task, model)
+        detection, labelled = labelled_images(task, model)
     if not (options.board_only or any(image.observations.face_ids() for image in labelled)):
-        _require_seen(files, labelled, target)
-    with overlays_beside(detection, labelled, target, folder, progress):
+        _require_seen(task, labelled)
+    with overlays_beside(detection, labelled, target, task.folder, task.progress):
         if is_board_assumed and not options.board_only and not _shows_dots(labelled):
             target = with_drawn_size(target, [image.observations.labels for image in labelled])
-            board = scale_reference(None, target)
-        return _solved(detection, labelled, model, folder, target, board, options, progress)
+            task = replace(task, target=target, board=scale_reference(None, target))
+        return _solved(task, detection, labelled, model)
 
 
-def _with_found_camera(
-    files: ImageFiles,
-    folder: RunFolder,
-    target: TargetDesign,
-    board: BoardDesign,
-    options: RunOptions,
-    progress: Progress,
-) -> tuple[DetectionResult, list[LabelledImage], CameraModel]:
+def _with_found_camera(task: Task) -> tuple[DetectionResult, list[LabelledImage], CameraModel]:
     """Finds the camera by the printed faces of the target, and labels the images with it."""
+    target, options, folder = task.target, task.options, task.folder
     printed = target.with_faces(printed=True)
-    guesses = guessed_cameras(files[0])
-    start = model_of(guesses[0], PHOTOGRAPHS)
-    detection, labelled = detected_images(files, start, folder, printed, None, options, progress)
-    _require_seen(files, labelled, target)
+    guesses = guessed_cameras(task.files[0])
+    faces_alone = replace(task, target=printed, board=scale_reference(None, printed))
+    detection, labelled = detected_images(faces_alone, model_of(guesses[0], PHOTOGRAPHS))
+    _require_seen(task, labelled)
     observations = [image.observations for image in labelled]
     found = place_and_find_camera(observations, printed.faces, guesses).camera
     model = model_of(found, PHOTOGRAPHS)
-    if board.rows or len(printed.faces) < len(target.faces):
-        return *labelled_images(files, model, folder, target, board, options, progress), model
+    if task.board.rows or len(printed.faces) < len(target.faces):
+        return *labelled_images(task, model), model
     detection = seen_by(detection, found, target)
     labelled = label_images(detection, target, None, options.ellipses, folder.cache, options.workers)
     save(folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
@@ -293,15 +279,7 @@ def is_rough(model: CameraModel, options: RunOptions) -> bool:
     return bool(np.sqrt(model.covariance[0, 0]) > MAX_FOCAL_SIGMA * model.focal[0])
 
 
-def _camera_of_dots(
-    files: ImageFiles,
-    rough: CameraModel | None,
-    folder: RunFolder,
-    target: TargetDesign,
-    board: BoardDesign,
-    options: RunOptions,
-    progress: Progress,
-) -> CameraModel:
+def _camera_of_dots(task: Task, rough: CameraModel | None) -> CameraModel:
     """Returns the camera calibrated from the dots of the board, with the weak prior of an unknown lens.
 
     The adjustment of all groups estimates it again from the same dots, so that the σ of the calibration are not used.
@@ -311,17 +289,18 @@ def _camera_of_dots(
     DetectionError, DegenerateError
         Boards in too few images, or a lens that the boards do not tell.
     """
-    start = guessed_cameras(files[0])[0] if rough is None else rough.calibrated(*require_common_size(files[0])[0])
+    files = task.files[0]
+    start = guessed_cameras(files)[0] if rough is None else rough.calibrated(*require_common_size(files)[0])
 
     def told(stage: str, done: int, total: int) -> None:
-        progress(f"{stage} for the camera", done, total)
+        task.progress(f"{stage} for the camera", done, total)
 
-    detection, _ = detected_images(files, model_of(start, PHOTOGRAPHS), folder, target, board, options, told)
-    found = camera_of_dots(files[0], detection, board, start, LENS).camera
+    detection, _ = detected_images(replace(task, progress=told), model_of(start, PHOTOGRAPHS))
+    found = camera_of_dots(files, detection, task.board, start, LENS).camera
     return model_of(unknown_lens(found), PHOTOGRAPHS)
 
 
-def _require_seen(files: ImageFiles, labelled: Sequence[LabelledImage], target: TargetDesign) -> None:
+def _require_seen(task: Task, labelled: Sequence[LabelledImage]) -> None:
     """Refuses images in which no printed face of the target is seen, and names the tags that are.
 
     Raises
@@ -329,16 +308,16 @@ def _require_seen(files: ImageFiles, labelled: Sequence[LabelledImage], target: 
     DetectionError
         No image shows one, and the target has some.
     """
-    if unseen := _why_unseen(files, labelled, target):
+    if unseen := _why_unseen(task, labelled):
         raise DetectionError("E-TARGET-UNSEEN", unseen)
 
 
-def _why_unseen(files: ImageFiles, labelled: Sequence[LabelledImage], target: TargetDesign) -> str:
-    printed = target.with_faces(printed=True).faces
+def _why_unseen(task: Task, labelled: Sequence[LabelledImage]) -> str:
+    printed = task.target.with_faces(printed=True).faces
     ids = {face.id for face in printed}
     if not printed or any(ids.intersection(image.observations.face_ids()) for image in labelled):
         return ""
-    return why_unseen(files[0], printed)
+    return why_unseen(task.files[0], printed)
 
 
 def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
@@ -355,23 +334,16 @@ def guessed_cameras(files: Sequence[ImageFile]) -> list[Camera]:
     return [Camera.of(start_camera(width, height, LENS), LENS)]
 
 
-def _camera_for_a_look(
-    files: ImageFiles,
-    folder: RunFolder,
-    target: TargetDesign,
-    board: BoardDesign | None,
-    options: RunOptions,
-    progress: Progress,
-) -> tuple[CameraModel, bool]:
+def _camera_for_a_look(task: Task) -> tuple[CameraModel, bool]:
     """Returns the camera with which images are detected where none is given, and whether the dots of the board told it.
 
     Where they do not, it is one of medium focal length without distortion: it moves no corner of a printed face and the
     centres of circles a little, but far from the middle of a wide image faces may lose their names.
     """
-    if board is not None and board.rows:
+    if task.board.rows:
         with suppress(DetectionError, DegenerateError):
-            return _camera_of_dots(files, None, folder, target, board, options, progress), True
-    return model_of(guessed_cameras(files[0])[0], PHOTOGRAPHS), False
+            return _camera_of_dots(task, None), True
+    return model_of(guessed_cameras(task.files[0])[0], PHOTOGRAPHS), False
 
 
 def _require_for_printed(options: RunOptions) -> None:
@@ -414,49 +386,33 @@ def _on_surface(result: RunResult) -> Calibration:
     return on_luminous_surface(calibration, heights, sigma_mm, design, frame)
 
 
-def _published(
-    files: ImageFiles,
-    model: CameraModel,
-    folder: RunFolder,
-    target: TargetDesign,
-    board: BoardDesign,
-    options: RunOptions,
-    progress: Progress,
-) -> RunResult | StcalError:
+def _published(task: Task, model: CameraModel) -> RunResult | StcalError:
     """Returns the result of the published method on the same photographs, or the error that prevents it."""
-    published_options = replace(
-        options, solve="paper", frame="three-point", eccentricity=False, refine_camera=False, compare=None
-    ).settled(target)
+    options = replace(
+        task.options, solve="paper", frame="three-point", eccentricity=False, refine_camera=False, compare=None
+    ).settled(task.target)
 
     def told(stage: str, done: int, total: int) -> None:
-        progress(f"{stage}, as published", done, total)
+        task.progress(f"{stage}, as published", done, total)
 
+    published = replace(task, options=options, progress=told)
     try:
-        detection, labelled = detected_images(files, model, folder, target, board, published_options, told)
-        return _solved(detection, labelled, model, folder, target, board, published_options, told)
+        return _solved(published, *detected_images(published, model), model)
     except StcalError as error:
         return error
 
 
-def _solved(
-    detection: DetectionResult,
-    labelled: list[LabelledImage],
-    model: CameraModel,
-    folder: RunFolder,
-    target: TargetDesign,
-    board: BoardDesign,
-    options: RunOptions,
-    progress: Progress,
-) -> RunResult:
+def _solved(task: Task, detection: DetectionResult, labelled: list[LabelledImage], model: CameraModel) -> RunResult:
+    folder, target, options, progress = task.folder, task.target, task.options, task.progress
     calibrated_camera = model.calibrated(detection.camera.width, detection.camera.height)
     calibrated_camera = refinable(calibrated_camera) if options.refine_camera else calibrated_camera
-    if not board.rows:
+    if not task.board.rows:
         labelled = as_one_group(labelled)
     observations = [image.observations for image in labelled]
     board_alone = options.board_only or is_board_alone(detection)
     if board_alone and options.solve == "joint":  # which adjusts faces, and there are none
         options = replace(options, solve="chain", refine_camera=False)
-    board = with_edge_sigma(board, observations)
+    board = with_edge_sigma(task.board, observations)
     known = faces_of_known_shape(board)
     groups, unusable = usable_groups(
         by_group(observations), detection.skipped, board_alone, needs_board=not target.has_scale
@@ -562,7 +518,8 @@ def detect_images(
             return detect_images(images, camera, scratch, target, board, options, progress)
     options, progress = options or RunOptions(), progress or (lambda *_: None)
     target_design = body_of(target)
-    board_design = None if board is None and target_design.has_scale else board_of(board)
+    has_none = board is None and target_design.has_scale
+    board_design = scale_reference(None, target_design) if has_none else board_of(board)
     require_no_calibration(out)
     with mosaic_of(options.bayer) if options.bayer else nullcontext():
         if isinstance(images, Mapping):
@@ -572,26 +529,18 @@ def detect_images(
     model = None if camera is None else camera_model(camera)
     given = {"images": place, "--camera": camera, "--target": target, "--board": board}
     with run_folder(out, MarkerFile.of(place, None), given) as folder:
-        return _detected(files, model, folder, target_design, board_design, options, progress)
+        return _detected(Task(files, folder, target_design, board_design, options, progress), model)
 
 
-def _detected(
-    files: ImageFiles,
-    model: CameraModel | None,
-    folder: RunFolder,
-    target: TargetDesign,
-    board: BoardDesign | None,
-    options: RunOptions,
-    progress: Progress,
-) -> DetectedImages:
-    """Detects and labels the images, and writes ``detections.csv`` and overlays into a claimed folder."""
+def _detected(task: Task, model: CameraModel | None) -> DetectedImages:
+    """Detects and labels the images, and writes ``detections.csv`` and overlays into the folder."""
     notes = []
     if model is None:
-        model, told = _camera_for_a_look(files, folder, target, board, options, progress)
-        if target.with_faces(printed=False).faces:
+        model, told = _camera_for_a_look(task)
+        if task.target.with_faces(printed=False).faces:
             notes.append(FOUND_BY_DOTS.format(model.focal[0]) if told else ASSUMED)
-    detection, labelled = labelled_images(files, model, folder, target, board, options, progress)
-    if unseen := _why_unseen(files, labelled, target):
+    detection, labelled = labelled_images(task, model)
+    if unseen := _why_unseen(task, labelled):
         notes.append(unseen)
-    with overlays_beside(detection, labelled, target, folder, progress):
+    with overlays_beside(detection, labelled, task.target, task.folder, task.progress):
         return DetectedImages(detection, tuple(labelled), tuple(notes))

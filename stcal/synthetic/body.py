@@ -20,7 +20,7 @@ from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import write_cameras_txt
 from stcal.parallel import run_parallel
-from stcal.synthetic.dataset import FIRST_IMAGE, TruthFile
+from stcal.synthetic.dataset import FIRST_IMAGE, TruthFile, new_dataset
 from stcal.synthetic.render import encode
 
 BLACK, WHITE, BACKGROUND = 0.08, 0.85, 0.35
@@ -456,21 +456,12 @@ def write_body(
         The folder is not empty or cannot be written.
     """
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give a new or an empty folder"
-        )
-    try:
+    with new_dataset(folder):
         (folder / "images").mkdir(parents=True, exist_ok=True)
         write_cameras_txt(folder / "cameras.txt", scene.camera)
         (folder / "target.toml").write_text(body_toml(scene.target), encoding="utf-8")
-        (folder / "truth.json").write_text(
-            json.dumps(body_truth(scene, image_format).content()) + "\n", encoding="utf-8"
-        )
-    except OSError as error:
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
-        ) from error
+        truth = json.dumps(body_truth(scene, image_format).content())
+        (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
     drawings = scene.drawings()
     count = len(scene.camera_from_target)
     paths = [folder / "images" / _image_name(i, image_format) for i in range(count)]

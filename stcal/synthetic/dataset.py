@@ -1,7 +1,8 @@
 """Data sets of rendered images in a folder, with their truth."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
@@ -163,6 +164,21 @@ def render_all(
 IMAGE_FORMATS = ("jpg", "png")
 
 
+@contextmanager
+def new_dataset(folder: Path) -> Iterator[None]:
+    """Refuses a folder that is not empty, or that cannot be written within the block."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(
+            "E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give a new or an empty folder"
+        )
+    try:
+        yield
+    except OSError as error:
+        raise InputError(
+            "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
+        ) from error
+
+
 @require_arguments
 def write_dataset(
     folder: str | Path,
@@ -209,12 +225,8 @@ def write_dataset(
         raise InputError("E-OPTION-FORM", f"data set: JPEG holds 8 bits, not {options.bit_depth}; choose png")
     if not 1 <= jpeg_quality <= 100:
         raise InputError("E-OPTION-RANGE", f"data set: JPEG quality {jpeg_quality}, 1 to 100 needed")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(
-            "E-OUTPUT-EXISTS", f"data set folder {folder}: exists and is not empty; give a new or an empty folder"
-        )
-    check_lens(scene, options.lens)
-    try:
+    with new_dataset(folder):
+        check_lens(scene, options.lens)
         truth = json.dumps(TruthFile.of(scene, image_format, options).content())
         for group in scene.groups:
             (folder / "images" / group).mkdir(parents=True, exist_ok=True)
@@ -222,10 +234,6 @@ def write_dataset(
         save_body(folder / "target.toml", scene.target)
         save_run_board(folder / "board.toml", scene.board)
         (folder / "truth.json").write_text(truth + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(
-            "E-OUTPUT-UNWRITABLE", f"data set folder {folder}: {error.strerror or error}; give a writable folder"
-        ) from error
     jobs = {
         image_name(group, i, image_format): (scene, group, i, options, jpeg_quality)
         for group, g in scene.groups.items()

@@ -8,19 +8,13 @@ import numpy as np
 from stcal.boards.design import TAG_SIGMA_MM, TagLayout
 from stcal.boards.dictionaries import dictionary_of, known_tags
 from stcal.boards.target import printed_face, tags_on
-from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_target
+from stcal.design import BoardDesign, FaceDesign, TargetDesign
 from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 
 REFERENCE_GROUPS = (("1", "2"), ("1", "4"), ("1", "5"), ("2", "3"))
 """Groups of Zhang & Wei (2017), sec. 2."""
-
-
-def nominal_target_from_face() -> dict[str, Rigid]:
-    """Returns the nominal face poses of the reference design, target frame = frame of face 1, mm."""
-    return reference_target().rough_poses()
-
 
 # Drawings of the second design: id, x, y, radius in mm, in a drawing frame with the origin in a corner of the face.
 _TOP = [

@@ -4,10 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_image_offset
-from stcal.labels import DotLabel, Label
+from stcal.labels import Label
 from stcal.synthetic.scene import Scene
 
 MAX_FOUND_TILT_RAD = np.radians(70)
@@ -45,8 +44,8 @@ class ImageCircles:
             "tilt_rad": (n,),
             "centre_px": (n, 2),
         }.items():
-            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
-        object.__setattr__(self, "must_find", frozen(self.must_find, (n,), "must_find", bool))
+            freeze(self, name, shape, name)
+        freeze(self, "must_find", (n,), "must_find", bool)
 
     def select(self, rows: np.ndarray) -> "ImageCircles":
         """Returns the circles of a mask (n,)."""
@@ -125,22 +124,3 @@ def rim_points(xyz: np.ndarray, normal: np.ndarray, radius: np.ndarray, count: i
     angle = 2 * np.pi * np.arange(count) / count
     circle = np.cos(angle)[:, None] * e1[:, None] + np.sin(angle)[:, None] * e2[:, None]
     return xyz[:, None] + radius[:, None, None] * circle
-
-
-def simulate_centres(
-    scene: Scene, group: str, image: int, noise_px: float, rng: np.random.Generator
-) -> dict[Label, np.ndarray]:
-    """Simulates measured ellipse centres of one image by label, (2,) px, as from a detector with this noise.
-
-    A measurement is the centre of the ideal ellipse (not the image of the circle's centre), distorted by the lens, plus
-    Gaussian noise of ``noise_px`` per axis. It covers circles of all faces with a tilt up to 70°, and all dots.
-    """
-    circles = image_circles(scene, group, image)
-    ellipse_centre = scene.camera.project(
-        circle_image_offset(circles.xyz_camera, circles.normal_camera, circles.radius_mm)
-    )
-    measured = ellipse_centre + noise_px * rng.standard_normal(ellipse_centre.shape)
-    keep = (circles.tilt_rad <= MAX_FOUND_TILT_RAD) | np.array(
-        [isinstance(label, DotLabel) for label in circles.labels]
-    )
-    return {label: xy for label, xy, k in zip(circles.labels, measured, keep, strict=True) if k}

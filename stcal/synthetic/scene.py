@@ -8,16 +8,16 @@ import numpy as np
 
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
+from stcal.geometry.arrays import Brief, freeze, frozen, require_arguments, require_fields
 from stcal.geometry.camera import FISHEYE, Camera
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.cameras.read import camera_model
 from stcal.labels import CircleLabel
-from stcal.synthetic.designs import REFERENCE_GROUPS, nominal_target_from_face, second_design, three_point_frame
+from stcal.synthetic.designs import REFERENCE_GROUPS, second_design, three_point_frame
 from stcal.synthetic.placement import GroupShape, place_group, viewing_axes
 
-__all__ = ["Group", "Scene", "SceneOptions", "make_scene", "nominal_target_from_face", "second_design"]
+__all__ = ["Group", "Scene", "SceneOptions", "make_scene", "second_design"]
 
 FACE_MARGIN_MM = 15.0
 """How far a plate of which the design states no outline is assumed to reach beyond the rims of its circles."""
@@ -122,8 +122,8 @@ class Group:
     camera_from_target: tuple[Rigid, ...]
 
     def __post_init__(self):
-        object.__setattr__(self, "axes", frozen(self.axes, (3, 3), "axes"))
-        object.__setattr__(self, "board_circles_target", frozen(self.board_circles_target, (None, 3), "board circles"))
+        freeze(self, "axes", (3, 3), "axes")
+        freeze(self, "board_circles_target", (None, 3), "board circles")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from stcal.boards.aprilgrid import find_aprilgrid
 from stcal.boards.charuco import find_charuco
 from stcal.boards.chessboard import find_chessboard, why_no_chessboard
 from stcal.boards.design import (
@@ -23,7 +22,7 @@ from stcal.boards.design import (
     TagLayout,
     turns,
 )
-from stcal.boards.tags import Tags, find_tags, view_of_tags
+from stcal.boards.tags import Tags, find_aprilgrid, find_tags, view_of_tags
 from stcal.design import BoardDesign, TargetDesign
 from stcal.errors import InputError, StcalError
 from stcal.geometry.arrays import require_arguments

@@ -20,7 +20,7 @@ from stcal.register.core.pairs import WHAT, Pairs
 from stcal.register.core.result import ErrorFigures, Registration
 from stcal.register.report.file import FiguresRow, HeldOutBoth, MeanRmsMax, RobotPart
 from stcal.register.report.page import matrix_table
-from stcal.register.workspace.findings import Findings, findings
+from stcal.register.workspace import Findings, findings
 from stcal.report import document
 from stcal.report.text import number
 from stcal.robot.identification.residuals import State, tips

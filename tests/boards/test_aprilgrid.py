@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stcal.boards.aprilgrid import find_aprilgrid
 from stcal.boards.design import AprilGridDesign
+from stcal.boards.tags import find_aprilgrid
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography
 from tests.boards.drawn import IMAGE_FROM_MM, aprilgrid_mm, photograph

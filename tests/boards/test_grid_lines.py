@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from stcal.boards.area.grid_lines import OuterLines, told_by_lines
-from stcal.boards.area.step import PRIOR_PX, displacement_variance
+from stcal.boards.area import PRIOR_PX, OuterLines, displacement_variance, told_by_lines
 
 CELLS, WIDTH_PX, BLUR_PX, DARK, RISE, NOISE = 8, 14.3, 0.6, 30.0, 180.0, 0.7
 AT_PX = 20.4

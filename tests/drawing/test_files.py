@@ -14,12 +14,22 @@ import stcal
 from stcal.boards.cells import outlines
 from stcal.boards.design import AprilGridDesign, CharucoDesign, ChessboardDesign
 from stcal.design import reference_board, reference_target
-from stcal.drawing.dimensions import framed
 from stcal.drawing.draw import SUFFIXES, draw
 from stcal.drawing.formats import POINT_MM, pdf
 from stcal.drawing.parts import board_parts
 from stcal.drawing.shapes import Disc, Line, Text, extent
-from stcal.drawing.sheets import EDGE, FOOT, FURNITURE, OVERLAP, PAPERS, SIDE, one_sheet, paper_sheets, seams_between
+from stcal.drawing.sheets import (
+    EDGE,
+    FOOT,
+    FURNITURE,
+    OVERLAP,
+    PAPERS,
+    SIDE,
+    framed,
+    one_sheet,
+    paper_sheets,
+    seams_between,
+)
 from stcal.io.design import board_toml, target_toml
 from tests.outcome import fails_with
 

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from stcal.boards.aprilgrid import find_aprilgrid
 from stcal.boards.charuco import find_charuco
 from stcal.boards.chessboard import find_chessboard
 from stcal.boards.design import AprilGridDesign, AsymmetricCirclesDesign, CharucoDesign, ChessboardDesign, TagLayout
-from stcal.boards.tags import find_tags
+from stcal.boards.tags import find_aprilgrid, find_tags
 from stcal.design import BoardDesign, TargetDesign, reference_target
 from stcal.drawing.draw import OWN, draw, sheets_of
 from stcal.drawing.parts import board_parts, target_parts

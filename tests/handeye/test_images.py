@@ -16,7 +16,6 @@ from stcal.boards.design import (
     TagLayout,
 )
 from stcal.design import BoardDesign
-from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
 from stcal.io.cameras.model import CameraModel
 from stcal.io.images import find_images
@@ -31,6 +30,7 @@ from tests.handeye.photographed import (
     take,
 )
 from tests.outcome import fails_with
+from tests.support.circle_images import circle_conic, ellipse_of_conic
 
 MODEL = CameraModel(CAMERA.focal, CAMERA.centre, CAMERA.distortion, "PINHOLE", None, None, "cameras.txt")
 SLANTED = Rigid(Rotation.from_rotvec([0.5, -0.3, 0.2]).as_matrix(), [-60, -50, 420])

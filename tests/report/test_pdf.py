@@ -6,8 +6,7 @@ import sys
 
 import pytest
 
-from stcal.report.document import Document, Html, Section, Table, fold
-from stcal.report.page import pdf_of
+from stcal.report.document import Document, Html, Section, Table, fold, pdf_of
 from tests.outcome import fails_with
 
 pytestmark = pytest.mark.skipif(shutil.which("pdftotext") is None, reason="poppler-utils is not installed")

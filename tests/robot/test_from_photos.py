@@ -20,8 +20,8 @@ from stcal.robot.use.targets import Targets
 from stcal.sfm.measurement.images import MeasuredImage, MeasureResult
 from stcal.sfm.measurement.pose import common_errors, pose_from_circles
 from stcal.synthetic.scene import SceneOptions, make_scene
-from stcal.workflows.from_photos import run as work
-from stcal.workflows.from_photos.result import FromPhotos, files_of, story
+from stcal.workflows import from_photos as work
+from stcal.workflows.from_photos import FromPhotos, files_of, story
 from tests.outcome import fails_with
 from tests.support.image_poses import known_target, see
 

@@ -8,9 +8,10 @@ import pytest
 from stcal.design import TargetDesign, reference_target
 from stcal.errors import DegenerateError
 from stcal.geometry.rigid import Rigid
-from stcal.synthetic.observe import image_circles, rim_points, simulate_centres
-from stcal.synthetic.scene import SceneOptions, make_scene, nominal_target_from_face, second_design
+from stcal.synthetic.observe import image_circles, rim_points
+from stcal.synthetic.scene import SceneOptions, make_scene, second_design
 from tests.outcome import fails_with
+from tests.support.circle_images import simulate_centres
 
 OPTIONS = SceneOptions(seed=3, width=1296, height=864, images_per_group=4)
 
@@ -47,7 +48,7 @@ def test_made_differs_from_design_as_much_as_asked(scene):
 
 
 def test_true_poses_are_near_nominal():
-    scene, nominal = make_scene(OPTIONS), nominal_target_from_face()
+    scene, nominal = make_scene(OPTIONS), reference_target().rough_poses()
     for face, pose in scene.target_from_face.items():
         difference = nominal[face].inverse() @ pose
         # 0.5° of the face and 0.5° of the reference face, whose lever is 200 mm: 1.7 mm; four times that at most.
@@ -57,7 +58,7 @@ def test_true_poses_are_near_nominal():
 
 
 def test_nominal_faces_point_out_of_the_box():
-    nominal = nominal_target_from_face()
+    nominal = reference_target().rough_poses()
     middles = {f.id: nominal[f.id] @ np.append(f.xy_mm.mean(0), 0) for f in reference_target().faces}
     box = np.mean([middles["1"], middles["3"]], axis=0)
     for face, middle in middles.items():
@@ -166,10 +167,10 @@ def test_errors_say_what_to_do():
         make_scene(replace(OPTIONS, groups=(("1", "2"), ("1", "2"))))
     target = reference_target()
     with fails_with("E-TARGET-ROUGH-POSE … 5"):
-        make_scene(OPTIONS, target, nominal={f: p for f, p in nominal_target_from_face().items() if f != "5"})
+        make_scene(OPTIONS, target, nominal={f: p for f, p in reference_target().rough_poses().items() if f != "5"})
     pair = TargetDesign("pair", "bright", target.faces[:2])
     with fails_with("E-SCENE-FACES"):
-        make_scene(OPTIONS, pair, nominal={"1": Rigid(), "2": Rigid(nominal_target_from_face()["2"].rotation)})
+        make_scene(OPTIONS, pair, nominal={"1": Rigid(), "2": Rigid(reference_target().rough_poses()["2"].rotation)})
     with fails_with("E-SIMULATE-OPTIONS … images_per_group … 0"):
         SceneOptions(images_per_group=0)
 

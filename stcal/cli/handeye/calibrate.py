@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from stcal.handeye import EvolutionOptions
     from stcal.handeye.data.pairs import Setup
     from stcal.handeye.methods.evolution import Bounds
-    from stcal.handeye.report.export.frames import CameraFrame
+    from stcal.handeye.report.export import CameraFrame
     from stcal.handeye.report.outcome import Outcome
 
 EVOLVED = ("de", "de-polished")

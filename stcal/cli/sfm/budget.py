@@ -38,7 +38,7 @@ def budget(
     strict: StrictByDefault = True,
 ) -> None:
     """Compute the uncertainty budget (GUM) of the faces and of the target's longest distances, by contributions."""
-    from stcal.report.page import pdf_of
+    from stcal.report.document import pdf_of
     from stcal.sfm.budget.of_run import uncertainty_budget
     from stcal.sfm.budget.sources import fields_of
 
@@ -63,7 +63,7 @@ def _require_pdf(page: Path | None, run: Path) -> None:
     Raises InputError if there is no page, the page itself has the suffix of a PDF, or the extra ``pdf`` is not
     installed.
     """
-    from stcal.report.page import require_pdf
+    from stcal.report.document import require_pdf
 
     if page is None:
         raise InputError("E-OPTION-NEEDS", "--pdf: the PDF stands beside the page; give that with --report FILE.html")

@@ -48,9 +48,9 @@ def plan(
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
+    from stcal.sfm.planning.advise import expected_noise, noise_of_run, stated_noise
     from stcal.sfm.planning.bodies import plan as planned
     from stcal.sfm.planning.file import PlanFile, plan_text
-    from stcal.sfm.planning.noise import expected_noise, noise_of_run, stated_noise
     from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
     from stcal.sfm.runs.options import RunOptions
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, frozen, require_fields
+from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Order, Poses, Rigid, skew
 from stcal.io.table import LENGTHS, Table, read_table
 
@@ -65,9 +65,9 @@ class HandEyePoses(Brief):
             )
         for name in ("base_from_flange_covariance", "camera_from_board_covariance"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name), (m, 6, 6), name))
-        if (common := self.camera_from_board_common) is not None:
-            object.__setattr__(self, "camera_from_board_common", frozen(common, (m, 6, None), "common errors"))
+                freeze(self, name, (m, 6, 6), name)
+        if self.camera_from_board_common is not None:
+            freeze(self, "camera_from_board_common", (m, 6, None), "common errors")
         names = tuple(self.names) or tuple(f"pose {i}" for i in range(1, m + 1))
         if len(names) != m:
             raise InputError("E-NAMES-COUNT", f"{self.where}: {len(names)} names of {m} poses; one each needed")

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, frozen, require_fields
+from stcal.geometry.arrays import Brief, freeze, require_fields
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import HandEyePoses, Setup
 from stcal.handeye.data.views import Views, pairs_of_views
@@ -43,7 +43,7 @@ class RigCamera(Brief):
 
     def __post_init__(self):
         require_fields(self, "camera of a rig")
-        object.__setattr__(self, "rows", frozen(self.rows, (len(self.views),), "rows", int))
+        freeze(self, "rows", (len(self.views),), "rows", int)
         if len(self.images) != len(self.views):
             raise InputError(
                 "E-NAMES-COUNT", f"camera {self.name}: {len(self.images)} names of {len(self.views)} views; one each"

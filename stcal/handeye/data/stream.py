@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Poses
 
 LONGEST_S = 0.25
@@ -45,7 +45,7 @@ class Stream:
     where: str
 
     def __post_init__(self):
-        object.__setattr__(self, "seconds", frozen(self.seconds, (len(self.base_from_flange),), "times"))
+        freeze(self, "seconds", (len(self.base_from_flange),), "times")
 
     def __len__(self) -> int:
         return len(self.seconds)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.errors import DegenerateError, InputError
-from stcal.geometry.arrays import Brief, frozen, require_arguments, require_fields
+from stcal.geometry.arrays import Brief, freeze, require_arguments, require_fields
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import Minimum, NormalEquations, minimise, perturbed
 from stcal.geometry.plane import camera_from_plane, fit_homography
@@ -40,13 +40,13 @@ class View(Brief):
     normal: np.ndarray | None = None
 
     def __post_init__(self):
-        object.__setattr__(self, "xyz_board", frozen(self.xyz_board, (None, 3), "corners on the board"))
+        freeze(self, "xyz_board", (None, 3), "corners on the board")
         k = len(self.xyz_board)
-        object.__setattr__(self, "xy_px", frozen(self.xy_px, (k, 2), "corners in the image"))
+        freeze(self, "xy_px", (k, 2), "corners in the image")
         if self.covariance is not None:
-            object.__setattr__(self, "covariance", frozen(self.covariance, (k, 2, 2), "covariance of corners"))
+            freeze(self, "covariance", (k, 2, 2), "covariance of corners")
         if self.normal is not None:
-            object.__setattr__(self, "normal", frozen(self.normal, (k, 3), "normals"))
+            freeze(self, "normal", (k, 3), "normals")
 
     def __len__(self) -> int:
         return len(self.xyz_board)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.rigid import Poses
 from stcal.handeye.data.pairs import Loop
@@ -60,11 +60,11 @@ class Reprojection:
     arm_covariance: np.ndarray | None = None
 
     def __post_init__(self):
-        object.__setattr__(self, "designed", frozen(self.designed, (None, 3), "corners"))
-        object.__setattr__(self, "corners", frozen(self.corners, self.designed.shape, "corners"))
-        object.__setattr__(self, "view", frozen(self.view, (None,), "views", int))
-        object.__setattr__(self, "corner", frozen(self.corner, self.view.shape, "numbers of corners", int))
-        object.__setattr__(self, "residuals_px", frozen(self.residuals_px, (len(self.view), 2), "residuals"))
+        freeze(self, "designed", (None, 3), "corners")
+        freeze(self, "corners", self.designed.shape, "corners")
+        freeze(self, "view", (None,), "views", int)
+        freeze(self, "corner", self.view.shape, "numbers of corners", int)
+        freeze(self, "residuals_px", (len(self.view), 2), "residuals")
 
     def rms_px(self, pose: int) -> float:
         """Returns the RMS length of the residuals in one view; NaN where it has none."""

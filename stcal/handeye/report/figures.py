@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.handeye.data.pairs import HandEyePoses, Loop
 from stcal.handeye.data.views import Views
 from stcal.handeye.judge.observability import Observability
@@ -40,7 +40,7 @@ class ImageCoverage:
     share: float
 
     def __post_init__(self):
-        object.__setattr__(self, "counts", frozen(self.counts, (None, None), "counts", int))
+        freeze(self, "counts", (None, None), "counts", int)
 
 
 def image_coverage(views: Views) -> ImageCoverage:

@@ -15,7 +15,7 @@ from stcal.handeye.judge.verdict import Verdict, Word
 from stcal.handeye.methods.noise import kind
 from stcal.handeye.report.outcome import ArmFound, Outcome, RigOutcome, judged, rig_judged
 from stcal.handeye.result import HandEye
-from stcal.handeye.rig.validate import CameraHeldOut
+from stcal.handeye.rig import CameraHeldOut
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 from stcal.io.json import Finite, Matrix3, Matrix6, NamedReason, Part, Pose, ResultFile, Shape, Vector, Vector3
 

@@ -16,8 +16,7 @@ from stcal.handeye.judge.observability import COMMON_MM, in_words
 from stcal.handeye.judge.remarks import MANY, Aside, Grave, spoken
 from stcal.handeye.judge.verdict import BAD, CARE, GOOD, Finding, Verdict, Word
 from stcal.handeye.result import HandEye
-from stcal.handeye.rig.solve import Rig
-from stcal.handeye.rig.validate import RigHeldOut
+from stcal.handeye.rig import Rig, RigHeldOut
 from stcal.handeye.time_offset import TimeOffset
 from stcal.handeye.validate import Compared, HeldOutMotions, HeldOutPoses
 

@@ -23,7 +23,7 @@ from stcal.handeye.report.page import (
     verdict_blocks,
 )
 from stcal.handeye.result import HandEye
-from stcal.handeye.rig.validate import RigHeldOut
+from stcal.handeye.rig import RigHeldOut
 from stcal.report.document import (
     Block,
     Document,

@@ -11,7 +11,7 @@ from stcal.errors import InputError
 from stcal.geometry.camera import Camera
 from stcal.io.cameras.model import camera_from_opencv
 from stcal.io.files import IMAGE_BYTES, read_bytes
-from stcal.io.photographs.extras import heic_turns, is_heic, require_heic
+from stcal.io.photographs.decoding import heic_turns, is_heic, require_heic
 
 HEADS = (b"\xff\xd8\xff", b"II*\0", b"MM\0*", b"\x89PNG")
 """First bytes of JPEG, TIFF and PNG."""

@@ -60,18 +60,19 @@ def image_lines(text: str, where: str) -> list[ImageLine]:
 def _record(line: str) -> tuple[list[float], str] | None:
     """Return pose and name of an image's first line; None for any other line."""
     cells = line.split(maxsplit=CELLS - 1)
-    pose = _floats(cells[1:8])
-    if len(cells) < CELLS or pose is None or _floats([cells[0], cells[8]]) is None or _are_points(line):
+    pose = floats_of(cells[1:8])
+    if len(cells) < CELLS or pose is None or floats_of([cells[0], cells[8]]) is None or _are_points(line):
         return None
     return pose, cells[9].strip()
 
 
 def _are_points(line: str) -> bool:
     cells = line.split()
-    return len(cells) % POINT_CELLS == 0 and _floats(cells) is not None
+    return len(cells) % POINT_CELLS == 0 and floats_of(cells) is not None
 
 
-def _floats(cells: list[str]) -> list[float] | None:
+def floats_of(cells: list[str]) -> list[float] | None:
+    """Return the numbers of the cells; None if a cell is no number."""
     try:
         return [float(cell) for cell in cells]
     except ValueError:

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Order
 from stcal.io.files import TABLE_BYTES, read_bytes
 from stcal.io.poses.matrices import find_matrices
@@ -62,7 +62,7 @@ class Turned:
     stated: bool = True
 
     def __post_init__(self):
-        object.__setattr__(self, "rotation", frozen(self.rotation, (len(self.rotation), 3, 3), "rotations"))
+        freeze(self, "rotation", (len(self.rotation), 3, 3), "rotations")
 
 
 def places_of(table: Table) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from stcal.boards.design import BoardView
 from stcal.boards.edges import corners_by_edges
 from stcal.boards.tags import Tags
 from stcal.errors import DegenerateError
-from stcal.geometry.arrays import Brief, require_arguments
+from stcal.geometry.arrays import Brief, require_arguments, rms
 from stcal.geometry.camera import Camera
 from stcal.geometry.least_squares import minimise
 from stcal.geometry.normal_equations import Reduction, reduce
@@ -149,9 +149,9 @@ def adjust(images: Sequence[ImageCorners], start: np.ndarray) -> AdjustedLayout:
         board_factor=noise.board,
         sigma_px=noise.corner_px,
         tag_sigma_px=noise.tag_px,
-        board_rms_px=_rms(np.concatenate([g.px.ravel() for g in board])),
-        tag_rms_px=_rms(np.concatenate([g.px.ravel() for g in tags])),
-        image_rms_px=np.array([_rms(g.px) for g in tags]),
+        board_rms_px=rms(np.concatenate([g.px.ravel() for g in board])),
+        tag_rms_px=rms(np.concatenate([g.px.ravel() for g in tags])),
+        image_rms_px=np.array([rms(g.px) for g in tags]),
         downweighted=float((np.concatenate([g.weight for g in tags]) < 1).mean()),
         settled=settled,
     )
@@ -163,10 +163,6 @@ def _first_noise(images, poses: Poses, corners: np.ndarray) -> "_Noise":
     board = np.concatenate([np.linalg.norm(b[0].residual, axis=1) for b in blocks])
     tags = np.concatenate([np.linalg.norm(b[1].px.reshape(-1, 2), axis=1) for b in blocks])
     return _Noise(max(robust_sigma(board, 2), LEAST_FACTOR), robust_sigma(tags, 2), 0.0)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt((values**2).mean()))
 
 
 def _settled(images, poses: Poses, corners: np.ndarray, noise: _Noise) -> tuple[Poses, np.ndarray]:

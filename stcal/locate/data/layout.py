@@ -11,7 +11,7 @@ from stcal.boards.design import TagLayout as TagLayout
 from stcal.boards.dictionaries import known_tags
 from stcal.boards.file import TagsFile, load_tags, require_sizes
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, frozen, require_fields
+from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.io.files import require_written
 from stcal.io.toml import toml_string
 from stcal.lengths import side, stated_unusual
@@ -95,8 +95,8 @@ class TargetLayout(Brief):
         require_fields(self, "target layout", origin=0, sigma_px=0, tag_sigma_px=0)
         n = len(self.tags)
         object.__setattr__(self, "tags", known_tags(self.tags, "target layout"))
-        object.__setattr__(self, "corners_mm", frozen(self.corners_mm, (n, 4, 2), "tags' corners"))
-        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (8 * n, 8 * n), "corners' covariance"))
+        freeze(self, "corners_mm", (n, 4, 2), "tags' corners")
+        freeze(self, "covariance_mm2", (8 * n, 8 * n), "corners' covariance")
         require_tags(self.tags, self.corners_mm, self.unusual_size, "target layout")
 
     @classmethod

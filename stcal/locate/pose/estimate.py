@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from stcal.boards.edges import corners_by_edges
 from stcal.errors import DegenerateError
 from stcal.geometry import least_squares
-from stcal.geometry.arrays import Brief, frozen, require_arguments
+from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.least_squares import (
     Minima,
@@ -180,11 +180,11 @@ class SeenTags(Brief):
     edge_sigma_px: np.ndarray
 
     def __post_init__(self):
-        object.__setattr__(self, "rows", frozen(self.rows, (None,), "rows", int))
+        freeze(self, "rows", (None,), "rows", int)
         k = len(self.rows)
-        object.__setattr__(self, "corners_px", frozen(self.corners_px, (k, 4, 2), "tags' corners"))
-        object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (k, 8, 8), "corners' covariances"))
-        object.__setattr__(self, "edge_sigma_px", frozen(self.edge_sigma_px, (k,), "edges' σ"))
+        freeze(self, "corners_px", (k, 4, 2), "tags' corners")
+        freeze(self, "covariance_px2", (k, 8, 8), "corners' covariances")
+        freeze(self, "edge_sigma_px", (k,), "edges' σ")
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -133,7 +133,9 @@ def search(problem: Problem, score: Score, rng: np.random.Generator) -> Consensu
     """
     count, size = len(problem), problem.model.sample
     drawn, needed, best = 0, 1.0, None
-    every = _all_samples(count, size) if comb(count, size) <= EXHAUSTIVE else None
+    every = None
+    if comb(count, size) <= EXHAUSTIVE:
+        every = np.array(list(combinations(range(count), size)))
     while drawn < needed:
         samples = every if every is not None else _random_samples(count, size, rng)
         drawn += len(samples)
@@ -190,10 +192,6 @@ def _squares_of_many(linear: np.ndarray, translation: np.ndarray, problem: Probl
         return np.maximum(np.einsum("sin,sin->sn", residual, weighted), 0)
     plain = np.einsum("sin,sin->sn", residual, residual)
     return plain if precision is None else plain * precision
-
-
-def _all_samples(count: int, size: int) -> np.ndarray:
-    return np.array(list(combinations(range(count), size)))
 
 
 def _random_samples(count: int, size: int, rng: np.random.Generator) -> np.ndarray:

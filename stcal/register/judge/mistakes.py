@@ -1,6 +1,5 @@
 """Mistakes that the data show: units, mirrored axes, exchanged rows, scale, and correlated residuals of neighbours."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,13 +9,13 @@ from scipy.special import bdtrc, ndtr
 
 from stcal.errors import InputError, StcalError
 from stcal.geometry.align import best_rotations
-from stcal.geometry.rigid import Affine, Similarity
+from stcal.geometry.rigid import Affine, Rigid, Similarity
 from stcal.geometry.robust import ratio_limit
-from stcal.register.core.models import MODELS, Model, Transform, parts, unit_covariance
+from stcal.register.core.models import MODELS, Model, Transform, jacobian, parts, unit_covariance, whitened
 from stcal.register.core.pairs import Problem
 from stcal.register.core.robust import BY_CHANCE, Fitted
-
-Namer = Callable[[int], str]
+from stcal.register.judge.degeneracy import Namer
+from stcal.row_order import Change, change_along
 
 UNITS = {1000.0: ("m", "m"), 25.4: ("inches", "in"), 10.0: ("cm", "cm")}
 """Units by their length in mm, with name and suffix of their columns."""
@@ -245,3 +244,50 @@ def neighbours_alike(xyz_a: np.ndarray, residuals: np.ndarray) -> bool:
     one, two = np.unique(np.sort(pairs, axis=1), axis=0).T
     product = np.einsum("ni,ni->n", r[one], r[two])
     return bool(ndtr(-product.sum() / max(np.sqrt((product**2).sum()), 1e-300)) < BY_NEIGHBOURS)
+
+
+LEVEL = 0.01
+"""Probability that sound points seem to move along the order of their rows."""
+TRIED = 10_000
+"""Largest number of points that are examined; larger sets are clouds without an order."""
+
+
+def moved_meanwhile(problem: Problem, transform: Transform) -> Change | None:
+    """Returns the jump or drift of one frame against the other along the order of the rows; None if there is none
+    beyond chance, or the frames are bent and it explains no bend."""
+    if len(problem) > TRIED:
+        return None
+    from_middle = problem.xyz_a - problem.xyz_a.mean(0)
+    by_parameters = jacobian(problem.model, transform, from_middle)
+    motions = jacobian(MODELS["rigid"], Rigid(_turn(transform)), from_middle)
+    residuals, precision = problem.residuals(transform), problem.noise.precision
+
+    def white(values: np.ndarray) -> np.ndarray:
+        return np.stack([whitened(values[:, :, k], precision) for k in range(values.shape[2])], axis=2)
+
+    change = change_along(whitened(residuals, precision), white(by_parameters), white(motions))
+    size = 0.0 if change is None else float(np.abs(motions @ change.motion).max())
+    if change is None or change.p > LEVEL or size <= problem.rounding_mm():
+        return None
+    rest = residuals - change.moves[:, None] * (motions @ change.motion)
+    alike = [neighbours_alike(problem.xyz_a[change.good], each[change.good]) for each in (residuals, rest)]
+    return None if all(alike) else change
+
+
+def _turn(transform: Transform) -> np.ndarray:
+    """Returns the rotation next to the linear part of a transform."""
+    u, _, vt = np.linalg.svd(parts(transform)[0])
+    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+
+
+def order_note(change: Change, name: Namer) -> str:
+    """Returns one line on a change along the order of the rows."""
+    size = f"{np.linalg.norm(change.motion[3:]):.3g} mm and {np.degrees(np.linalg.norm(change.motion[:3])):.2g}°"
+    share = f"{change.share:.0%} of the squared residuals, p {'< 0.001' if change.p < 1e-3 else f'= {change.p:.2g}'}"
+    if change.kind == "drift":
+        return f"one frame drifts against the other along the rows, by {size} from the first to the last ({share})"
+    likely = f" ({name(change.first)} to {name(change.last)} as likely)" if change.first < change.last else ""
+    return (
+        f"from {name(change.row)} on{likely} an instrument stands elsewhere, by {size} ({share}): register the rows "
+        "before and from there on each by themselves"
+    )

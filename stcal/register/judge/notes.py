@@ -15,8 +15,16 @@ from stcal.register.core.result import Alternative
 from stcal.register.core.robust import CLEAN_SETS_WITH_OUTLIER, LEVERAGE_UP_TO, Fitted
 from stcal.register.judge.degeneracy import WIDER_THAN, row_name, single_supports, spreads, symmetry, symmetry_note
 from stcal.register.judge.groups import Shifted
-from stcal.register.judge.mistakes import SHOWN, UNIT_WITHIN, UNITS, Wider, neighbours_alike, outlier_notes
-from stcal.register.judge.order import moved_meanwhile, order_note
+from stcal.register.judge.mistakes import (
+    SHOWN,
+    UNIT_WITHIN,
+    UNITS,
+    Wider,
+    moved_meanwhile,
+    neighbours_alike,
+    order_note,
+    outlier_notes,
+)
 
 LOW_REDUNDANCY = 6
 """Degrees of freedom below which the relative uncertainty of σ exceeds 30 %."""

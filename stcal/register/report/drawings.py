@@ -3,8 +3,7 @@
 import numpy as np
 
 from stcal.register.core.liu2017 import SampleSize
-from stcal.register.workspace.field import Cubes, Field
-from stcal.register.workspace.findings import Findings
+from stcal.register.workspace import Cubes, Field, Findings
 from stcal.report.figure import COLOURS, FAINT, INK, SMALL, calm, locator, new_figure, round_below
 
 VIEWS = ((0, 1), (0, 2), (1, 2))

@@ -13,9 +13,8 @@ from stcal.io.json import Finite, Matrix, Matrix4, Part, Points, Pose, ResultFil
 from stcal.io.table import POSE_MM
 from stcal.register.core.models import Transform, parts
 from stcal.register.core.result import Alternative, ErrorFigures, HeldOutPoints
-from stcal.register.workspace.field import Cubes
-from stcal.register.workspace.field import Field as ResidualField
-from stcal.register.workspace.findings import Findings
+from stcal.register.workspace import Cubes, Findings
+from stcal.register.workspace import Field as ResidualField
 
 NAMES = {
     6: ("rx", "ry", "rz", "x", "y", "z"),

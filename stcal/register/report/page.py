@@ -16,8 +16,7 @@ from stcal.register.report.drawings import (
     space_figure,
 )
 from stcal.register.report.file import matrix_of
-from stcal.register.workspace.field import Cubes, Field
-from stcal.register.workspace.findings import Findings
+from stcal.register.workspace import Cubes, Field, Findings
 from stcal.report.document import (
     MOST_ROWS,
     Block,

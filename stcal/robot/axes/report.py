@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field
 
 import stcal
+from stcal.geometry.arrays import rms
 from stcal.io.json import ByName, Matrix, Part, Pose, ResultFile, Vector3
 from stcal.report.document import Document, Section, Table, bullets, legend, page_only, plot
 from stcal.report.figure import AXIS_COLOURS, INK, calm, new_figure
@@ -137,16 +138,12 @@ def _axis_cells(fit: AxisFit) -> list[str]:
         str(len(fit.arcs)),
         str(len(length)),
         f"{fit.span:.1f} mm" if sliding else f"{np.degrees(fit.span):.1f}°",
-        f"{_rms(length) / np.sqrt(2):.4f}",
+        f"{rms(length) / np.sqrt(2):.4f}",
         f"{length.mean():.4f}",
-        f"{_rms(length):.4f}",
+        f"{rms(length):.4f}",
         f"{1e6 * np.linalg.norm(deviation[:2]):.1f}",
         "–" if sliding else f"{np.linalg.norm(deviation[2:]):.4f}",
     ]
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _names(pair: Pair) -> str:
@@ -240,9 +237,9 @@ def _axis_json(fit: AxisFit, off: Mapping[int, float]) -> dict:
         "point_mm": fit.world_from_axis.translation.tolist(),
         "world_from_axis": fit.world_from_axis.matrix().tolist(),
         "covariance": fit.covariance.tolist(),
-        "residual_rms_mm": _rms(length) / np.sqrt(2),
+        "residual_rms_mm": rms(length) / np.sqrt(2),
         "residual_length_mean_mm": float(length.mean()),
-        "residual_length_rms_mm": _rms(length),
+        "residual_length_rms_mm": rms(length),
         "sigma_mm": fit.sigma_mm,
         "dof": fit.redundancy,
         "span_mm" if len(fit.gain) == 2 else "span_rad": fit.span,

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stcal.geometry.arrays import rms
 from stcal.geometry.rigid import Rigid
 from stcal.robot.identification.observability import directions_named
 from stcal.robot.identification.residuals import WIDTH, Kind, Observed, State, tip_jacobian
@@ -41,7 +42,7 @@ class Predicted:
 
     def elsewhere(self) -> float:
         """Returns σ over the joints' ranges as a multiple of σ at the measured rows (RMS)."""
-        return _rms(self.ranges_mm) / max(_rms(self.here_mm), 1e-9)
+        return rms(self.ranges_mm) / max(rms(self.here_mm), 1e-9)
 
 
 def predicted(state: State, robot: Robot, measured: Observed, covariance: np.ndarray) -> Predicted | None:
@@ -117,7 +118,7 @@ def widened(found: Predicted | None, left: Sequence[Finding]) -> tuple[Predicted
     wider = replace(found, ranges_mm=np.hypot(found.ranges_mm, size), left_mm=size)
     return wider, (
         f"σ hold for these rows, and for places like theirs: the model leaves {size:.2g} mm RMS that goes with what is "
-        f"named above; over the joints' ranges the tool's position is known to {_rms(wider.ranges_mm):.2g} mm (σ, with "
+        f"named above; over the joints' ranges the tool's position is known to {rms(wider.ranges_mm):.2g} mm (σ, with "
         "that in it)",
     )
 
@@ -151,13 +152,9 @@ def doubts(
         sizes, directions = np.linalg.eigh(covariance / units[:, None] / units)
         worst = directions_named(directions[:, -1:], names)[0]
         notes.append(
-            f"over the joints' ranges the tool's position is known to {_rms(found.ranges_mm):.2g} mm (σ), "
-            f"{found.elsewhere():.0f} times that at the measured rows, {_rms(found.here_mm):.2g} mm: they are few, or "
+            f"over the joints' ranges the tool's position is known to {rms(found.ranges_mm):.2g} mm (σ), "
+            f"{found.elsewhere():.0f} times that at the measured rows, {rms(found.here_mm):.2g} mm: they are few, or "
             f"of a small part of the ranges; least known: {worst}, ± {np.sqrt(sizes[-1]):.2g} mm; add rows "
             "(`stcal robot design`), or use the result where it was measured only"
         )
     return tuple(notes)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt((values**2).mean()))

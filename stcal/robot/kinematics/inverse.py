@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from scipy.stats import qmc
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, frozen, require_arguments
+from stcal.geometry.arrays import Brief, freeze, require_arguments
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.robot.kinematics.forward import forward, jacobian
 from stcal.robot.kinematics.model import Robot
@@ -208,9 +208,9 @@ class Inverse(Brief):
 
     def __post_init__(self):
         m = len(self.status)
-        object.__setattr__(self, "q", frozen(self.q, (m, None), "joint values"))
-        object.__setattr__(self, "error_mm", frozen(self.error_mm, (m,), "errors"))
-        object.__setattr__(self, "error_rad", frozen(self.error_rad, (m,), "errors"))
+        freeze(self, "q", (m, None), "joint values")
+        freeze(self, "error_mm", (m,), "errors")
+        freeze(self, "error_rad", (m,), "errors")
 
     def __len__(self) -> int:
         return len(self.status)

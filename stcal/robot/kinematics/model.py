@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, frozen, require_fields
+from stcal.geometry.arrays import Brief, freeze, frozen, require_fields
 from stcal.geometry.rigid import Rigid
 from stcal.lengths import LEAST_LINK_MM, MOST_LINK_MM, Length, require_millimetres
 from stcal.robot.kinematics.conditions import loaded
@@ -159,7 +159,7 @@ class Elasticity:
         shapes |= {"hysteresis": (n,), "pivot": (n, 3)}
         loaded(self.payload_kg, 1)
         for name, shape in shapes.items():
-            object.__setattr__(self, name, frozen(getattr(self, name), shape, f"elasticity: {name}"))
+            freeze(self, name, shape, f"elasticity: {name}")
         length = float(np.linalg.norm(self.gravity))
         if length == 0:
             raise InputError(
@@ -422,10 +422,10 @@ class Chain:
 
     def __post_init__(self):
         n = len(self.prismatic)
-        object.__setattr__(self, "rotation", frozen(self.rotation, (n, 3, 3), "chain"))
-        object.__setattr__(self, "translation", frozen(self.translation, (n, 3), "chain"))
-        object.__setattr__(self, "prismatic", frozen(self.prismatic, (n,), "chain", bool))
-        object.__setattr__(self, "coupling", frozen(self.coupling, (n, None), "coupling"))
+        freeze(self, "rotation", (n, 3, 3), "chain")
+        freeze(self, "translation", (n, 3), "chain")
+        freeze(self, "prismatic", (n,), "chain", bool)
+        freeze(self, "coupling", (n, None), "coupling")
 
     def __len__(self) -> int:
         return len(self.prismatic)

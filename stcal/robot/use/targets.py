@@ -86,15 +86,14 @@ class Targets(Brief):
 
     def __getitem__(self, rows: np.ndarray) -> "Targets":
         """Returns the targets of these indices."""
-        return Targets(
-            self.where,
-            [self.lines[i] for i in rows],
-            tuple(self.tools[i] for i in rows),
-            None if self.poses is None else self.poses[rows],
-            None if self.q is None else self.q[rows],
-            {column: tuple(own[i] for i in rows) for column, own in self.names.items()},
-            self.notes,
-            self.conditions[rows],
+        return replace(
+            self,
+            lines=[self.lines[i] for i in rows],
+            tools=tuple(self.tools[i] for i in rows),
+            poses=None if self.poses is None else self.poses[rows],
+            q=None if self.q is None else self.q[rows],
+            names={column: tuple(own[i] for i in rows) for column, own in self.names.items()},
+            conditions=self.conditions[rows],
         )
 
     def joints(self) -> np.ndarray:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import Brief, frozen
+from stcal.geometry.arrays import Brief, freeze
 from stcal.io.table import Table, read_table
 from stcal.robot.kinematics.conditions import unread
 from stcal.robot.kinematics.measurements import within
@@ -45,8 +45,8 @@ class MeasuredPoses:
 
     def __post_init__(self):
         m = len(self.lines)
-        object.__setattr__(self, "commanded", frozen(self.commanded, (m, 3), "commanded positions"))
-        object.__setattr__(self, "measured", frozen(self.measured, (m, 3), "measured positions"))
+        freeze(self, "commanded", (m, 3), "commanded positions")
+        freeze(self, "measured", (m, 3), "measured positions")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

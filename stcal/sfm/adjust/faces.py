@@ -9,7 +9,7 @@ import numpy as np
 from stcal.design import FaceDesign, TargetDesign
 from stcal.errors import DegenerateError
 from stcal.geometry.align import align_rigid, best_rotations
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import fit_planes
 from stcal.geometry.rigid import Poses, Rigid
@@ -44,8 +44,8 @@ class FaceInGroup:
 
     def __post_init__(self):
         n = len(self.labels)
-        object.__setattr__(self, "xyz_face", frozen(self.xyz_face, (n, 3), "circles"))
-        object.__setattr__(self, "information", frozen(self.information, (n, 3, 3), "information"))
+        freeze(self, "xyz_face", (n, 3), "circles")
+        freeze(self, "information", (n, 3, 3), "information")
 
 
 def missing_frame_circles(face: FaceDesign, mapped: Collection[str]) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from scipy.linalg import solve_triangular
 from stcal.design import BoardDesign, faces_of_known_shape, known_distances
 from stcal.errors import ConvergenceError, ScaleError
 from stcal.geometry.align import align_rigid
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import PARAMETER_NAMES, Camera, intrinsic_basis
 from stcal.geometry.least_squares import Minimum, minimise
 from stcal.geometry.normal_equations import constrained_inverse
@@ -98,8 +98,8 @@ class JointResult:
 
     def __post_init__(self):
         c = len(self.labels)
-        object.__setattr__(self, "xyz_model", frozen(self.xyz_model, (c, 3), "circles"))
-        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (3 * c, 3 * c), "covariance"))
+        freeze(self, "xyz_model", (c, 3), "circles")
+        freeze(self, "covariance_mm2", (3 * c, 3 * c), "covariance")
 
     @property
     def sigma_scale(self) -> float:

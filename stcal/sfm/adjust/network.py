@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.normal_equations import blocks_of, constrained_inverse, free_motions, reduce
 from stcal.sfm.adjust.refine import projection_jacobians
@@ -44,7 +44,7 @@ class Network:
 
     def __post_init__(self):
         p = 3 * len(self.model.labels)
-        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (p, p), "covariance"))
+        freeze(self, "covariance_mm2", (p, p), "covariance")
 
     def square_by_image(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns squared residuals over σ² and redundancy of each image, (m,)."""

@@ -9,7 +9,7 @@ import numpy as np
 from stcal.design import BoardDesign, FaceDesign, ScaleReference, faces_of_known_shape, known_distances
 from stcal.errors import DegenerateError, ScaleError
 from stcal.geometry.align import align_rigid, align_similarity
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.labels import CircleLabel, Label, dot_cells
 from stcal.sfm.data.model import ImageObservations, WorldModel
@@ -43,7 +43,7 @@ class Scale:
     source: ScaleSource = "board"
 
     def __post_init__(self):
-        object.__setattr__(self, "residuals_mm", frozen(self.residuals_mm, (len(self.labels), 3), "residuals"))
+        freeze(self, "residuals_mm", (len(self.labels), 3), "residuals")
 
     @property
     def mm_per_unit(self) -> float:

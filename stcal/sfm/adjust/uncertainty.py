@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 
 from stcal.design import FaceDesign, TargetDesign
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze, frozen
 from stcal.geometry.camera import PARAMETER_NAMES
 from stcal.geometry.normal_equations import constrained_inverse
 from stcal.geometry.rigid import Poses, Rigid, skew
@@ -290,8 +290,8 @@ class Contributions:
         c = 3 * len(self.joint.labels)
         fixed = {kind: frozen(matrix, (c, c), f"{kind}: covariance") for kind, matrix in self.covariance_mm2.items()}
         object.__setattr__(self, "covariance_mm2", fixed)
-        object.__setattr__(self, "by_scale", frozen(self.by_scale, (c,), "scale"))
-        object.__setattr__(self, "by_intrinsics", frozen(self.by_intrinsics, (c, len(PARAMETER_NAMES)), "intrinsics"))
+        freeze(self, "by_scale", (c,), "scale")
+        freeze(self, "by_intrinsics", (c, len(PARAMETER_NAMES)), "intrinsics")
 
 
 def contributions_of(state: Adjusted) -> Contributions:

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.labels import CircleLabel
 from stcal.sfm.adjust.calibration import rim_covariance_mm2
@@ -44,8 +44,8 @@ class Measurand:
     designed: np.ndarray
 
     def __post_init__(self):
-        object.__setattr__(self, "jacobian", frozen(self.jacobian, (None, None), f"{self.name}: jacobian"))
-        object.__setattr__(self, "designed", frozen(self.designed, (None, None), f"{self.name}: designed"))
+        freeze(self, "jacobian", (None, None), f"{self.name}: jacobian")
+        freeze(self, "designed", (None, None), f"{self.name}: designed")
 
     def covariance(self, source: Source, designed_sigma_mm: float) -> np.ndarray:
         """Returns the covariance (r, r) from one source. ``designed_sigma_mm`` matters only for the source of placed

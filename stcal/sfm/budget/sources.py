@@ -10,7 +10,7 @@ from pydantic import Field
 
 from stcal.design import BoardDesign, StatedSize, faces_of_known_shape, known_distances
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.io.design import BoardSizeEntry, SizeEntry
 from stcal.io.toml import Strict, load_toml
@@ -125,7 +125,7 @@ class Source:
     covariance_mm2: np.ndarray
 
     def __post_init__(self):
-        object.__setattr__(self, "covariance_mm2", frozen(self.covariance_mm2, (None, None), f"{self.key}: covariance"))
+        freeze(self, "covariance_mm2", (None, None), f"{self.key}: covariance")
 
 
 def sources_of(

@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 
 from stcal.design import BoardDesign
 from stcal.errors import ConvergenceError, DegenerateError, StcalError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import FISHEYE, Camera, intrinsic_basis, parameter_names
 from stcal.labels import Label
 from stcal.parallel import run_in_order
@@ -52,7 +52,7 @@ class ProjectionSigma:
 
     def __post_init__(self):
         for name in ("xy_px", "sigma_px", "reach", "corner_sigma_px"):
-            object.__setattr__(self, name, frozen(getattr(self, name), what=name))
+            freeze(self, name, what=name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -165,10 +165,9 @@ class State:
     def _poses(self, i: int) -> tuple[Rigid, ...]:
         poses, k = self.first_from_board[self.folder[i]], self.camera_of[i]
         own = [poses[t] for t in self.instant_of[i].tolist()]
-        return tuple(self.camera_from_first[k] @ pose for pose in own) if self._sits(k) else tuple(own)
-
-    def _sits(self, k: int) -> bool:
-        return bool(self.camera_from_first) and k > 0
+        return (
+            tuple(self.camera_from_first[k] @ pose for pose in own) if self.camera_from_first and k > 0 else tuple(own)
+        )
 
     def cost(self, huber: float) -> float:
         """Returns the χ² of the images, with Huber's loss beyond ``huber``."""

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze, frozen
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.labels import CircleLabel, Label, parse_labels
@@ -40,7 +40,7 @@ class ImageObservations:
         n = len(self.labels)
         for field, shape in (("centre_px", (n, 2)), ("centre", (n, 2)), ("shape", (n, 2, 2))):
             object.__setattr__(self, field, frozen(getattr(self, field), shape, field))
-        object.__setattr__(self, "covariance_px2", frozen(self.covariance_px2, (n, 2, 2), "covariance_px2"))
+        freeze(self, "covariance_px2", (n, 2, 2), "covariance_px2")
         uneven = np.zeros((n, 2)) if self.uneven_px is None else self.uneven_px
         object.__setattr__(self, "uneven_px", frozen(uneven, (n, 2), "uneven_px"))
         blur = np.zeros(n) if self.blur_px is None else self.blur_px
@@ -124,8 +124,8 @@ class Centres:
             ("rim", (n,)),
             ("uneven_px", (n, 2)),
         ):
-            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
-        object.__setattr__(self, "ok", frozen(self.ok, (n,), "ok", dtype=bool))
+            freeze(self, name, shape, name)
+        freeze(self, "ok", (n,), "ok", dtype=bool)
 
     def __len__(self) -> int:
         return len(self.centre_px)
@@ -185,11 +185,11 @@ class GroupModel:
     def __post_init__(self):
         object.__setattr__(self, "labels", parse_labels(self.labels))
         n = len(self.image_index)
-        object.__setattr__(self, "xyz_model", frozen(self.xyz_model, (len(self.labels), 3), "points"))
+        freeze(self, "xyz_model", (len(self.labels), 3), "points")
         for name, shape in (("measured_px", (n, 2)), ("shift_px", (n, 2)), ("covariance_px2", (n, 2, 2))):
-            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
+            freeze(self, name, shape, name)
         for name in ("image_index", "point_index", "keypoint"):
-            object.__setattr__(self, name, frozen(getattr(self, name), (n,), name, dtype=int))
+            freeze(self, name, (n,), name, dtype=int)
 
     def corrected_px(self) -> np.ndarray:
         """Returns the images of the circles' centres, (n, 2): measured ellipse centres minus eccentricity."""

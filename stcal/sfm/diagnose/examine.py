@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from stcal.design import BoardDesign, Polarity, TargetDesign
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.plane import apply_homography
 from stcal.geometry.rigid import Rigid
@@ -215,7 +215,7 @@ class Expected:
     missing: np.ndarray
 
     def __post_init__(self):
-        object.__setattr__(self, "missing", frozen(self.missing, (len(self.pattern.labels),), "missing", dtype=bool))
+        freeze(self, "missing", (len(self.pattern.labels),), "missing", dtype=bool)
 
     @property
     def is_board(self) -> bool:

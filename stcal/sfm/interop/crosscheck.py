@@ -8,7 +8,7 @@ import numpy as np
 
 from stcal.errors import InputError, MappingError
 from stcal.geometry.align import align_similarity
-from stcal.geometry.arrays import require_arguments
+from stcal.geometry.arrays import require_arguments, rms
 from stcal.geometry.rigid import Poses, Rigid
 from stcal.io.json import read_json
 from stcal.parallel import Progress
@@ -270,7 +270,9 @@ def _comparison(
         tolerances=tolerances,
         images=images,
         residual_rms_px=ResidualRms(
-            native=_rms_px(external, run), pycolmap=_rms_px(of_pycolmap, run), run=_run_rms(run)
+            native=_rms_px(external, run),
+            pycolmap=_rms_px(of_pycolmap, run),
+            run=run.report["summary"]["residual_rms_px"],
         ),
         mapping=mapping,
         result=result,
@@ -393,12 +395,7 @@ def _images(calibration: Calibration) -> set[str]:
 
 
 def _rms_px(calibration: Calibration, run: SavedRun) -> float:
-    residual = np.concatenate([model.residuals_px(run.camera) for model in calibration.models])
-    return float(np.sqrt((residual**2).mean()))
-
-
-def _run_rms(run: SavedRun) -> float:
-    return run.report["summary"]["residual_rms_px"]
+    return rms(np.concatenate([model.residuals_px(run.camera) for model in calibration.models]))
 
 
 def comparison_text(check: Crosscheck) -> str:

@@ -14,8 +14,8 @@ from stcal.io.files import BOARD, TARGET
 from stcal.parallel import Progress
 from stcal.sfm.make.box import require_size
 from stcal.sfm.make.design import DesignOptions, Made, make_target
+from stcal.sfm.planning.advise import expected_noise
 from stcal.sfm.planning.bodies import plan_body
-from stcal.sfm.planning.noise import expected_noise
 from stcal.sfm.planning.session import Plan, PlanOptions, plan_with_board
 from stcal.synthetic.designs import Body, tag_body
 

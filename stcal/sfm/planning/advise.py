@@ -15,6 +15,10 @@ from stcal.sfm.adjust.joint import JointResult, basis_of, photographs_of
 from stcal.sfm.data.model import MetricModel
 from stcal.sfm.planning.bodies import body_views
 from stcal.sfm.planning.forecast import (
+    BLUR_PX,
+    CONTRAST,
+    IMAGE_NOISE,
+    PRACTICE,
     CentreNoise,
     Forecast,
     Photographs,
@@ -262,3 +266,36 @@ def _new_model(known: Known, pair: tuple[str, str], images: int) -> MetricModel:
     alone = replace(scene, groups={name: group})
     (model,) = true_models(alone, observe(alone, 0.0, np.random.default_rng(0)))
     return known.noise.applied(model, scene.camera, known.setup.radius_mm())
+
+
+def stated_noise(sigma_px: float) -> tuple[CentreNoise, str]:
+    """Returns the same σ for every circle and corner."""
+    return CentreNoise(0.0, floor_px=sigma_px, corner_px=sigma_px), "--noise, whatever the size of a circle"
+
+
+@require_arguments
+def noise_of_run(run: AnyRun) -> CentreNoise:
+    """Returns the noise of centres by size and tilt of the circles, as estimated from a run.
+
+    Parameters
+    ----------
+    run : str, Path, SavedRun or RunResult
+        The run's folder, or what :func:`stcal.sfm.load_run` or :func:`stcal.sfm.run` returned.
+
+    Returns
+    -------
+    CentreNoise
+        As :class:`stcal.sfm.PlanOptions` takes it.
+    """
+    known = known_of(saved_run(run))
+    return known.noise.scaled(known.setup.sigma0)
+
+
+def expected_noise(of_corners: bool = False) -> tuple[CentreNoise, str]:
+    """Returns the σ to expect in good photographs; ``of_corners`` : of tags and squares, not of circles."""
+    if of_corners:
+        return CentreNoise.expected(), "what corners of tags have in rendered photographs (--noise, --run)"
+    return CentreNoise.expected(), (
+        f"image noise {100 * IMAGE_NOISE:g} % and contrast {100 * CONTRAST:g} % of full scale, edges "
+        f"blurred by {BLUR_PX:g} px, {PRACTICE:g} × the Cramér–Rao bound (--noise, --run)"
+    )

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.design import TargetDesign
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.geometry.camera import Camera
 from stcal.geometry.rigid import Rigid
 from stcal.labels import CircleLabel, DotLabel, Label
@@ -63,7 +63,7 @@ class _Stand:
 
     def __post_init__(self):
         for name, shape in (("centre", (3,)), ("axes", (3, 3)), ("directions", (None, 3))):
-            object.__setattr__(self, name, frozen(getattr(self, name), shape, name))
+            freeze(self, name, shape, name)
 
     @classmethod
     def of(cls, model: MetricModel) -> "_Stand":

@@ -71,46 +71,43 @@ def require_dots(board: BoardDesign | None, option: str) -> None:
         )
 
 
-def labelled_images(
-    files: ImageFiles,
-    camera: CameraModel,
-    folder: RunFolder,
-    target: TargetDesign,
-    board: BoardDesign | None,
-    options: RunOptions,
-    progress: Progress,
-) -> tuple[DetectionResult, list[LabelledImage]]:
-    """Detects and labels the images, and writes ``detections.csv`` into a claimed folder."""
-    detection, labelled = detected_images(files, camera, folder, target, board, options, progress)
-    save(folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """The subject of all stages of a run.
+
+    ``files`` : the photographs; ``folder`` : the claimed folder; ``board`` : without rows where there is none.
+    """
+
+    files: ImageFiles
+    folder: RunFolder
+    target: TargetDesign
+    board: BoardDesign
+    options: RunOptions
+    progress: Progress
+
+
+def labelled_images(task: Task, camera: CameraModel) -> tuple[DetectionResult, list[LabelledImage]]:
+    """Detects and labels the images, and writes ``detections.csv`` into the folder."""
+    detection, labelled = detected_images(task, camera)
+    save(task.folder.stage / "detections.csv", detections_csv([image.observations for image in labelled]))
     return detection, labelled
 
 
-def detected_images(
-    files: ImageFiles,
-    camera: CameraModel,
-    folder: RunFolder,
-    target: TargetDesign,
-    board: BoardDesign | None,
-    options: RunOptions,
-    progress: Progress,
-) -> tuple[DetectionResult, list[LabelledImage]]:
+def detected_images(task: Task, camera: CameraModel) -> tuple[DetectionResult, list[LabelledImage]]:
     """Detects and labels the images by the rules that the options ask for."""
-    chosen, skipped = files
-    step = counted(progress, "detect", len(chosen))
-    dots = board if board is not None and board.rows else None
+    (chosen, skipped), target, options, cache = task.files, task.target, task.options, task.folder.cache
+    step = counted(task.progress, "detect", len(chosen))
+    dots = task.board if task.board.rows else None
     published = options.solve == "paper"
     if published:
         require_dots(dots, "--solve paper")
         PublishedPattern.of(target)
     detector = detect_published if published else None
-    detection = detect_files(
-        chosen, camera, target, dots, options.ellipses, folder.cache, options.workers, step, detector
-    )
+    detection = detect_files(chosen, camera, target, dots, options.ellipses, cache, options.workers, step, detector)
     detection = replace(detection, skipped=(*skipped, *detection.skipped))
     require_upright(detection.images)
     if dots is not None and (options.board_only or is_board_alone(detection)):
         return detection, label_boards(detection, target, dots)
     if published:
         return detection, label_once(detection, target, dots)
-    return detection, label_images(detection, target, dots, options.ellipses, folder.cache, options.workers)
+    return detection, label_images(detection, target, dots, options.ellipses, cache, options.workers)

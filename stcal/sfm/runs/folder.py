@@ -33,7 +33,7 @@ from stcal.io.files import (
 )
 from stcal.io.json import checked, read_json
 from stcal.parallel import Progress
-from stcal.report.page import pdf_of, require_pdf
+from stcal.report.document import pdf_of, require_pdf
 from stcal.sfm.adjust.file import FacesFile, require_faces_written
 from stcal.sfm.data.model import GroupModel, ImageObservations
 from stcal.sfm.detect.files import DetectedImage, DetectionResult

@@ -16,8 +16,17 @@ from stcal.handeye.data.rig import RigCamera, RigFiles, RigPoses, read_rig_file
 from stcal.handeye.data.robot_poses import RobotPoses, read_robot_poses
 from stcal.handeye.data.stream import TOLERANCE_S
 from stcal.handeye.report.outcome import Outcome, RigOutcome
-from stcal.handeye.rig.solve import Rig, RigOptions, alone_or_none, handeye_rig, of_places, same_numbering
-from stcal.handeye.rig.validate import RigHeldOut, cross_validate_rig, widened_by_scatter
+from stcal.handeye.rig import (
+    Rig,
+    RigHeldOut,
+    RigOptions,
+    alone_or_none,
+    cross_validate_rig,
+    handeye_rig,
+    of_places,
+    same_numbering,
+    widened_by_scatter,
+)
 from stcal.handeye.validate import LEAST_LEFT, splits
 from stcal.io.cameras.read import read_camera
 from stcal.parallel import Progress, one_thread

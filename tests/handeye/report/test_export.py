@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
 from stcal.handeye import HandEye
-from stcal.handeye.report.export import FORMS, ROS_FORMS, exported, opencv_yaml, ros_yaml, tree, urdf_joint
-from stcal.handeye.report.export.files import read_urdf
+from stcal.handeye.report.export import FORMS, ROS_FORMS, exported, opencv_yaml, read_urdf, ros_yaml, tree, urdf_joint
 from stcal.io.poses.columns import program_name
 from stcal.io.poses.static import read_messages
 from tests.outcome import fails_with

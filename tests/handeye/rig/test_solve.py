@@ -12,8 +12,7 @@ from stcal.handeye import Noise, RigCamera, RigOptions, RigPoses, View, Views, h
 from stcal.handeye.data.pairs import Loop
 from stcal.handeye.methods.bundle import RigBundle, RigCorners
 from stcal.handeye.methods.reprojection import board_of, problem
-from stcal.handeye.rig.solve import alone, of_places
-from stcal.handeye.rig.validate import ERRORS, CameraHeldOut
+from stcal.handeye.rig import ERRORS, CameraHeldOut, alone, of_places
 from stcal.io.cameras.model import camera_prior
 from tests.handeye.derivatives import assert_derivatives
 from tests.outcome import fails_with

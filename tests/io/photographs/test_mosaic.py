@@ -8,7 +8,7 @@ import pytest
 
 from stcal.errors import InputNote
 from stcal.io.images import decode, find_images, image_file, mosaic_of
-from stcal.io.photographs.mosaic import PATTERNS, patterns_seen
+from stcal.io.photographs.decoding import PATTERNS, patterns_seen
 from tests.outcome import fails_with
 
 Y, X = np.mgrid[:240, :320]

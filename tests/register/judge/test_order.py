@@ -7,7 +7,7 @@ from stcal.geometry.rigid import Rigid
 from stcal.register import register
 from stcal.register.core.models import MODELS
 from stcal.register.core.pairs import PointNoise, Problem
-from stcal.register.judge.order import moved_meanwhile
+from stcal.register.judge.mistakes import moved_meanwhile
 from tests.outcome import fails_with
 
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])

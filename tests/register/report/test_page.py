@@ -10,13 +10,12 @@ import pytest
 from stcal.geometry.rigid import Rigid, Similarity
 from stcal.io.files import json_text
 from stcal.parallel import _limited
-from stcal.register import register
+from stcal.register import register, workspace
 from stcal.register.report import page
 from stcal.register.report.drawings import MOST_LABELS, space_figure
 from stcal.register.report.file import GRID, RegistrationFile
 from stcal.register.report.page import FEW_ROWS, registration_report
-from stcal.register.workspace import findings as workspace
-from stcal.register.workspace.findings import findings
+from stcal.register.workspace import findings
 from stcal.report.document import Section
 
 B_FROM_A = Rigid.exp([0.3, -0.4, 1.1, 2500.0, -300.0, 800.0])

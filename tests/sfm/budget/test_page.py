@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from stcal.report import page as pdf
+from stcal.report import document as pdf
 from stcal.report.text import significant
 from tests.outcome import INPUT, assert_error
 

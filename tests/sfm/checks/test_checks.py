@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.adjust import joint
 from stcal.sfm.adjust.calibration import calibrate
@@ -25,6 +24,7 @@ from stcal.sfm.runs.options import RunOptions
 from stcal.synthetic.observe import image_circles
 from stcal.synthetic.render import RenderOptions, render
 from stcal.synthetic.scene import SceneOptions, make_scene
+from tests.support.circle_images import circle_conic, ellipse_of_conic
 
 NOISE_PX = 0.005
 JOINT = {"agreement", "halves", "groups", "loops"}

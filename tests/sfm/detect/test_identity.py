@@ -6,13 +6,13 @@ from scipy.spatial.transform import Rotation
 
 from stcal.design import BoardDesign, FaceDesign, TargetDesign, reference_board, reference_target
 from stcal.geometry.camera import Camera
-from stcal.geometry.conic import circle_conic, ellipse_of_conic
 from stcal.geometry.rigid import Rigid
 from stcal.sfm.data.model import Centres
 from stcal.sfm.detect.board import find_boards
 from stcal.sfm.detect.circles.candidates import Candidates, Ellipses
 from stcal.sfm.detect.faces import FaceFinder
 from stcal.sfm.detect.sightings import BoardSighting, ImageDetection, confusable, is_named, mirror_images
+from tests.support.circle_images import circle_conic, ellipse_of_conic
 
 CAMERA = Camera(2592, 1728, [2785.0, 2785.0], [1295.5, 863.5], np.zeros(8))
 TARGET = reference_target()

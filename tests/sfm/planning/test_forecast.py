@@ -41,7 +41,7 @@ from stcal.sfm.planning.session import plan_with_board as make_plan
 from stcal.sfm.planning.views import PlannedView, candidates, known_scene
 from stcal.sfm.runs.saved import load_run
 from stcal.synthetic.designs import tag_cube
-from stcal.synthetic.scene import Scene, SceneOptions, make_scene, nominal_target_from_face, second_design
+from stcal.synthetic.scene import Scene, SceneOptions, make_scene, second_design
 from tests.outcome import fails_with
 from tests.shared import own_copy
 
@@ -58,7 +58,9 @@ SMALL = SceneOptions(
 @pytest.fixture(scope="module")
 def exact() -> Scene:
     """Faces 1, 2 and 4 in two groups of three images; the board as designed."""
-    return make_scene(SMALL, reference_target(), replace(reference_board(), sigma_mm=0.0), nominal_target_from_face())
+    return make_scene(
+        SMALL, reference_target(), replace(reference_board(), sigma_mm=0.0), reference_target().rough_poses()
+    )
 
 
 def setup_of(scene: Scene, board_sigma_mm: float = 0.02, common: float = 0.0) -> Setup:
@@ -310,7 +312,7 @@ def test_a_new_group_is_advised_for_faces_not_seen_together(coarse):
     """Faces 2 and 5 meet in no group; the forecast of a third group is what a scene with that group has."""
     pairs = (("1", "2"), ("1", "5"), ("2", "5"))
     board = replace(reference_board(), sigma_mm=0.0)
-    three = make_scene(replace(SMALL, groups=pairs), reference_target(), board, nominal_target_from_face())
+    three = make_scene(replace(SMALL, groups=pairs), reference_target(), board, reference_target().rough_poses())
     two = replace(three, groups={name: three.groups[name] for name in ("12", "15")})
     advice = advise(known_from(two), 3)
     (group,) = advice.new_groups
@@ -469,7 +471,7 @@ def test_plan_command(stcal_sfm, tmp_path):
 def plan(images=2, noise=NOISE, groups=(("1", "2"), ("2", "3"))):
     """Of faces 1, 2 and 3, the last two groups away from the first."""
     options = PlanOptions(width=2592, images=images, groups=groups, noise=noise)
-    return make_plan(options, reference_target(), reference_board(), nominal_target_from_face())
+    return make_plan(options, reference_target(), reference_board(), reference_target().rough_poses())
 
 
 @pytest.mark.slow
@@ -605,7 +607,7 @@ def test_a_fine_board_is_planned():
     coarse = replace(fine, rows=10, columns=10, pitch_mm=20.0)
     options = PlanOptions(images=4, width=2592, groups=(("1", "2"), ("1", "4")))
     sigma = [
-        make_plan(options, reference_target(), board, nominal_target_from_face()).forecast.worst()[1]
+        make_plan(options, reference_target(), board, reference_target().rough_poses()).forecast.worst()[1]
         for board in (fine, coarse)
     ]
     assert sigma[0] < sigma[1] < 5 * sigma[0]
@@ -619,4 +621,4 @@ def test_a_board_of_too_many_dots_is_refused_at_once(rows, images, said):
     board = replace(reference_board(), rows=rows, columns=rows if rows > 100 else 100, pitch_mm=4.0, radius_mm=1.2)
     board = replace(board, corner=None, corner_radius_mm=None)
     with fails_with(said):
-        make_plan(PlanOptions(images=images), reference_target(), board, nominal_target_from_face())
+        make_plan(PlanOptions(images=images), reference_target(), board, reference_target().rough_poses())

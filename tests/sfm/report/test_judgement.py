@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from stcal.report.document import tone_of
-from stcal.report.page import environment
+from stcal.report.document import environment, tone_of
 from stcal.sfm import checks
 from stcal.sfm.checks.verdict import FAILED, SUSPICIOUS
 from stcal.sfm.report.judgement import (

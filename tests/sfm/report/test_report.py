@@ -12,8 +12,8 @@ import pytest
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
+from stcal.report.document import environment
 from stcal.report.figure import round_below
-from stcal.report.page import environment
 from stcal.report.text import number
 from stcal.sfm.report import figures
 from stcal.sfm.report.figures import FIRST_IMAGES, shown_overlays, upright

@@ -9,7 +9,7 @@ import shutil
 import pytest
 
 from stcal.io.files import RUN_MARKER
-from stcal.report.page import with_code
+from stcal.report.document import with_code
 from stcal.sfm.report.judgement import Judgement
 from stcal.sfm.runs import folder
 from stcal.sfm.runs.text import run_text

@@ -16,7 +16,7 @@ from stcal.sfm.adjust.uncertainty import calibrated_target
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.mapping.incremental import left_out
 from stcal.sfm.report.compare import compare
-from stcal.sfm.runs.detection import labelled_images
+from stcal.sfm.runs.detection import Task, labelled_images
 from stcal.sfm.runs.transaction import RunFolder
 from stcal.synthetic.scene import SceneOptions, make_scene
 
@@ -66,7 +66,7 @@ def test_kept_results_are_not_taken_for_other_options(small_set, tmp_path):
     coarse = RunOptions(workers=1, solve="chain", ellipses=EllipseOptions(min_diameter_px=9.0)).settled(target)
     own, camera = RunFolder(small.out, small.out / "unfinished", small.out / "cache"), folder / "cameras.txt"
     files = find_images(folder / "images")
-    detection, _ = labelled_images(files, read_camera(camera), own, target, board, coarse, lambda *_: None)
+    detection, _ = labelled_images(Task(files, own, target, board, coarse, lambda *_: None), read_camera(camera))
     assert not any(image.reused for image in detection.images)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from stcal.errors import InputError
 from stcal.handeye.data.formats.record import Content, Frames, Side, require_each_once
 from stcal.io.files import MODEL_BYTES, read_bytes
-from stcal.io.poses.colmap_images import image_lines
+from stcal.io.poses.colmap_images import floats_of, image_lines
 from stcal.io.poses.rotations import of_quaternions, require_finite
 
 TEXT, BINARY = "images.txt", "images.bin"
@@ -27,9 +27,9 @@ def model_file(folder: Path) -> Path | None:
 def is_text(text: str) -> bool:
     """True if these are the lines of images.txt."""
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
-    if not _IMAGE.fullmatch(first.strip()) or _floats(first.split()) is not None:
+    if not _IMAGE.fullmatch(first.strip()) or floats_of(first.split()) is not None:
         return False
-    return _floats(first.split()[1:8]) is not None
+    return floats_of(first.split()[1:8]) is not None
 
 
 def read_text(text: str, where: str) -> Content:
@@ -84,10 +84,3 @@ def _content(rows: list, names: list[str], places: list[str], where: str) -> Con
     turned = "quaternions w, x, y, z"
     side = Side(rotation, values[:, 4:], tuple(places), turned, None, frames, tuple(names), scaled=True)
     return Content(FORM, (side,))
-
-
-def _floats(cells: list[str]) -> list[float] | None:
-    try:
-        return [float(cell) for cell in cells]
-    except ValueError:
-        return None

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.keys import frames_of, role_of
 from stcal.handeye.data.formats.record import (
     EVERY_FRAME,
     FRAMES,
@@ -21,8 +20,10 @@ from stcal.handeye.data.formats.record import (
     Said,
     Side,
     Unit,
+    frames_of,
     of_matrices,
     require_each_once,
+    role_of,
 )
 from stcal.handeye.data.formats.single import ROS
 from stcal.io.poses.columns import find_column, places_of, read_rotations

@@ -1,5 +1,6 @@
 """The content of a file of poses, and what the user states where the file does not."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.geometry.arrays import frozen
+from stcal.geometry.arrays import freeze
 from stcal.io.poses.rotations import proper, require_finite
 from stcal.io.table import LENGTHS
 
@@ -77,8 +78,8 @@ class Side:
 
     def __post_init__(self):
         m = len(self.places)
-        object.__setattr__(self, "rotation", frozen(self.rotation, (m, 3, 3), "rotations"))
-        object.__setattr__(self, "translation", frozen(self.translation, (m, 3), "translations"))
+        freeze(self, "rotation", (m, 3, 3), "rotations")
+        freeze(self, "translation", (m, 3), "translations")
 
     def __len__(self) -> int:
         return len(self.places)
@@ -212,3 +213,65 @@ def require_each_once(names: Sequence[str], places: Sequence[str], where: str, k
                 "E-POSE-REPEATED", f"{where}: {first[name]} and {place}: both are of {kind}{name!r}; one row needed"
             )
         first[name] = place
+
+
+_WORDS = {
+    "base": "base|robot_?base|robotbase|world",
+    "flange": "flange|gripper|hand|ee|eef|effector|end_?effector|endeffector|tool0?|tcp",
+    "camera": "camera|cam|sensor|optical",
+    "board": "board|target|marker|tag|object|pattern|checkerboard|chessboard|charuco|aruco",
+}
+"""Words that name each frame."""
+_ANY = "|".join(f"(?P<{{0}}_{frame}>{words})" for frame, words in _WORDS.items())
+_LEFT, _RIGHT = _ANY.replace("{0}", "a"), _ANY.replace("{0}", "b")
+_FORMS = (
+    (re.compile(rf"(?:{_LEFT})_from_(?:{_RIGHT})"), "ab", True),
+    (re.compile(rf"(?:{_LEFT})2(?:{_RIGHT})"), "ba", True),
+    (re.compile(rf"(?:{_LEFT})_(?:wrt|in)_(?:{_RIGHT})"), "ba", True),
+    (re.compile(rf"(?:{_LEFT})_?t_?(?:{_RIGHT})"), "ab", False),
+    (re.compile(rf"t_(?:{_LEFT})_(?:{_RIGHT})"), "ab", False),
+)
+"""Forms of names of transforms; which of the two frames is the first of ``a_from_b``; and whether no other reading is
+possible."""
+_PART = re.compile(r"(?:rot|trans|rotation|translation|rvecs?|tvecs?|[rth])_(?=[a-z_]+2)")
+"""Prefix for rotation, translation or the whole matrix, before a name like OpenCV's gripper2base."""
+ROLES_BY_NAME: dict[Role, re.Pattern] = {
+    "robot": re.compile(r"(robot|arm|hand|gripper|flange|eef?|end_?effector|tcp)(_?(pose|transform|matri(x|ce))s?)?"),
+    "camera": re.compile(
+        r"(tracking|optical|camera|cam|board|target|marker|tag|object|pattern)(_?(pose|transform|matri(x|ce))s?)?"
+    ),
+}
+"""Names that tell whether poses are the robot's or the camera's, but not in which direction."""
+
+
+def frames_of(key: str) -> Frames | None:
+    """Returns the transform that a name means; None where it means none."""
+    name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
+    if name in EVERY_FRAME:
+        return Frames(name, f"by its name {key}")
+    bare = _PART.sub("", name, count=1) if _PART.match(name) else name
+    for form, order, only in _FORMS:
+        match = form.fullmatch(bare)
+        if match:
+            sides = {part[0]: part[2:] for part, text in match.groupdict().items() if text is not None}
+            frames = f"{sides[order[0]]}_from_{sides[order[1]]}"
+            if frames in EVERY_FRAME:
+                return Frames(frames, f"by its name {key}", only)
+    return None
+
+
+def inverse_name(key: str) -> str:
+    """Returns a name with its two frames changed about, like ``t_cam2target`` of ``t_target2cam``; empty where the name
+    is of another form."""
+    for between in ("_from_", "_wrt_", "_in_", "2"):
+        head, separator, tail = key.partition(between)
+        if separator:
+            prefix = next(iter(re.findall(r"^(?:rot|trans|rotation|translation|rvecs?|tvecs?|[rthRTH])_", head)), "")
+            return f"{prefix}{tail}{separator}{head.removeprefix(prefix)}"
+    return ""
+
+
+def role_of(key: str) -> Role | None:
+    """Returns the side whose poses a name means, where the name has no direction."""
+    name = re.sub(r"[\s.\-/]+", "_", str(key).strip()).lower()
+    return next((role for role, form in ROLES_BY_NAME.items() if form.fullmatch(name)), None)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from stcal.errors import InputError
-from stcal.handeye.data.formats.keys import frames_of, role_of
 from stcal.handeye.data.formats.record import (
     FRAMES,
     MATRICES,
@@ -19,8 +18,10 @@ from stcal.handeye.data.formats.record import (
     Role,
     Said,
     Side,
+    frames_of,
     of_matrices,
     require_each_once,
+    role_of,
 )
 from stcal.handeye.data.formats.single import ROS, One, name_in, numbers, one
 from stcal.io.poses.rotations import ROTATION_VECTOR, Convention, proper, require_finite, rotations, turned_values

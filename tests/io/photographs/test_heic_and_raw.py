@@ -9,7 +9,7 @@ from PIL import Image
 
 from stcal.io.cameras.photograph import camera_of_photograph
 from stcal.io.images import decode, find_images
-from stcal.io.photographs import extras
+from stcal.io.photographs import decoding
 from tests.outcome import fails_with
 
 HEIGHT, WIDTH = 96, 128
@@ -61,7 +61,7 @@ def test_the_turn_of_the_container_is_undone():
     upright = decode(heic(), "a.heic")
     for orientation in (6, 8, 3):
         data = heic(exif=exif(orientation))
-        if not extras.heic_turns(data):
+        if not decoding.heic_turns(data):
             pytest.skip("this package writes no turn into the container")
         np.testing.assert_allclose(decode(data, "a.heic").astype(int), upright, atol=8)
 
@@ -80,7 +80,7 @@ def test_the_camera_of_a_heic_photograph(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".heic", ".dng"])
 def test_a_missing_package_is_named(monkeypatch, suffix):
-    monkeypatch.setattr(extras, "find_spec", lambda _: None)
+    monkeypatch.setattr(decoding, "find_spec", lambda _: None)
     data = b"\0\0\0\x18ftypheic" + bytes(40) if suffix == ".heic" else dng(SCENE)
     with fails_with("E-IMAGE-EXTRA … pip install 'stereo-target-calibration["):
         decode(data, f"a{suffix}")

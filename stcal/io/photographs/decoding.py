@@ -1,6 +1,8 @@
-"""HEIC and raw photographs, which optional packages decode: extras ``heic`` and ``raw``."""
+"""What decoders leave out: whether a photograph's file is whole, mosaics of Bayer filters, HEIC and raw files."""
 
+import re
 import struct
+import zlib
 from importlib.util import find_spec
 from io import BytesIO
 from types import ModuleType
@@ -9,6 +11,104 @@ import cv2
 import numpy as np
 
 from stcal.errors import InputError
+
+_JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
+"""A JPEG marker other than a restart marker, which occurs inside a scan."""
+
+
+def is_png(data: bytes) -> bool:
+    """Return True if the file begins as a PNG."""
+    return data[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def png_intact(data: bytes) -> bool:
+    """Return True if the checksums of all chunks are right."""
+    at = 8
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at = end + 4
+    return False
+
+
+def ends_properly(data: bytes) -> bool:
+    """Return True if a JPEG, PNG or BMP is complete: decoders silently fill in missing data."""
+    if data[:2] == b"\xff\xd8":
+        return _jpeg_ends(data)
+    if is_png(data):
+        return data.rfind(b"IEND") > 0
+    if data[:2] == b"BM" and len(data) >= 6:
+        return len(data) >= int.from_bytes(data[2:6], "little")
+    return True
+
+
+def _jpeg_ends(data: bytes) -> bool:
+    """Return True if the end marker of the main image exists; an embedded thumbnail or appended video has its own."""
+    at = 2
+    while marker := _JPEG_MARKER.search(data, at):
+        kind, at = data[marker.end() - 1], marker.end()
+        if kind == 0xD9:
+            return True
+        if kind not in (0x01, 0xD8):
+            at += max(int.from_bytes(data[at : at + 2], "big"), 2)
+    return False
+
+
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+"""Colours of the first two rows and columns."""
+LEAST_COLOUR = 0.05
+"""Smallest relative difference between neighbours of two colours that tells a mosaic."""
+GREEN_ALIKE = 0.3
+"""Largest difference between both greens, as a share of that between green and the other colours."""
+TRIED_PX = 1024
+"""Side of the middle of the image that is judged, px."""
+
+
+def demosaiced(mosaic: np.ndarray, pattern: str, name: str) -> np.ndarray:
+    """Return the grey image of a mosaic; ``pattern`` : one of :data:`PATTERNS`.
+
+    Raises InputError: the pattern is unknown, or the image has colours already.
+    """
+    word = pattern.upper()
+    if word not in PATTERNS:
+        raise InputError("E-OPTION-VALUE", f"--bayer {pattern[:20]}: one of {', '.join(PATTERNS)} needed")
+    if mosaic.ndim != 2:
+        raise InputError("E-IMAGE-TYPE", f"{name}: a colour image, not a mosaic; leave --bayer out")
+    return cv2.cvtColor(mosaic, getattr(cv2, f"COLOR_Bayer{word}2GRAY"))
+
+
+def patterns_seen(image: np.ndarray) -> tuple[str, ...]:
+    """Return the patterns that a grey image may be a mosaic of: two, as red and blue look alike; none if it is none.
+
+    In a mosaic both greens, on one diagonal of each 2×2 pixels, are alike, and another colour differs from them all
+    over the image. Medians hide what the scene adds, as it favours no pixel of the four.
+    """
+    height, width = (min(side, TRIED_PX) // 2 * 2 for side in image.shape)
+    if not height or not width:
+        return ()
+    top, left = ((side - part) // 4 * 2 for side, part in zip(image.shape, (height, width), strict=True))
+    grey = image[top : top + height, left : left + width].astype(np.float32)
+    a, b, c, d = grey[::2, ::2], grey[::2, 1::2], grey[1::2, ::2], grey[1::2, 1::2]
+    total = a + b + c + d
+    bright = total >= max(float(np.median(total)), 1.0)
+    if not bright.any():
+        return ()
+
+    def apart(one: np.ndarray, two: np.ndarray) -> float:
+        return float(np.median((one - two)[bright] / total[bright])) * 4
+
+    for greens, others, patterns in (
+        ((b, c), (a, d), ("RGGB", "BGGR")),
+        ((a, d), (b, c), ("GRBG", "GBRG")),
+    ):
+        colour = max(min(abs(apart(other, green)) for green in greens) for other in others)
+        if colour > LEAST_COLOUR and abs(apart(*greens)) < GREEN_ALIKE * colour:
+            return patterns
+    return ()
+
 
 HEIC = (".heic", ".heif", ".hif")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")

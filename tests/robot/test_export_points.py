@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stcal.geometry.rigid import Rigid
 from stcal.io.table import POSE, pose_cells
-from stcal.robot.export import robot_program
-from stcal.robot.export.files import FORMS
+from stcal.robot.export import FORMS, robot_program
 from stcal.robot.kinematics.file import robot_toml
 from stcal.robot.kinematics.forward import forward
 from stcal.robot.kinematics.model import DHRow, Joint, Robot, mh80

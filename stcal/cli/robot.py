@@ -1,0 +1,561 @@
+"""Commands of robots."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from stcal.cli import options as shared
+from stcal.cli.declare import WRITES, Arg, Opt
+from stcal.cli.help import PLAIN, Commands
+from stcal.cli.terminal import StageProgress, print_each, say, write, write_if
+from stcal.errors import DegenerateError, InputError
+
+if TYPE_CHECKING:
+    from stcal.robot.kinematics.measurements import Measurements
+
+
+XML = (".urdf", ".xml")
+
+
+ConventionName = Literal["standard", "modified"]
+"""Convention of Denavit–Hartenberg rows."""
+
+
+def convert(
+    source: Annotated[
+        Path,
+        "Read the robot from this file: a robot file (TOML), URDF, or the calibration of an arm of Universal "
+        "Robots: YAML of ur_calibration, or calibration.conf.",
+        Arg("A"),
+    ],
+    out: Annotated[Path, "Write the other form to this file: .toml or .urdf.", Arg("B", writes=True)],
+    from_link: Annotated[str, "Begin at this link of a URDF; if not given, at its root."] = "",
+    to_link: Annotated[
+        list[str] | None,
+        "End at this link of a URDF; if not given, at the only possible one. Repeat it for the hands of several arms "
+        "on a trunk.",
+    ] = None,
+    convention: Annotated[ConventionName, "Write Denavit-Hartenberg rows in this convention."] = "standard",
+    nominal: Annotated[
+        Path | None, "Add the deviations of a calibration.conf to the rows of this robot file (TOML)."
+    ] = None,
+) -> None:
+    """Write a robot file as URDF, or a URDF or the calibration of a Universal Robots arm as a robot file."""
+    from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
+    from stcal.robot.urdf.read import load_urdf
+    from stcal.robot.urdf.universal import read_universal
+    from stcal.robot.urdf.write import coupled, require_urdf_written, robot_urdf
+
+    if out.suffix.lower() not in (*XML, ".toml"):
+        raise InputError("E-OUTPUT-SUFFIX", f"{out}: a name ending in .urdf or .toml needed")
+    made = None if source.suffix.lower() in (*XML, ".toml") else read_universal(source, nominal, convention)
+    if made is None and nominal is not None:
+        raise InputError("E-OPTION-NEEDS", "--nominal: only with a calibration.conf; leave it out")
+    if made is not None:
+        if from_link or to_link:
+            raise InputError("E-OPTION-NEEDS", "--from-link, --to-link: only for reading a URDF; leave them out")
+        robot = made.robot
+        say(f"robot {robot.name}: {len(robot.rows)} joints, of Universal Robots")
+        print_each(f"note: {source}", made.notes)
+        if out.suffix.lower() in XML:
+            write(out, robot_urdf(robot))
+            require_urdf_written(out, robot)
+        else:
+            write(out, robot_toml(robot, [f"From {source.name}, calibration of Universal Robots."]))
+            require_robot_written(out, robot)
+        return
+    if _is_xml(source) == (out.suffix.lower() in XML):
+        raise InputError(
+            "E-OPTION-FILES",
+            f"{source}, {out}: both are {'URDF' if _is_xml(source) else 'robot files'}; one of each needed",
+        )
+    if _is_xml(source):
+        urdf = load_urdf(source, from_link, to_link or "", convention)
+        joints = ", ".join(urdf.joints)
+        say(f"robot {urdf.robot.name}: {len(urdf.joints)} joints from {urdf.from_link} to {urdf.to_link}: {joints}")
+        print_each(f"note: {source}", urdf.notes)
+        write(out, robot_toml(urdf.robot, [f"From {source.name}, {urdf.from_link} to {urdf.to_link}: {joints}."]))
+        require_robot_written(out, urdf.robot)
+        return
+    if from_link or to_link or convention != "standard":
+        raise InputError(
+            "E-OPTION-NEEDS", "--from-link, --to-link, --convention: only for reading a URDF; leave them out"
+        )
+    robot = load_robot(source)
+    text = robot_urdf(robot)
+    ends = f"flange, and {len(robot.tools)} tools" if robot.tree is None else f"{len(robot.tools)} tools on branches"
+    say(f"robot {robot.name}: {len(robot.rows)} joints from base_link to {ends}")
+    if coupled(robot):
+        say("note: URDF has no coupling; its joint values are the coupling times the controller's, with wider limits")
+    write(out, text)
+    require_urdf_written(out, robot)
+
+
+def _is_xml(path: Path) -> bool:
+    if path.suffix.lower() in (*XML, ".toml"):
+        return path.suffix.lower() in XML
+    try:
+        with path.open("rb") as file:
+            return file.read(200).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+    except OSError as error:
+        raise InputError("E-FILE-UNREADABLE", f"{path}: {error.strerror or error}; check the path") from error
+
+
+def init(
+    file: Annotated[Path, "Write the robot file to this file.", Arg(writes=True)] = Path("robot.toml"),
+) -> None:
+    """Write an example of a robot file, to edit: a six-axis arm of 2 m reach."""
+    from stcal.robot.kinematics.file import require_robot_written, robot_toml
+    from stcal.robot.kinematics.model import mh80
+
+    comments = (
+        "One [[joint]] for each joint, from the base; of type revolute or prismatic (then min_mm and max_mm).",
+        "Optional: min_deg, max_deg, beta_deg, base, tool, [[target]] for more tools, and coupling, which makes",
+        "kinematic joint values of the controller's (Fanuc: its third row is [0, 1, 1, 0, 0, 0]).",
+    )
+    write(file, robot_toml(robot := mh80(), comments))
+    require_robot_written(file, robot)
+
+
+def axes(
+    robot_file: shared.RobotFile,
+    sweeps: Annotated[
+        Path | None, "Read joint values and positions of reflectors in sweeps from this file (CSV).", Arg()
+    ] = None,
+    out: Annotated[Path | None, "Write the robot with these axes to this file (TOML).", WRITES] = None,
+    still_deg: Annotated[
+        float, "Treat joints that change by less than this as not moving, degrees.", Opt(min=1e-9, max=1.0)
+    ] = 0.0015,
+    orientations: Annotated[
+        str,
+        "Use measured orientations too, weighted like reflectors at this distance from the target, mm; auto uses "
+        "them by their stated σ, if there are any, and off ignores them.",
+    ] = "auto",
+    rotation: shared.Rotation = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "image",
+    columns_a: shared.FirstColumns = None,
+    columns: shared.ColumnsFile = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
+) -> None:
+    """Find the axis of each joint from sweeps of that joint alone, and the robot with these axes (the axis method)."""
+    from stcal.robot.axes.model import robot_from_sweeps
+    from stcal.robot.axes.report import axes_file, axes_report
+    from stcal.robot.axes.sweeps import ring
+    from stcal.robot.kinematics.file import load_robot, require_robot_written, robot_toml
+    from stcal.robot.kinematics.measurements import read_measurements
+
+    nominal = load_robot(robot_file)
+    source = shared.one_table(sweeps, first, second, key, "SWEEPS", columns=columns, columns_a=columns_a)
+    data = read_measurements(source, nominal, rotation=rotation)
+    if len(set(data.stations)) > 1:
+        raise InputError(
+            "E-STATION-SINGLE",
+            f"{data.where}: stations {', '.join(data.by_station())}; sweeps are seen from one, so give one at a time",
+        )
+    length_mm = _length(orientations, data)
+    result = robot_from_sweeps(data, nominal, math.radians(still_deg), None if length_mm is None else ring(length_mm))
+    document = axes_report(result, data.where)
+    say(document.text())
+    if length_mm is not None:
+        say(f"orientations: used, as points {length_mm:.0f} mm from the target")
+    elif data.rotations is not None:
+        say("orientations: not used; state σ (cov_… columns), or give --orientations a length")
+    print_each(f"warning: {data.where}", result.notes)
+    write_if(out, lambda: robot_toml(result.robot, [f"Identified by the axis method from {shared.name_of(source)}."]))
+    if out:
+        require_robot_written(out, result.robot, result.chain)
+    write_if(json_file, lambda: axes_file(result))
+    write_if(report, document.page)
+
+
+def _length(text: str, data: "Measurements") -> float | None:
+    """Returns the distance of virtual reflectors, mm; None for positions alone."""
+    from stcal.robot.axes.sweeps import length_of
+
+    if text in ("auto", "off"):
+        return length_of(data) if text == "auto" else None
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError("E-OPTION-VALUE", f"--orientations {text}: a length in mm, auto or off needed") from error
+
+
+Kind = Literal["pose", "position", "distance"]
+"""Quantity that is used of the measurements."""
+
+
+Model = Literal["rigid", "elastic", "auto"]
+"""Model of the arm."""
+
+
+def identify(
+    robot_file: shared.RobotFile,
+    data_file: Annotated[
+        Path | None, "Read joint values, and the measurements at each, from this file (CSV).", Arg("DATA")
+    ] = None,
+    out: Annotated[Path | None, "Write the identified robot to this file (TOML).", WRITES] = None,
+    offsets: Annotated[
+        Path | None, "Write mastering offsets and differences of D-H values to this file (CSV).", WRITES
+    ] = None,
+    observe: Annotated[
+        Kind | None, "Use this part of the measurements; if not given, everything that was measured."
+    ] = None,
+    sigma_mm: Annotated[
+        float | None, "Set σ of a measured position, mm per axis; estimated if not given.", Opt(min=1e-9, max=1e4)
+    ] = None,
+    sigma_rad: Annotated[
+        float | None, "Set σ of a measured orientation, rad per axis; estimated if not given.", Opt(min=1e-12, max=4)
+    ] = None,
+    folds: Annotated[int, "Cross-validate with this many folds; 0 for none.", Opt(min=0, max=100_000)] = 6,
+    seed: Annotated[int, "Divide the rows into folds with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    robust: Annotated[
+        bool, "Give outliers less weight, or weight all rows equally.", Opt("--robust/--least-squares")
+    ] = True,
+    partial: Annotated[
+        bool, "Keep parameters that the data do not determine nominal, instead of refusing the data."
+    ] = False,
+    adjust: Annotated[
+        str,
+        "Adjust only base and tools (base,tool), also the zero positions of joints (zeros), or their geometry, or all.",
+        Opt(metavar="WHAT"),
+    ] = "all",
+    model: Annotated[
+        Model,
+        "Take the arm as rigid, or as elastic: links bend under gravity, gears have periodic errors. auto chooses by "
+        "held-out rows.",
+    ] = "rigid",
+    quaternions: shared.Quaternions = "wxyz",
+    rotation: shared.Rotation = None,
+    payload_kg: shared.PayloadKg = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "image",
+    columns_a: shared.FirstColumns = None,
+    columns: shared.ColumnsFile = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
+) -> None:
+    """Identify the kinematics from poses, positions or distances; estimate σ that are not given."""
+    from stcal.robot.identification.prior import adjusted
+    from stcal.robot.identification.report import identified_file, identified_report
+    from stcal.robot.identification.result import IdentifyOptions, require_identified_written
+    from stcal.robot.identification.solve import identify as identified_from
+    from stcal.robot.kinematics.file import load_robot, robot_toml
+    from stcal.robot.kinematics.measurements import read_measurements
+
+    nominal = load_robot(robot_file)
+    source = shared.one_table(
+        data_file, first, second, key, "DATA", quaternions=quaternions, columns=columns, columns_a=columns_a
+    )
+    data = read_measurements(source, nominal, quaternions, rotation, payload_kg)
+    options = IdentifyOptions(
+        observe, sigma_mm, sigma_rad, robust, folds, seed=seed, partial=partial, model=model, adjust=adjusted(adjust)
+    )
+    result = identified_from(nominal, data, options)
+    document = identified_report(result, nominal)
+    say(document.text())
+    if out:
+        write(
+            out,
+            robot_toml(result.robot, [f"Identified from {shared.name_of(source)}: {result.rank} parameters."]),
+        )
+        require_identified_written(out, result)
+    if offsets:
+        from stcal.robot.export import offsets_csv, require_offsets_written
+
+        write(offsets, offsets_csv(result, nominal))
+        require_offsets_written(offsets, result, nominal)
+    write_if(json_file, lambda: identified_file(result, nominal))
+    write_if(report, document.page)
+
+
+RefitParts = Literal["none", "base", "tool", "base-tool"]
+"""Transforms that are fitted again to the new measurements."""
+
+
+def evaluate(
+    robot_files: Annotated[
+        list[Path], "Read a robot from this file (TOML); repeat it for more robots.", Opt("--robot")
+    ],
+    data_file: Annotated[
+        Path | None, "Read joint values, and the measurements at each, from this file (CSV).", Arg("DATA")
+    ] = None,
+    refit: Annotated[
+        RefitParts, "Fit this to the data, keeping each robot's own axes; everything else comes from its file."
+    ] = "base-tool",
+    out: Annotated[Path | None, "Write the residuals of each row to this file (CSV).", WRITES] = None,
+    quaternions: shared.Quaternions = "wxyz",
+    payload_kg: shared.PayloadKg = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "image",
+    columns: shared.ColumnsFile = None,
+    columns_a: shared.FirstColumns = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
+) -> None:
+    """Compare robot files on new measurements, and tell what their residuals depend on."""
+    from stcal.robot.kinematics.file import load_robot
+    from stcal.robot.kinematics.measurements import read_measurements
+    from stcal.robot.use import report as shown
+    from stcal.robot.use.evaluation import evaluate as evaluated
+
+    robots = dict(zip(shown.names_of(robot_files), map(load_robot, robot_files), strict=True))
+    source = shared.one_table(
+        data_file, first, second, key, "DATA", quaternions=quaternions, columns=columns, columns_a=columns_a
+    )
+    data = [  # within reach of each
+        read_measurements(source, robot, quaternions, payload_kg=payload_kg) for robot in robots.values()
+    ]
+    result = evaluated(robots, data[0], refit)
+    document = shown.evaluation_report(result)
+    say(document.text())
+    print_each("note", data[0].notes)
+    write_if(out, lambda: shown.evaluated_csv(result))
+    if out:
+        shown.require_evaluated_written(out, result)
+    write_if(json_file, lambda: shown.evaluation_file(result))
+    write_if(report, document.page)
+
+
+def verify(
+    measured: Annotated[
+        Path | None, "Read commanded_x_mm …, measured x_mm … and set (before or after) from this file (CSV).", Arg()
+    ] = None,
+    plot: Annotated[Path | None, "Draw the error of each pose and set to this file (.png or .svg).", WRITES] = None,
+    first: shared.FirstTable = None,
+    seconds: Annotated[
+        list[Path] | None,
+        "Read the measurements from this file (CSV); several files are sets, named after the files.",
+        Opt("--b", metavar="<path>"),
+    ] = None,
+    key: shared.Key = "pose",
+    columns_a: shared.FirstColumns = None,
+    columns: shared.ColumnsFile = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
+) -> None:
+    """Compare distances of positions from the first one, measured and commanded, before and after compensation."""
+    from stcal.io.join import stack_tables
+    from stcal.robot.use import verification
+    from stcal.robot.use.report import verification_report
+
+    if plot and plot.suffix.lower() not in (".png", ".svg"):
+        raise InputError("E-OUTPUT-SUFFIX", f"--plot {plot}: a name ending in .png or .svg needed")
+    tables = shared.several_tables(
+        measured, first, seconds or [], key, "MEASURED", ("commanded_", ""), columns=columns, columns_a=columns_a
+    )
+    if isinstance(tables, list):
+        tables = stack_tables(tables, [path.stem for path in seconds or ()], {"pose": key})
+    result = verification.verify(verification.read_measured(tables))
+    document = verification_report(result)
+    say(document.text())
+    print_each("note", result.notes)
+    print_each("warning", result.warnings())
+    if plot:
+        from stcal.robot.use.report import figure_bytes, verification_figure
+
+        write(plot, figure_bytes(verification_figure(result), plot.suffix.lower()[1:]))
+    write_if(json_file, lambda: verification.verification_file(result))
+    write_if(report, document.page)
+
+
+ExportAs = Literal["joints", "poses"]
+"""Content of the files for controllers."""
+
+
+def compensate(
+    robot_file: Annotated[Path, "Read the identified robot from this file (TOML).", Opt("--robot")],
+    targets: Annotated[Path | None, "Read commanded poses or joint values from this file (CSV).", Arg()] = None,
+    nominal: Annotated[Path | None, "Read the controller's model of the robot from this file (TOML)."] = None,
+    out: Annotated[
+        Path | None, "Write the joint values to send, with status and errors, to this file (CSV).", WRITES
+    ] = None,
+    export: Annotated[
+        list[str] | None,
+        "Write the reachable points to this file; repeat it for more files. Forms: yaskawa (JBI), fanuc (LS), kuka "
+        "(dat), abb (mod), ur (script).",
+        Opt(metavar="FORM=FILE"),
+    ] = None,
+    export_as: Annotated[
+        ExportAs, "Write joint values, or the poses of the nominal robot at these joint values, to command instead."
+    ] = "joints",
+    pulses_per_deg: Annotated[
+        str | None,
+        "Write joint values for yaskawa with these pulses per degree of each joint, separated by commas; poses if "
+        "not given.",
+    ] = None,
+    quaternions: shared.Quaternions = "wxyz",
+    rotation: shared.Rotation = None,
+    payload_kg: shared.PayloadKg = None,
+    first: shared.FirstTable = None,
+    second: shared.SecondTable = None,
+    key: shared.Key = "pose",
+    columns: shared.ColumnsFile = None,
+    columns_a: shared.FirstColumns = None,
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
+) -> None:
+    """Compute the joint values with which the real robot reaches the commanded poses."""
+    from stcal.io.files import require_same
+    from stcal.robot.export import require_form, robot_program
+    from stcal.robot.kinematics.file import load_robot
+    from stcal.robot.use import compensation
+    from stcal.robot.use.report import compensation_report
+    from stcal.robot.use.targets import read_targets
+
+    exports, pulses = shared.exports_of(export or [], require_form), _pulses(pulses_per_deg)
+    identified = load_robot(robot_file)
+    source = shared.one_table(
+        targets, first, second, key, "TARGETS", quaternions=quaternions, columns=columns, columns_a=columns_a
+    )
+    wanted = read_targets(source, identified, quaternions, rotation, payload_kg)
+    result = compensation.compensate(identified, wanted, load_robot(nominal) if nominal else None)
+    document = compensation_report(result, identified)
+    say(document.text())
+    print_each(f"note: {wanted.where}", wanted.notes)
+    print_each(f"warning: {wanted.where}", result.notes())
+    write_if(out, lambda: compensation.compensated_csv(result, identified))
+    if out:
+        compensation.require_compensated_written(out, result, identified)
+    write_if(json_file, lambda: compensation.compensation_file(result, identified))
+    write_if(report, document.page)
+    for form, path in exports if result.found.usable.any() else ():
+        exported_file = robot_program(result, identified, form, path, export_as, pulses)
+        write(path, exported_file.text)
+        require_same(path, path.read_bytes, exported_file.text.encode())  # which gave the points back
+        print_each("note", exported_file.notes)
+    if not result.found.usable.any():
+        raise DegenerateError(
+            "E-ROBOT-UNREACHED", f"{wanted.where}: none of {len(result)} poses is reached; see the warnings above"
+        )
+
+
+def _pulses(text: str | None) -> list[float] | None:
+    try:
+        return None if text is None else [float(cell) for cell in text.split(",")]
+    except ValueError as error:
+        raise InputError(
+            "E-OPTION-VALUE", f"--pulses-per-deg {text}: numbers with commas between needed, one for each joint"
+        ) from error
+
+
+ObservedKind = Literal["pose", "position"]
+"""Quantity that the instrument measures."""
+
+
+def design(
+    robot_file: shared.RobotFile,
+    count: Annotated[int, "Choose this many poses.", Opt(min=1, max=2000)] = 40,
+    seed: Annotated[int, "Draw the candidates with this seed.", Opt(min=0, max=shared.MOST_SEED)] = 0,
+    out: Annotated[Path | None, "Write the poses to this file (CSV).", WRITES] = None,
+    observe: Annotated[ObservedKind, "Plan for an instrument that measures this."] = "position",
+    candidates: Annotated[int, "Choose from this many random poses.", Opt(min=2, max=100_000)] = 1000,
+    sigma_mm: Annotated[float, "Assume this σ of measured positions, mm per axis."] = 0.05,
+    sigma_rad: Annotated[float, "Assume this σ of measured orientations, rad per axis."] = 2e-4,
+    box: Annotated[str | None, "Keep the tool inside this box, mm in the base: xmin,ymin,zmin,xmax,ymax,zmax."] = None,
+    target: Annotated[str, "Measure the target (tool) of this name."] = "",
+    json_file: shared.JsonFile = None,
+    report: shared.ReportFile = None,
+) -> None:
+    """Choose the measurement poses that determine the robot's parameters best."""
+    from stcal.robot.kinematics.file import load_robot
+    from stcal.robot.use import design as pose_design
+    from stcal.robot.use.report import design_report
+
+    options = pose_design.DesignOptions(
+        count, seed, observe, candidates, sigma_mm, sigma_rad, _box(box) if box else None, target
+    )
+    robot = load_robot(robot_file)
+    result = pose_design.design(robot, options)
+    document = design_report(result, robot)
+    say(document.text())
+    also = f" and {sigma_rad:g} rad" if observe == "pose" else ""
+    say(f"for an instrument whose {observe}s have σ {sigma_mm:g} mm{also} per axis (--sigma-mm, --sigma-rad)")
+    write_if(out, lambda: pose_design.design_csv(result, robot))
+    if out:
+        pose_design.require_design_written(out, result, robot, target)
+    write_if(json_file, lambda: pose_design.design_file(result))
+    write_if(report, document.page)
+
+
+def _box(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(cell) for cell in text.split(","))
+    except ValueError as error:
+        raise InputError("E-OPTION-VALUE", f"--box {text}: six numbers with commas between needed, in mm") from error
+
+
+def from_photos(
+    images: Annotated[Path, "Read the photographs of this folder and of its subfolders.", Arg("VIEWS")],
+    camera: shared.CameraFile,
+    faces: Annotated[Path, "Read the calibrated target from this faces.json."],
+    joints: Annotated[Path, "Read the joint values of each photograph from this file, matched by --key (CSV)."],
+    robot_file: shared.RobotFile,
+    out: Annotated[
+        Path,
+        "Write all results to this new folder. For more options, use its poses.csv, which has the joint values, in "
+        "robot axes and identify, and its identified.toml in robot compensate.",
+    ],
+    targets: Annotated[
+        Path | None, "Compute joint values for the poses in this file, or for the poses at its joint values (CSV)."
+    ] = None,
+    target: shared.TargetFile = None,
+    board: Annotated[Path | None, "Identify the dots of the board in this board.toml, if the board is in view."] = None,
+    model: Annotated[Model, "Take the arm as rigid, or as elastic; auto chooses by held-out rows."] = "rigid",
+    partial: Annotated[bool, "Keep parameters that the photographs do not determine nominal."] = False,
+    key: Annotated[str, "Match photographs and joint values by this column."] = "image",
+    columns: Annotated[Path | None, "Read --joints with the columns, delimiter … of this file (TOML)."] = None,
+    workers: shared.Workers = None,
+) -> None:
+    """Measure the target on an arm in photographs, find axes and kinematics, and compensate poses, in one folder."""
+    shared.load_ahead(workers)
+    from stcal.io.cameras.read import read_camera
+    from stcal.io.design import load_board, target_of
+    from stcal.io.files import require_new_folder, save_folder
+    from stcal.robot.identification.result import IdentifyOptions
+    from stcal.robot.kinematics.file import load_robot
+    from stcal.sfm.measurement.images import MeasureOptions
+    from stcal.sfm.measurement.target import read_target
+    from stcal.workflows.from_photos import files_of, require_files_written, robot_from_photos, story
+
+    require_new_folder(out, images)
+    design = target_of(target)
+    with StageProgress() as progress:
+        result = robot_from_photos(
+            images,
+            read_camera(camera),
+            read_target(faces, design),
+            design,
+            joints,
+            load_robot(robot_file),
+            targets,
+            load_board(board) if board else None,
+            key,
+            MeasureOptions(workers=workers),
+            IdentifyOptions(model=model, partial=partial),
+            progress,
+            columns,
+        )
+    print_each("note", result.notes)
+    for line in story(result):
+        say(line)
+    save_folder(out, files_of(result))
+    require_files_written(out, result)
+    say(f"report: {out / 'report.html'}")
+
+
+app = typer.Typer(
+    name="stcal robot",
+    help="Calibrate a robot from measured data of any instrument, and compensate it.",
+    cls=Commands,
+    **PLAIN,
+)
+COMMANDS = (init, axes, identify, evaluate, compensate, verify, design, convert, from_photos)
+for command in COMMANDS:
+    app.command()(command)

@@ -1,0 +1,375 @@
+"""Export of a hand-eye transform to files of other programs; each file is read back and compared."""
+
+import json
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import yaml
+
+import stcal
+from stcal.errors import InputError, StcalError
+from stcal.geometry.rigid import Poses, Rigid
+from stcal.handeye.data.pairs import FRAMES, Setup
+from stcal.handeye.result import HandEye
+from stcal.io.plain_yaml import load_yaml, opencv_matrix
+from stcal.io.poses.columns import program_name
+from stcal.io.poses.controllers import ABB, FANUC, KUKA, UR
+from stcal.io.poses.static import (
+    Static,
+    fixed_joint,
+    messages,
+    metres,
+    plain_numbers,
+    pose_of_metres,
+    read_messages,
+    read_ros1_launch,
+    read_ros2_commands,
+    read_ros2_launch,
+    ros1_launch,
+    ros2_commands,
+    ros2_launch,
+    static_of_joint,
+    xyzw,
+)
+from stcal.io.table import require_poses_written
+
+CAMERA_FRAME = "camera_optical_frame"
+"""Name in ROS of a camera frame with Z along the line of sight and X to the right, as in stcal."""
+CAMERA_LINK = "camera_link"
+"""Name in ROS of a camera frame with X along the line of sight, Y to the left and Z up."""
+LINK_FROM_OPTICAL = Rigid([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
+"""Rotation between both frames, which share their origin: REP 103, suffix frames."""
+CameraFrame = Literal["optical", "link"]
+
+
+def tree(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> list[Static]:
+    """Returns the transforms that add the camera to a tree of frames, in which each frame has one parent.
+
+    ``parent``, ``child`` : names of the frames. If empty: flange or base, and :data:`CAMERA_FRAME` or
+    :data:`CAMERA_LINK`. ``camera_frame`` : ``optical``: the camera's own frame; ``link``: the link, and the optical
+    frame in it.
+
+    Raises InputError: a name is invalid, or the names are not all different.
+    """
+    mount, *names = frame_names(result.setup, parent, child, camera_frame)
+    require_frame_names(mount, *names)
+    if camera_frame == "optical":
+        return [Static(mount, names[0], result.mount_from_camera)]
+    link, optical = names
+    mount_from_link = result.mount_from_camera @ LINK_FROM_OPTICAL.inverse()
+    return [Static(mount, link, mount_from_link), Static(link, optical, LINK_FROM_OPTICAL)]
+
+
+def frame_names(setup: Setup, parent: str, child: str, camera_frame: CameraFrame) -> tuple[str, ...]:
+    """Returns the names of the frames of :func:`tree` from the root; NAME_link has the child NAME_optical_frame."""
+    mount = parent or FRAMES[setup].mount
+    if camera_frame == "optical":
+        return mount, child or CAMERA_FRAME
+    link = child or CAMERA_LINK
+    return mount, link, f"{link.removesuffix('_link')}_optical_frame"
+
+
+def require_frame_names(*names: str) -> None:
+    """Checks that names of frames are printable and all different; empty names stand for the defaults.
+
+    Raises InputError: a name has a control character, or occurs twice.
+    """
+    given = [name for name in names if name]
+    for name in given:
+        if not name.isprintable():
+            raise InputError("E-FRAME-NAME", f"frames: {name!r} has control characters; give a name in letters")
+        if given.count(name) > 1:
+            raise InputError("E-FRAME-NAME", f"frames: parent and child are both {name!r}; two names needed")
+
+
+def said_of(result: HandEye) -> list[str]:
+    """Returns lines for comments: the transform's name, σ, and covariance. ASCII only, for robot controllers."""
+    frames = FRAMES[result.setup]
+    lines = [f"stcal {stcal.__version__}: {frames.camera}, {result.setup}, {result.method}, {len(result.names)} poses"]
+    if result.covariance is None:
+        return [*lines, f"no covariance: method {result.method} gives none"]
+    sigma = np.sqrt(np.diag(result.covariance))
+    turn, shift = (" ".join(f"{v:.4g}" for v in part) for part in (np.degrees(sigma[:3]), sigma[3:]))
+    lines.append(f"sigma along x y z of the {frames.mount}: {shift} mm; about them: {turn} deg")
+    lines.append(f"covariance, rotation about x y z (rad), then shift along x y z (mm), axes of the {frames.mount}:")
+    return lines + ["  " + " ".join(f"{v:.6e}" for v in row) for row in result.covariance]
+
+
+def opencv_yaml(result: HandEye) -> str:
+    """Returns a file for ``cv2.FileStorage``: both transforms, 4×4, and their covariances if there are any; mm, rad."""
+    covariances = (result.covariance, result.stand_covariance)
+    lines = ["%YAML:1.0", "---", f'setup: "{result.setup}"', f'method: "{result.method}"', 'unit: "mm"']
+    for (name, pose), covariance in zip(result.transforms.items(), covariances, strict=True):
+        lines += opencv_matrix(name, pose.matrix())
+        if covariance is not None:
+            lines += opencv_matrix(f"{name}_covariance", covariance)
+    return "\n".join(lines) + "\n"
+
+
+def zivid_yaml(result: HandEye) -> str:
+    """Returns a file as ``zivid.Matrix4x4`` saves and loads it: 4×4, mm."""
+    head = "".join(f"# {line}\n" for line in said_of(result))
+    content = {
+        "__version__": {"serializer": 1, "data": 1},
+        "FloatMatrix": {"Data": result.mount_from_camera.matrix().tolist()},
+    }
+    return head + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=200)
+
+
+def read_zivid(text: str) -> Rigid:
+    """Returns the transform in a file of :func:`zivid_yaml`, mm."""
+    return Rigid.from_matrix(load_yaml(text)["FloatMatrix"]["Data"])
+
+
+REMARK = 32
+"""Largest number of characters of a remark in a FANUC program."""
+
+
+def kuka_dat(result: HandEye, name: str) -> str:
+    """Returns a data list of KRL with the frame."""
+    head = "".join(f"; {line}\n" for line in said_of(result))
+    frame = f"DECL GLOBAL FRAME {FRAMES[result.setup].camera}={{{KUKA.write(result.mount_from_camera)}}}\n"
+    return f"&ACCESS RVP\nDEFDAT {name} PUBLIC\n{head}{frame}ENDDAT\n"
+
+
+def abb_module(result: HandEye, name: str) -> str:
+    """Returns a module of RAPID with a ``pose``."""
+    head = "".join(f"  ! {line}\n" for line in said_of(result))
+    frame = f"  PERS pose {FRAMES[result.setup].camera}:=[{ABB.write(result.mount_from_camera)}];\n"
+    return f"MODULE {name}\n{head}{frame}ENDMODULE\n"
+
+
+def ur_script(result: HandEye) -> str:
+    """Returns a pose of URScript."""
+    head = "".join(f"# {line}\n" for line in said_of(result))
+    return f"{head}{FRAMES[result.setup].camera} = {UR.write(result.mount_from_camera)}\n"
+
+
+def fanuc_program(result: HandEye, name: str) -> str:
+    """Returns a program (LS) with the frame as its position."""
+    remarks = [FRAMES[result.setup].camera]
+    if result.covariance is not None:
+        sigma = np.sqrt(np.diag(result.covariance))
+        for unit, part in (("mm", sigma[3:]), ("deg", np.degrees(sigma[:3]))):
+            remarks.append(f"sigma {unit} " + " ".join(f"{v:.2g}" for v in part))
+    lines = [f"/PROG  {name}", "/ATTR", 'COMMENT = "stcal handeye";', "/MN"]
+    lines += [f"   {k}:  !{remark[:REMARK]} ;" for k, remark in enumerate(remarks, 1)]
+    lines += ["/POS", "P[1]{", "   GP1:", "\tUF : 0, UT : 0,\t\tCONFIG : 'N U T, 0, 0, 0',"]
+    return "\n".join([*lines, FANUC.write(result.mount_from_camera), "};", "/END"]) + "\n"
+
+
+IN_HAND = "eye-in-hand"
+
+
+def ros_yaml(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
+    """Returns ``geometry_msgs/TransformStamped`` as YAML, for a static transform; lengths in metres.
+
+    ``parent``, ``child``, ``camera_frame`` : see :func:`~stcal.handeye.report.export.tree`. Each of its
+    transforms becomes one document.
+    """
+    return messages(tree(result, parent, child, camera_frame))
+
+
+def urdf_joint(result: HandEye, parent: str = "", child: str = "", camera_frame: CameraFrame = "optical") -> str:
+    """Returns a fixed joint of URDF: ``origin`` in metres, and roll, pitch, yaw about the parent's axes in rad.
+
+    For ``camera_frame`` ``link`` these are two joints with their child links, in a ``robot`` that xacro can include.
+    """
+    transforms = tree(result, parent, child, camera_frame)
+    joints = [fixed_joint(each) for each in transforms]
+    if len(joints) == 1:
+        return joints[0]
+    links = [f"<link name={quoteattr(each.child)}/>\n" for each in transforms]
+    return "<robot>\n" + "".join(link + joint for link, joint in zip(links, joints, strict=True)) + "</robot>\n"
+
+
+def read_urdf(text: str) -> list[Static]:
+    """Returns the transforms in a text of :func:`urdf_joint`."""
+    root = ElementTree.fromstring(text)
+    return [static_of_joint(joint) for joint in ([root] if root.tag == "joint" else root.findall("joint"))]
+
+
+def easy_handeye(result: HandEye, transforms: list[Static], name: str) -> str:
+    """Returns the file ``~/.ros/easy_handeye/NAME.yaml`` of ROS 1's easy_handeye."""
+    first = transforms[0]
+    turn = dict(zip(("qx", "qy", "qz", "qw"), xyzw(first.pose), strict=True))
+    content = {
+        "parameters": {
+            "eye_on_hand": result.setup == IN_HAND,
+            "freehand_robot_movement": True,
+            "move_group": "manipulator",
+            "move_group_namespace": "/",
+            "namespace": f"/{name}/",
+            **_robot_frames(result, first),
+        },
+        "transformation": turn | dict(zip("xyz", metres(first.pose), strict=True)),
+    }
+    return _commented_yaml(result, transforms, content)
+
+
+def read_easy_handeye(text: str) -> list[Static]:
+    """Returns the transform in a text of :func:`easy_handeye`."""
+    content = load_yaml(text)
+    numbers, frames = content["transformation"], content["parameters"]
+    pose = pose_of_metres([numbers[c] for c in "xyz"], [numbers[f"q{c}"] for c in "xyzw"])
+    return [_static_of_frames(frames, frames["eye_on_hand"], pose)]
+
+
+def easy_handeye2(result: HandEye, transforms: list[Static], name: str) -> str:
+    """Returns the file ``~/.ros2/easy_handeye2/calibrations/NAME.calib`` of ROS 2's easy_handeye2."""
+    first = transforms[0]
+    content = {
+        "parameters": {
+            "name": name,
+            "calibration_type": "eye_in_hand" if result.setup == IN_HAND else "eye_on_base",
+            **_robot_frames(result, first),
+            "freehand_robot_movement": True,
+            "move_group_namespace": "/",
+            "move_group": "manipulator",
+        },
+        "transform": {
+            "translation": dict(zip("xyz", metres(first.pose), strict=True)),
+            "rotation": dict(zip("xyzw", xyzw(first.pose), strict=True)),
+        },
+    }
+    return _commented_yaml(result, transforms, content)
+
+
+def read_easy_handeye2(text: str) -> list[Static]:
+    """Returns the transform in a text of :func:`easy_handeye2`."""
+    content = load_yaml(text)
+    numbers, frames = content["transform"], content["parameters"]
+    pose = pose_of_metres([numbers["translation"][c] for c in "xyz"], [numbers["rotation"][c] for c in "xyzw"])
+    return [_static_of_frames(frames, frames["calibration_type"] == "eye_in_hand", pose)]
+
+
+def _robot_frames(result: HandEye, first: Static) -> dict[str, str]:
+    """Returns the names of all frames. The frame of the board, and the robot's frame without the camera, are unused."""
+    frames = FRAMES[result.setup]
+    carries = {frames.mount: first.parent, frames.stand: frames.stand}
+    return {
+        "robot_base_frame": carries["base"],
+        "robot_effector_frame": carries["flange"],
+        "tracking_base_frame": first.child,
+        "tracking_marker_frame": "board",
+    }
+
+
+def _static_of_frames(frames: dict, in_hand: bool, pose: Rigid) -> Static:
+    return Static(
+        frames["robot_effector_frame" if in_hand else "robot_base_frame"], frames["tracking_base_frame"], pose
+    )
+
+
+def _commented_yaml(result: HandEye, transforms: list[Static], content: dict) -> str:
+    lines = said_of(result)
+    for each in transforms[1:]:
+        words = " ".join(plain_numbers(xyzw(each.pose), 3))
+        lines.append(f"{each.child} is not in this file: in {each.parent} at 0 0 0, quaternion x y z w {words}")
+    return "".join(f"# {line}\n" for line in lines) + yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+
+
+SAME_MM, SAME_RAD = 1e-6, 1e-9
+"""Largest deviations of a transform that is read back; the digits printed cause less."""
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """A file format.
+
+    ``write`` : returns the text for a result, its named transforms, and the file's name without its ending; ``read`` :
+    returns the transforms, or the one pose, of the text.
+    """
+
+    write: Callable[[HandEye, list[Static], str], str]
+    read: Callable[[str], "list[Static] | Rigid"]
+
+
+ROS_FORMS = {
+    "ros2": Form(lambda result, transforms, _: ros2_commands(transforms, said_of(result)), read_ros2_commands),
+    "moveit": Form(lambda result, transforms, _: ros1_launch(transforms, said_of(result)), read_ros1_launch),
+    "moveit2": Form(lambda result, transforms, _: ros2_launch(transforms, said_of(result)), read_ros2_launch),
+    "easy-handeye": Form(easy_handeye, read_easy_handeye),
+    "easy-handeye2": Form(easy_handeye2, read_easy_handeye2),
+}
+"""Formats that hold names of frames, and the camera's link on demand."""
+FORMS = ROS_FORMS | {
+    "zivid": Form(lambda result, *_: zivid_yaml(result), read_zivid),
+    "kuka": Form(lambda result, _, name: kuka_dat(result, program_name(name)), KUKA.first),
+    "abb": Form(lambda result, _, name: abb_module(result, program_name(name)), ABB.first),
+    "ur": Form(lambda result, *_: ur_script(result), UR.first),
+    "fanuc": Form(lambda result, _, name: fanuc_program(result, program_name(name)), FANUC.first),
+}
+"""All formats, by the word of ``--export``."""
+
+
+def require_form(form: str) -> None:
+    """Checks the name of a format.
+
+    Raises InputError: the format is unknown; the message lists all formats.
+    """
+    if form not in FORMS:
+        raise InputError("E-OPTION-FORM", f"--export {form}: unknown; one of {', '.join(FORMS)} needed")
+
+
+def exported(
+    result: HandEye,
+    form: str,
+    name: str = "handeye",
+    parent: str = "",
+    child: str = "",
+    camera_frame: CameraFrame = "optical",
+) -> str:
+    """Returns the file's text, after reading it back and comparing the transform.
+
+    ``form`` : one of :data:`FORMS`; ``name`` : name of the file without its ending; files of easy_handeye and of robot
+    controllers hold it too; ``parent``, ``child``, ``camera_frame`` : frames for :data:`ROS_FORMS`; see
+    :func:`~stcal.handeye.report.export.tree`.
+
+    Raises InputError: the format is unknown, or cannot hold the name of a frame.
+    """
+    require_form(form)
+    transforms = tree(result, parent, child, camera_frame)
+    text = FORMS[form].write(result, transforms, name)
+    read_back = FORMS[form].read(text)
+    if isinstance(read_back, Rigid):
+        read_back, transforms = [Static("", "", read_back)], [Static("", "", result.mount_from_camera)]
+    for static, wanted in zip(read_back, transforms, strict=False):
+        difference = static.pose.inverse() @ wanted.pose
+        same_names = (static.parent, static.child) == (wanted.parent, wanted.child)
+        if not same_names or difference.angle_rad() > SAME_RAD or np.abs(difference.translation).max() > SAME_MM:
+            raise StcalError(
+                "E-EXPORT-READ-BACK", f"--export {form}: the file does not give the transform back; use another form"
+            )
+    return text
+
+
+def require_export_written(
+    path: Path,
+    kind: str,
+    result: HandEye,
+    parent: str = "",
+    child: str = "",
+    camera_frame: CameraFrame = "optical",
+) -> None:
+    """Read a written file again, and require the transforms of ``result``.
+
+    ``kind`` : ``json``, the result file, or ``opencv``, ``ros``, ``urdf`` of :func:`opencv_yaml`, :func:`ros_yaml` and
+    :func:`urdf_joint`.
+    """
+
+    def again() -> Poses:
+        text = path.read_text(encoding="utf-8")
+        if kind in ("ros", "urdf"):
+            return Poses.of(static.pose for static in (read_messages if kind == "ros" else read_urdf)(text))
+        content = json.loads(text) if kind == "json" else load_yaml(text)
+        matrices = [content[name] if kind == "json" else content[name]["data"] for name in result.transforms]
+        return Poses.of(Rigid.from_matrix(np.reshape(matrix, (4, 4))) for matrix in matrices)
+
+    statics = tree(result, parent, child, camera_frame) if kind in ("ros", "urdf") else ()
+    require_poses_written(path, again, Poses.of([each.pose for each in statics] or result.transforms.values()))

@@ -1,1 +1,0 @@
-"""Hand-eye calibration of several cameras of one robot that see one board, solved together."""

@@ -1,1 +1,0 @@
-"""Range of validity of a registration."""
