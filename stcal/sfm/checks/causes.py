@@ -88,7 +88,7 @@ def whole_set_cause(networks: Sequence[Network], camera: Camera, moved: bool = F
     square = sum(float((n.residual**2).sum()) for n in networks)
     after = float(np.sqrt(best.left * _redundancy(networks) / square))
     reason = (
-        f"{best.cause.name}, {size}: {best.test.freedom} parameter{'s' * (best.test.freedom > 1)} explain"
+        f"{size}: {best.test.freedom} parameter{'s' * (best.test.freedom > 1)} explain"
         f"{'s' * (best.test.freedom == 1)} {100 * best.explained / most:.0f} % of what any cause explains; residuals "
         f"would be {after:.2f} times as large"
     )
@@ -197,7 +197,7 @@ def _explained_by_one(networks: Sequence[Network], left: float) -> float:
 
 
 def _percent(what: str) -> Callable[[np.ndarray, np.ndarray], str]:
-    return lambda value, sigma: f"{what} {100 * value[0]:+.3g} ± {100 * sigma[0]:.2g} %"
+    return lambda value, sigma: f"{what} {100 * value[0]:+.3g} ± {100 * sigma[0]:.2g} % against the file"
 
 
 def _spread(what: str) -> Callable[[np.ndarray, np.ndarray], str]:

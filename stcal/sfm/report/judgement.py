@@ -166,7 +166,8 @@ def _use(report: dict) -> tuple[Use, str]:
     missing = _missing_faces(report)
     if verdict != "no" and missing:
         return "no", f"No: {'; '.join(gaps)}."
-    if verdict == "yes" and (_lost_groups(report) or any(_is_read(report, f) for f in _absent(report))):
+    open_ = [] if report["summary"].get("faces_expected") else _absent(report)  # the photographs may have meant them
+    if verdict == "yes" and (_lost_groups(report) or any(_is_read(report, face) for face in open_)):
         verdict, answer = "with care", f"With care: {answer.removeprefix('Yes: ')}"
     elif verdict == "yes" and _absent(report):
         answer = f"Yes, for face {join(list(report['faces']))}: {answer.removeprefix('Yes: ')}"
