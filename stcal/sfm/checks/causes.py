@@ -41,7 +41,8 @@ class _Cause:
 
     ``name``, ``remedy`` in words; ``size`` : its size in words, from the estimates (q,) and their σ; ``columns`` : (n,
     2, q) derivatives of the projections of a network over σ; ``scope`` : one set of parameters for all images, or one
-    for each group or image; ``whole`` : True if the parameter is 1 where the hypothesis is true.
+    for each group or image; ``whole`` : True if the first parameter is 1 where the hypothesis is true, and so is not
+    free.
     """
 
     name: str
@@ -81,7 +82,7 @@ def whole_set_cause(networks: Sequence[Network], camera: Camera, moved: bool = F
     ]
     if not named:
         return None
-    best = min(named, key=lambda f: (f.cause.columns is _by_motion, f.test.freedom, -f.explained))
+    best = min(named, key=lambda f: (f.cause.columns is _by_motion, f.test.freedom - f.cause.whole, -f.explained))
     if best.cause.scope == "image" and _explained_by_one(networks, best.left) > EXPLAINS * most:
         return None  # its checks name that image
     size = best.cause.size(best.test.estimate, np.sqrt(np.maximum(np.diag(best.test.covariance), 0)))
@@ -256,6 +257,13 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
                    "have: give the original photographs, or set the distortion in the camera file to 0",
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
                    "not in them", by(removed), whole=True)
+        )  # fmt: skip
+        causes.append(
+            _Cause("the photographs are already undistorted, with another camera matrix", "give the original "
+                   "photographs, or a camera file with the matrix that they were undistorted to, and a distortion of 0",
+                   lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
+                   f"not in them, {_listed(('fx', 'fy', 'cx', 'cy'))(value[1:], sigma[1:])}",
+                   by(np.hstack([removed, unit[:, :4]])), whole=True)
         )  # fmt: skip
         causes.append(
             _Cause("the distortion of the camera file has its sign reversed", "its program undistorts where this one "

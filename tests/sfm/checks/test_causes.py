@@ -66,6 +66,10 @@ PLANTED = {
         of_photographs(lambda i, camera, _: i.centre * camera.focal + camera.centre),
         "already undistorted",
     ),
+    "undistorted to another matrix": (
+        of_photographs(lambda i, camera, _: 0.985 * i.centre * camera.focal + camera.centre + np.array([3, 1])),
+        "already undistorted, with another camera matrix",
+    ),
     "signs reversed": (of_file(distortion=lambda d, _: -d), "sign reversed"),
     "scaled": (of_photographs(lambda i, *_: 1.005 * (i.centre_px + 0.5) - 0.5), "scaled against the camera file"),
     "turned": (
