@@ -32,10 +32,10 @@ from stcal.parallel import one_thread
 from stcal.report.text import text_table
 from stcal.sfm.adjust.calibration import calibrate
 from stcal.sfm.adjust.options import AdjustOptions
-from stcal.sfm.adjust.refine import refine
+from stcal.sfm.adjust.refine import Refined, refine
 from stcal.sfm.checks.suite import Evidence, run_checks
 from stcal.sfm.checks.verdict import Check, ranked
-from stcal.sfm.data.model import ImageObservations
+from stcal.sfm.data.model import ImageObservations, WorldModel
 from stcal.sfm.detect.circles.candidates import EllipseOptions
 from stcal.sfm.detect.files import detect_files
 from stcal.sfm.detect.labels import label_images
@@ -486,12 +486,25 @@ def seen_in_last(case: Case) -> str:
 # ---------------------------------------------------------------- runs
 
 
+def refined_groups(case: Case, starts: list[WorldModel]) -> list[Refined]:
+    """The groups that can be solved; as in a run, the others are left out whole."""
+    refined, errors = [], []
+    for model in starts:
+        try:
+            refined.append(refine(model, case.camera, case.target, case.board))
+        except StcalError as error:
+            errors.append(error)
+    if not refined:
+        raise errors[0]
+    return refined
+
+
 def answer(case: Case) -> dict:
     """Verdict, the check that the first sentence names, and the largest error of a face in σ."""
     try:
         world = Similarity(1, Rigid.exp([0.3, -0.2, 0.5, 40, -30, 900]))
         starts = [model.in_world(world) for model in true_models(case.scene, case.images)]
-        refined = [refine(model, case.camera, case.target, case.board) for model in starts]
+        refined = refined_groups(case, starts)
         options = AdjustOptions(case.target.faces[0].id, "joint")
         models = tuple(each.model for each in refined)
         calibration = calibrate(models, case.camera, case.target, case.board, options)

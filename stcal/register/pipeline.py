@@ -27,7 +27,7 @@ from stcal.register.core.robust import (
     turn_between,
 )
 from stcal.register.core.search import LEAST_SHARE
-from stcal.register.judge.degeneracy import check_extent, check_supports, row_name
+from stcal.register.judge.degeneracy import by_chance, check_extent, check_supports, row_name
 from stcal.register.judge.groups import Shifted, shifted_rows, two_groups
 from stcal.register.judge.mistakes import (
     Wider,
@@ -297,11 +297,7 @@ def _as_assigned(problem: Problem, group: np.ndarray, threshold: float | None) -
 
 def _check_chance(problem: Problem, fitted: Fitted) -> None:
     if len(problem) > problem.model.sample and chance(problem, fitted) > np.log(BY_CHANCE):
-        raise DegenerateError(
-            "E-REGISTER-CHANCE",
-            f"registration: {fitted.inliers.sum()} of {len(problem)} point pairs agree to {fitted.sigma:.4g} mm, no "
-            "better than chance; check that row i of both is the same point",
-        )
+        raise by_chance(int(fitted.inliers.sum()), len(problem), fitted.sigma)
 
 
 def _check_mirrored_with_outliers(problem: Problem, fitted: Fitted | None, threshold: float | None, seed: int) -> None:

@@ -48,11 +48,12 @@ def plan(
     from stcal.boards.target import body_of
     from stcal.io.cameras.read import read_camera
     from stcal.io.design import load_board
-    from stcal.sfm.planning.advise import expected_noise, noise_of_run, stated_noise
+    from stcal.sfm.planning.advise import expected_noise, failures_of, noise_of_run, stated_noise
     from stcal.sfm.planning.bodies import plan as planned
     from stcal.sfm.planning.file import PlanFile, plan_text
     from stcal.sfm.planning.session import PlanOptions, pairs_of_faces
     from stcal.sfm.runs.options import RunOptions
+    from stcal.sfm.runs.saved import load_run
 
     design = body_of(target)
     printed = bool(design.with_faces(printed=True).faces)
@@ -67,7 +68,10 @@ def plan(
     if noise is not None:
         centre_noise, source = stated_noise(noise)
     elif run is not None:
-        centre_noise, source = noise_of_run(run), f"by size and tilt as in {run}"
+        saved = load_run(run)
+        centre_noise, source = noise_of_run(saved), f"by size and tilt as in {run}"
+        if failures := failures_of(saved):
+            print_each("warning", [f"{failures}: the σ of its centres have in them what failed"])
     else:
         centre_noise, source = expected_noise(of_corners=printed)
     options = PlanOptions(

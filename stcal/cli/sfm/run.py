@@ -124,7 +124,7 @@ def run(
         ellipses=shared.ellipse_options(min_diameter, max_diameter),
         workers=workers,
         exclude=tuple(exclude or ()),
-        expect_faces=tuple(face.strip() for face in (expect_faces or "").split(",") if face.strip()),
+        expect_faces=() if expect_faces is None else tuple(face.strip() for face in expect_faces.split(",")),
     )
     with shared.designs_told(target, board), shared.handed_over(scheduler, send_images), StageProgress() as progress:
         result = pipeline.run(images, camera, out, target, board, options, progress, every=every)

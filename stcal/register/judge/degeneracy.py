@@ -28,15 +28,27 @@ def spreads(xyz: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred)[::-1], 0))
 
 
+def by_chance(agreeing: int, n: int, sigma_mm: float) -> DegenerateError:
+    """Returns the error of point pairs that agree no better than chance."""
+    return DegenerateError(
+        "E-REGISTER-CHANCE",
+        f"registration: {agreeing} of {n} point pairs agree to {sigma_mm:.4g} mm, no better than chance; check that "
+        "row i of both is the same point",
+    )
+
+
 def check_extent(model: Model, xyz_a: np.ndarray, sigma_mm: float) -> None:
     """Refuses points that do not determine the model at their σ.
 
-    Raises DegenerateError: the points lie along a line, or in a plane for the affine model.
+    Raises DegenerateError: the points lie along a line, or in a plane for the affine model; or σ is as large as their
+    whole extent.
     """
     n, spread = len(xyz_a), spreads(xyz_a)
     needed = WIDER_THAN * sigma_mm
     off_line = float(np.hypot(spread[1], spread[2]))
     length = spread[0] / np.sqrt(n)
+    if n > model.needed and spread[0] < needed:
+        raise by_chance(n, n, sigma_mm)
     if off_line < needed:
         raise DegenerateError(
             "E-POINTS-COLLINEAR",

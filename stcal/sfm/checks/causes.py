@@ -41,7 +41,8 @@ class _Cause:
 
     ``name``, ``remedy`` in words; ``size`` : its size in words, from the estimates (q,) and their σ; ``columns`` : (n,
     2, q) derivatives of the projections of a network over σ; ``scope`` : one set of parameters for all images, or one
-    for each group or image; ``whole`` : True if the parameter is 1 where the hypothesis is true.
+    for each group or image; ``whole`` : True if the first parameter is 1 where the hypothesis is true, and so is not
+    free.
     """
 
     name: str
@@ -81,14 +82,14 @@ def whole_set_cause(networks: Sequence[Network], camera: Camera, moved: bool = F
     ]
     if not named:
         return None
-    best = min(named, key=lambda f: (f.cause.columns is _by_motion, f.test.freedom, -f.explained))
+    best = min(named, key=lambda f: (f.cause.columns is _by_motion, f.test.freedom - f.cause.whole, -f.explained))
     if best.cause.scope == "image" and _explained_by_one(networks, best.left) > EXPLAINS * most:
         return None  # its checks name that image
     size = best.cause.size(best.test.estimate, np.sqrt(np.maximum(np.diag(best.test.covariance), 0)))
     square = sum(float((n.residual**2).sum()) for n in networks)
     after = float(np.sqrt(best.left * _redundancy(networks) / square))
     reason = (
-        f"{best.cause.name}, {size}: {best.test.freedom} parameter{'s' * (best.test.freedom > 1)} explain"
+        f"{size}: {best.test.freedom} parameter{'s' * (best.test.freedom > 1)} explain"
         f"{'s' * (best.test.freedom == 1)} {100 * best.explained / most:.0f} % of what any cause explains; residuals "
         f"would be {after:.2f} times as large"
     )
@@ -197,7 +198,7 @@ def _explained_by_one(networks: Sequence[Network], left: float) -> float:
 
 
 def _percent(what: str) -> Callable[[np.ndarray, np.ndarray], str]:
-    return lambda value, sigma: f"{what} {100 * value[0]:+.3g} ± {100 * sigma[0]:.2g} %"
+    return lambda value, sigma: f"{what} {100 * value[0]:+.3g} ± {100 * sigma[0]:.2g} % against the file"
 
 
 def _spread(what: str) -> Callable[[np.ndarray, np.ndarray], str]:
@@ -256,6 +257,13 @@ def _hypotheses(camera: Camera) -> list[_Cause]:
                    "have: give the original photographs, or set the distortion in the camera file to 0",
                    lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
                    "not in them", by(removed), whole=True)
+        )  # fmt: skip
+        causes.append(
+            _Cause("the photographs are already undistorted, with another camera matrix", "give the original "
+                   "photographs, or a camera file with the matrix that they were undistorted to, and a distortion of 0",
+                   lambda value, sigma: f"{100 * value[0]:.0f} ± {100 * sigma[0]:.2g} % of the file's distortion is "
+                   f"not in them, {_listed(('fx', 'fy', 'cx', 'cy'))(value[1:], sigma[1:])}",
+                   by(np.hstack([removed, unit[:, :4]])), whole=True)
         )  # fmt: skip
         causes.append(
             _Cause("the distortion of the camera file has its sign reversed", "its program undistorts where this one "

@@ -161,11 +161,12 @@ def groups_check(again: Again, networks: Sequence[Network]) -> Check:
             change = _difference(without.target_from_face[face], whole.target_from_face[face])
             larger = scale * without.face_covariance[face]
             name = f"face {face} without group {group}"
-            trials.append(_nested_trial(name, change, larger, whole.face_covariance[face], joint.redundancy))
+            trial = _nested_trial(name, change, larger, whole.face_covariance[face], joint.redundancy)
+            trials += [trial] if trial else []
     if not trials:
         reason = "every group holds a face that no other links"
         return impossible(key, title, reason, again.loop_remedy())
-    check = judge(key, title, [t for t in trials if t.freedom], "faces", "")
+    check = judge(key, title, trials, "faces", "")
     if not check.names:
         return check
     curing = [group for group, cured in zip(removable, cures, strict=True) if cured]
@@ -194,11 +195,14 @@ def _added(joint: JointResult, networks: Sequence[Network]) -> tuple[float, int,
     return max(joint.sigma0**2 * joint.redundancy - square, 0.0), round(joint.redundancy - free), free
 
 
-def _nested_trial(name: str, change, larger: np.ndarray, smaller: np.ndarray, redundancy: float) -> Trial:
+def _nested_trial(name: str, change, larger: np.ndarray, smaller: np.ndarray, redundancy: float) -> Trial | None:
+    """Returns the trial of the change of a face; None if what was left out tells nothing of that face."""
     root = np.linalg.cholesky(larger)
     half = np.linalg.solve(root, np.linalg.solve(root, larger - smaller).T)
     value, vector = np.linalg.eigh((half + half.T) / 2)
     held = value > EXPLAINED
+    if not held.any():
+        return None
     along = vector[:, held].T @ np.linalg.solve(root, change)
     statistic = float((along**2 / value[held]).sum())
     return Trial(name, MICRO * float(np.linalg.norm(change[3:])), "µm", statistic, int(held.sum()), redundancy)

@@ -16,7 +16,7 @@ from scipy.special import fdtrc
 from stcal.geometry.arrays import Brief, require_arguments, require_fields
 from stcal.geometry.robust import ratio_limit
 from stcal.sfm.report.checks import ORDER
-from stcal.sfm.report.judgement import CAUSE, GENERAL
+from stcal.sfm.report.judgement import CAUSE, not_first
 
 Verdict = Literal["passed", "suspicious", "failed", "not possible"]
 SUSPICIOUS = 1e-3
@@ -188,10 +188,11 @@ def ranked(checks: Sequence[Check], images: frozenset[str]) -> list[Check]:
     Among equal verdicts the cause of the whole set comes first, then those that name an image: it may be the reason why
     the others fail. Those that do not tell what is wrong come last.
     """
+    later = {verdict: not_first(check.key for check in checks if check.verdict == verdict) for verdict in ORDER}
 
     def place(check: Check) -> tuple:
         named = not images.isdisjoint(check.names)
-        return ORDER.index(check.verdict), check.key != CAUSE, not named, check.key in GENERAL
+        return ORDER.index(check.verdict), check.key != CAUSE, not named, check.key in later[check.verdict]
 
     return sorted(checks, key=place)
 

@@ -168,8 +168,9 @@ def across_groups(groups: Sequence[Arrangement], patterns: dict[str, Pattern], r
 
     A face is removed from a group in which its place differs from that in most groups. A face is added to a group if
     its place is known from other groups, even if no image of the group has a reading of it: the second look decides.
-    The places of all faces then also identify the mirror image of a face that a group does not show. A group that
-    contradicts the others, and whose faces may all be mirror images of other faces, has mirrored images and loses them.
+    The places of all faces then also identify the mirror image of a face that a group does not show. A face that any
+    group shows to be real stays in all groups that have it at the same place. A group that contradicts the others, and
+    whose faces may all be mirror images of other faces, has mirrored images and loses them.
     """
     faces = [_as_faces(group) for group in groups]
     best: Arrangement = Arrangement({}, {}, {})
@@ -194,14 +195,30 @@ def across_groups(groups: Sequence[Arrangement], patterns: dict[str, Pattern], r
         foreign = {k: group.foreign.get(k, ()) + foreign.get(k, ()) for k in {*group.foreign, *foreign}}
         settled.append(replace(reduced, group_from_plane=known | reduced.group_from_plane, foreign=foreign))
     cleared = [_without_reflections(group, patterns, reach_mm) for group in settled]
-    reflections = [s.group_from_plane.keys() - c.group_from_plane.keys() for s, c in zip(settled, cleared, strict=True)]
-    if not any(reflections):
-        return settled
-    without_reflections = [
-        replace(g.without(set(p))[0], reflected=c.reflected)
-        for g, p, c in zip(groups, reflections, cleared, strict=True)
+    real = {view.plane for i in best.views for own in cleared[i].views.values() for view in own}
+    gone = [
+        (s.group_from_plane.keys() - c.group_from_plane.keys()) - (real if i in best.views else set())
+        for i, (s, c) in enumerate(zip(settled, cleared, strict=True))
     ]
+    if not any(gone):
+        return [_restored(group, reach_mm) if i in best.views else group for i, group in enumerate(settled)]
+    without_reflections = []
+    for group, planes in zip(groups, gone, strict=True):
+        rest, removed = group.without(planes)
+        reflected = {i: group.reflected.get(i, ()) + removed.get(i, ()) for i in {*group.reflected, *removed}}
+        without_reflections.append(replace(rest, reflected=reflected))
     return across_groups(without_reflections, patterns, reach_mm)
+
+
+def _restored(group: Arrangement, reach_mm: float) -> Arrangement:
+    """Returns the group with the readings that passed for a mirror image, but lie where other groups see that face."""
+    views, reflected = dict(group.views), dict(group.reflected)
+    for i in reflected.keys() & views.keys():
+        pose, taken = group.camera_from_group[i], {view.plane for view in views[i]}
+        back, _ = _agreeing([[view] for view in reflected[i]], pose, group.group_from_plane, reach_mm, taken)
+        views[i] = (*views[i], *back)
+        reflected[i] = tuple(view for view in reflected[i] if not any(view is each for each in back))
+    return replace(group, views=views, reflected=reflected)
 
 
 def _as_faces(group: Arrangement) -> list[Readings]:
@@ -445,7 +462,7 @@ def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, imag
     """True if a plane is the mirror image of another one.
 
     In most images its circles are those of the mirrored design, radii included. They are where the mirror would show
-    them, and most images are taken from the side of the other plane."""
+    them, and no image that shows them is taken from behind the mirror."""
     if not {real, image} <= found.group_from_plane.keys():
         return False
     seen = _circles_seen(found, patterns, image)
@@ -457,8 +474,7 @@ def _reflected(found: Arrangement, patterns: dict[str, Pattern], real: str, imag
         if mirror is None:
             continue
         normal, middle = mirror
-        sides = [(found.camera_from_group[i].inverse().translation - middle) @ normal > 0 for i in seen]
-        if np.mean(sides) > 0.5:
+        if all((found.camera_from_group[i].inverse().translation - middle) @ normal > 0 for i in seen):
             return True
     return False
 

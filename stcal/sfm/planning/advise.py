@@ -138,11 +138,14 @@ def doubts(run: SavedRun) -> str:
     """Returns the reason why the forecast σ may not hold for the run's faces; empty if there is none."""
     if not run.options.eccentricity:
         return f"{run.folder} is an uncorrected control, whose faces are biased by tens of µm: these σ are not theirs"
+    failures = failures_of(run)
+    return failures and f"{failures}: its faces may be off by far more than these σ"
+
+
+def failures_of(run: SavedRun) -> str:
+    """Returns in words which checks of a run failed; empty if none did."""
     failed = [check["title"] for check in run.report.get("checks", ()) if check["verdict"] == "failed"]
-    if failed:
-        failures = f"{len(failed)} checks of {run.folder} failed, first {failed[0]}"
-        return f"{failures}: its faces may be off by far more than these σ"
-    return ""
+    return f"{len(failed)} checks of {run.folder} failed, first {failed[0]}" if failed else ""
 
 
 @require_arguments

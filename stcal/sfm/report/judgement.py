@@ -37,6 +37,13 @@ CAUSE = "cause"
 """Key of the check that names what all images have in common and makes others fail."""
 GENERAL = ("centres", "agreement", "halves")
 """Keys of the checks that tell that something is wrong and not what. Other checks are said before them."""
+EXPLAINED_BY = {
+    "radius-design": ("rim",),
+    "groups": ("board", "board-lines", "flatness"),
+    "loops": ("board", "board-lines", "flatness"),
+}
+"""Checks that fail because of what others found; those are said before them. Board and flatness are tested in each
+group by itself, and need no agreement of groups."""
 OF_WHOLE_SET = "Cause of the whole set: "
 """How the title of that check begins, before the cause."""
 LEFT_OUT_WHOLE = "left out whole: "
@@ -61,9 +68,9 @@ INVALIDATES: dict[str, tuple[str, ...]] = {
     "board": (DISTANCES, EVERY_SIGMA),
     "board-lines": (DISTANCES, EVERY_SIGMA),
     "pitch": (DISTANCES,),
-    "radius": ("the centres of the circles that it names", EVERY_SIGMA),
+    "radius": ("the centres of the circles whose radius stands out", EVERY_SIGMA),
     "radius-design": (CENTRES, PLACES),
-    "flatness": ("the frames of the faces whose circles it names", EVERY_SIGMA),
+    "flatness": ("the frames of the faces with circles off their plane", EVERY_SIGMA),
     "control": (CENTRES, PLACES),
 }
 """What does not hold where a check has failed, by its key."""
@@ -153,6 +160,12 @@ def without_sigma(report: dict) -> dict:
     }
 
 
+def not_first(keys: Iterable[str]) -> set[str]:
+    """Returns which of the checks of one verdict, by their keys, are said after the others."""
+    own = set(keys)
+    return {key for key in own if key in GENERAL or not own.isdisjoint(EXPLAINED_BY.get(key, ()))}
+
+
 # --- may I use it -----------------------------------------------------------------------------------------------------
 
 
@@ -166,7 +179,8 @@ def _use(report: dict) -> tuple[Use, str]:
     missing = _missing_faces(report)
     if verdict != "no" and missing:
         return "no", f"No: {'; '.join(gaps)}."
-    if verdict == "yes" and (_lost_groups(report) or any(_is_read(report, f) for f in _absent(report))):
+    open_ = [] if report["summary"].get("faces_expected") else _absent(report)  # the photographs may have meant them
+    if verdict == "yes" and (_lost_groups(report) or any(_is_read(report, face) for face in open_)):
         verdict, answer = "with care", f"With care: {answer.removeprefix('Yes: ')}"
     elif verdict == "yes" and _absent(report):
         answer = f"Yes, for face {join(list(report['faces']))}: {answer.removeprefix('Yes: ')}"
@@ -273,7 +287,8 @@ def _first(report: dict, verdict: str) -> dict:
     images = {image["name"] for image in report["images"]}
     matching = [check for check in report.get("checks", []) if check["verdict"] == verdict]
     naming = [check for check in matching if any(name in images for name in check["names"])]
-    telling = [check for check in matching if check["key"] not in GENERAL]
+    later = not_first(check["key"] for check in matching)
+    telling = [check for check in matching if check["key"] not in later]
     return [*(check for check in matching if check["key"] == CAUSE), *naming, *telling, *matching][0]
 
 

@@ -337,6 +337,14 @@ def test_points_without_correspondence_are_refused():
             register(rng.uniform(-100, 100, (n, 3)), rng.uniform(-100, 100, (n, 3)))
 
 
+def test_few_points_without_correspondence_are_not_called_a_line():
+    """Least squares of 30 random pairs: σ is as large as the cloud, along all of its axes."""
+    a, b = np.random.default_rng(21).uniform(-100, 100, (2, 30, 3))
+    for model in ("rigid", "affine"):
+        with fails_with("E-REGISTER-CHANCE … 30"):
+            register(a, b, model=model, method="least-squares")
+
+
 def test_the_bound_is_above_the_distribution():
     for a, b in ((3, 1.5), (10.5, 40), (300, 200)):
         x = np.linspace(0.3, 1, 50) * a / (a + b)

@@ -66,6 +66,10 @@ PLANTED = {
         of_photographs(lambda i, camera, _: i.centre * camera.focal + camera.centre),
         "already undistorted",
     ),
+    "undistorted to another matrix": (
+        of_photographs(lambda i, camera, _: 0.985 * i.centre * camera.focal + camera.centre + np.array([3, 1])),
+        "already undistorted, with another camera matrix",
+    ),
     "signs reversed": (of_file(distortion=lambda d, _: -d), "sign reversed"),
     "scaled": (of_photographs(lambda i, *_: 1.005 * (i.centre_px + 0.5) - 0.5), "scaled against the camera file"),
     "turned": (
@@ -95,8 +99,8 @@ def test_the_planted_cause_is_named_first(few, lab, name):
 
 def test_the_size_of_the_cause_is_said(few, lab):
     images, camera = PLANTED["focal length long"][0](few, lab.observe(few))
-    assert re.search(r"focal length -(1|0\.99\d*) ", first(few, lab, images, camera).reason)
-    assert "1 parameter explains" in first(few, lab, images, camera).reason
+    check = first(few, lab, images, camera)
+    assert re.match(r"focal length -(1|0\.99\d*) ± \S+ % against the file: 1 parameter explains", check.reason)
 
 
 def shifted(image):

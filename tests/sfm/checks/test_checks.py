@@ -327,3 +327,12 @@ def test_verdicts_are_tests_of_significance():
     at = [judge("k", "t", [replace(edge, statistic=s)], "things", "do") for s in ((limit**2) * 0.99, limit**2 * 1.01)]
     assert [check.verdict for check in at] == ["passed", "suspicious"]
     assert [check.remedy for check in at] == ["", "do"]
+
+
+def test_a_group_that_tells_nothing_of_a_face_is_no_trial():
+    """Without it the face's covariance is the same but for rounding, so that no change of it can be tested."""
+    covariance = np.diag([1e-8, 1e-8, 1e-8, 1e-6, 1e-6, 1e-6])
+    assert faces._nested_trial("face 2 without group 15", np.zeros(6), covariance, covariance, 100) is None
+    trial = faces._nested_trial("face 2 without group 15", 1e-3 * np.ones(6), 2 * covariance, covariance, 100)
+    assert trial is not None
+    assert trial.freedom == 6

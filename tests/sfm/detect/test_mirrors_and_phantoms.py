@@ -285,6 +285,39 @@ def test_a_face_that_stands_like_a_mirror_image_but_has_other_radii_stays(kind, 
     assert all(each.notes == () for each in labelled)
 
 
+def seen_at_right_angles(target, group, turns):
+    """Images of both faces at right angles, the camera turned about their common edge."""
+    images = []
+    for i, turn in enumerate(turns):
+        turned = Rigid.exp([3.1, 0.02 * i, 0, 0, 0, 0]) @ Rigid.exp([0, turn, 0, 0, 0, 0])
+        pose, seen = Rigid(turned.rotation, np.array([0.0, 20 * i, 900])), Seen()
+        for face, own in zip(target.faces, (pose, pose @ TARGET_FROM_RIGHT), strict=True):
+            seen.face(face.id, plane_centres(own, face.xy_mm), range(9))
+        images.append((f"{group}{i}", group, seen.detection()))
+    return images
+
+
+BEFORE, BEHIND = (-0.45, -0.4, -0.35, -0.3), (-1.2, -1.15, -1.1, -1.05)
+"""Turns at which the camera is on the side of the first face, or of the second one, of the plane half way, rad."""
+
+
+@pytest.mark.parametrize(
+    ("turns", "stays"),
+    [((BEFORE,), False), ((BEFORE[:3] + BEHIND[:1],), True), ((BEFORE, BEFORE[:3] + BEHIND[:1]), True)],
+)
+def test_a_face_that_is_the_mirror_image_of_its_neighbour_stays_if_a_camera_stands_behind_the_mirror(turns, stays):
+    """No camera sees a reflection from behind its mirror; of several groups one is enough. From in front of it alone
+    nothing tells the second face from a reflection of the first."""
+    front = GRIDS["perturbed"][0]
+    turned = replace(front, id="right", xy_mm=front.xy_mm * [-1, 1] + [70, 0], origin="3", x="1", y="9")
+    target = TargetDesign("two", "dark", (front, turned))
+    groups = [seen_at_right_angles(target, name, own) for name, own in zip("ab", turns, strict=False)]
+    for labelled, _ in label_groups(groups, target, None, FOCAL_PX):
+        for image in labelled:
+            assert ("right" in image.observations.face_ids()) == stays
+            assert any("in a mirror" in note for note in image.notes) != stays
+
+
 @pytest.mark.parametrize("kind", GRIDS)
 def test_a_real_mirror_image_of_the_same_patterns_goes_out(kind, monkeypatch):
     """The second face is the first one's mirror image with its radii: the design says so, and the group leaves it out

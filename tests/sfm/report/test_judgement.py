@@ -243,6 +243,10 @@ def test_a_face_that_was_read_and_left_out_and_a_lost_group_call_for_care():
     assert told.verdict == "with care"
     assert told.use == "With care: 17 checks passed; face 5 was read in 3 images and left out."
     assert "Read why face 5 was left out" in told.next
+    own["summary"]["faces_expected"] = ["1", "2"]  # the photographs were not to show it, but it is said
+    told = judgement_of(own)
+    assert (told.verdict, told.missing) == ("yes", [])
+    assert "face 5 was read in 3 images and left out" in told.use
     own = report()
     own["notes"] = [LEFT_OUT_WHOLE + "group 25: no board recognised in 4 images; keep it in view"]
     told = judgement_of(own)

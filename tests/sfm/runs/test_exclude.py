@@ -9,6 +9,7 @@ import pytest
 
 from stcal.io.images import chosen_images
 from stcal.sfm.checks.verdict import Check, ranked
+from stcal.sfm.report.judgement import _first
 from stcal.sfm.runs.saved import load_run
 from stcal.sfm.runs.text import _faces, _noted
 from tests.outcome import INPUT, assert_error, fails_with
@@ -125,3 +126,13 @@ def test_of_failed_checks_those_that_name_an_image_come_first():
     ]
     order = [each.key for each in ranked(checks, frozenset({"a.jpg", "b.jpg"}))]
     assert order == ["image", "camera", "dull", "centre", "passed"]
+
+
+@pytest.mark.parametrize("verdict", ["failed", "suspicious"])
+@pytest.mark.parametrize(("later", "why"), [("radius-design", "rim"), ("groups", "board"), ("loops", "flatness")])
+def test_a_check_that_another_one_explains_comes_after_it(later, why, verdict):
+    checks = [Check(key, key, verdict, "", (), 1, (key,), "") for key in (later, why, "agreement")]
+    assert [each.key for each in ranked(checks, frozenset())] == [why, later, "agreement"]
+    assert [each.key for each in ranked(checks[::2], frozenset())] == [later, "agreement"]
+    rows = [{"key": c.key, "title": c.title, "verdict": c.verdict, "names": list(c.names)} for c in checks]
+    assert _first({"checks": rows, "images": []}, verdict)["key"] == why
