@@ -8,8 +8,8 @@ of the server and its processes, pages that they share counted once, at the tent
 
 With ``--hostile`` one client follows the target, undisturbed for a quarter of the time, and then beside one that
 attacks: connections that send nothing, photographs whose sender leaves, bytes one by one, uploads of 60 MB that lack
-the last byte, broken and smuggled requests. Ends with 1 where an answer is lost, or takes longer than 2 s beside the
-attacker and three times as long as the slowest one before: a machine that is busy otherwise is slow in both parts.
+the last byte, broken and smuggled requests. Ends with 1 where an answer is lost, or takes longer than 2 s: on a machine
+that is busy otherwise the search of a whole image alone may take that long.
 """
 
 import argparse
@@ -138,8 +138,8 @@ def rubbish(port: int, frames: list, start: float, seconds: float, rate: float) 
     return {"sent": i, "lost": lost}
 
 
-QUIET, MOST_S, AS_SLOW = 0.25, 2.0, 3.0
-"""Share of the time without an attack; longest time to an answer beside it, and over the longest one before it."""
+QUIET, MOST_S = 0.25, 2.0
+"""Share of the time without an attack; longest time to an answer, s."""
 IDLE, STALLED, SLOW = 100, 20, 30
 """Number of connections of each kind that are held open."""
 STALLED_BYTES = 60_000_000
@@ -212,12 +212,11 @@ def hostile(options, films: list, port: int, pid: int) -> bool:
     before, beside = np.array(found["taken"][:early]), np.array(found["taken"][early:])
     for words, taken in (("before", before), ("beside", beside)):
         print(f"from sent to answered {words} the attack, s: median {np.median(taken):.2f}, most {taken.max():.2f}")
-    late = [f"{QUIET * options.seconds + i / (options.rate / 10):.0f}" for i in np.flatnonzero(beside > MOST_S)]
+    late = [f"{i / (options.rate / 10):.0f}" for i in np.flatnonzero(np.array(found["taken"]) > MOST_S)]
     print(f"answers after more than {MOST_S:g} s: {len(late)}", *(f"at {second} s" for second in late[:9]))
     print(f"parts answered as second requests: {attacked['smuggled']}")
     print(f"memory: {memory[0]:.0f} MB at first, {max(memory):.0f} MB at most")
-    slow = beside.max() > max(MOST_S, AS_SLOW * before.max())
-    return not (found["lost"] or found["refused"] or attacked["smuggled"] or slow)
+    return not (found["lost"] or found["refused"] or attacked["smuggled"] or max(found["taken"]) > MOST_S)
 
 
 def run_client(answers, function, *arguments) -> None:
