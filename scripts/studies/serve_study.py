@@ -234,9 +234,10 @@ def hostile(options, films: list, port: int, pid: int) -> bool:
     print(f"parts answered as second requests: {attacked['smuggled']}")
     undisturbed, most = (max(part) for part in (memory[: round(QUIET * len(memory))], memory))
     budget = (HELD_BYTES + 2 * CHUNK_BYTES * CONNECTIONS) / 1e6
-    print(f"memory: {undisturbed:.0f} MB before the attack, at most {most - undisturbed:.0f} MB more, {budget:.0f} allowed")
+    grown = most - undisturbed
+    print(f"memory: {undisturbed:.0f} MB before the attack, up to {grown:.0f} MB more, {budget:.0f} MB allowed")
     bad = found["lost"] + found["refused"] + attacked["smuggled"]
-    return not bad and max(found["taken"]) <= MOST_S and most - undisturbed <= budget
+    return not bad and max(found["taken"]) <= MOST_S and grown <= budget
 
 
 def run_client(answers, function, *arguments) -> None:
