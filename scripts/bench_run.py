@@ -22,6 +22,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from bench_rows import ADVISED, GROUPS, TREE, timed_advice, timed_boards, timed_growing, timed_handeye, timed_tree
 
 from stcal.design import reference_board
 from stcal.io.cameras.read import read_camera
@@ -29,7 +30,6 @@ from stcal.io.design import board_toml, load_board, load_target
 from stcal.parallel import run_parallel
 
 FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION  # as stcal.io.images.decode
-GROUPS = 4
 RIGHT_PX = 3.0  # a board is right when every centre is this close to the image of a true dot
 BY_HAND = "OpenCV, 1 threshold, set by hand"
 THRESHOLDS = {
@@ -40,16 +40,8 @@ THRESHOLDS = {
 """minThreshold, maxThreshold, thresholdStep, minRepeatability. The last one is the least with which it can work."""
 
 
-ADVISED = 2000
-"""Images of the larger set for ``advise``."""
 STREAM = 40, 1728
 """Photographs for ``measure``, and their width, px: 2 megapixels."""
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
-REAL_BOARDS = {
-    "calibrate-camera, 25 chessboards, 8 Mpx": ("multidic_chessboard", "201"),
-    "calibrate-camera, 22 ChArUco, 1.3 Mpx": ("pycamset_charuco", "1"),
-}
-"""Sets of real photographs of boards in ``shared/data/real``; a set that is not there is left out."""
 MEMORY_EVERY_S = 0.05
 TARGET_SIGMA_MM = 0.002
 """Of the circles of the target that is followed, about that of a run."""
@@ -262,54 +254,6 @@ def timed_large(images: int) -> tuple[float, float]:
     return found[1]["ms_per_image"] / found[0]["ms_per_image"], found[1]["memory_mib"]
 
 
-def timed_advice() -> float:
-    """Seconds of ``advise`` over many images, by its function: labels simulated, the geometry that of a run."""
-    from stcal.geometry.rigid import Rigid
-    from stcal.sfm.adjust.chain import CalibratedTarget
-    from stcal.sfm.adjust.joint import covariance_of
-    from stcal.sfm.planning.advise import Known, advise
-    from stcal.sfm.planning.forecast import CentreNoise, Setup
-    from stcal.sfm.planning.nominal import observe, true_models
-    from stcal.sfm.planning.views import known_scene
-    from stcal.synthetic.scene import SceneOptions, make_scene
-
-    scene = make_scene(SceneOptions(images_per_group=ADVISED // GROUPS))
-    noise, radius = CentreNoise.expected(), scene.target.radius_of() | scene.board.radius_of()
-    models = true_models(scene, observe(scene, 0.0, np.random.default_rng(0)))
-    models = [noise.applied(model, scene.camera, radius) for model in models]
-    poses, groups = dict(scene.target_from_face), dict.fromkeys(scene.groups, Rigid())
-    start = CalibratedTarget(scene.reference_face, poses, scene.circles_target, groups)
-    setup = Setup(scene.target, scene.board, scene.camera, start, "plane", 0.02, None, 0.0)
-    joint = covariance_of(models, setup.board, setup.camera, setup.flatness_mm)
-    known = Known(tuple(models), joint, setup, noise, known_scene(models, joint, setup, "OPENCV"))
-    begin = time.perf_counter()
-    advise(known)
-    return time.perf_counter() - begin
-
-
-def timed_boards(stream: Path, scratch: Path, log: Path) -> dict[str, dict]:
-    """Seconds of ``calibrate-camera`` and of ``handeye`` on each set, the latter by its function."""
-    sys.path.append(str(Path(__file__).parent / "studies"))
-    import handeye_shared
-
-    places = {"calibrate-camera, 40 dot boards, 2 Mpx": (stream / "images", stream / "board.toml")}
-    places |= {
-        title: (SHARED / "real" / name / folder, SHARED / "real" / name / "board.toml")
-        for title, (name, folder) in REAL_BOARDS.items()
-    }
-    rows = {}
-    for title, (images, board) in places.items():
-        if images.is_dir():
-            words = ["calibrate-camera", images, "--board", board, "--out", scratch / "camera.txt", "--overwrite"]
-            rows[title] = {"seconds": timed_program(words, log)[0]}
-    for title, name in (("ChArUco, 16 of 1.9 Mpx", "charuco"), ("dot boards, 15 of 0.3 Mpx", "dots")):
-        if (SHARED / f"{name.replace('dots', 'dotgrid')}_handeye").is_dir():
-            start = time.perf_counter()
-            getattr(handeye_shared, name)(SHARED, scratch / name, splits=handeye_shared.DEFAULT)
-            rows[f"handeye, {title}"] = {"seconds": time.perf_counter() - start}
-    return rows
-
-
 def boards(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> dict[str, int]:
     """How many boards were found, how many with every dot, and how many with no centre where no dot is."""
     off = [np.linalg.norm(xy[:, None] - true[name], axis=2).min(1).max() for name, xy in found.items()]
@@ -334,6 +278,7 @@ def measure(data: Path, stream: Path, film: Path, scratch: Path) -> dict:
     words = ["run", "--no-strict", data / "images", *files_of(data), "--out", scratch / "run"]
     rows["stcal-sfm run"] = {"seconds": timed_program(words, log)[0]}
     rows["run again, a photograph more"] = {"seconds": timed_second_run(data, scratch, log)}
+    rows["watch, capture: after a photograph"] = {"seconds": timed_growing(data, scratch)}
     seconds, found = timed_detection(data, scratch / "cache")
     rows["stcal detection"] = {"seconds": seconds} | boards(found, true)
     rows["joint adjustment alone"] = {"seconds": timed_calibration(scratch / "run")}
@@ -357,7 +302,9 @@ def measure(data: Path, stream: Path, film: Path, scratch: Path) -> dict:
     following = timed_following(film, filmed_scene())
     for title, seconds in zip(("measure --sequence, one core", "Tracker.locate, one core"), following, strict=True):
         rows[title] = {"seconds": seconds, "images": STREAM[0]}
-    rows |= timed_boards(stream, scratch, log)
+    rows |= timed_boards(stream, scratch, log, timed_program)
+    rows |= timed_handeye(scratch)
+    rows[TREE] = {"seconds": timed_tree()}
     shutil.rmtree(scratch)
     about = {"images": len(paths), "size_px": [camera.width, camera.height], "megabytes": megabytes}
     about["workers"] = os.cpu_count()

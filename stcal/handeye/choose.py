@@ -22,6 +22,7 @@ from stcal.handeye.validate import (
     predicted,
     require_solvable_without,
     widened_by_scatter,
+    with_common_errors,
     with_jackknife,
 )
 from stcal.io.cameras.model import CameraPrior
@@ -145,6 +146,7 @@ def _solved(
         result = solution.result
         if result.covariance is None:
             result = with_jackknife(result, [solution.without(np.array([i])) for i in range(len(pairs))])
+            result = with_common_errors(result, pairs, setup, options)
     except StcalError as error:
         return error
     errors = [

@@ -52,6 +52,9 @@ class HandEye(Brief):
         What the poses determine.
     notes : tuple of str
         Notes on the result, one line each.
+    common_covariance : (6, 6) array, optional
+        Part of ``covariance`` that comes from what the errors of the board's poses have in common, where that is
+        stated; more poses do not make it smaller.
     judgement : Verdict, optional
         Whether to use the result; None of a single method's solution, which was not judged. See :attr:`verdict`.
     """
@@ -72,13 +75,14 @@ class HandEye(Brief):
     reprojection: Reprojection | None = None
     observability: Observability | None = None
     notes: tuple[str, ...] = ()
+    common_covariance: np.ndarray | None = None
     judgement: Verdict | None = None
 
     def __post_init__(self):
         m = len(self.names)
         object.__setattr__(self, "residuals", frozen(self.residuals, (m, 6), "residuals"))
         object.__setattr__(self, "outliers", frozen(self.outliers, (m,), "outliers", bool))
-        for name in ("covariance", "stand_covariance"):
+        for name in ("covariance", "stand_covariance", "common_covariance"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, frozen(getattr(self, name), (6, 6), name))
 

@@ -21,7 +21,7 @@ from stcal.handeye.judge.remarks import Aside
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods import closed_form
 from stcal.handeye.methods.arm import ArmModel
-from stcal.handeye.methods.camera_error import of_poses
+from stcal.handeye.methods.camera_error import in_common, of_poses
 from stcal.handeye.methods.closed_form import AX_XB, AX_ZB, solve_closed_form
 from stcal.handeye.methods.convex import convex
 from stcal.handeye.methods.evolution import EvolutionOptions, Objective, evolve, polish
@@ -56,6 +56,7 @@ chance may exceed the ratio that is required."""
 REST_WORSE = 1.2
 """Factor by which corners must fit worse with an exact robot before a robot that is stated as exact is doubted."""
 ROBOT = ("robot_rad", "robot_mm")
+IN_COMMON = "σ contain the errors that the board's poses have in common (columns common…)"
 HELD_MM = 1e-6
 """σ that holds X along the one axis of rotation of a four-axis robot, where the poses do not determine it, in mm."""
 
@@ -325,6 +326,11 @@ def _by_poses(task: _Task) -> Solved:
         notes += beyond
         if beyond and solution.variance_factor > 1:
             covariance = covariance * solution.variance_factor
+    common = None
+    if task.loop.camera_common is not None:
+        alone = covariance[:12, :12]
+        covariance = in_common(task.loop, solution, task.loop.camera_common).covariance(alone)
+        common, notes = (covariance - alone)[:6, :6], (*notes, Aside(IN_COMMON))
     if task.views is not None and options.camera is not None:
         error = of_poses(task.loop, solution, task.views, options.camera)
         covariance = error.covariance(covariance[:12, :12])
@@ -345,6 +351,7 @@ def _by_poses(task: _Task) -> Solved:
         estimated=tuple(solution.sigma),
         observability=task.seen,
         notes=notes + remarks.of_rounds(solution.settled),
+        common_covariance=common,
     )
     return Solved(task, result, solution)
 

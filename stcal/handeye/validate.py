@@ -18,7 +18,7 @@ from stcal.handeye.judge.remarks import Aside, Grave
 from stcal.handeye.judge.symmetry import repair
 from stcal.handeye.methods.noise import UNKNOWNS
 from stcal.handeye.result import HandEye
-from stcal.handeye.solve import METHODS, HandEyeOptions, handeye
+from stcal.handeye.solve import IN_COMMON, METHODS, HandEyeOptions, handeye, solved
 from stcal.parallel import one_thread, run_in_order
 
 SETUP_SPLITS = 6
@@ -391,6 +391,32 @@ def with_jackknife(result: HandEye, without_one: list[HandEye]) -> HandEye:
         covariances[key] = (m - 1) / m * moved.T @ moved
     note = Aside(f"σ of both transforms are by the jackknife: the scatter of {result.method} without each of the poses")
     return replace(result, **covariances, notes=(*result.notes, note))
+
+
+def with_common_errors(result: HandEye, pairs: HandEyePoses, setup: Setup, options: HandEyeOptions) -> HandEye:
+    """Returns a result with covariances that contain the errors that the board's poses have in common, if any.
+
+    These are what a solution moves by if the poses err by one σ of each.
+    """
+    common, seen = pairs.camera_from_board_common, pairs.camera_from_board
+    if common is None:
+        return result
+    erring = [
+        solved(replace(pairs, camera_from_board=seen.moved(step.copy())), setup, result.method, None, options).result
+        for step in np.moveaxis(common, 2, 0)
+    ]
+    covariances = {}
+    for name, key in (("mount_from_camera", "covariance"), ("stand_from_board", "stand_covariance")):
+        poses = Poses.of([getattr(part, name) for part in erring])
+        moved = poses.difference(Poses.of([getattr(result, name)] * len(erring)))
+        covariances[key] = moved.T @ moved
+    return replace(
+        result,
+        covariance=result.covariance + covariances["covariance"],
+        stand_covariance=result.stand_covariance + covariances["stand_covariance"],
+        common_covariance=covariances["covariance"],
+        notes=(*result.notes, Aside(IN_COMMON)),
+    )
 
 
 SCATTERED = 1.5

@@ -1,7 +1,7 @@
 """The main job: calibrates a target from a folder of images. Each call is a stage, and its result is saved."""
 
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -45,7 +45,7 @@ from stcal.sfm.detect.files import PHOTOGRAPHS, DetectionResult, seen_by
 from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.sfm.mapping.body import MIN_CORNERS
 from stcal.sfm.mapping.pairs import image_graph
-from stcal.sfm.mapping.placed import LENS, PlacedBody, place_and_find_camera, place_with_camera, unknown_lens
+from stcal.sfm.mapping.placed import LENS, place_and_find_camera, place_with_camera, unknown_lens
 from stcal.sfm.runs.detection import (
     DetectedImages,
     detected_images,
@@ -57,7 +57,15 @@ from stcal.sfm.runs.folder import overlays_beside, write_run
 from stcal.sfm.runs.options import RunOptions
 from stcal.sfm.runs.published import compare_with_paper, require_comparable
 from stcal.sfm.runs.result import RunResult
-from stcal.sfm.runs.solve import solve_body, solve_groups, ungrouped, unknown_face_notes, unseen_board, usable_groups
+from stcal.sfm.runs.solve import (
+    GroupSolution,
+    solve_body,
+    solve_groups,
+    ungrouped,
+    unknown_face_notes,
+    unseen_board,
+    usable_groups,
+)
 from stcal.sfm.runs.transaction import MarkerFile, RunFolder, frames_folder, require_ours, run_folder
 
 IN_MEMORY = "images in memory"
@@ -456,26 +464,36 @@ def _solved(
 
     progress("map", 0, len(groups))
     graph = image_graph(observations, board, options.graph)
-    if known and not board_alone:
-        usable = [image for image in observations if image.group in groups]
-        circles = [face for face in target.with_faces(printed=False).faces if len(face.ids) >= MIN_CORNERS]
-        body = place_with_camera(usable, (*known, *circles), calibrated_camera)
-        solutions, unsolved = solve_body(usable, body, calibrated_camera, target, board, options.eccentricity, progress)
-        unsolved += unlinked_notes(body)
-    else:
+    usable = [image for image in observations if image.group in groups]
+    circles = [face for face in target.with_faces(printed=False).faces if len(face.ids) >= MIN_CORNERS]
+
+    def solve(camera: Camera, names: Collection[str]) -> tuple[list[GroupSolution], list[str]]:
+        if known and not board_alone:
+            body = place_with_camera(usable, (*known, *circles), camera)
+            found, notes = solve_body(usable, body, camera, target, board, options.eccentricity, progress)
+            return found, notes + body.unlinked_notes()
         scratch = folder.stage / "scratch"
-        solutions, unsolved = solve_groups(
-            observations, graph, scratch, folder.cache, calibrated_camera, target, board, options, progress, groups
-        )
-    models, adjust_options = [s.model for s in solutions], options.adjustment(target)
+        return solve_groups(observations, graph, scratch, folder.cache, camera, target, board, options, progress, names)
+
+    solutions, unsolved = solve(calibrated_camera, groups)
+    adjust_options, prior = options.adjustment(target), camera_prior(calibrated_camera)
     if board_alone:
         progress("faces", 0, 1)
-        calibration = calibrate_board(models, calibrated_camera, board, adjust_options)
+        calibration = calibrate_board([s.model for s in solutions], calibrated_camera, board, adjust_options)
         progress("faces", 1, 1)
     else:
-        calibration = calibrate(
-            models, calibrated_camera, target, board, adjust_options, camera_prior(calibrated_camera), progress
-        )
+
+        def adjust_all() -> Calibration:
+            models = [s.model for s in solutions]
+            return calibrate(models, calibrated_camera, target, board, adjust_options, prior, progress)
+
+        calibration = adjust_all()
+        if doubted := {s.model.group for s in solutions if s.outliers and options.refine_camera}:
+            # What disagrees with the others by the first camera may agree by the refined one.
+            with suppress(StcalError):
+                again = {s.model.group: s for s in solve(calibration.camera, doubted)[0]}
+                solutions = [again.get(s.model.group, s) for s in solutions]
+                calibration = adjust_all()
     return RunResult(
         out=folder.out,
         camera=calibrated_camera,
@@ -506,15 +524,6 @@ def _shows_dots(labelled: Sequence[LabelledImage]) -> bool:
 def as_one_group(labelled: Sequence[LabelledImage]) -> list[LabelledImage]:
     """Returns the images as one group: without a board nothing but the body is used, whatever stands beside it."""
     return [replace(image, observations=replace(image.observations, group=TOP_GROUP)) for image in labelled]
-
-
-def unlinked_notes(body: PlacedBody) -> list[str]:
-    """Returns a note for each face of known shape that no image shows together with one that is placed."""
-    return [
-        f"face {face}: left out, no image shows it with a face that is linked to the others, by {MIN_CORNERS} corners "
-        "each; add one that does"
-        for face in body.unlinked
-    ]
 
 
 @require_arguments

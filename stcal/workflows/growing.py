@@ -17,7 +17,7 @@ from stcal.io.cameras.read import camera_model, read_camera
 from stcal.io.design import target_of
 from stcal.io.files import CACHE
 from stcal.io.images import Skipped, chosen_images, find_images
-from stcal.parallel import Progress
+from stcal.parallel import Progress, kept_processes, one_thread
 from stcal.sfm.detect.files import detect_files
 from stcal.sfm.detect.labels import LabelledImage, label_images
 from stcal.sfm.pipeline import ImageFiles, run_on_files
@@ -141,19 +141,20 @@ class GrowingRun:
         """Returns the state after a run over all photographs, or the ``complete`` ones alone. Detections of earlier
         photographs are kept."""
         result, reason, advice = None, "", None
-        try:
-            files = self._files(complete)
-            given = self.images, self.camera, self.out, self.target, self.board, self.options
-            result = run_on_files(files, *given, progress, RELOAD_S)
-        except StcalError as error:
-            if not (self.out / CACHE).is_dir():  # the run refused the folder itself
-                raise
-            reason = str(error)
-        if result is not None and self.views:
+        with one_thread(), kept_processes(self.options.workers):  # those of the run also compare the views
             try:
-                advice = advise(known_of(load_run(self.out)), self.views, progress)
+                files = self._files(complete)
+                given = self.images, self.camera, self.out, self.target, self.board, self.options
+                result = run_on_files(files, *given, progress, RELOAD_S)
             except StcalError as error:
+                if not (self.out / CACHE).is_dir():  # the run refused the folder itself
+                    raise
                 reason = str(error)
+            if result is not None and self.views:
+                try:
+                    advice = advise(known_of(load_run(self.out)), self.views, progress)
+                except StcalError as error:
+                    reason = str(error)
         new, left_out, blur_px = self._found(came, result, complete)
         return Update(images, new, left_out, tuple(gone), result, reason, advice, blur_px)
 

@@ -13,7 +13,7 @@ from stcal.handeye.data.formats.keys import inverse_name
 from stcal.handeye.data.formats.numeric import read_columns, todays
 from stcal.handeye.data.formats.recognise import read_content
 from stcal.handeye.data.formats.record import FRAMES, Content, Frames, Role, Said, Side
-from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance
+from stcal.handeye.data.pairs import HandEyePoses, inverse_covariance, inverse_jacobian
 from stcal.handeye.data.stream import LONGEST_S, TOLERANCE_S, Stream, Timed, stamps_of, stem_of, taken_at, time_of
 from stcal.io.join import keys_of
 from stcal.io.poses.columns import read_mapped
@@ -33,7 +33,7 @@ class Posed:
 
     ``names`` : image or timestamp of each pose, or none; ``places`` : place of each pose in its file; ``understood`` :
     how the file was read; ``scaled`` : whether lengths have no unit; ``guessed`` : the unit that was guessed from the
-    size of lengths, empty where it is known.
+    size of lengths, empty where it is known; ``common`` : (m, 6, k) errors that the poses have in common.
     """
 
     poses: Poses
@@ -44,6 +44,7 @@ class Posed:
     understood: str
     scaled: bool = False
     guessed: str = ""
+    common: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -255,8 +256,9 @@ def _by_time(
         )
     rows = np.flatnonzero(taken.kept)
     of_camera = None if camera.covariance is None else camera.covariance[rows]
+    common = None if camera.common is None else camera.common[rows]
     names = tuple(camera.names[i] for i in rows)
-    pairs = HandEyePoses(taken.base_from_flange, camera.poses[rows], None, of_camera, names, where)
+    pairs = HandEyePoses(taken.base_from_flange, camera.poses[rows], None, of_camera, names, where, common)
     left_out = tuple((camera.names[i], why) for i, why in enumerate(taken.why) if why)
     dropped = (
         ("covariances of the robot's poses are not used: they are of other times",)
@@ -296,17 +298,18 @@ def settled(side: Side, role: Role, content: Content, path: Path, statements: Sa
     frames = _direction(side, role, path, statements)
     factor, unit, guessed = _unit(side, frames.name, path, statements)
     poses = Poses(side.rotation, factor * side.translation)
-    covariance = side.covariance
+    covariance, common = side.covariance, side.common
     wanted = FRAMES[role][0]
     if frames.name != wanted:
         covariance = None if covariance is None else inverse_covariance(poses, covariance)
+        common = None if common is None else inverse_jacobian(poses) @ common
         poses = poses.inverse()
     parts = [f"{path.name}: {content.form}", f"{len(side)} poses", f"{frames.name} {frames.by}", side.turned, unit]
     if content.passed_over:
         ellipsis = " …" if len(content.passed_over) > SHOWN else ""
         parts.append(f"passed over: {', '.join(content.passed_over[:SHOWN])}{ellipsis}")
     scaled = side.scaled and statements.length_unit is None
-    return Posed(poses, side.names, side.places, covariance, str(path), "; ".join(parts), scaled, guessed)
+    return Posed(poses, side.names, side.places, covariance, str(path), "; ".join(parts), scaled, guessed, common)
 
 
 def _direction(side: Side, role: Role, path: Path, statements: Said) -> Frames:
@@ -365,7 +368,8 @@ def _pairs(
 ) -> HandEyePoses:
     of_robot = None if robot.covariance is None else robot.covariance[list(a)]
     of_camera = None if camera.covariance is None else camera.covariance[list(b)]
-    return HandEyePoses(robot.poses[list(a)], camera.poses[list(b)], of_robot, of_camera, names, where)
+    common = None if camera.common is None else camera.common[list(b)]
+    return HandEyePoses(robot.poses[list(a)], camera.poses[list(b)], of_robot, of_camera, names, where, common)
 
 
 def _both(robot: Posed, camera: Posed) -> tuple[str, ...]:

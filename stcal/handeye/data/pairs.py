@@ -37,6 +37,9 @@ class HandEyePoses(Brief):
         Name of each pair in messages: ``line 7``, an image's name; ``pose 1`` … where no names are given.
     where : str
         Source of the poses.
+    camera_from_board_common : (m, 6, k) array, optional
+        Errors that the poses of the board have in common, as :func:`stcal.sfm.measure` states them: pose i errs by
+        ``common[i] @ z`` with the same z, k independent normal numbers of σ 1, for all. The covariances contain them.
 
     Raises
     ------
@@ -50,6 +53,7 @@ class HandEyePoses(Brief):
     camera_from_board_covariance: np.ndarray | None = None
     names: tuple[str, ...] = ()
     where: str = "poses"
+    camera_from_board_common: np.ndarray | None = None
 
     def __post_init__(self):
         require_fields(self, "poses")
@@ -62,6 +66,8 @@ class HandEyePoses(Brief):
         for name in ("base_from_flange_covariance", "camera_from_board_covariance"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, frozen(getattr(self, name), (m, 6, 6), name))
+        if (common := self.camera_from_board_common) is not None:
+            object.__setattr__(self, "camera_from_board_common", frozen(common, (m, 6, None), "common errors"))
         names = tuple(self.names) or tuple(f"pose {i}" for i in range(1, m + 1))
         if len(names) != m:
             raise InputError("E-NAMES-COUNT", f"{self.where}: {len(names)} names of {m} poses; one each needed")
@@ -112,6 +118,7 @@ class HandEyePoses(Brief):
         """Returns the pairs selected by a mask, slice or list."""
         rows = np.arange(len(self))[index]
         of_flange, of_board = self.base_from_flange_covariance, self.camera_from_board_covariance
+        common = self.camera_from_board_common
         return HandEyePoses(
             self.base_from_flange[rows],
             self.camera_from_board[rows],
@@ -119,6 +126,7 @@ class HandEyePoses(Brief):
             None if of_board is None else of_board[rows],
             tuple(self.names[i] for i in rows),
             self.where,
+            None if common is None else common[rows],
         )
 
     def _check_copies(self):
@@ -187,6 +195,7 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
 
     Columns ``base_from_flange_x_mm`` … ``_qw`` … and ``camera_from_board_…`` (or ``flange_from_base_…``,
     ``board_from_camera_…``), lengths in any unit of :data:`~stcal.io.table.LENGTHS`, covariances as ``…_cov_rx_rx``.
+    The camera's side may also have ``…_common1_rx`` …, what the errors of its poses have in common.
 
     Parameters
     ----------
@@ -208,13 +217,14 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
     """
     table = read_table(path, WHAT, quaternions)
     sides = [read_side(table, *names) for names in SIDES]
-    (flange, flange_covariance), (board, board_covariance) = sides
+    (flange, flange_covariance, _), (board, board_covariance, common) = sides
     names = tuple(f"line {line}" for line in table.lines)
-    return HandEyePoses(flange, board, flange_covariance, board_covariance, names, table.where)
+    return HandEyePoses(flange, board, flange_covariance, board_covariance, names, table.where, common)
 
 
-def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None]:
-    """Returns poses ``wanted`` and their covariances, from the columns of ``wanted`` or of its inverse."""
+def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None, np.ndarray | None]:
+    """Returns poses ``wanted``, their covariances and what their errors have in common, from the columns of ``wanted``
+    or of its inverse."""
     names = [name for name in (wanted, inverse) if any(column.startswith(name + "_") for column in table.columns)]
     if len(names) != 1:
         fault = "no such columns" if not names else "both"
@@ -223,9 +233,15 @@ def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarra
             f"{table.where}: {fault}, {wanted}_x_mm … or {inverse}_x_mm … needed; the header is {table.header()}",
         )
     poses, covariance = table.poses(names[0] + "_"), table.pose_covariances(names[0] + "_")
+    common = table.common_errors(covariance, names[0] + "_")
     if names[0] == wanted:
-        return poses, covariance
-    return poses.inverse(), None if covariance is None else inverse_covariance(poses, covariance)
+        return poses, covariance, common
+    carried = inverse_jacobian(poses)
+    return (
+        poses.inverse(),
+        None if covariance is None else carried @ covariance @ np.swapaxes(carried, 1, 2),
+        None if common is None else carried @ common,
+    )
 
 
 def inverse_jacobian(poses: Poses) -> np.ndarray:
@@ -273,7 +289,8 @@ class Loop:
     """m pose pairs in the terms of the one equation.
 
     ``inverted`` : whether stand_from_mount is the inverse of what the robot reports, base_from_flange;
-    ``robot_covariance``, ``camera_covariance`` : (m, 6, 6) of base_from_flange and camera_from_board, where known.
+    ``robot_covariance``, ``camera_covariance`` : (m, 6, 6) of base_from_flange and camera_from_board, where known, the
+    latter without ``camera_common`` : (m, 6, k), the errors that camera_from_board have in common.
     """
 
     stand_from_mount: Poses
@@ -281,6 +298,7 @@ class Loop:
     inverted: bool = False
     robot_covariance: np.ndarray | None = None
     camera_covariance: np.ndarray | None = None
+    camera_common: np.ndarray | None = None
 
     @classmethod
     def of(cls, pairs: HandEyePoses, setup: Setup) -> "Loop":
@@ -289,7 +307,10 @@ class Loop:
             raise InputError("E-HANDEYE-SETUP", f"hand-eye: setup {setup!r}; {' or '.join(SETUPS)} needed")
         inverted = setup == "eye-to-hand"
         hand = pairs.base_from_flange.inverse() if inverted else pairs.base_from_flange
-        covariances = (pairs.base_from_flange_covariance, pairs.camera_from_board_covariance)
+        of_camera, common = pairs.camera_from_board_covariance, pairs.camera_from_board_common
+        if of_camera is not None and common is not None:
+            of_camera = of_camera - common @ np.swapaxes(common, 1, 2)
+        covariances = (pairs.base_from_flange_covariance, of_camera, common)
         return cls(hand, pairs.camera_from_board, inverted, *covariances)
 
     def __len__(self) -> int:
@@ -297,7 +318,8 @@ class Loop:
 
     def __getitem__(self, index) -> "Loop":
         """Returns the pairs selected by a mask, slice or list."""
-        covariances = (None if c is None else c[index] for c in (self.robot_covariance, self.camera_covariance))
+        known = (self.robot_covariance, self.camera_covariance, self.camera_common)
+        covariances = (None if c is None else c[index] for c in known)
         return Loop(self.stand_from_mount[index], self.camera_from_board[index], self.inverted, *covariances)
 
     def chain(self, mount_from_camera: Rigid, scale: float = 1.0) -> Poses:

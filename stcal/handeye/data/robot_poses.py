@@ -152,7 +152,7 @@ def read_robot_poses(path: str | Path, quaternions: Order = "wxyz", statements: 
     timed = "image" not in table and TIME in table
     images, places = table.text(TIME if timed else "image"), tuple(f"line {line}" for line in table.lines)
     require_each_once(images, places, table.where, "image ")
-    poses, covariance = read_side(table, *SIDES[0])
+    poses, covariance, _ = read_side(table, *SIDES[0])
     frame = next(name for name in SIDES[0] if any(column.startswith(f"{name}_") for column in table.columns))
     understood = f"{path.name}: table; {len(images)} poses; {frame} by its columns; {table.unit(f'{frame}_x', LENGTHS)}"
     return RobotPoses(tuple(images), poses, covariance, places, table.where, understood, timed=timed)

@@ -52,10 +52,14 @@ def repair(pairs: HandEyePoses, setup: Setup, symmetries: tuple[Rigid, ...], vie
             best, least = labels, cost
     best = _most_as_they_are(best, every)
     poses = Poses.of(variants[k][i] for i, k in enumerate(best))
-    covariance = pairs.camera_from_board_covariance
-    if covariance is not None:
-        covariance = _carried(covariance, as_numbered, poses)
-    repaired = replace(pairs, camera_from_board=poses, camera_from_board_covariance=covariance)
+    covariance, common = pairs.camera_from_board_covariance, pairs.camera_from_board_common
+    carried = _carried(as_numbered, poses)
+    repaired = replace(
+        pairs,
+        camera_from_board=poses,
+        camera_from_board_covariance=None if covariance is None else carried @ covariance @ np.swapaxes(carried, 1, 2),
+        camera_from_board_common=None if common is None else carried @ common,
+    )
     if views is not None:
         turned = (turned_view(view, every[k]) for view, k in zip(views.views, best, strict=True))
         views = Views(views.camera, tuple(turned))
@@ -120,12 +124,12 @@ def _nearest(turn: Rigid, every: tuple[Rigid, ...]) -> int:
     return int(np.argmin(angles))
 
 
-def _carried(covariance: np.ndarray, seen: Poses, poses: Poses) -> np.ndarray:
-    """Returns the covariances of camera_from_board when its origin moves on the board: the error of the rotation moves
-    the origin too."""
+def _carried(seen: Poses, poses: Poses) -> np.ndarray:
+    """Returns the derivative (m, 6, 6) of errors of camera_from_board when its origin moves on the board: the error of
+    the rotation moves the origin too."""
     jacobian = np.tile(np.eye(6), (len(poses), 1, 1))
     jacobian[:, 3:, :3] = -skew(poses.translation - seen.translation)
-    return jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    return jacobian
 
 
 def turned_view(view: View, turn: Rigid) -> View:

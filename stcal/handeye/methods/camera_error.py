@@ -82,14 +82,27 @@ def considered(wider: RigCorners, state: RigBundle, free: tuple[str, ...]) -> Ca
 def of_poses(loop: Loop, solution: PoseSolution, views: Views, prior: CameraPrior) -> CameraError:
     """Returns the camera error of an adjustment of the board's poses, each of which was found from its view with the
     camera as filed."""
-    used = np.flatnonzero(~solution.outliers)
     basis = intrinsic_basis(prior.colmap_model)
     by_camera, second_moment = poses_by_camera(views, loop.camera_from_board, basis, prior)
+    return CameraError(_slope(loop, solution, by_camera), second_moment)
+
+
+def in_common(loop: Loop, solution: PoseSolution, common: np.ndarray) -> CameraError:
+    """Returns the effect of errors (m, 6, k) that the board's poses have in common, which their residuals hardly show.
+
+    The poses were weighed by their other errors alone.
+    """
+    return CameraError(_slope(loop, solution, common), np.eye(common.shape[2]))
+
+
+def _slope(loop: Loop, solution: PoseSolution, by_unknown: np.ndarray) -> np.ndarray:
+    """Returns the derivative (12, q) of the gradient of X and Z, from that of the board's poses (m, 6, q)."""
+    used = np.flatnonzero(~solution.outliers)
     state: LoopState = solution.state
     jacobian = loop.jacobian(state.mount_from_camera, state.scale)[:, :, :12]
-    moves = loop.by_camera(state.mount_from_camera, state.scale) @ by_camera
+    moves = loop.by_camera(state.mount_from_camera, state.scale) @ by_unknown
     weighted = np.linalg.solve(solution.covariance[used], moves[used])
-    return CameraError(np.einsum("mai,maj->ij", jacobian[used], weighted), second_moment)
+    return np.einsum("mai,maj->ij", jacobian[used], weighted)
 
 
 def poses_by_camera(

@@ -135,6 +135,7 @@ def judged(outcome: Outcome) -> Verdict:
         _of_residuals(outcome),
         _of_prediction(outcome),
         _of_share(outcome),
+        _of_common_errors(outcome),
         _of_motions(outcome),
         _of_outliers(outcome),
     ]
@@ -216,17 +217,40 @@ def _of_share(outcome: Outcome) -> Finding | None:
     return Finding("σ of the transform", word, said, f"{share_of_transform:.0%} of the variance", f"{HALF:.0%}", remedy)
 
 
-def share_of_variance(outcome: Outcome) -> tuple[float, float, float] | None:
-    """Returns the board's distance, σ there due to the transform, and the RMS error of one pose, all in mm and 3-D."""
+def _of_common_errors(outcome: Outcome) -> Finding | None:
+    """Judges what the errors of the board's poses have in common: σ contain it, and more poses do not reduce it."""
+    if (common := outcome.result.common_covariance) is None:
+        return None
+    share = share_of_variance(outcome, common)
+    if share is None:
+        return None
+    distance, sigma, shift = share
+    word: Word = CARE if sigma > shift else GOOD
+    said = (
+        f"of the σ of {FRAMES[outcome.result.setup].camera}, {sigma:.2g} mm where the board was ({distance:.0f} mm "
+        "away) are from errors that all poses of the board have in common"
+    )
+    remedy = "calibrate the camera better, or solve from the images: more poses do not help" if word != GOOD else ""
+    return Finding("Common errors of the board's poses", word, said, f"{sigma:.2g} mm", f"{shift:.2g} mm", remedy)
+
+
+def share_of_variance(outcome: Outcome, covariance: np.ndarray | None = None) -> tuple[float, float, float] | None:
+    """Returns the board's distance, σ there due to the transform, and the RMS error of one pose, all in mm and 3-D.
+
+    ``covariance`` : of the transform, (6, 6); that of the result, without common errors of the poses, if None
+    """
     result, pairs = outcome.result, outcome.pairs
+    if covariance is None and result.covariance is not None:
+        common = result.common_covariance
+        covariance = result.covariance if common is None else result.covariance - common
     shift, used = result.rms()[1], int((~result.outliers).sum())
-    if result.covariance is None or pairs is None or used <= 2 or shift < NOTHING_MM:
+    if covariance is None or pairs is None or used <= 2 or shift < NOTHING_MM:
         return None
     place = pairs.camera_from_board.translation[~result.outliers] * result.scale
     jacobian = np.concatenate(
         [-skew(place @ result.mount_from_camera.rotation.T), np.tile(np.eye(3), (used, 1, 1))], axis=2
     )
-    variance = np.einsum("mab,bc,mac->m", jacobian, result.covariance, jacobian).mean()
+    variance = np.einsum("mab,bc,mac->m", jacobian, covariance, jacobian).mean()
     distance = float(np.linalg.norm(place, axis=1).mean())
     return distance, float(np.sqrt(variance)), shift / float(np.sqrt(1 - 2 / used))
 

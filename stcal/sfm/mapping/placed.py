@@ -12,7 +12,16 @@ from stcal.geometry.camera import Camera, intrinsic_basis
 from stcal.geometry.rigid import Rigid
 from stcal.labels import Label
 from stcal.sfm.data.model import ImageObservations, Outlier, WorldModel
-from stcal.sfm.mapping.body import FOCAL_STEPS, Body, Corners, adjust_body, contradictions, place_body, settled_body
+from stcal.sfm.mapping.body import (
+    FOCAL_STEPS,
+    MIN_CORNERS,
+    Body,
+    Corners,
+    adjust_body,
+    contradictions,
+    place_body,
+    settled_body,
+)
 from stcal.sfm.mapping.incremental import MAX_REPROJECTION_PX, MIN_RAY_ANGLE_RAD, assemble, complete
 from stcal.sfm.mapping.pairs import PairScore
 
@@ -42,6 +51,14 @@ class PlacedBody:
     camera: Camera
     unlinked: tuple[str, ...]
     contradictions: tuple[Outlier, ...]
+
+    def unlinked_notes(self) -> list[str]:
+        """Returns a note for each face of known shape that no image shows together with one that is placed."""
+        return [
+            f"face {face}: left out, no image shows it with a face that is linked to the others, by {MIN_CORNERS} "
+            "corners each; add one that does"
+            for face in self.unlinked
+        ]
 
 
 def unknown_lens(camera: Camera) -> Camera:

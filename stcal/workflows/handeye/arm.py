@@ -81,7 +81,7 @@ def read_arm(path: Path, robot: Robot, quaternions: Order = "wxyz") -> tuple[Rob
     flange = arm.poses(np.zeros(len(arm.angles)))
     understood = f"{path.name}: joint values of {len(images)} images; poses by the file of {robot.name}"
     if any(name.startswith(side) for side in SIDES[0] for name in table.columns):
-        reported, _ = read_side(table, *SIDES[0])
+        reported, *_ = read_side(table, *SIDES[0])
         apart = (reported.inverse() @ flange).difference((reported.inverse() @ flange)[[0] * len(flange)])
         understood += (
             f"; its flange moves against the one reported by up to {np.linalg.norm(apart[:, 3:], axis=1).max():.3g} mm "

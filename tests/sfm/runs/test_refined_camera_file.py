@@ -66,3 +66,16 @@ def test_an_unknown_or_rough_camera_is_found_from_the_dots(small_dataset, small_
         if face != result.target.reference_face:
             sigma = np.sqrt(np.diag(result.target.face_covariance[face])[3:])
             assert 0.05 < np.abs(error / sigma).max() < 4
+
+
+@pytest.mark.slow
+def test_circles_that_only_a_rough_camera_contradicts_are_not_left_out(small_dataset, small_scene):
+    """A tangential distortion that is off by 0.003 moves centres by up to tenths of a pixel against one another. The
+    refined camera follows the lens, and what was left out before is judged by it."""
+    rough = small_scene.camera.parameters().copy()
+    rough[6] += 0.003
+    camera = small_scene.camera.with_parameters(rough)
+    files = [small_dataset / name for name in ("target.toml", "board.toml")]
+    result = run(small_dataset / "images", camera, None, *files, RunOptions(refine_camera=True, workers=1))
+    assert [outlier for group in result.solutions for outlier in group.outliers] == []
+    assert [check.key for check in result.checks if check.verdict == "failed"] == []

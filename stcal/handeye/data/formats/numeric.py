@@ -440,7 +440,8 @@ def _side(table: Table, prefix: str, frames: Frames | None, names: tuple[str, ..
     if turned is None:
         return None
     covariance = table.pose_covariances(prefix)
-    return Side(turned.rotation, at, places_of(table), turned.words, unit, frames, names, covariance=covariance)
+    known = {"covariance": covariance, "common": table.common_errors(covariance, prefix)}
+    return Side(turned.rotation, at, places_of(table), turned.words, unit, frames, names, **known)
 
 
 def _of_matrix(table: Table, matrix: MatrixColumns, frames: Frames | None, names: tuple[str, ...]) -> Side:

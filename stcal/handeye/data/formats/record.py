@@ -60,6 +60,7 @@ class Side:
     trajectory : whether poses are those of a moving body in a world, as in files of trajectories
     scaled : whether the lengths have no unit at all, like those of a COLMAP model
     covariance : (m, 6, 6) covariances of the transforms of ``frames``, mm and rad
+    common : (m, 6, k) errors that these transforms have in common, contained in their covariances
     """
 
     rotation: np.ndarray
@@ -72,6 +73,7 @@ class Side:
     trajectory: bool = False
     scaled: bool = False
     covariance: np.ndarray | None = None
+    common: np.ndarray | None = None
 
     def __post_init__(self):
         m = len(self.places)

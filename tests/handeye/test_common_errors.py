@@ -1,0 +1,108 @@
+"""Errors that the board's poses have in common, as those of a camera that was found, are in σ of the hand-eye."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from stcal.geometry.rigid import Poses
+from stcal.handeye import handeye
+from stcal.handeye.data.pairs import read_poses
+from stcal.handeye.solve import HandEyeOptions, solved
+from stcal.handeye.solve import handeye as handeye_by
+from stcal.handeye.validate import with_common_errors, with_jackknife
+from stcal.io.join import join_tables
+from stcal.io.table import COVARIANCE, POSE, common_columns, pose_cells
+from stcal.workflows.handeye.inputs import PREFIXES
+from tests.support.handeye import simulated
+
+COMMON = np.array([[1e-3, 0, 0, 0, 0.4, 0], [0, -1e-3, 0, 0.4, 0, 0], [0, 0, 0, 0, 0, 0.8]]).T
+"""Errors of the principal point and of the focal length at about 450 mm, rad and mm, (6, 3)."""
+OWN = np.diag(np.repeat([2e-4, 0.05], 3) ** 2)
+DRAWS = 40
+
+
+def draw(seed: int, count: int = 16, stated: bool = True):
+    """Pairs with these errors, which they state, and the truth."""
+    rng = np.random.default_rng(seed)
+    truth = simulated(rng, count, robot=(1e-4, 0.03))
+    noise = rng.normal(size=(count, 6)) @ np.linalg.cholesky(OWN).T + COMMON @ rng.normal(size=3)
+    pairs = truth.pairs
+    common = np.tile(COMMON, (count, 1, 1))
+    pairs = replace(
+        pairs,
+        camera_from_board=pairs.camera_from_board.moved(noise),
+        camera_from_board_covariance=np.tile(OWN + COMMON @ COMMON.T, (count, 1, 1)),
+        camera_from_board_common=common if stated else None,
+    )
+    return pairs, truth
+
+
+def squared(found, truth) -> float:
+    """eᵀ C⁻¹ e of X, six degrees of freedom."""
+    error = Poses.of([found.mount_from_camera]).difference(Poses.of([truth.mount_from_camera]))[0]
+    return float(error @ np.linalg.solve(found.covariance, error))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["pose", None])
+def test_sigma_hold_with_common_errors(method):
+    """The mean of 6·n squared normal numbers lies within these limits in 998 of 1000 studies; without the common errors
+    it is many times as large."""
+    draws = DRAWS if method else 3
+    limits = chi2.ppf([0.001, 0.999], 6 * draws) / 6 / draws
+    found = []
+    for seed in range(draws):
+        pairs, truth = draw(seed)
+        result = handeye_by(pairs, method=method) if method else handeye(pairs)
+        found.append(squared(result, truth) / 6)
+        assert any("in common" in note for note in result.notes)
+    assert np.mean(found) < limits[1]
+    if method:
+        assert np.mean(found) > limits[0] / 1.3  # σ of the robot and factors are estimated
+    pairs, truth = draw(0, stated=False)
+    assert squared(handeye_by(pairs), truth) / 6 > 10 * limits[1]
+
+
+def test_a_closed_form_by_the_jackknife_contains_them():
+    found = []
+    for seed in range(20):
+        pairs, truth = draw(seed)
+        solution = solved(pairs, "eye-in-hand", "shah", None, None)
+        result = with_jackknife(solution.result, [solution.without(np.array([i])) for i in range(len(pairs))])
+        found.append(squared(with_common_errors(result, pairs, "eye-in-hand", HandEyeOptions()), truth) / 6)
+    assert np.mean(found) < chi2.ppf(0.999, 120) / 120 * 1.3  # a jackknife of sixteen poses
+
+
+def test_they_are_read_from_what_measure_writes(tmp_path):
+    """Also where the file states the inverse transforms, whose errors differ."""
+    pairs, _ = draw(0)
+    flange, board = pairs.base_from_flange, pairs.camera_from_board
+    rows, columns = np.triu_indices(6), (*POSE, *COVARIANCE, *common_columns(3))
+    lines = [",".join(["image", *columns])]
+    for i, pose in enumerate(board):
+        numbers = (*pairs.camera_from_board_covariance[i][rows], *pairs.camera_from_board_common[i].T.ravel())
+        lines.append(",".join([f"{i}.jpg", *pose_cells(pose), *map(repr, map(float, numbers))]))
+    (tmp_path / "poses.csv").write_text("\n".join(lines) + "\n")
+    lines = [",".join(["image", *POSE])] + [",".join([f"{i}.jpg", *pose_cells(p)]) for i, p in enumerate(flange)]
+    (tmp_path / "robot.csv").write_text("\n".join(lines) + "\n")
+    joined = join_tables(tmp_path / "robot.csv", tmp_path / "poses.csv", "image", PREFIXES)
+    as_read = read_poses(joined.table)
+    assert np.allclose(as_read[[3, 5]].camera_from_board_common, pairs.camera_from_board_common[[3, 5]], rtol=1e-9)
+    columns = {
+        name.replace("camera_from_board", "board_from_camera"): own for name, own in joined.table.columns.items()
+    }
+    inverse = read_poses(replace(joined.table, columns=columns))
+    step = 1e-4 * pairs.camera_from_board_common[:, :, 1]
+    moved = board.moved(step).inverse().difference(board.inverse())
+    assert np.allclose(1e-4 * inverse.camera_from_board_common[:, :, 1], moved, rtol=1e-3, atol=1e-9)
+
+
+def test_the_verdict_does_not_ask_for_more_poses():
+    pairs, _ = draw(0)
+    found = handeye(pairs)
+    assert found.verdict.word == "use with care"
+    assert "have in common" in found.verdict.sentence()
+    assert "more poses do not help" in found.verdict.reasons()[0].remedy
+    assert np.linalg.eigvalsh(found.covariance - found.common_covariance).min() > 0
