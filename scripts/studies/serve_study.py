@@ -8,8 +8,9 @@ of the server and its processes, pages that they share counted once, at the tent
 
 With ``--hostile`` one client follows the target, undisturbed for a quarter of the time, and then beside one that
 attacks: connections that send nothing, photographs whose sender leaves, bytes one by one, uploads of 60 MB that lack
-the last byte, broken and smuggled requests. Ends with 1 where an answer is lost, or takes longer than 2 s beside the
-attacker and three times as long as the slowest one before: a machine that is busy otherwise is slow in both parts.
+the last byte, ones that are too large, broken and smuggled requests, and answers that are not read. Ends with 1 where
+an answer is lost, takes longer than 2 s (on a machine that is busy otherwise, one search may take that long), or memory
+grows beyond the documented budget: the images under way, and what is read at a time from each connection.
 """
 
 import argparse
@@ -34,6 +35,7 @@ from stcal.io.files import json_text
 from stcal.sfm.adjust.chain import CalibratedTarget
 from stcal.sfm.adjust.file import FacesFile
 from stcal.sfm.adjust.options import AdjustOptions
+from stcal.sfm.measurement.serve import CHUNK_BYTES, CONNECTIONS, HELD_BYTES
 from stcal.synthetic.dataset import write_dataset
 from stcal.synthetic.scene import SceneOptions, make_scene
 from tests.support.film import filmed
@@ -138,43 +140,49 @@ def rubbish(port: int, frames: list, start: float, seconds: float, rate: float) 
     return {"sent": i, "lost": lost}
 
 
-QUIET, MOST_S, AS_SLOW = 0.25, 2.0, 3.0
-"""Share of the time without an attack; longest time to an answer beside it, and over the longest one before it."""
-IDLE, STALLED, SLOW = 100, 20, 30
+QUIET, MOST_S = 0.25, 2.0
+"""Share of the time without an attack; longest time to an answer, s."""
+IDLE, STALLED, SLOW, DEAF = 100, 20, 30, 10
 """Number of connections of each kind that are held open."""
 STALLED_BYTES = 60_000_000
-SMUGGLED = b"GET / HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\n%b\r\nGET / HTTP/1.1\r\nHost: x\r\n\r\n"
+WHOLE = b"POST /measure HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n"
+ASKED = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
+HEAD = b" HTTP/1.1\r\nHost: x\r\n"
+SMUGGLED = (
+    b"GET /" + HEAD + b"Content-Length: 44\r\n\r\n",
+    b"GET /" + HEAD + b"Content-Length: 44\r\nContent-Length: 45\r\n\r\n",
+    b"GET /" + HEAD + b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
+    b"POST /measure" + HEAD + b"Content-Length: 4\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
+    b"POST /measure" + HEAD + b"Transfer-Encoding: chunked\r\nContent-Length: 4\r\n\r\n1;a=b\r\nx\r\n0\r\n\r\n",
+    b"POST /measure" + HEAD + b"Transfer-Encoding : chunked\r\nContent-Length: 0\r\n\r\n",
+    b"POST /measure" + HEAD + b"Content-Length: 0, 44\r\n\r\n",
+)
+"""Heads behind which another server could find a second request."""
 
 
 def attack(port: int, frames: list, start: float, seconds: float, rate: float) -> dict:
     """Use up what the service has; number of requests, and of those of which a part was answered as a second one."""
-    photograph, held, smuggled, i = frames[0][1], {"idle": [], "stalled": [], "slow": []}, 0, 0
-    whole = b"POST /measure HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n"
-    kinds = ["idle", "idle", "left", "slow", "stalled", "smuggled", "broken", "left"]
+    photograph, smuggled, i = frames[0][1], 0, 0
+    held: dict[str, list[socket.socket]] = {"idle": [], "stalled": [], "slow": [], "deaf": []}
+    kinds = ["idle", "idle", "left", "slow", "stalled", "smuggled", "broken", "left", "oversized", "deaf"]
     while due(start, rate, i) < start + seconds:
         kind = kinds[i % len(kinds)]
         kind = "idle" if kind == "stalled" and len(held[kind]) == STALLED else kind
         i += 1
         try:
             line = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
-            if kind == "left":
-                line.sendall(whole % len(photograph) + photograph)
-                line.close()
-            elif kind == "smuggled":
-                line.sendall(SMUGGLED % (b"Content-Length: 6\r\n" if i % 2 else b""))
-                line.settimeout(2)
-                answer = b""
-                while part := line.recv(1 << 16):
-                    answer += part
-                smuggled += answer.count(b"HTTP/1.1 ") > 1
-                line.close()
-            elif kind == "broken":
-                line.sendall(random.Random(i).randbytes(300) + b"\r\n\r\n")
-                line.close()
-            else:
+            if kind in held:
                 if kind == "stalled":
-                    line.sendall(whole % STALLED_BYTES + bytes(STALLED_BYTES - 1))
+                    line.sendall(WHOLE % STALLED_BYTES + bytes(STALLED_BYTES - 1))
+                if kind == "deaf":  # what is answered is never read
+                    line.sendall(100 * ASKED)
                 held[kind].append(line)
+            else:
+                sent = {"left": WHOLE % len(photograph) + photograph, "oversized": WHOLE % 10**12 + bytes(10**6)}
+                sent |= {"smuggled": SMUGGLED[i % len(SMUGGLED)] + ASKED, "broken": random.Random(i).randbytes(300)}
+                line.sendall(sent[kind] + (b"\r\n\r\n" if kind == "broken" else b""))
+                smuggled += kind == "smuggled" and answers_on(line) > 1
+                line.close()
         except OSError:
             line.close()
         for slow in list(held["slow"]):
@@ -182,10 +190,19 @@ def attack(port: int, frames: list, start: float, seconds: float, rate: float) -
                 slow.send(b"P")
             except OSError:  # ended from the other side
                 held["slow"].remove(slow)
-        for kind, most in (("idle", IDLE), ("slow", SLOW)):
+        for kind, most in (("idle", IDLE), ("slow", SLOW), ("deaf", DEAF)):
             while len(held[kind]) > most:
                 held[kind].pop(0).close()
     return {"sent": i, "smuggled": smuggled}
+
+
+def answers_on(line: socket.socket) -> int:
+    """Number of answers that come before the other side ends the connection."""
+    line.settimeout(2)
+    answer = b""
+    while part := line.recv(1 << 16):
+        answer += part
+    return answer.count(b"HTTP/1.1 ")
 
 
 def hostile(options, films: list, port: int, pid: int) -> bool:
@@ -212,12 +229,15 @@ def hostile(options, films: list, port: int, pid: int) -> bool:
     before, beside = np.array(found["taken"][:early]), np.array(found["taken"][early:])
     for words, taken in (("before", before), ("beside", beside)):
         print(f"from sent to answered {words} the attack, s: median {np.median(taken):.2f}, most {taken.max():.2f}")
-    late = [f"{QUIET * options.seconds + i / (options.rate / 10):.0f}" for i in np.flatnonzero(beside > MOST_S)]
+    late = [f"{i / (options.rate / 10):.0f}" for i in np.flatnonzero(np.array(found["taken"]) > MOST_S)]
     print(f"answers after more than {MOST_S:g} s: {len(late)}", *(f"at {second} s" for second in late[:9]))
     print(f"parts answered as second requests: {attacked['smuggled']}")
-    print(f"memory: {memory[0]:.0f} MB at first, {max(memory):.0f} MB at most")
-    slow = beside.max() > max(MOST_S, AS_SLOW * before.max())
-    return not (found["lost"] or found["refused"] or attacked["smuggled"] or slow)
+    undisturbed, most = (max(part) for part in (memory[: round(QUIET * len(memory))], memory))
+    budget = (HELD_BYTES + 2 * CHUNK_BYTES * CONNECTIONS) / 1e6
+    grown = most - undisturbed
+    print(f"memory: {undisturbed:.0f} MB before the attack, up to {grown:.0f} MB more, {budget:.0f} MB allowed")
+    bad = found["lost"] + found["refused"] + attacked["smuggled"]
+    return not bad and max(found["taken"]) <= MOST_S and grown <= budget
 
 
 def run_client(answers, function, *arguments) -> None:

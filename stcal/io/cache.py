@@ -70,6 +70,8 @@ def kept(path: Path, make: Callable[[Mapping[str, np.ndarray], dict[str, Any]], 
     None if there is no such file; None, with a note, if it is damaged, edited, or was made from other inputs.
     """
     try:
+        if path.exists() and not path.is_file():  # a named pipe would never end
+            raise ValueError("no file")
         with np.load(io.BytesIO(read_bytes(path, TABLE_BYTES))) as stored:
             if sum(part.file_size for part in stored.zip.infolist()) > TABLE_BYTES:
                 raise ValueError("too large")

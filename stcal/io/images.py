@@ -92,7 +92,7 @@ class ImageFile:
             return self.content
         try:
             data = read_bytes(self.path, IMAGE_BYTES)
-        except FileNotFoundError as error:
+        except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
             reason = "was there when the work began, and is gone; put it back, or begin again without it"
             raise InputError("E-IMAGES-GONE", f"{self.path}: {reason}") from error
         return without_mosaic(data, self.name, self.bayer)

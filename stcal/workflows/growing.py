@@ -248,11 +248,11 @@ def watch(
         stamps = _stamps(images)
         complete = {name: stamp for name, stamp in stamps.items() if last_stamps.get(name) == stamp}
         last_stamps = stamps
-        if not complete or complete == processed:
+        removed = tuple(name for name in processed if name not in stamps)
+        if complete == processed or not (complete or removed):
             sleep(options.interval_s)
             idle_s += options.interval_s
             continue
-        removed = tuple(name for name in processed if name not in stamps)
         added = {name for name, stamp in complete.items() if processed.get(name) != stamp}
         processed, idle_s = complete, 0.0
         yield growing.update(len(complete), added, removed, progress, complete)

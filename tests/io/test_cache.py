@@ -88,6 +88,15 @@ def test_a_folder_in_its_place_makes_room(tmp_path):
     assert kept(path, together) is not None
 
 
+def test_a_named_pipe_in_its_place_is_not_waited_for(tmp_path):
+    path = tmp_path / "key.npz"
+    os.mkfifo(path)
+    with pytest.warns(InputNote, match=r"key\.npz is damaged"):
+        assert kept(path, together) is None
+    keep(path, ARRAYS, META)
+    assert kept(path, together) is not None
+
+
 def test_a_file_of_another_form_is_none(tmp_path):
     path = tmp_path / "key.npz"
     keep(path, {"xyz": ARRAYS["xyz"]}, META)

@@ -107,18 +107,34 @@ class _Pairs:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Starts:
     """n hypotheses, the best supported first: ``origin`` : (n,) first outline; ``face`` : (n,) number of the face;
-    ``circles`` : (n, s) of this face; ``candidates`` : (n, s) that match these circles, −1 if there is none."""
+    ``circles`` : (n, s) of this face; ``candidates`` : (n, s) that match these circles, −1 if there is none; ``rows`` :
+    hypotheses by face, circle and candidate."""
 
     origin: np.ndarray
     face: np.ndarray
     circles: np.ndarray
     candidates: np.ndarray
+    rows: dict[tuple[int, int, int], np.ndarray]
+
+    @classmethod
+    def of(cls, origin: np.ndarray, face: np.ndarray, circles: np.ndarray, candidates: np.ndarray) -> "_Starts":
+        """Returns the hypotheses, listed by each match of a circle with a candidate."""
+        row, column = np.nonzero(candidates >= 0)
+        keys = np.stack([face[row], circles[row, column], candidates[row, column]])
+        order = np.lexsort(keys[::-1])
+        keys, row = keys[:, order], row[order]
+        begin = np.flatnonzero(np.diff(keys, prepend=-1).any(0))
+        matches = zip(*keys[:, begin].tolist(), strict=True)
+        rows = dict(zip(matches, np.split(row, begin)[1:], strict=True))
+        return cls(origin, face, circles, candidates, rows)
 
     def agree(self, face: int, index: np.ndarray) -> np.ndarray:
         """Returns the hypotheses of a face that agree with a reading, ``index`` by circle, in two circles or more."""
-        own = np.flatnonzero(self.face == face)
-        same = (index[self.circles[own]] == self.candidates[own]) & (self.candidates[own] >= 0)
-        return own[same.sum(1) >= 2]
+        matched = np.flatnonzero(index >= 0)
+        keys = zip(matched.tolist(), index[matched].tolist(), strict=True)
+        same = [self.rows[face, *key] for key in keys if (face, *key) in self.rows]
+        count = np.bincount(np.concatenate([*same, np.zeros(0, int)]), minlength=len(self.origin))
+        return np.flatnonzero(count >= 2)
 
     def index(self, rank: int, width: int | None = None) -> np.ndarray:
         """Returns the candidate of each circle of the hypothesis's face, −1 if there is none; ``width`` : length."""
@@ -263,7 +279,7 @@ class FaceFinder:
         supported, origin = supported[best], origin[best]
         begin, count = pairs.uses[pair[supported]], np.diff(pairs.uses)[pair[supported]]
         use = np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
-        return _Starts(
+        return _Starts.of(
             np.repeat(origin, count), pairs.face[use], pairs.circles[use], np.repeat(support[supported], count, axis=0)
         )
 

@@ -86,12 +86,18 @@ def test_a_copy_and_a_file_that_is_no_image_are_named(detected):
     assert reasons["12/copy.jpg"] == f"the same image as {IMAGE}"
 
 
-def test_a_photograph_that_is_gone_is_an_error(detected, sample, monkeypatch):
+@pytest.mark.parametrize("in_its_place", ["nothing", "a folder", "a file for its folder"])
+def test_a_photograph_that_is_gone_is_an_error(detected, sample, monkeypatch, in_its_place):
     """It was there when the folder was looked at: a result without it would be another one."""
     detect, folder, _ = detected
     listed = find_images(folder)
     monkeypatch.setattr(f"{__name__}.find_images", lambda _: listed)
     (folder / IMAGE).unlink()
+    if in_its_place == "a folder":
+        (folder / IMAGE).mkdir()
+    elif in_its_place != "nothing":
+        shutil.rmtree((folder / IMAGE).parent)
+        (folder / IMAGE).parent.write_bytes(b"x")
     with fails_with(f"E-IMAGES-GONE … {IMAGE}"):
         detect()
 

@@ -153,6 +153,10 @@ def test_rubbish(server, photographs, kind):
     assert post(server, photograph, f"?name={name}")[0] == 200
 
 
+SMUGGLED = b"POST /measure HTTP/1.1\r\nHost: x\r\n%b\r\n\r\n1;a=b\r\nx\r\n0\r\n\r\nGET / HTTP/1.1\r\nHost: x\r\n\r\n"
+"""A body in chunks, with an extension, before a second request."""
+
+
 @pytest.mark.parametrize(
     ("raw", "code"),
     [
@@ -172,6 +176,20 @@ def test_rubbish(server, photographs, kind):
         (b"GET / HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\n\r\nGET / HTTP/1.1\r\nHost: x\r\n\r\n", 400),
         (b"POST /measure HTTP/1.1\r\nHost: x\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\nsixsix", 400),
         (b"POST /measure HTTP/1.1\r\nHost: x\r\nContent-Length : 5\r\n\r\nshort", 400),
+        (SMUGGLED % b"Transfer-Encoding: chunked\r\nContent-Length: 4", 411),
+        (SMUGGLED % b"Content-Length: 4\r\nTransfer-Encoding: chunked", 411),
+        (SMUGGLED % b"Transfer-Encoding:\r\n chunked\r\nContent-Length: 4", 411),
+        (SMUGGLED % b"Transfer-Encoding : chunked\r\nContent-Length: 4", 400),
+        (SMUGGLED % b"Transfer-Encoding: identity\r\nContent-Length: 4", 501),
+        (SMUGGLED % b"Transfer-Encoding: chunked\r\nTransfer-Encoding: chunked", 501),
+        (SMUGGLED % b"Content-Length: 4, 5", 400),
+        (SMUGGLED % b"Content-Length: 4\x00", 400),
+        (SMUGGLED % b"Content-Length: +4", 411),
+        (SMUGGLED % b"Content-Length: 0x4", 411),
+        (SMUGGLED % b"Content-Length: \xb2", 411),
+        (b"GET //[/ HTTP/1.1\r\nHost: x\r\n\r\n", 400),
+        (b"GET / HTTP/1.1\r\nHost: x\r\nHost: y\r\n\r\n", 400),
+        (b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", 505),
     ],
 )
 def test_broken_requests(server, raw, code):

@@ -108,6 +108,27 @@ def test_a_folder_that_goes_is_told(small_dataset, tmp_path):
         list(watched(small_dataset, folder, tmp_path / "run", lambda _: folder.rmdir() if folder.is_dir() else None))
 
 
+def test_photographs_that_all_go_are_told(small_dataset, tmp_path):
+    """As where the disk is unmounted whose files were watched: the folder is there, and empty."""
+    folder = tmp_path / "images"
+    folder.mkdir()
+    names = ["a.jpg", "b.jpg"]
+
+    def put():
+        for name in names:
+            (folder / name).write_bytes(b"x")
+
+    def take():
+        for name in names:
+            (folder / name).unlink()
+
+    steps = iter([put, lambda: None, take])
+    came, empty = watched(small_dataset, folder, tmp_path / "run", lambda _: next(steps, lambda: None)())
+    assert (came.images, came.gone) == (2, ())
+    assert (empty.images, empty.gone, empty.result) == (0, tuple(names), None)
+    assert str(folder) in empty.reason
+
+
 def test_a_photograph_counts_when_two_looks_agree_and_no_other_is_used(small_dataset, tmp_path, monkeypatch):
     """One is renamed when the others are used: it is not complete under its new name."""
     used = []
