@@ -84,6 +84,7 @@ def report_of(result: RunResult) -> ReportFile:
                 "circle_sigma_px": result.calibration.circle_sigma_px,
                 "size_sigma_ppm": 1e6 * printed.size_sigma if printed else None,
                 "edge_share": printed.edge_share if printed else None,
+                "printed_faces": sorted(result.target_design.printed_ids()),
             },
             "faces": {face: _face(result, face) for face in result.target.target_from_face},
             "between_faces": _between(result),
