@@ -333,7 +333,10 @@ def labels_check(
     (squared residual over its own redundancy: Baarda's data snooping) are named, too; their weight is reduced. Labels
     of one image that are at each other's places are a fault: other labels may be exchanged without being noticed.
     """
-    remedy = "look at these circles in the overlays: hidden in part, dirty, a reflection, or a wrong label"
+    remedy = (
+        "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label; a centre that "
+        "was left out does no harm where other images show it"
+    )
     check = judge("labels", "Each centre against all others", _trials(networks), "centres", remedy, "suspicious")
     swapped = _exchanged(networks, outliers, images, camera)
     guilt = _images_of_outliers(networks, outliers)
@@ -344,7 +347,7 @@ def labels_check(
     measured = tuple(
         Measured(name, o.residual_px, o.limit_px, "px", None) for name, o in zip(named, outliers, strict=True)
     )
-    reason = f"{len(outliers)} left out, first {named[0]}: {outliers[0].residual_px:.3g} px"
+    reason = f"{len(outliers)} left out, first {named[0]}: {outliers[0].residual_px:.3g} px, limit {outliers[0].limit_px:.3g}"
     verdict = "suspicious"
     if guilt:
         verdict = "failed"

@@ -434,7 +434,7 @@ def _left_out(report: dict, words: Words) -> list[Block]:
         if rows:
             blocks += [subheading(title), Table(heads, rows, css="text")]
     if unseen:
-        blocks.append(f"Faces of the design not seen: {join(unseen)}")
+        blocks.append(f"Faces of the design that are not in the result: {join(unseen)}")
     return blocks or ["Nothing was left out"]
 
 

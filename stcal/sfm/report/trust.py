@@ -145,6 +145,7 @@ def settings(report: dict, words: Words) -> list[list[str]]:
     sizes = " × ".join(str(size) for size in camera["size_px"])
     solve, frame = str(options["solve"]), str(options["frame"])
     round_ = words.point != "corner"
+    single = sum(row.get("gate") == "views" for row in left_out["circles"])
     return [
         ["Solve", SOLVES.get(solve, solve)],
         ["Face frames", FRAMES.get(frame, frame) if round_ else "those of their drawings"],
@@ -152,12 +153,13 @@ def settings(report: dict, words: Words) -> list[list[str]]:
         *([["Surface", f"luminous, behind rims of {rim:.3f} mm"]] if (rim := summary.get("rim_mm")) else []),
         *([["Dots of the board", f"behind rims of {rim:.3f} mm"]] if (rim := summary.get("dot_rim_mm")) else []),
         ["Reference face", report["reference_face"]],
-        ["Faces not seen", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
+        ["Faces not in the result", join(summary["faces_not_seen"]) if summary["faces_not_seen"] else "none"],
         ["Centres observed", f"{summary['observations']}, redundancy {summary['redundancy'] or NONE}"],
         ["Last step of the joint adjustment", NONE if last_move is None else f"{last_move:.1g} px"],
         [
             "Left out",
-            f"{len(left_out['files'])} files, {len(left_out['images'])} images, {len(left_out['circles'])} {words.points}",
+            f"{len(left_out['files'])} files, {len(left_out['images'])} images, "
+            f"{len(left_out['circles']) - single} {words.points}; {single} more that one image of a group alone shows",
         ],
         ["Scale", join([SCALES[source] for source in summary.get("scale_from", ["board"])])],
         [
@@ -191,7 +193,7 @@ def _worst_values(report: dict, words: Words) -> list[list[str]]:
                 "Board residual, RMS (µm)" if words.board else "Residual of what gives the scale, RMS (µm)",
                 board,
                 1,
-                "the group's model against the board's grid" if words.board else "the model against what was stated",
+                "of the length in space: the group's model against the board's grid" if words.board else "the model against what was stated",
             ),
             *([("λ by rows against least squares (ppm)", ppm, 1, over)] if words.board else []),
             ("Residual (px)", single, 4, "one centre in one image"),

@@ -322,7 +322,7 @@ def _without_point(model: GroupModel, images: list[ImageObservations], outliers:
         needed = float(np.degrees(MIN_RAY_ANGLE_RAD))
         if len(sightings) == 1:
             gate = {"gate": "views", "value": 1, "limit": 2, "unit": "images"}
-            reason = "seen in one mapped image only; 2 needed"
+            reason = "seen in one mapped image of its group only; 2 needed"
         else:
             gate = {"gate": "ray_angle", "value": angle, "limit": needed, "unit": "deg"}
             reason = (

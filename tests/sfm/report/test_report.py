@@ -333,7 +333,7 @@ def test_left_out_with_reasons():
     assert ["a/1.jpg", "3", "5:0, 5:1, 5:2", "seen once"] in rows  # one row for one reason
     assert ["a/1.jpg", "board of 20 dots left out"] in rows
     assert ["1", "group a: face <6> has no frame"] in rows
-    assert "Faces of the design not seen: 6." in Page(page).text
+    assert "Faces of the design that are not in the result: 6." in Page(page).text
 
 
 def test_same_report_same_page(joint):
