@@ -134,11 +134,13 @@ def _ways(part: Part, paper: str) -> list[_Way]:
     return ways
 
 
-def seams_between(low: float, high: float, room: float, taken: np.ndarray, words: np.ndarray | None = None) -> list[float]:
+def seams_between(
+    low: float, high: float, room: float, taken: np.ndarray, words: np.ndarray | None = None
+) -> list[float]:
     """Return the places that split a length so that no piece, with half the overlap at either end, exceeds ``room``.
 
-    Seams avoid the intervals ``taken`` (n, 2), and those of ``words`` (m, 2) too where they can, if the second half of a
-    piece has a free place.
+    Seams avoid the intervals ``taken`` (n, 2), and those of ``words`` (m, 2) too where they can, if the second half
+    of a piece has a free place.
     """
     both = taken if words is None else np.concatenate([taken, words])
     seams, start = [], low
@@ -151,7 +153,7 @@ def seams_between(low: float, high: float, room: float, taken: np.ndarray, words
 
 
 def _free(last: float, first: float, taken: np.ndarray) -> float | None:
-    """Return the last place up to ``last`` that is clear of the intervals ``taken``; None if none is beyond ``first``."""
+    """Return the last place up to ``last`` that is clear of the intervals ``taken``, or None beyond ``first``."""
     place = last
     while place > first:
         hit = taken[(taken[:, 0] < place + CLEAR) & (taken[:, 1] > place - CLEAR)]

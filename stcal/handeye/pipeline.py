@@ -173,5 +173,6 @@ def handeye(
     prior = None if views is None else options.camera
     choosing = method is None and not options.names_unknowns
     found = validated(pairs, asked, method, views, options, prior, rows, choosing=choosing)
-    outcome = Outcome("", found.result, found.held_out, notes=found.notes, choice=found.choice, pairs=pairs)
-    return replace(found.result, judgement=judged(outcome))
+    result = found.result.with_common(pairs.common_of_camera())
+    outcome = Outcome("", result, found.held_out, notes=found.notes, choice=found.choice, pairs=pairs)
+    return replace(result, judgement=judged(outcome))

@@ -125,6 +125,22 @@ class HandEye(Brief):
         mount = None if self.covariance is None else square * self.covariance
         return replace(self, covariance=mount, stand_covariance=None if stand is None else square * stand)
 
+    def with_common(self, errors: np.ndarray | None) -> "HandEye":
+        """Returns the result with errors in σ that all poses have in common, which no residual shows.
+
+        ``errors`` : (6, r) of :meth:`HandEyePoses.common_of_camera`; the mount takes them over, reversed.
+        """
+        if errors is None or self.covariance is None:
+            return self
+        turn = np.kron(np.eye(2), self.mount_from_camera.rotation)
+        added = turn @ errors @ errors.T @ turn.T
+        degrees, mm = np.degrees(np.sqrt(np.diag(added)[:3].max())), np.sqrt(np.diag(added)[3:].max())
+        note = (
+            f"errors that all poses of the camera have in common, as of its intrinsics, are in σ with up to "
+            f"{degrees:.2g}° and {mm:.2g} mm; residuals do not show them"
+        )
+        return replace(self, covariance=self.covariance + added, notes=(*self.notes, note))
+
     def rms(self) -> tuple[float, float]:
         """Returns the RMS lengths of the residuals of all poses except outliers: rad, mm."""
         squared = (self.residuals[~self.outliers].reshape(-1, 2, 3) ** 2).sum(2).mean(0)

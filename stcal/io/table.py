@@ -194,12 +194,15 @@ class Table:
                 f"{self.where}: line {self.lines[fault.row]}: covariance: {fault.reason}; correct it",
             )
 
-    def common_errors(self, covariance: np.ndarray | None) -> np.ndarray | None:
+    def common_errors(self, covariance: np.ndarray | None, prefix: str = "") -> np.ndarray | None:
         """Return the common errors (m, 6, r) of the columns ``common1_rx`` … ``common1_z``, ``common2_rx`` …, or None.
+
+        ``prefix`` : of the columns' names.
 
         Raises InputError: only some of the columns exist, or they exceed the covariance (m, 6, 6), which includes them.
         """
-        count = len({name.split("_")[0] for name in self.columns if COMMON.fullmatch(name)})
+        own = [name.removeprefix(prefix) for name in self.columns if name.startswith(prefix)]
+        count = len({name.split("_")[0] for name in own if COMMON.fullmatch(name)})
         if not count:
             return None
         if covariance is None:
@@ -207,13 +210,14 @@ class Table:
                 "E-TABLE-COVARIANCE",
                 f"{self.where}: columns common1_… without columns cov_…, which must include them; give both",
             )
-        for name in common_columns(count):
+        names = [f"{prefix}{name}" for name in common_columns(count)]
+        for name in names:
             if name not in self.columns:
                 raise InputError(
                     "E-TABLE-COLUMN-MISSING",
                     f"{self.where}: {name} is missing; all columns common1_rx … or none needed",
                 )
-        values = np.column_stack([self.numbers(name) for name in common_columns(count)])
+        values = np.column_stack([self.numbers(name) for name in names])
         full = np.swapaxes(values.reshape(len(self), count, 6), 1, 2)
         fault = first_fault(covariance - full @ np.swapaxes(full, 1, 2), OF_POSE, definite=True)
         if fault is not None:

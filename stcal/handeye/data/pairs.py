@@ -37,6 +37,9 @@ class HandEyePoses(Brief):
         Name of each pair in messages: ``line 7``, an image's name; ``pose 1`` … where no names are given.
     where : str
         Source of the poses.
+    camera_common : (m, 6, r) array, optional
+        Errors that all camera_from_board have in common, such as those of the intrinsics: pose i errs by
+        ``camera_common[i] @ z`` with the same r normal numbers z for all, beside its own covariance.
 
     Raises
     ------
@@ -50,6 +53,7 @@ class HandEyePoses(Brief):
     camera_from_board_covariance: np.ndarray | None = None
     names: tuple[str, ...] = ()
     where: str = "poses"
+    camera_common: np.ndarray | None = None
 
     def __post_init__(self):
         require_fields(self, "poses")
@@ -62,6 +66,8 @@ class HandEyePoses(Brief):
         for name in ("base_from_flange_covariance", "camera_from_board_covariance"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, frozen(getattr(self, name), (m, 6, 6), name))
+        if self.camera_common is not None:
+            object.__setattr__(self, "camera_common", frozen(self.camera_common, (m, 6, None), "common errors"))
         names = tuple(self.names) or tuple(f"pose {i}" for i in range(1, m + 1))
         if len(names) != m:
             raise InputError("E-NAMES-COUNT", f"{self.where}: {len(names)} names of {m} poses; one each needed")
@@ -119,7 +125,19 @@ class HandEyePoses(Brief):
             None if of_board is None else of_board[rows],
             tuple(self.names[i] for i in rows),
             self.where,
+            None if self.camera_common is None else self.camera_common[rows],
         )
+
+    def common_of_camera(self) -> np.ndarray | None:
+        """Returns the errors of the camera's frame (6, r) that the common errors amount to, the mean of all poses.
+
+        Rotation (rad) and translation (mm) of the frame by which every camera_from_board is displaced alike.
+        """
+        if self.camera_common is None:
+            return None
+        turned, shifted = self.camera_common[:, :3], self.camera_common[:, 3:]
+        about_camera = shifted + skew(self.camera_from_board.translation) @ turned
+        return np.concatenate([turned, about_camera], axis=1).mean(0)
 
     def _check_copies(self):
         """Refuse poses that are equal to the last digit: measured values never are, so equal values were copied."""
@@ -186,7 +204,8 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
     """Read a CSV file of pose pairs.
 
     Columns ``base_from_flange_x_mm`` … ``_qw`` … and ``camera_from_board_…`` (or ``flange_from_base_…``,
-    ``board_from_camera_…``), lengths in any unit of :data:`~stcal.io.table.LENGTHS`, covariances as ``…_cov_rx_rx``.
+    ``board_from_camera_…``), lengths in any unit of :data:`~stcal.io.table.LENGTHS`, covariances as ``…_cov_rx_rx``,
+    common errors as ``camera_from_board_common1_rx``.
 
     Parameters
     ----------
@@ -210,7 +229,10 @@ def read_poses(path: str | Path | Table, quaternions: Order = "wxyz") -> HandEye
     sides = [read_side(table, *names) for names in SIDES]
     (flange, flange_covariance), (board, board_covariance) = sides
     names = tuple(f"line {line}" for line in table.lines)
-    return HandEyePoses(flange, board, flange_covariance, board_covariance, names, table.where)
+    common = table.common_errors(board_covariance, f"{SIDES[1][0]}_")
+    if common is not None and board_covariance is not None:  # its own errors alone weight a pose
+        board_covariance = board_covariance - common @ np.swapaxes(common, 1, 2)
+    return HandEyePoses(flange, board, flange_covariance, board_covariance, names, table.where, common)
 
 
 def read_side(table: Table, wanted: str, inverse: str) -> tuple[Poses, np.ndarray | None]:

@@ -396,7 +396,11 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
         notes.insert(0, f"may the run be used? {run.report['judgement']['use']} No uncertainty of it is given")
     if not run.board_design.rows and budget.statement.board != StatedSize():
         notes.append("no board was in view: what is stated of [board] is not used")
-    if run.board_design.rows and budget.statement.board.temperature_sigma_k and budget.statement.target.temperature_sigma_k:
+    if (
+        run.board_design.rows
+        and budget.statement.board.temperature_sigma_k
+        and budget.statement.target.temperature_sigma_k
+    ):
         notes.append(
             "errors of the temperatures and expansions of board and target are taken as uncorrelated; where one "
             "thermometer measured both, U is too large"

@@ -164,13 +164,13 @@ def budget_report(file: BudgetFile) -> Document:
         ],
         banner=[
             *([macro("answers", [("May the run be used?", file.use)], _tone(file))] if file.use else []),
-            Table(["<Field", "<"], [[name, value or NONE] for name, value in file.fields.items()], css="text facts")
+            Table(["<Field", "<"], [[name, value or NONE] for name, value in file.fields.items()], css="text facts"),
         ],
     )
 
 
 def certifies(file: BudgetFile) -> bool:
-    """Returns whether the page is a certificate: the run may be used, and all inputs and the traceability are stated."""
+    """Returns whether the page is a certificate: the run may be used, inputs and traceability are stated."""
     return _is_valid(file) and not _unstated(file)
 
 
@@ -291,7 +291,9 @@ def _table(title: str, columns: dict[str, Uncertainty], file: BudgetFile) -> Tab
         slope = f"{_slope(first, source):.3g} {unit}/{source.unit}" if source.key in first.sensitivities else "–"
         parts = [number(u.contributions[source.key], 2) for u in columns.values()]
         none = all(u.contributions[source.key] <= ROUNDING * u.standard for u in columns.values())
-        if source.key == "intrinsics" and source.origin == "estimated" and none:  # what they do is in the rows of the centres, with which they were adjusted
+        if (
+            source.key == "intrinsics" and source.origin == "estimated" and none
+        ):  # what they do is in the rows of the centres, with which they were adjusted
             parts = ["in the others"] * len(parts)
         rows.append(
             [source.title, slope, *("–" if source.origin == "not stated" else contribution for contribution in parts)]

@@ -334,8 +334,8 @@ def labels_check(
     of one image that are at each other's places are a fault: other labels may be exchanged without being noticed.
     """
     remedy = (
-        "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label; a centre that "
-        "was left out does no harm where other images show it"
+        "look at them in the overlays: hidden in part, dirty, a reflection, at an edge, or a wrong label; a centre "
+        "that was left out does no harm where other images show it"
     )
     check = judge("labels", "Each centre against all others", _trials(networks), "centres", remedy, "suspicious")
     swapped = _exchanged(networks, outliers, images, camera)
@@ -347,7 +347,8 @@ def labels_check(
     measured = tuple(
         Measured(name, o.residual_px, o.limit_px, "px", None) for name, o in zip(named, outliers, strict=True)
     )
-    reason = f"{len(outliers)} left out, first {named[0]}: {outliers[0].residual_px:.3g} px, limit {outliers[0].limit_px:.3g}"
+    first = f"{named[0]}: {outliers[0].residual_px:.3g} px, limit {outliers[0].limit_px:.3g}"
+    reason = f"{len(outliers)} left out, first {first}"
     verdict = "suspicious"
     if guilt:
         verdict = "failed"

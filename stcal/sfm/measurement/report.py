@@ -96,6 +96,8 @@ class PosesFile(ResultFile):
     left_out: list[NamedReason] = Field(description="`name`, `reason` of files and images without a pose")
 
 
+COMMON_SHARE = 0.5
+"""Share of the variance from which on it is told that poses err in common."""
 MOST_LISTED = 20
 """Largest number of images for which the terminal has a line each."""
 
@@ -307,6 +309,15 @@ def summary(result: MeasureResult) -> list[str]:
     lines = [f"{len(poses)} poses: {counts}; centres' σ × {result.sigma_factor:.3g}"]
     held = "held: their errors are not in σ"
     lines[0] += f", intrinsics {held if result.intrinsics_held else 'with their σ'}"
+    if poses and result.common.size:
+        whole = np.array([np.diag(pose.covariance)[3:].sum() for pose in poses])
+        share = np.median((result.common[:, 3:] ** 2).sum((1, 2)) / whole)
+        if share > COMMON_SHARE:
+            alone = 1e3 * np.sqrt(np.median(whole) * max(1 - share, 0.0) / 3)
+            lines.append(
+                f"{100 * share:.0f} % of the variance of positions is common to all poses (target and intrinsics); "
+                f"between poses σ is about {alone:.2g} µm along an axis"
+            )
     if result.searched is not None:
         total = len(poses) + sum(image.gate == "pose" for image in result.left_out)
         lines.append(

@@ -24,7 +24,7 @@ from stcal.report.document import (
     tiles,
     tone_of,
 )
-from stcal.report.text import NONE, cells, join, number
+from stcal.report.text import cells, join, number
 from stcal.sfm.report import figures
 from stcal.sfm.report.checks import checks_section, crosscheck_section, published_section
 from stcal.sfm.report.figures import FIRST_IMAGES, Residuals, photographs, space_parts
@@ -37,6 +37,8 @@ BY_ROWS = (2, 3, 4)
 """Columns of the scales that only a board has."""
 FIRST_PAIRS = 15
 """Number of rows that the page has room for."""
+
+
 def report_html(
     report: dict,
     overlays: dict[str, bytes],
@@ -77,7 +79,9 @@ def report_html(
         Section(
             "Cross-check", crosscheck_section(report["crosscheck"]) if "crosscheck" in report else [], name="crosscheck"
         ),
-        Section("Settings", [Table(["<Setting", "<Value"], settings(report, words), css="text facts")], name="settings"),
+        Section(
+            "Settings", [Table(["<Setting", "<Value"], settings(report, words), css="text facts")], name="settings"
+        ),
         Section("Overlays", _overlays(report, overlays, residuals or {}, gone, words), name="overlays"),
     ]
     counts = (
@@ -142,9 +146,7 @@ covariance = faces["target_from_face_covariance"]["{face}"]"""
 """Program that reads the result."""
 
 
-def _answer(
-    report: dict, colours: dict[str, str], views: list[tuple[str, str, str]], words: Words
-) -> list[Block]:
+def _answer(report: dict, colours: dict[str, str], views: list[tuple[str, str, str]], words: Words) -> list[Block]:
     """Returns the faces with σ, the target in space, and how to use the result."""
     rows = []
     for name, face in report["faces"].items():
@@ -258,9 +260,9 @@ def _faces_in_detail(report: dict) -> list[Block]:
             ],
             [
                 subheading("Chains"),
-                "Ways to each face through single groups, before these are adjusted together, and how far each is off the result. "
-                "A way uses a part of the images, so that it may be off by many σ of the result; checks judge whether the "
-                "ways agree"
+                "Ways to each face through single groups, before these are adjusted together, and how far each is off the "
+                "result. A way uses a part of the images, so that it may be off by many σ of the result; checks judge "
+                "whether the ways agree"
                 if ways
                 else "No face but the datum",
                 Table(heads, ways),
@@ -438,9 +440,7 @@ def _left_out(report: dict, words: Words) -> list[Block]:
     return blocks or ["Nothing was left out"]
 
 
-def _overlays(
-    report: dict, overlays: dict, residuals: Mapping[str, Residuals], gone: int, words: Words
-) -> list[Block]:
+def _overlays(report: dict, overlays: dict, residuals: Mapping[str, Residuals], gone: int, words: Words) -> list[Block]:
     """Returns the photographs with their circles."""
     rest = len(report["images"]) - len(overlays) - gone
     shown = photographs(report, overlays, residuals)

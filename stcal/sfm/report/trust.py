@@ -67,9 +67,8 @@ def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
             "have in them"
         )
     elif options.get("refine_camera", False):
-        scope = (
-            f"σ hold for {size}; the intrinsics were adjusted, and their σ are in them{stated}"
-            + (f". An error of {pitch} is not in them" if words.board else "")
+        scope = f"σ hold for {size}; the intrinsics were adjusted, and their σ are in them{stated}" + (
+            f". An error of {pitch} is not in them" if words.board else ""
         )
     else:
         scope = (
@@ -93,7 +92,6 @@ def trust(report: dict, judgement: Judgement, words: Words) -> list[Block]:
         Table(["<Check", "Value", "<Where", "<Remark"], _worst_values(report, words), css="text"),
         f"{one_way} {join(single)}" if single else "",
     ]
-
 
 
 def _size_mm(report: dict) -> float:
@@ -149,7 +147,11 @@ def settings(report: dict, words: Words) -> list[list[str]]:
     return [
         ["Solve", SOLVES.get(solve, solve)],
         ["Face frames", FRAMES.get(frame, frame) if round_ else "those of their drawings"],
-        *([["Eccentricity", "corrected" if options["eccentricity"] else "off (uncorrected control)"]] if round_ else []),
+        *(
+            [["Eccentricity", "corrected" if options["eccentricity"] else "off (uncorrected control)"]]
+            if round_
+            else []
+        ),
         *([["Surface", f"luminous, behind rims of {rim:.3f} mm"]] if (rim := summary.get("rim_mm")) else []),
         *([["Dots of the board", f"behind rims of {rim:.3f} mm"]] if (rim := summary.get("dot_rim_mm")) else []),
         ["Reference face", report["reference_face"]],
@@ -193,11 +195,11 @@ def _worst_values(report: dict, words: Words) -> list[list[str]]:
                 "Board residual, RMS (µm)" if words.board else "Residual of what gives the scale, RMS (µm)",
                 board,
                 1,
-                "of the length in space: the group's model against the board's grid" if words.board else "the model against what was stated",
+                "of the length in space: the group's model against the board's grid"
+                if words.board
+                else "the model against what was stated",
             ),
             *([("λ by rows against least squares (ppm)", ppm, 1, over)] if words.board else []),
             ("Residual (px)", single, 4, "one centre in one image"),
         )
     ]
-
-

@@ -63,7 +63,7 @@ class Summary(Part):
     circle_sigma_px: float | None = None
     size_sigma_ppm: float | None = None
     edge_share: float | None = None
-    printed_faces: list[str] = []
+    printed_faces: list[str] = Field(default=[])
 
 
 class FaceRow(Part):

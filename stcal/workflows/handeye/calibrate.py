@@ -201,7 +201,7 @@ def _outcome(
         pairs, views = mended.pairs, mended.views
     outcome = Outcome(
         given.where,
-        result,
+        result.with_common(given.pairs.common_of_camera()),
         solution.held_out,
         compared,
         given.pitch_mm,

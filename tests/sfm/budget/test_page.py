@@ -80,7 +80,9 @@ def test_a_certificate_has_all_inputs_stated_and_a_traceability(small_run, tmp_p
     ):
         page = budget_report(one).page()
         assert "Certificate" not in page
-        assert re.search(f"not a certificate: nothing is stated of [^<]*{re.escape(lacks.replace(chr(39), '&#39;'))}", page)
+        assert re.search(
+            f"not a certificate: nothing is stated of [^<]*{re.escape(lacks.replace(chr(39), '&#39;'))}", page
+        )
     page = budget_report(full).page()
     assert "<h1>Certificate of calibration and uncertainty budget: " in page
     assert "not a certificate" not in page

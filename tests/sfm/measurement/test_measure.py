@@ -590,7 +590,9 @@ def test_of_many_images_those_that_need_a_look_are_printed(scene, known):
     """One ambiguous pose and one image that was left out, of a hundred each."""
     rng = np.random.default_rng(4)
     truth = view(face_view(scene, "1"), np.radians(25), 4500, rng)
-    poses = [pose_of(see(scene, truth, faces, 0.5, rng), known.truth, scene.camera) for faces in (("1", "2", "4"), ("1",))]
+    poses = [
+        pose_of(see(scene, truth, faces, 0.5, rng), known.truth, scene.camera) for faces in (("1", "2", "4"), ("1",))
+    ]
     images = tuple(MeasuredImage(f"{i:03}.jpg", poses[i == 70]) for i in range(100))
     unknown = tuple(Skipped(f"x{i}.jpg", "no face of the target recognised", "pose") for i in range(100))
     none = measure_labelled([], scene.camera, known.truth)
