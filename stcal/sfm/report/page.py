@@ -260,9 +260,9 @@ def _faces_in_detail(report: dict) -> list[Block]:
             ],
             [
                 subheading("Chains"),
-                "Ways to each face through single groups, before these are adjusted together, and how far each is off the "
-                "result. A way uses a part of the images, so that it may be off by many σ of the result; checks judge "
-                "whether the ways agree"
+                "Ways to each face through single groups, before these are adjusted together, and how far each is off "
+                "the result. A way uses a part of the images, so that it may be off by many σ of the result; checks "
+                "judge whether the ways agree"
                 if ways
                 else "No face but the datum",
                 Table(heads, ways),

@@ -120,8 +120,8 @@ def test_a_suspicious_check_says_how_often_chance_makes_one():
     found = judgement_of(report(check("a", "suspicious", remedy="repeat it"), *others, check("d", "not possible")))
     assert found.verdict == "with care"
     assert found.use == (
-        "With care: 1 of 17 checks is suspicious, the first: Check a; of 17 checks one is so by chance in one sound run "
-        "of 59."
+        "With care: 1 of 17 checks is suspicious, the first: Check a; of 17 checks one is so by chance in one sound "
+        "run of 59."
     )
     assert found.limit.startswith("The centring of circles")
     assert found.next.startswith("Check a: because of a. Repeat it.")
