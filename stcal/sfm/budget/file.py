@@ -407,7 +407,7 @@ def notes_of(budget: Budget, verified: VerifyFile, run: SavedRun) -> list[str]:
         )
     notes += verified.said()
     notes.append(
-        "the reference face's frame is the target frame and carries no uncertainty; what its own circles do not know "
+        "the reference face's frame is the target frame and carries no uncertainty; what its own points do not tell "
         "is in the other faces"
     )
     return notes

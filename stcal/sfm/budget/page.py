@@ -97,7 +97,7 @@ def budget_report(file: BudgetFile) -> Document:
     ]
     return Document(
         title_of(file),
-        f"{file.run.folder}: {images} photographs in {len(file.views)} groups; faces against face "
+        f"{file.run.folder}: {images} photographs in {len(file.views)} group{'s' * (len(file.views) != 1)}; faces against face "
         f"{file.reference_face}, the target frame",
         [
             Section(
