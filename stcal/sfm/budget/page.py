@@ -97,8 +97,8 @@ def budget_report(file: BudgetFile) -> Document:
     ]
     return Document(
         title_of(file),
-        f"{file.run.folder}: {images} photographs in {len(file.views)} group{'s' * (len(file.views) != 1)}; faces against "
-        f"face {file.reference_face}, the target frame",
+        f"{file.run.folder}: {images} photographs in {len(file.views)} group{'s' * (len(file.views) != 1)}; faces "
+        f"against face {file.reference_face}, the target frame",
         [
             Section(
                 "Result",

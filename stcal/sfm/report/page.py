@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 from stcal.io.images import TOP_GROUP
 from stcal.labels import BOARD, parse_label
@@ -99,7 +100,7 @@ def _with_named_groups(report: dict) -> dict:
     """Returns the report with a word in place of the dot for the group of the folder itself."""
     word = "all" if len(report["groups"]) == 1 else "top folder"
 
-    def named(value, key: str):
+    def named(value: Any, key: str) -> Any:
         if isinstance(value, dict):
             return {word if k == TOP_GROUP and key == "boards" else k: named(v, k) for k, v in value.items()}
         if isinstance(value, list):
